@@ -15,15 +15,15 @@ from pathlib import Path
 
 import numpy as np
 
-from diagnosis.alignment import aligned
-from diagnosis.conclusion import conclusion
-from diagnosis.diagnosis import Diagnosis, diagnose
-from diagnosis.fit import Fit
-from diagnosis.held_out import Blocks, held_out_errors
-from diagnosis.observations import Observations
-from effects import Simulation, load_simulation
-from interfaces.recording import Recording
-from interfaces.records import FloatArray
+from bodyschema.diagnosis.alignment import aligned
+from bodyschema.diagnosis.conclusion import conclusion
+from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
+from bodyschema.diagnosis.fit import Fit
+from bodyschema.diagnosis.held_out import Blocks, held_out_errors
+from bodyschema.diagnosis.observations import Observations
+from bodyschema.effects import Simulation, load_simulation
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import FloatArray
 from kbmaps.arrays import BoolArray
 
 SETS = ("ur5_laser", "wam_laser", "ur10_laser_a", "ur10_laser_b", "panda_eyeinhand")

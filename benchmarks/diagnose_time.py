@@ -17,18 +17,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from daemon.synthesis import simulated, with_noise
-from diagnosis.conclusion import conclusion
-from diagnosis.diagnosis import diagnose
-from diagnosis.remedies import remedies
-from diagnosis.report import About, page
-from effects import Effect, Motion, Simulation
-from interfaces.recording import Recording
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
-from interfaces.toml_file import read_toml
+from bodyschema.daemon.synthesis import simulated, with_noise
+from bodyschema.diagnosis.conclusion import conclusion
+from bodyschema.diagnosis.diagnosis import diagnose
+from bodyschema.diagnosis.remedies import remedies
+from bodyschema.diagnosis.report import About, page
+from bodyschema.effects import Effect, Motion, Simulation
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.interfaces.toml_file import read_toml
+from bodyschema.sim_backend import model_file
 from kbmaps.arrays import BoolArray
-from sim_backend import model_file
 
 JOINTS = (
     "neck_yaw",

@@ -24,7 +24,7 @@ import numpy as np
 
 from benchmarks.changes import KNOWN, TOLERANCES, reference, walk
 from benchmarks.rough_arm import rough_arm
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 from kbmaps import ChangeDetector, SharedNoise
 from kbmaps.changes.detector import PAIRS_BETWEEN_FALSE_ALARMS
 from kbmaps.changes.mixture import SIZES

@@ -16,27 +16,27 @@ from functools import partial
 from random import Random
 from typing import Any
 
-from drivers.bench.device import Device
-from drivers.bench.faults import Storm, mute
-from drivers.bench.faults import storm as storm_of_lines
-from drivers.bench.virtual_port import VirtualClock, VirtualPort
-from drivers.dynamixel.bench.chain import Chain
-from drivers.dynamixel.bench.faults import storm as storm_of_dynamixel
-from drivers.dynamixel.bench.servo import Servo
-from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
-from drivers.dynamixel.joints import DynamixelJoints
-from drivers.dynamixel.models import BY_NAME
-from drivers.feetech.bench.chain import Chain as FeetechChain
-from drivers.feetech.bench.faults import storm as storm_of_feetech
-from drivers.feetech.bench.servo import Servo as FeetechServo
-from drivers.feetech.config import BusConfig as FeetechBus
-from drivers.feetech.config import FeetechConfig
-from drivers.feetech.joints import FeetechJoints
-from drivers.feetech.models import BY_NAME as FEETECH_MODELS
-from drivers.serial_lines.bench.board import EncoderBoard
-from drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
-from drivers.serial_lines.joints import SerialLineJoints
-from interfaces.errors import SourceLost
+from bodyschema.drivers.bench.device import Device
+from bodyschema.drivers.bench.faults import Storm, mute
+from bodyschema.drivers.bench.faults import storm as storm_of_lines
+from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
+from bodyschema.drivers.dynamixel.bench.chain import Chain
+from bodyschema.drivers.dynamixel.bench.faults import storm as storm_of_dynamixel
+from bodyschema.drivers.dynamixel.bench.servo import Servo
+from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from bodyschema.drivers.dynamixel.joints import DynamixelJoints
+from bodyschema.drivers.dynamixel.models import BY_NAME
+from bodyschema.drivers.feetech.bench.chain import Chain as FeetechChain
+from bodyschema.drivers.feetech.bench.faults import storm as storm_of_feetech
+from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
+from bodyschema.drivers.feetech.config import BusConfig as FeetechBus
+from bodyschema.drivers.feetech.config import FeetechConfig
+from bodyschema.drivers.feetech.joints import FeetechJoints
+from bodyschema.drivers.feetech.models import BY_NAME as FEETECH_MODELS
+from bodyschema.drivers.serial_lines.bench.board import EncoderBoard
+from bodyschema.drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
+from bodyschema.drivers.serial_lines.joints import SerialLineJoints
+from bodyschema.interfaces.errors import SourceLost
 
 JOINTS = 3  # in a storm
 JOINTS_OF_AN_ARM = 6

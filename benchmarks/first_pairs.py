@@ -23,10 +23,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.rough_arm import rough_arm
-from daemon.config import LearnerConfig
-from daemon.learning import DirectSolver, Learning, NominalModel
-from daemon.learning.nominal import chain_tolerances
-from interfaces.records import Pair, frozen_array
+from bodyschema.daemon.config import LearnerConfig
+from bodyschema.daemon.learning import DirectSolver, Learning, NominalModel
+from bodyschema.daemon.learning.nominal import chain_tolerances
+from bodyschema.interfaces.records import Pair, frozen_array
 from kbmaps import RigidChain
 from kbmaps.arrays import FloatArray
 

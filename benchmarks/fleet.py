@@ -32,12 +32,12 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon.bus import Bus, Request, client
-from daemon.config import Config
-from daemon.keys import Keys
-from daemon.wire import JointsRequest, PairMessage, PairsReply, PredictReply, decode, encode
-from interfaces.errors import BodyschemaError
-from interfaces.interpreter import module_command
+from bodyschema.daemon.bus import Bus, Request, client
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.keys import Keys
+from bodyschema.daemon.wire import JointsRequest, PairMessage, PairsReply, PredictReply, decode, encode
+from bodyschema.interfaces.errors import BodyschemaError
+from bodyschema.interfaces.interpreter import module_command
 
 JOINTS = 6
 SIGMA_M = 2e-3
@@ -180,7 +180,7 @@ def measure(robots: int, course: Course, processes: int) -> str:
             write_robot(Path(folder) / f"arm_{k}", f"arm_{k}", sampler, ends[k % processes]) for k in range(robots)
         ]
         walks = [Walk(Config.load(file), k) for k, file in enumerate(files)]
-        command = module_command("daemon", "learner", "--robot", str(folder), "--processes", str(processes))
+        command = module_command("bodyschema", "learner", "--robot", str(folder), "--processes", str(processes))
         with Bus(listen=sampler) as bus:
             publish = [bus.publisher(Keys(f"arm_{k}").pair, cache=256) for k in range(robots)]
             for k, walk in enumerate(walks):

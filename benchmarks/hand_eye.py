@@ -20,14 +20,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
-from interfaces.toml_file import read_toml
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.interfaces.toml_file import read_toml
+from bodyschema.vision.one_eye import first_pose
+from bodyschema.vision.pose import Pose, PoseEstimator, Sighting, mirrored
+from bodyschema.vision.tag_body import TAG_CORNERS
 from kbmaps import ChainTolerances, RigidChain, RigidLearner, align
-from vision.one_eye import first_pose
-from vision.pose import Pose, PoseEstimator, Sighting, mirrored
-from vision.tag_body import TAG_CORNERS
 
 ROBOT = Path(__file__).parent.parent / "examples" / "desk_arm" / "robot.toml"
 CAMERA = StereoCalibration(600.0, (319.5, 239.5), 0.0, (640, 480), pixel_sigma=0.0)

@@ -18,13 +18,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray, ImageArray, MarkerFix, StereoFrame
-from vision.blob import Disc, Region, find_patches, measure
-from vision.colour import ColourGate
-from vision.config import VisionConfig
-from vision.sphere import Pinhole
-from vision.tracker import StereoTracker
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray, ImageArray, MarkerFix, StereoFrame
+from bodyschema.vision.blob import Disc, Region, find_patches, measure
+from bodyschema.vision.colour import ColourGate
+from bodyschema.vision.config import VisionConfig
+from bodyschema.vision.sphere import Pinhole
+from bodyschema.vision.tracker import StereoTracker
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "vision"))
 

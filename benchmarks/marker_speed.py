@@ -17,9 +17,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray, MarkerFix, StereoFrame
-from vision.tracker import StereoTracker
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray, MarkerFix, StereoFrame
+from bodyschema.vision.tracker import StereoTracker
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "vision"))
 

@@ -23,10 +23,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, StereoFrame
-from vision.config import VisionConfig
-from vision.sphere import Pinhole
-from vision.tracker import StereoTracker
+from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, StereoFrame
+from bodyschema.vision.config import VisionConfig
+from bodyschema.vision.sphere import Pinhole
+from bodyschema.vision.tracker import StereoTracker
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "vision"))
 

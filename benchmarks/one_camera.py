@@ -23,16 +23,16 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray, ImageArray, MarkerFix, StereoFrame
-from interfaces.robot import RobotDescription
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray, ImageArray, MarkerFix, StereoFrame
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.sim_backend.config import CameraConfig, SimTag
+from bodyschema.sim_backend.eye import StereoEyes
+from bodyschema.sim_backend.raster import EmptyWorld
+from bodyschema.vision.tag_body import TagBody
+from bodyschema.vision.tag_config import TagConfig
+from bodyschema.vision.tag_tracker import TagTracker
 from kbmaps import ChainParameters, ChainTolerances, RigidChain, RigidLearner
-from sim_backend.config import CameraConfig, SimTag
-from sim_backend.eye import StereoEyes
-from sim_backend.raster import EmptyWorld
-from vision.tag_body import TagBody
-from vision.tag_config import TagConfig
-from vision.tag_tracker import TagTracker
 
 ROBOT = Path(__file__).parent.parent / "examples" / "desk_arm" / "robot.toml"
 CAMERA = StereoCalibration(600.0, (319.5, 239.5), 0.0, (640, 480), pixel_sigma=0.0)

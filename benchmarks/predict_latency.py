@@ -20,15 +20,15 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon.bus import Bus, Request, client
-from daemon.config import Config
-from daemon.keys import Keys
-from daemon.status import LearnerStatus
-from daemon.wire import JointsRequest, PairMessage, PairsReply, decode, encode
-from interfaces.errors import BusError
-from interfaces.interpreter import module_command
-from interfaces.records import FloatArray
-from sim_backend import model_file
+from bodyschema.daemon.bus import Bus, Request, client
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.keys import Keys
+from bodyschema.daemon.status import LearnerStatus
+from bodyschema.daemon.wire import JointsRequest, PairMessage, PairsReply, decode, encode
+from bodyschema.interfaces.errors import BusError
+from bodyschema.interfaces.interpreter import module_command
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.sim_backend import model_file
 
 STORED_PAIRS = 3000
 PAIRS_PER_S = 30.0
@@ -107,7 +107,7 @@ def asked(robot_file: Path) -> FloatArray:
 @contextmanager
 def running_learner(robot_file: Path, endpoint: str) -> Iterator[None]:
     """`bodyschema learner`, from when it answers to the end of the with statement."""
-    command = module_command("daemon", "learner", "--robot", str(robot_file))
+    command = module_command("bodyschema", "learner", "--robot", str(robot_file))
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
     try:
         while process.poll() is None:

@@ -12,11 +12,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from vision.board import Board
-from vision.calibration.calibrate import Asked, Calibrated, calibrate
-from vision.calibration.gather import gathered
-from vision.calibration.images import pair_files, read_pairs
-from vision.calibration.view import View
+from bodyschema.vision.board import Board
+from bodyschema.vision.calibration.calibrate import Asked, Calibrated, calibrate
+from bodyschema.vision.calibration.gather import gathered
+from bodyschema.vision.calibration.images import pair_files, read_pairs
+from bodyschema.vision.calibration.view import View
 
 BOARD = Board(10, 7, 0.025, pattern="chessboard")
 USUAL = Path("/usr/share/doc/opencv-doc/examples/data")

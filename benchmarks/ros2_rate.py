@@ -14,11 +14,11 @@ from multiprocessing.synchronize import Event
 
 import numpy as np
 
-from drivers.ros2.bench.node import Node
-from drivers.ros2.bench.zenoh_robot import ZenohRobot
-from drivers.ros2.config import Ros2Config
-from drivers.ros2.joints import Ros2Joints
-from interfaces.clock import SystemClock
+from bodyschema.drivers.ros2.bench.node import Node
+from bodyschema.drivers.ros2.bench.zenoh_robot import ZenohRobot
+from bodyschema.drivers.ros2.config import Ros2Config
+from bodyschema.drivers.ros2.joints import Ros2Joints
+from bodyschema.interfaces.clock import SystemClock
 
 ENDPOINT = "tcp/127.0.0.1:27447"
 JOINTS = tuple(f"joint{k}" for k in range(1, 8))

@@ -14,23 +14,23 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.bench.device import Device, Sampling
-from drivers.bench.pty_shell import PtyShell
-from drivers.dynamixel.bench.chain import Chain
-from drivers.dynamixel.bench.servo import CURRENT_MODE, Servo
-from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
-from drivers.dynamixel.joints import DynamixelJoints
-from drivers.dynamixel.models import BY_NAME
-from drivers.dynamixel.powered_config import FloatingJoint, ZeroForceConfig
-from drivers.dynamixel.zero_force import ZeroForce
-from drivers.feetech.bench.chain import Chain as FeetechChain
-from drivers.feetech.bench.servo import Servo as FeetechServo
-from drivers.feetech.config import BusConfig as FeetechBus
-from drivers.feetech.config import FeetechConfig
-from drivers.feetech.joints import FeetechJoints
-from drivers.feetech.models import BY_NAME as FEETECH_MODELS
-from drivers.servos.joints import ServoJoints
-from interfaces.clock import SystemClock
+from bodyschema.drivers.bench.device import Device, Sampling
+from bodyschema.drivers.bench.pty_shell import PtyShell
+from bodyschema.drivers.dynamixel.bench.chain import Chain
+from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE, Servo
+from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from bodyschema.drivers.dynamixel.joints import DynamixelJoints
+from bodyschema.drivers.dynamixel.models import BY_NAME
+from bodyschema.drivers.dynamixel.powered_config import FloatingJoint, ZeroForceConfig
+from bodyschema.drivers.dynamixel.zero_force import ZeroForce
+from bodyschema.drivers.feetech.bench.chain import Chain as FeetechChain
+from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
+from bodyschema.drivers.feetech.config import BusConfig as FeetechBus
+from bodyschema.drivers.feetech.config import FeetechConfig
+from bodyschema.drivers.feetech.joints import FeetechJoints
+from bodyschema.drivers.feetech.models import BY_NAME as FEETECH_MODELS
+from bodyschema.drivers.servos.joints import ServoJoints
+from bodyschema.interfaces.clock import SystemClock
 
 IDS = range(1, 7)
 NAMES = [f"joint{k}" for k in IDS]

@@ -12,12 +12,12 @@ import time
 
 import numpy as np
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
-from sim_backend import SimConfig, SimWorld, model_file, true_chain
-from sim_backend.physics import Physics
-from sim_backend.truth import TrueRobot
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.sim_backend import SimConfig, SimWorld, model_file, true_chain
+from bodyschema.sim_backend.physics import Physics
+from bodyschema.sim_backend.truth import TrueRobot
 
 # The longer tool: the shipped one's ball moved by 250 mm.
 LONG_TOOL = (0.23, 0.0, -0.37)

@@ -22,20 +22,20 @@ from typing import Any, Generic, Self, TypeVar
 
 import cv2
 
-from daemon.bus import Bus
-from daemon.config import Config
-from daemon.sampler import Sampler
-from daemon.session import session_of
-from daemon.sources import Sources
-from daemon.store import PairStore
-from interfaces.camera import StereoCalibration
-from interfaces.clock import SystemClock
-from interfaces.errors import SourceEnded
-from interfaces.records import JointReading, MarkerMiss, StereoFrame
-from sim_backend import SimWorld, model_file
-from vision.config import VisionConfig
-from vision.tracked_camera import TrackedCamera
-from vision.tracker import StereoTracker
+from bodyschema.daemon.bus import Bus
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.sampler import Sampler
+from bodyschema.daemon.session import session_of
+from bodyschema.daemon.sources import Sources
+from bodyschema.daemon.store import PairStore
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import SourceEnded
+from bodyschema.interfaces.records import JointReading, MarkerMiss, StereoFrame
+from bodyschema.sim_backend import SimWorld, model_file
+from bodyschema.vision.config import VisionConfig
+from bodyschema.vision.tracked_camera import TrackedCamera
+from bodyschema.vision.tracker import StereoTracker
 
 CAMERA_HZ = 30.0
 T = TypeVar("T")

@@ -1,4 +1,4 @@
-"""`python -m daemon` is `bodyschema`."""
+"""`python -m bodyschema` is `bodyschema`."""
 
 from __future__ import annotations
 
@@ -8,6 +8,6 @@ import sys
 if not sys.flags.safe_path:  # `-m` puts the current folder first, whose `vision` or `numpy` is a user's own
     sys.path[0] = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 
-from daemon.cli import main
+from bodyschema.daemon.cli import main
 
 main()

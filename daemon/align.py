@@ -9,7 +9,7 @@ from threading import Condition
 import numpy as np
 from numpy.typing import NDArray
 
-from interfaces.records import FloatArray, JointReading, Reason, frozen_array
+from bodyschema.interfaces.records import FloatArray, JointReading, Reason, frozen_array
 
 CAPACITY = 8192
 ROUNDING_S = 1e-9  # times of day-long clocks, subtracted

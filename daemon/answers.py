@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from daemon.bus import Request
-from daemon.learning import Learning, LearntModel
-from daemon.wire import (
+from bodyschema.daemon.bus import Request
+from bodyschema.daemon.learning import Learning, LearntModel
+from bodyschema.daemon.wire import (
     IkReply,
     IkRequest,
     JacobianReply,
@@ -18,7 +18,7 @@ from daemon.wire import (
     joint_vector,
     position,
 )
-from interfaces.robot import RobotDescription
+from bodyschema.interfaces.robot import RobotDescription
 from kbmaps import InverseKinematics
 
 

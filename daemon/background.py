@@ -10,9 +10,9 @@ import time
 from collections.abc import Sequence
 from typing import Protocol
 
-from daemon.service import Service
-from daemon.solver_process import SolverLostError
-from interfaces.protocols import Clock
+from bodyschema.daemon.service import Service
+from bodyschema.daemon.solver_process import SolverLostError
+from bodyschema.interfaces.protocols import Clock
 
 log = logging.getLogger(__name__)
 

@@ -20,10 +20,10 @@ from typing import IO, Any
 
 import msgspec
 
-from interfaces.errors import BodyschemaError, StoreError
-from interfaces.limited import check_regular
-from interfaces.robot import Name
-from interfaces.toml_file import read_toml
+from bodyschema.interfaces.errors import BodyschemaError, StoreError
+from bodyschema.interfaces.limited import check_regular
+from bodyschema.interfaces.robot import Name
+from bodyschema.interfaces.toml_file import read_toml
 
 from . import store_schema
 from .checkpoint import checkpoint_bytes

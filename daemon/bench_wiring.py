@@ -15,21 +15,21 @@ from typing import Any
 
 import msgspec
 
-from drivers.bench.asked_faults import AskedFault, FaultKinds
-from drivers.bench.dry_run import Angle, BenchArm, DryRun
-from drivers.bench.motion import played, swinging
-from drivers.bench.through_driver import LATENCY_MS, READ_S, Behind, ThroughDriver
-from drivers.dynamixel.config import DynamixelConfig
-from drivers.feetech.config import FeetechConfig
-from drivers.ros2.config import Ros2Config
-from drivers.serial_lines.config import SerialLinesConfig
-from interfaces.clock import SystemClock
-from interfaces.errors import ConfigError
-from interfaces.limited import read_at_most
-from interfaces.protocols import JointSource
-from interfaces.records import JointReading
-from interfaces.toml_file import read_toml
-from interfaces.toml_text import toml_text
+from bodyschema.drivers.bench.asked_faults import AskedFault, FaultKinds
+from bodyschema.drivers.bench.dry_run import Angle, BenchArm, DryRun
+from bodyschema.drivers.bench.motion import played, swinging
+from bodyschema.drivers.bench.through_driver import LATENCY_MS, READ_S, Behind, ThroughDriver
+from bodyschema.drivers.dynamixel.config import DynamixelConfig
+from bodyschema.drivers.feetech.config import FeetechConfig
+from bodyschema.drivers.ros2.config import Ros2Config
+from bodyschema.drivers.serial_lines.config import SerialLinesConfig
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.limited import read_at_most
+from bodyschema.interfaces.protocols import JointSource
+from bodyschema.interfaces.records import JointReading
+from bodyschema.interfaces.toml_file import read_toml
+from bodyschema.interfaces.toml_text import toml_text
 
 from .config import Config
 
@@ -79,7 +79,7 @@ def bench_motion(config: Config, tell: Callable[[float], None]) -> Motion:
     if why:
         angles = swinging(limits_of(config), monotonic())
         return Motion(dict(zip(joints, angles, strict=True)), f"each joint swings slowly by itself ({why})")
-    from sim_backend.guided_path import guided_path
+    from bodyschema.sim_backend.guided_path import guided_path
 
     from .wiring import simulation_settings
 
@@ -119,26 +119,26 @@ def open_bench(
 def _kinds(hardware: OnPorts) -> FaultKinds:
     match hardware:
         case DynamixelConfig():
-            from drivers.dynamixel.bench.arm import KINDS
+            from bodyschema.drivers.dynamixel.bench.arm import KINDS
         case FeetechConfig():
-            from drivers.feetech.bench.arm import KINDS
+            from bodyschema.drivers.feetech.bench.arm import KINDS
         case SerialLinesConfig():
-            from drivers.serial_lines.bench.arm import KINDS
+            from bodyschema.drivers.serial_lines.bench.arm import KINDS
     return KINDS
 
 
 def _arm(hardware: OnPorts, angles: Mapping[str, Angle], *, return_delay_s: float = 0.0, **settings: Any) -> BenchArm:
     match hardware:
         case DynamixelConfig():
-            from drivers.dynamixel.bench.arm import DynamixelArm
+            from bodyschema.drivers.dynamixel.bench.arm import DynamixelArm
 
             return DynamixelArm(hardware, angles, return_delay_s=return_delay_s, **settings)
         case FeetechConfig():
-            from drivers.feetech.bench.arm import FeetechArm
+            from bodyschema.drivers.feetech.bench.arm import FeetechArm
 
             return FeetechArm(hardware, angles, return_delay_s=return_delay_s, **settings)
         case SerialLinesConfig():
-            from drivers.serial_lines.bench.arm import EncoderArm
+            from bodyschema.drivers.serial_lines.bench.arm import EncoderArm
 
             return EncoderArm(hardware, angles, **settings)
 
@@ -244,7 +244,7 @@ def _looking_at_lines(
     hardware: SerialLinesConfig, angles: Mapping[str, Angle], open_driver: OpenDriver
 ) -> Iterator[Behind]:
     """Each look is at a line whose measurement began after it."""
-    from drivers.serial_lines.bench.listener import Listener
+    from bodyschema.drivers.serial_lines.bench.listener import Listener
 
     clock = SystemClock()
     quick = msgspec.structs.replace(hardware, baud=BOARD_BAUD, delay_ms=0.0, native_usb=False)
@@ -258,8 +258,8 @@ def _looking_at_messages(
     hardware: Ros2Config, angles: Mapping[str, Angle], open_driver: OpenDriver
 ) -> Iterator[Behind]:
     """A node that publishes when it is looked at, and a router, in this process."""
-    from drivers.ros2.bench.node import Node
-    from drivers.ros2.bench.zenoh_robot import ZenohRobot
+    from bodyschema.drivers.ros2.bench.node import Node
+    from bodyschema.drivers.ros2.bench.zenoh_robot import ZenohRobot
 
     clock = SystemClock()
     node = Node(dict(zip(hardware.ros_names(tuple(angles)), angles.values(), strict=True)), rate_hz=1.0)

@@ -19,7 +19,7 @@ from typing import Any, Self
 import zenoh
 import zenoh.ext
 
-from interfaces.errors import BodyschemaError, BusError, RequestError
+from bodyschema.interfaces.errors import BodyschemaError, BusError, RequestError
 
 from .identity import Route
 from .reception import Reception

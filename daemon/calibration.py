@@ -8,10 +8,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from interfaces.errors import BodyschemaError
-from interfaces.recording import Recording
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
+from bodyschema.interfaces.errors import BodyschemaError
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
 from kbmaps import (
     Alignment,
     ChainBelief,

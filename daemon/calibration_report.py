@@ -7,13 +7,13 @@ import math
 import msgspec
 import numpy as np
 
-from daemon.calibration import Calibration
-from daemon.learning.workmanship import WORKMANSHIP
-from daemon.plausibility.check import Plausibility
-from daemon.tool_jump import tool_jump
-from interfaces.recording import Recording
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
+from bodyschema.daemon.calibration import Calibration
+from bodyschema.daemon.learning.workmanship import WORKMANSHIP
+from bodyschema.daemon.plausibility.check import Plausibility
+from bodyschema.daemon.tool_jump import tool_jump
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
 
 # A joint that moved less is named [rad, m].
 STILL_RAD, STILL_M = math.radians(10.0), 0.02

@@ -8,7 +8,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from daemon.calibration_report import CalibrationReport, Figure, Zero
+from bodyschema.daemon.calibration_report import CalibrationReport, Figure, Zero
 
 # Told noise that explains the residuals leaves less than this.
 MISFIT = 1.5

@@ -10,24 +10,24 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from interfaces.clock import SystemClock
-from interfaces.errors import ConfigError
-from vision.board import Board
-from vision.board.board import Pattern
-from vision.board.page import page as board_page
-from vision.calibration.calibrate import Asked, Calibrated, ModelChoice, calibrate
-from vision.calibration.check import Check, check
-from vision.calibration.gather import Gathered, gathered, require_both
-from vision.calibration.images import ImagePair, PairFiles, pair_files, read_pairs, write_pair
-from vision.calibration.live import LiveViews
-from vision.calibration.report import page as report_page
-from vision.calibration.view import EYES, ONE_EYE
-from vision.printing.sheet import rulers_mm
-from vision.rectified import Rectification
-from vision.rig import CalibrationError, OneEyeRig, StereoRig
-from vision.rig_file import read_rig, write_rig
-from vision.spread import covariance_of
-from vision.triangulated import triangulated
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.vision.board import Board
+from bodyschema.vision.board.board import Pattern
+from bodyschema.vision.board.page import page as board_page
+from bodyschema.vision.calibration.calibrate import Asked, Calibrated, ModelChoice, calibrate
+from bodyschema.vision.calibration.check import Check, check
+from bodyschema.vision.calibration.gather import Gathered, gathered, require_both
+from bodyschema.vision.calibration.images import ImagePair, PairFiles, pair_files, read_pairs, write_pair
+from bodyschema.vision.calibration.live import LiveViews
+from bodyschema.vision.calibration.report import page as report_page
+from bodyschema.vision.calibration.view import EYES, ONE_EYE
+from bodyschema.vision.printing.sheet import rulers_mm
+from bodyschema.vision.rectified import Rectification
+from bodyschema.vision.rig import CalibrationError, OneEyeRig, StereoRig
+from bodyschema.vision.rig_file import read_rig, write_rig
+from bodyschema.vision.spread import covariance_of
+from bodyschema.vision.triangulated import triangulated
 
 from .pages import write_page
 
@@ -207,7 +207,7 @@ def from_images(images: Images, board: Board, tell: Tell) -> Gathered:
 
 @dataclass(frozen=True)
 class Wanted:
-    """Of a calibration, besides views and board; as `vision.calibration.calibrate.Asked` has it."""
+    """Of a calibration, besides views and board; as `bodyschema.vision.calibration.calibrate.Asked` has it."""
 
     serials: tuple[str, ...] = ("", "")
     model: ModelChoice = "auto"

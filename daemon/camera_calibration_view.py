@@ -8,8 +8,8 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from daemon.camera_calibration import AHEAD_M, CamerasFile, CheckFile
-from interfaces.interval import to_its_interval
+from bodyschema.daemon.camera_calibration import AHEAD_M, CamerasFile, CheckFile
+from bodyschema.interfaces.interval import to_its_interval
 
 _WISHES = 3
 

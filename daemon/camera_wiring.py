@@ -9,22 +9,22 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
 
-from drivers.checks import Check, holders
-from interfaces.clock import SystemClock
-from interfaces.errors import BodyschemaError, ConfigError
-from interfaces.protocols import Clock, StereoCamera
-from interfaces.toml_file import line_of, read_toml
-from vision.cameras.config import CamerasConfig, ImagesConfig, UvcSettings, VideosConfig
-from vision.cameras.controls import left_to_the_camera
-from vision.cameras.film import Film
-from vision.cameras.ideal import IdealCamera
-from vision.cameras.live import CameraFigures, LiveEyes
-from vision.cameras.opened import eyes_of
-from vision.cameras.serials import connected
-from vision.cameras.watched import PlainEyes, WatchedCamera
-from vision.rectified import RectifiedCamera
-from vision.rig import OneEyeRig, Rig
-from vision.rig_file import read_rig
+from bodyschema.drivers.checks import Check, holders
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import BodyschemaError, ConfigError
+from bodyschema.interfaces.protocols import Clock, StereoCamera
+from bodyschema.interfaces.toml_file import line_of, read_toml
+from bodyschema.vision.cameras.config import CamerasConfig, ImagesConfig, UvcSettings, VideosConfig
+from bodyschema.vision.cameras.controls import left_to_the_camera
+from bodyschema.vision.cameras.film import Film
+from bodyschema.vision.cameras.ideal import IdealCamera
+from bodyschema.vision.cameras.live import CameraFigures, LiveEyes
+from bodyschema.vision.cameras.opened import eyes_of
+from bodyschema.vision.cameras.serials import connected
+from bodyschema.vision.cameras.watched import PlainEyes, WatchedCamera
+from bodyschema.vision.rectified import RectifiedCamera
+from bodyschema.vision.rig import OneEyeRig, Rig
+from bodyschema.vision.rig_file import read_rig
 
 from .config import Config
 

@@ -9,11 +9,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from interfaces.calibrated import CalibratedGeometry
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
-from interfaces.rpy import rpy_of
-from interfaces.urdf import inverse
+from bodyschema.interfaces.calibrated import CalibratedGeometry
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.interfaces.rpy import rpy_of
+from bodyschema.interfaces.urdf import inverse
 from kbmaps import ChainBelief, ChainParameters
 
 BoolArray = NDArray[np.bool_]

@@ -26,12 +26,12 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from daemon.kept_files import sync_folder, unused_name
-from daemon.learning import LearningState
-from daemon.learning.state import LearningHeader
-from interfaces.errors import BodyschemaError
-from interfaces.limited import read_at_most
-from interfaces.records import FloatArray
+from bodyschema.daemon.kept_files import sync_folder, unused_name
+from bodyschema.daemon.learning import LearningState
+from bodyschema.daemon.learning.state import LearningHeader
+from bodyschema.interfaces.errors import BodyschemaError
+from bodyschema.interfaces.limited import read_at_most
+from bodyschema.interfaces.records import FloatArray
 
 MAGIC = b"BSCKPT\r\n"
 VERSION = 3

@@ -10,10 +10,10 @@ from typing import NoReturn
 
 import cyclopts
 
-from daemon.extras import missing_module
-from daemon.remedies import as_typed, printable
-from daemon.signals import end_with_parent
-from interfaces.errors import BodyschemaError, ConfigError
+from bodyschema.daemon.extras import missing_module
+from bodyschema.daemon.remedies import as_typed, printable
+from bodyschema.daemon.signals import end_with_parent
+from bodyschema.interfaces.errors import BodyschemaError, ConfigError
 
 COMMANDS = {
     "demo": "Watch it all in simulation, about a minute. No hardware needed.",
@@ -75,7 +75,7 @@ def command_line(called: str | None = None) -> cyclopts.App:
     )
     for place, (name, summary) in enumerate(COMMANDS.items()):
         own = None if name == called else summary
-        line.command(f"daemon.commands.{name}:{name}", name=name, help=own, sort_key=place)
+        line.command(f"bodyschema.daemon.commands.{name}:{name}", name=name, help=own, sort_key=place)
     return line
 
 

@@ -11,18 +11,18 @@ import cv2
 import msgspec
 import numpy as np
 
-from interfaces.errors import ConfigError
-from interfaces.records import ImageArray, Reason
-from vision.calibration.images import read_pairs
-from vision.cluster.measure import ClusterView, MeasuredCluster, measure_cluster
-from vision.cluster.tables import cluster_tables
-from vision.rectified import Rectification
-from vision.rig import CalibrationError
-from vision.rig_file import read_rig
-from vision.tag_config import Dictionary, TagConfig
-from vision.tag_dictionary import tags_of
-from vision.tag_finder import Seen, TagFinder
-from vision.tag_image import TagImage
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.records import ImageArray, Reason
+from bodyschema.vision.calibration.images import read_pairs
+from bodyschema.vision.cluster.measure import ClusterView, MeasuredCluster, measure_cluster
+from bodyschema.vision.cluster.tables import cluster_tables
+from bodyschema.vision.rectified import Rectification
+from bodyschema.vision.rig import CalibrationError
+from bodyschema.vision.rig_file import read_rig
+from bodyschema.vision.tag_config import Dictionary, TagConfig
+from bodyschema.vision.tag_dictionary import tags_of
+from bodyschema.vision.tag_finder import Seen, TagFinder
+from bodyschema.vision.tag_image import TagImage
 
 from .camera_calibration import Images
 

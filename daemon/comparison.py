@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from interfaces.errors import RecordingError
-from interfaces.recording import Recording
-from interfaces.records import FloatArray
+from bodyschema.interfaces.errors import RecordingError
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import FloatArray
 
 # Rows whose joints differ by more are not of the same joint angles [rad, m].
 SAME_ANGLES = 1e-6

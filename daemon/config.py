@@ -17,15 +17,15 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from drivers.config import DriversConfig
-from effects import Simulation, simulation_of
-from interfaces.calibrated_files import EXTENSIONS
-from interfaces.errors import ConfigError
-from interfaces.robot import CameraSection, RobotDescription, RobotSection
-from interfaces.suggest import did_you_mean, hint_at, with_choices
-from interfaces.toml_file import convert, line_of, line_of_endless_key, read_toml
-from sim_backend.config import SimConfig
-from vision.config import VisionConfig
+from bodyschema.drivers.config import DriversConfig
+from bodyschema.effects import Simulation, simulation_of
+from bodyschema.interfaces.calibrated_files import EXTENSIONS
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.robot import CameraSection, RobotDescription, RobotSection
+from bodyschema.interfaces.suggest import did_you_mean, hint_at, with_choices
+from bodyschema.interfaces.toml_file import convert, line_of, line_of_endless_key, read_toml
+from bodyschema.sim_backend.config import SimConfig
+from bodyschema.vision.config import VisionConfig
 
 from .identity import Route
 from .zenoh_config import ZenohConfig
@@ -108,7 +108,7 @@ class LearnerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Tables(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """All tables of robot.toml; [robot] and [camera] are checked by `interfaces.robot`, the last three by `effects`."""
+    """All tables of robot.toml; [robot] and [camera] are checked by `bodyschema.interfaces.robot`, the last three by `effects`."""
 
     robot: dict[str, Any]
     camera: dict[str, Any]

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
-from interfaces.protocols import Clock, JointSource
+from bodyschema.interfaces.protocols import Clock, JointSource
 
 from .store import PairStore
 
@@ -21,7 +21,7 @@ IN_ROBOT_TOML = ("zero_ticks", "direction")
 
 @runtime_checkable
 class KeepsRecord(Protocol):
-    """Encoders that can say what they are; see `drivers.servos.joints.ServoJoints`."""
+    """Encoders that can say what they are; see `bodyschema.drivers.servos.joints.ServoJoints`."""
 
     @property
     def record(self) -> Sequence[Device]:

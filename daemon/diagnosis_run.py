@@ -13,21 +13,21 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from diagnosis.conclusion import conclusion
-from diagnosis.diagnosis import Diagnosis
-from diagnosis.diagnosis import diagnose as diagnosed
-from diagnosis.hypotheses import STILL
-from diagnosis.observations import ticks
-from diagnosis.remedies import remedies
-from diagnosis.report import About, page
-from diagnosis.result import DiagnosisFile
-from diagnosis.words import modelled
-from effects import KINDS, write_corrected, write_extended
-from interfaces.errors import BodyschemaError, RecordingError, RequestError
-from interfaces.recording import Recording
-from interfaces.records import Pair
-from interfaces.robot import RobotDescription
-from interfaces.suggest import did_you_mean
+from bodyschema.diagnosis.conclusion import conclusion
+from bodyschema.diagnosis.diagnosis import Diagnosis
+from bodyschema.diagnosis.diagnosis import diagnose as diagnosed
+from bodyschema.diagnosis.hypotheses import STILL
+from bodyschema.diagnosis.observations import ticks
+from bodyschema.diagnosis.remedies import remedies
+from bodyschema.diagnosis.report import About, page
+from bodyschema.diagnosis.result import DiagnosisFile
+from bodyschema.diagnosis.words import modelled
+from bodyschema.effects import KINDS, write_corrected, write_extended
+from bodyschema.interfaces.errors import BodyschemaError, RecordingError, RequestError
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import Pair
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.interfaces.suggest import did_you_mean
 
 from . import recordings
 from .bus import client

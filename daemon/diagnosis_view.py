@@ -10,9 +10,9 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from diagnosis.numbers import chance, mm, numbers_of, percent, place, rival_named, share, telling
-from diagnosis.result import Cause, DiagnosisFile, Errors, Indistinguishable, Verdict
-from diagnosis.words import beside_geometry, made_to, modelled
+from bodyschema.diagnosis.numbers import chance, mm, numbers_of, percent, place, rival_named, share, telling
+from bodyschema.diagnosis.result import Cause, DiagnosisFile, Errors, Indistinguishable, Verdict
+from bodyschema.diagnosis.words import beside_geometry, made_to, modelled
 
 # So many hypotheses that were rejected are shown.
 NEAREST = 6

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import msgspec
 
-from interfaces.errors import BodyschemaError, BusError
+from bodyschema.interfaces.errors import BodyschemaError, BusError
 
 from .bus import Bus, is_alive
 from .config import Config

@@ -8,25 +8,25 @@ from typing import get_args
 
 import msgspec
 
-from drivers.dynamixel.config import Baud as DynamixelBaud
-from drivers.dynamixel.config import BusConfig as DynamixelBus
-from drivers.dynamixel.config import DynamixelConfig
-from drivers.dynamixel.joints import DYNAMIXEL
-from drivers.dynamixel.joints import open_serial as open_dynamixel
-from drivers.feetech.config import Baud as FeetechBaud
-from drivers.feetech.config import BusConfig as FeetechBus
-from drivers.feetech.config import FeetechConfig
-from drivers.feetech.joints import FEETECH
-from drivers.feetech.joints import open_serial as open_feetech
-from drivers.servos.config import ServoConfig
-from drivers.servos.handshake import FittedServo
-from drivers.servos.model import Model
-from drivers.servos.port import Port
-from drivers.servos.settings import BAUD, HOMING_OFFSET, ID, Setting, setting_called
-from drivers.servos.workbench import Change, Done, Outcome, Workbench
-from interfaces.clock import SystemClock
-from interfaces.errors import ConfigError, SourceError
-from interfaces.suggest import did_you_mean
+from bodyschema.drivers.dynamixel.config import Baud as DynamixelBaud
+from bodyschema.drivers.dynamixel.config import BusConfig as DynamixelBus
+from bodyschema.drivers.dynamixel.config import DynamixelConfig
+from bodyschema.drivers.dynamixel.joints import DYNAMIXEL
+from bodyschema.drivers.dynamixel.joints import open_serial as open_dynamixel
+from bodyschema.drivers.feetech.config import Baud as FeetechBaud
+from bodyschema.drivers.feetech.config import BusConfig as FeetechBus
+from bodyschema.drivers.feetech.config import FeetechConfig
+from bodyschema.drivers.feetech.joints import FEETECH
+from bodyschema.drivers.feetech.joints import open_serial as open_feetech
+from bodyschema.drivers.servos.config import ServoConfig
+from bodyschema.drivers.servos.handshake import FittedServo
+from bodyschema.drivers.servos.model import Model
+from bodyschema.drivers.servos.port import Port
+from bodyschema.drivers.servos.settings import BAUD, HOMING_OFFSET, ID, Setting, setting_called
+from bodyschema.drivers.servos.workbench import Change, Done, Outcome, Workbench
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import ConfigError, SourceError
+from bodyschema.interfaces.suggest import did_you_mean
 
 from .config import Config
 

@@ -7,12 +7,12 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
-from daemon.learning.snapshot import NoFrameError, Snapshot
-from daemon.reopen import Reopening
-from daemon.sources import MarkerTopic, StampedJoints
-from interfaces.errors import SourceError
-from interfaces.protocols import Clock
-from interfaces.records import JointReading
+from bodyschema.daemon.learning.snapshot import NoFrameError, Snapshot
+from bodyschema.daemon.reopen import Reopening
+from bodyschema.daemon.sources import MarkerTopic, StampedJoints
+from bodyschema.interfaces.errors import SourceError
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.records import JointReading
 
 log = logging.getLogger(__name__)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 
-from interfaces.errors import ConfigError
+from bodyschema.interfaces.errors import ConfigError
 
 # Each extra of pyproject.toml and the modules by which it is recognised.
 MODULES = {

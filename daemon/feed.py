@@ -11,11 +11,11 @@ from datetime import datetime
 
 import msgspec
 
-from daemon.history import Page, Unreadable
-from daemon.learning import Learning
-from daemon.wire import PairMessage, decode, pair_from_wire
-from interfaces.errors import BusError, RequestError
-from interfaces.protocols import Clock
+from bodyschema.daemon.history import Page, Unreadable
+from bodyschema.daemon.learning import Learning
+from bodyschema.daemon.wire import PairMessage, decode, pair_from_wire
+from bodyschema.interfaces.errors import BusError, RequestError
+from bodyschema.interfaces.protocols import Clock
 
 log = logging.getLogger(__name__)
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from interfaces.protocols import Clock
-from interfaces.robot import RobotDescription
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.robot import RobotDescription
 from kbmaps import ChainBelief, KBMapsError
 
 from .chain_figures import ChainFigures, is_told, no_surer_than_possible

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from interfaces.records import FloatArray, Pair, Reason
+from bodyschema.interfaces.records import FloatArray, Pair, Reason
 
 from .align import joint_difference
 from .config import DaemonConfig

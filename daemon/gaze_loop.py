@@ -12,11 +12,11 @@ from typing import Self
 
 import numpy as np
 
-from interfaces.errors import BusError, ConfigError, RequestError
-from interfaces.pointing import Pointing
-from interfaces.protocols import Clock
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
+from bodyschema.interfaces.errors import BusError, ConfigError, RequestError
+from bodyschema.interfaces.pointing import Pointing
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
 
 from .bus import Bus
 from .keys import Keys

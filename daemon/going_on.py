@@ -6,8 +6,8 @@ import logging
 from collections.abc import Callable
 from pathlib import Path
 
-from daemon.checkpoint import CheckpointError, generations, read_checkpoint, set_aside
-from daemon.learning import Learning, StateError
+from bodyschema.daemon.checkpoint import CheckpointError, generations, read_checkpoint, set_aside
+from bodyschema.daemon.learning import Learning, StateError
 from kbmaps import KBMapsError
 
 log = logging.getLogger(__name__)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import msgspec
 
-from interfaces.errors import RequestError
+from bodyschema.interfaces.errors import RequestError
 
 from .bus import Request
 from .store import PairReader

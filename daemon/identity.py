@@ -10,8 +10,8 @@ from typing import Any
 
 import msgspec
 
-from interfaces.errors import ConfigError
-from interfaces.limited import read_at_most
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.limited import read_at_most
 
 SECURE = ("tls", "quic")
 READ_BY_OTHERS = stat.S_IROTH

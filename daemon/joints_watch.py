@@ -12,10 +12,10 @@ from typing import Protocol, Self, runtime_checkable
 import msgspec
 import numpy as np
 
-from interfaces.protocols import Clock, JointSource
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
-from interfaces.urdf import chain_between
+from bodyschema.interfaces.protocols import Clock, JointSource
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.interfaces.urdf import chain_between
 from kbmaps import RigidChain
 
 from .config import Config
@@ -43,7 +43,7 @@ class Sample(Protocol):
 
 
 class Fitted(Protocol):
-    """A servo as it was found; see `drivers.servos.handshake.FittedServo`."""
+    """A servo as it was found; see `bodyschema.drivers.servos.handshake.FittedServo`."""
 
     @property
     def id(self) -> int: ...
@@ -52,7 +52,7 @@ class Fitted(Protocol):
 
 
 class EncoderJoints(JointSource, Protocol):
-    """A real arm's joints, which know how they are; see `drivers.serial_lines.joints.SerialLineJoints`."""
+    """A real arm's joints, which know how they are; see `bodyschema.drivers.serial_lines.joints.SerialLineJoints`."""
 
     @property
     def health(self) -> tuple[str, ...]: ...
@@ -60,7 +60,7 @@ class EncoderJoints(JointSource, Protocol):
 
 @runtime_checkable
 class ServoJoints(EncoderJoints, Protocol):
-    """Encoders that are servos; see `drivers.servos.joints.ServoJoints`."""
+    """Encoders that are servos; see `bodyschema.drivers.servos.joints.ServoJoints`."""
 
     @property
     def servos(self) -> Sequence[Fitted]: ...

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.optimize import minimize_scalar
 
-from interfaces.errors import BodyschemaError
-from interfaces.records import FloatArray, frozen_array
+from bodyschema.interfaces.errors import BodyschemaError
+from bodyschema.interfaces.records import FloatArray, frozen_array
 from kbmaps import RigidChain
 
 EARLIEST_S, LATEST_S = -0.05, 0.25  # that is looked for

@@ -2,7 +2,7 @@
 
 Threads: zenoh's (queries, from an immutable snapshot; published pairs, into a queue), one for each robot that learns
 each pair at once, one at low priority for replay and the solver's orders, and the main thread for status and
-checkpoints; `daemon.learner_host` has the last two.
+checkpoints; `bodyschema.daemon.learner_host` has the last two.
 """
 
 from __future__ import annotations
@@ -13,27 +13,27 @@ import threading
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
 
-from daemon.answers import Answers
-from daemon.bus import Bus, Request
-from daemon.changes import Changes
-from daemon.checkpoint import CheckpointError, write_checkpoint
-from daemon.config import Config
-from daemon.expected import ExpectedMarker
-from daemon.feed import BEHIND, PairFeed
-from daemon.findings import Findings, FindingTurns
-from daemon.going_on import go_on
-from daemon.history import Page, read_page
-from daemon.keys import Keys
-from daemon.learning import Learning, NominalModel
-from daemon.learning.solver import LARGEST_NET, Solver
-from daemon.reload import reload
-from daemon.service import Service, with_health
-from daemon.status import LearnerStatus
-from daemon.thread_names import show_name
-from daemon.wire import OCTETS, CommandReply, CommandRequest, decode, encode
-from daemon.wiring import open_marker_topic
-from interfaces.errors import RequestError
-from interfaces.protocols import Clock
+from bodyschema.daemon.answers import Answers
+from bodyschema.daemon.bus import Bus, Request
+from bodyschema.daemon.changes import Changes
+from bodyschema.daemon.checkpoint import CheckpointError, write_checkpoint
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.expected import ExpectedMarker
+from bodyschema.daemon.feed import BEHIND, PairFeed
+from bodyschema.daemon.findings import Findings, FindingTurns
+from bodyschema.daemon.going_on import go_on
+from bodyschema.daemon.history import Page, read_page
+from bodyschema.daemon.keys import Keys
+from bodyschema.daemon.learning import Learning, NominalModel
+from bodyschema.daemon.learning.solver import LARGEST_NET, Solver
+from bodyschema.daemon.reload import reload
+from bodyschema.daemon.service import Service, with_health
+from bodyschema.daemon.status import LearnerStatus
+from bodyschema.daemon.thread_names import show_name
+from bodyschema.daemon.wire import OCTETS, CommandReply, CommandRequest, decode, encode
+from bodyschema.daemon.wiring import open_marker_topic
+from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.protocols import Clock
 
 log = logging.getLogger(__name__)
 

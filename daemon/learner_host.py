@@ -15,23 +15,23 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
-from daemon.access import Names, Subjects, access_control
-from daemon.background import Background
-from daemon.bus import Bus
-from daemon.config import Config
-from daemon.findings import FindingTurns
-from daemon.identity import SECURE
-from daemon.keys import Keys
-from daemon.learner import LISTENING, LOOPS, Learner, more_rarely, status_line
-from daemon.notify import Notifier
-from daemon.service import Service
-from daemon.signals import Wishes
-from daemon.solver_process import SolverProcess
-from daemon.solver_seats import SharedSolver
-from daemon.thread_names import show_name
-from daemon.wire import encode
-from interfaces.errors import BodyschemaError, ConfigError
-from interfaces.protocols import Clock
+from bodyschema.daemon.access import Names, Subjects, access_control
+from bodyschema.daemon.background import Background
+from bodyschema.daemon.bus import Bus
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.findings import FindingTurns
+from bodyschema.daemon.identity import SECURE
+from bodyschema.daemon.keys import Keys
+from bodyschema.daemon.learner import LISTENING, LOOPS, Learner, more_rarely, status_line
+from bodyschema.daemon.notify import Notifier
+from bodyschema.daemon.service import Service
+from bodyschema.daemon.signals import Wishes
+from bodyschema.daemon.solver_process import SolverProcess
+from bodyschema.daemon.solver_seats import SharedSolver
+from bodyschema.daemon.thread_names import show_name
+from bodyschema.daemon.wire import encode
+from bodyschema.interfaces.errors import BodyschemaError, ConfigError
+from bodyschema.interfaces.protocols import Clock
 
 log = logging.getLogger(__name__)
 

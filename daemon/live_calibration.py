@@ -9,16 +9,16 @@ from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
-from interfaces.errors import SourceEnded, SourceError
-from interfaces.protocols import Clock, StereoEyes
-from interfaces.records import StereoFrame
-from vision.calibration.calibrate import Calibrated
-from vision.calibration.check import Check, check
-from vision.calibration.gather import Gathered, require_both
-from vision.calibration.guidance import Coverage
-from vision.calibration.images import ImagePair
-from vision.calibration.live import LiveViews, Look, Outcome
-from vision.rig import CalibrationError
+from bodyschema.interfaces.errors import SourceEnded, SourceError
+from bodyschema.interfaces.protocols import Clock, StereoEyes
+from bodyschema.interfaces.records import StereoFrame
+from bodyschema.vision.calibration.calibrate import Calibrated
+from bodyschema.vision.calibration.check import Check, check
+from bodyschema.vision.calibration.gather import Gathered, require_both
+from bodyschema.vision.calibration.guidance import Coverage
+from bodyschema.vision.calibration.images import ImagePair
+from bodyschema.vision.calibration.live import LiveViews, Look, Outcome
+from bodyschema.vision.rig import CalibrationError
 
 from .camera_calibration import Tell, pair_in
 from .reopen import Reopening
@@ -60,7 +60,7 @@ Show = Callable[[Shown], None]
 
 
 class HealthyEyes(StereoEyes, Protocol):
-    """Eyes that say what is wrong with them; see `vision.cameras.live.LiveEyes`."""
+    """Eyes that say what is wrong with them; see `bodyschema.vision.cameras.live.LiveEyes`."""
 
     @property
     def health(self) -> tuple[str, ...]: ...

@@ -10,10 +10,10 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from interfaces.protocols import Clock
-from vision.calibration.guidance import TILTED_EACH_WAY, WANTED_VIEWS, Coverage, cell_counts
-from vision.calibration.live import Look, Outcome
-from vision.calibration.view import Eye, all_px, image_of
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.vision.calibration.guidance import TILTED_EACH_WAY, WANTED_VIEWS, Coverage, cell_counts
+from bodyschema.vision.calibration.live import Look, Outcome
+from bodyschema.vision.calibration.view import Eye, all_px, image_of
 
 from .live_calibration import Show, Shown
 

@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from interfaces.errors import SourceEnded
-from interfaces.protocols import Clock, StereoEyes
-from interfaces.records import ImageArray
+from bodyschema.interfaces.errors import SourceEnded
+from bodyschema.interfaces.protocols import Clock, StereoEyes
+from bodyschema.interfaces.records import ImageArray
 
 from .reopen import Reopening
 
@@ -22,7 +22,7 @@ def learnt_colour_table(images: Sequence[Path], at: tuple[float, float] | None) 
     Raises:
         ColourUnlearnt: there is no such ball; the message says why.
     """
-    from vision.colour_model import colour_at, colour_of_the_moving, colour_table, read_images
+    from bodyschema.vision.colour_model import colour_at, colour_of_the_moving, colour_table, read_images
 
     shown = read_images(images)
     return colour_table(colour_of_the_moving(shown) if at is None else colour_at(shown[0], *at))
@@ -39,7 +39,7 @@ def moving_colour_table(eyes: StereoEyes, clock: Clock, seconds: float, tell: Ca
         ColourUnlearnt: nothing colourful moved.
         SourceError: the cameras cannot be opened.
     """
-    from vision.colour_model import colour_of_the_moving, colour_table
+    from bodyschema.vision.colour_model import colour_of_the_moving, colour_table
 
     shown: list[ImageArray] = []
     source = Reopening(eyes, "the cameras", clock)

@@ -18,9 +18,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from interfaces.errors import RecordingError
-from interfaces.recording import Recording
-from interfaces.records import FloatArray
+from bodyschema.interfaces.errors import RecordingError
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import FloatArray
 
 from .store import Devices
 

@@ -8,7 +8,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from types import TracebackType
 from typing import Any, Self
 
-from interfaces.errors import ConfigError
+from bodyschema.interfaces.errors import ConfigError
 
 from .local_web import HEADERS, LOOPBACK, host_refusal
 

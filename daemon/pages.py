@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from interfaces.errors import ConfigError
-from vision.printing import Page, pdf, svg
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.vision.printing import Page, pdf, svg
 
 _WRITERS = {".pdf": pdf, ".svg": svg}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from interfaces.errors import ConfigError, RequestError
+from bodyschema.interfaces.errors import ConfigError, RequestError
 
 from .sources import Powered
 

@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from drivers.dynamixel.config import DynamixelConfig
-from effects.gravity import GravityLoad
-from interfaces.errors import ConfigError
-from interfaces.protocols import Clock
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
-from interfaces.toml_file import line_of, read_toml
+from bodyschema.drivers.dynamixel.config import DynamixelConfig
+from bodyschema.effects.gravity import GravityLoad
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.interfaces.toml_file import line_of, read_toml
 
 from .config import Config
 
 if TYPE_CHECKING:
-    from drivers.dynamixel.gaze import Gaze
-    from drivers.dynamixel.zero_force import ZeroForce
+    from bodyschema.drivers.dynamixel.gaze import Gaze
+    from bodyschema.drivers.dynamixel.zero_force import ZeroForce
 
 
 def holding_torques(robot: RobotDescription) -> Callable[[FloatArray], FloatArray]:
@@ -45,12 +45,12 @@ def open_drives(config: Config, servos: DynamixelConfig, clock: Clock) -> tuple[
     joints, drives = config.robot.joints, []
     _check_hold(config, servos)
     if servos.zero_force is not None:
-        from drivers.dynamixel.zero_force import ZeroForce
+        from bodyschema.drivers.dynamixel.zero_force import ZeroForce
 
         torques = holding_torques(config.robot)
         drives.append(ZeroForce(servos, servos.zero_force, joints, torques, clock))
     if servos.gaze is not None:
-        from drivers.dynamixel.gaze import Gaze
+        from bodyschema.drivers.dynamixel.gaze import Gaze
 
         limits = list(zip(config.robot.lower.tolist(), config.robot.upper.tolist(), strict=True))
         drives.append(Gaze(servos.gaze, joints, limits, clock))

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
-from interfaces.errors import RequestError
+from bodyschema.interfaces.errors import RequestError
 
 T = TypeVar("T")
 

@@ -8,12 +8,12 @@ from pathlib import Path
 from threading import Event
 from typing import TextIO
 
-from interfaces.errors import BusError, RecordingError
-from interfaces.recording import CSV
-from interfaces.recording_csv import write_csv_rows
-from interfaces.recording_parquet import INTEGER_COLUMNS
-from interfaces.records import Pair
-from interfaces.robot import RobotDescription
+from bodyschema.interfaces.errors import BusError, RecordingError
+from bodyschema.interfaces.recording import CSV
+from bodyschema.interfaces.recording_csv import write_csv_rows
+from bodyschema.interfaces.recording_parquet import INTEGER_COLUMNS
+from bodyschema.interfaces.records import Pair
+from bodyschema.interfaces.robot import RobotDescription
 
 from . import recordings
 from .bus import Bus

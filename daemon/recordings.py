@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from interfaces.errors import RecordingError
-from interfaces.recording import CSV, PARQUET, Recording, joints_in
-from interfaces.records import Pair
+from bodyschema.interfaces.errors import RecordingError
+from bodyschema.interfaces.recording import CSV, PARQUET, Recording, joints_in
+from bodyschema.interfaces.records import Pair
 
 from .mcap_export import write_mcap
 from .rerun_export import write_rerun

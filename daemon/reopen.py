@@ -9,8 +9,8 @@ from contextlib import ExitStack
 from types import TracebackType
 from typing import Generic, Protocol, Self, TypeVar
 
-from interfaces.errors import SourceError, SourceLost
-from interfaces.protocols import Clock, Source
+from bodyschema.interfaces.errors import SourceError, SourceLost
+from bodyschema.interfaces.protocols import Clock, Source
 
 log = logging.getLogger(__name__)
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from interfaces.errors import ConfigError, StoreError
-from interfaces.toml_file import convert, read_toml
+from bodyschema.interfaces.errors import ConfigError, StoreError
+from bodyschema.interfaces.toml_file import convert, read_toml
 
 from . import store_schema
 from .backup import CHECKPOINT, ELSEWHERE, ROBOT, ROBOT_TOML, STORE, Backup, BackupError, description_files

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from interfaces.urdf import UrdfTree
+    from bodyschema.interfaces.urdf import UrdfTree
 
 
 class Guess(NamedTuple):
@@ -135,7 +135,7 @@ def guess_from(urdf: Path, robot: Path) -> Guess:
     Raises:
         RobotError: the URDF cannot be read.
     """
-    from interfaces.urdf import MOVING, UrdfTree
+    from bodyschema.interfaces.urdf import MOVING, UrdfTree
 
     tree = UrdfTree.load(urdf)
     root = _root(tree)

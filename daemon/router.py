@@ -16,10 +16,10 @@ from typing import Any
 
 import msgspec
 
-from interfaces.errors import ConfigError
-from interfaces.protocols import Clock
-from interfaces.robot import NAME
-from interfaces.toml_file import convert, line_of, read_toml
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.robot import NAME
+from bodyschema.interfaces.toml_file import convert, line_of, read_toml
 
 from .access import EVERY_ROBOT, ROLES, Names, Subjects, access_control
 from .bus import LARGEST_REPLY_BYTES, LEASE_MS, Bus

@@ -11,10 +11,10 @@ from importlib.metadata import version
 
 import numpy as np
 
-from interfaces.clock import SystemClock
-from interfaces.errors import ConfigError, RequestError, SourceEnded
-from interfaces.protocols import Clock
-from interfaces.records import FloatArray, JointReading, MarkerFix, MarkerMiss, Reason
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import ConfigError, RequestError, SourceEnded
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.records import FloatArray, JointReading, MarkerFix, MarkerMiss, Reason
 
 from .align import JointBuffer
 from .bus import Bus, Request

@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import threading
 
-from interfaces.errors import BodyschemaError
-from interfaces.protocols import Clock
+from bodyschema.interfaces.errors import BodyschemaError
+from bodyschema.interfaces.protocols import Clock
 
 from .align import JointBuffer
 from .config import Config, DaemonConfig

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Servo(Protocol):
-    """A servo that answered; see `drivers.scan.FoundServo`."""
+    """A servo that answered; see `bodyschema.drivers.scan.FoundServo`."""
 
     @property
     def port(self) -> str: ...
@@ -43,7 +43,7 @@ class Servo(Protocol):
 
 
 class ScannedPort(Protocol):
-    """What came of a port; see `drivers.scan.ScannedBus`."""
+    """What came of a port; see `bodyschema.drivers.scan.ScannedBus`."""
 
     @property
     def port(self) -> str: ...

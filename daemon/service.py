@@ -7,7 +7,7 @@ import os
 import threading
 from collections.abc import Callable, Collection, Sequence
 
-from interfaces.protocols import Clock
+from bodyschema.interfaces.protocols import Clock
 
 from .notify import Notifier
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from interfaces.errors import ConfigError
-from interfaces.robot import NAME
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.robot import NAME
 
 from .config import Config
 from .udev import ROOT, run_quietly

@@ -8,8 +8,8 @@ from itertools import groupby
 
 import msgspec
 
-from interfaces.errors import BodyschemaError, ConfigError
-from interfaces.protocols import Clock
+from bodyschema.interfaces.errors import BodyschemaError, ConfigError
+from bodyschema.interfaces.protocols import Clock
 
 from .eeprom_wiring import (
     BAUD,

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import msgspec
 
-from interfaces.errors import ConfigError
-from interfaces.limited import read_at_most
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.limited import read_at_most
 
 from .servo_wiring import KnownModel, known_models
 

@@ -10,8 +10,8 @@ from typing import Literal
 
 import msgspec
 
-from interfaces.errors import BodyschemaError, ConfigError
-from interfaces.limited import read_at_most
+from bodyschema.interfaces.errors import BodyschemaError, ConfigError
+from bodyschema.interfaces.limited import read_at_most
 
 FILE = "servo_writes.jsonl"
 State = Literal["begun", "written", "not written", "something else stands there", "not known"]

@@ -6,8 +6,8 @@ import logging
 from collections.abc import Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
-from interfaces.errors import RequestError
-from interfaces.protocols import JointSource
+from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.protocols import JointSource
 
 from .status import BusStatus, ServoStatus
 
@@ -15,7 +15,7 @@ log = logging.getLogger(__name__)
 
 
 class ServoHealth(Protocol):
-    """See `drivers.servos.health.ServoHealth`."""
+    """See `bodyschema.drivers.servos.health.ServoHealth`."""
 
     @property
     def joint(self) -> str: ...
@@ -42,7 +42,7 @@ class ServoHealth(Protocol):
 
 
 class BusHealth(Protocol):
-    """See `drivers.servos.health.BusHealth`."""
+    """See `bodyschema.drivers.servos.health.BusHealth`."""
 
     @property
     def exchanges(self) -> int: ...
@@ -64,7 +64,7 @@ class TellsHealth(Protocol):
 
 @runtime_checkable
 class Servos(TellsHealth, Protocol):
-    """Encoders that are servos; see `drivers.servos.joints.ServoJoints`."""
+    """Encoders that are servos; see `bodyschema.drivers.servos.joints.ServoJoints`."""
 
     @property
     def servo_health(self) -> Sequence[ServoHealth]: ...

@@ -7,25 +7,25 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, get_args
 
-from drivers import checks
-from drivers.checks import Check, Holder
-from drivers.dynamixel.config import Baud as DynamixelBaud
-from drivers.dynamixel.config import DynamixelConfig
-from drivers.dynamixel.joints import DYNAMIXEL
-from drivers.dynamixel.joints import open_serial as open_dynamixel
-from drivers.dynamixel.models import BY_NAME as DYNAMIXEL_MODELS
-from drivers.feetech.config import Baud as FeetechBaud
-from drivers.feetech.config import FeetechConfig
-from drivers.feetech.joints import FEETECH
-from drivers.feetech.joints import open_serial as open_feetech
-from drivers.feetech.models import BY_NAME as FEETECH_MODELS
-from drivers.scan import ScannedBus, Tell, scan_port, serial_ports
-from drivers.scanners import SCANNERS
-from drivers.serial_line import adapter_latency_s
-from drivers.serial_lines.checks import encoder_checks as checks_of_encoders
-from drivers.servos.checks import servo_checks as checks_of_servos
-from interfaces.clock import SystemClock
-from interfaces.errors import ConfigError
+from bodyschema.drivers import checks
+from bodyschema.drivers.checks import Check, Holder
+from bodyschema.drivers.dynamixel.config import Baud as DynamixelBaud
+from bodyschema.drivers.dynamixel.config import DynamixelConfig
+from bodyschema.drivers.dynamixel.joints import DYNAMIXEL
+from bodyschema.drivers.dynamixel.joints import open_serial as open_dynamixel
+from bodyschema.drivers.dynamixel.models import BY_NAME as DYNAMIXEL_MODELS
+from bodyschema.drivers.feetech.config import Baud as FeetechBaud
+from bodyschema.drivers.feetech.config import FeetechConfig
+from bodyschema.drivers.feetech.joints import FEETECH
+from bodyschema.drivers.feetech.joints import open_serial as open_feetech
+from bodyschema.drivers.feetech.models import BY_NAME as FEETECH_MODELS
+from bodyschema.drivers.scan import ScannedBus, Tell, scan_port, serial_ports
+from bodyschema.drivers.scanners import SCANNERS
+from bodyschema.drivers.serial_line import adapter_latency_s
+from bodyschema.drivers.serial_lines.checks import encoder_checks as checks_of_encoders
+from bodyschema.drivers.servos.checks import servo_checks as checks_of_servos
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import ConfigError
 
 if TYPE_CHECKING:
     from .config import Config  # takes the better part of a second, and a scan may need none
@@ -150,7 +150,7 @@ def joint_state_checks(config: Config) -> Iterator[Check]:
     """Of the ROS 2 robot of robot.toml, if it has one. Only listens."""
     robot = config.tables.drivers.ros2
     if robot is not None:
-        from drivers.ros2.checks import joint_state_checks as checks_of_joint_states
+        from bodyschema.drivers.ros2.checks import joint_state_checks as checks_of_joint_states
 
         prismatic = config.robot.chain.prismatic.tolist()
         yield from checks_of_joint_states(robot, config.robot.joints, SystemClock(), prismatic=prismatic)

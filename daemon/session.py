@@ -7,9 +7,9 @@ from importlib.metadata import version
 
 import msgspec
 
-from interfaces.limited import read_at_most
-from interfaces.protocols import Clock
-from interfaces.toml_file import read_toml
+from bodyschema.interfaces.limited import read_at_most
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.toml_file import read_toml
 
 from .config import Config
 from .store import Session

@@ -6,8 +6,8 @@ import math
 
 import msgspec
 
-from interfaces.errors import RequestError
-from interfaces.protocols import Clock
+from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.protocols import Clock
 
 from .bus import Request
 from .sources import Simulation

@@ -23,12 +23,12 @@ from typing import IO, Self
 import msgspec
 import numpy as np
 
-from daemon.learning import DirectSolver, Solved, Task
-from daemon.learning.members import RESIDUAL
-from daemon.learning.orientation_solver import OrientationSolution
-from interfaces.errors import BodyschemaError
-from interfaces.interpreter import module_command
-from interfaces.records import FloatArray
+from bodyschema.daemon.learning import DirectSolver, Solved, Task
+from bodyschema.daemon.learning.members import RESIDUAL
+from bodyschema.daemon.learning.orientation_solver import OrientationSolution
+from bodyschema.interfaces.errors import BodyschemaError
+from bodyschema.interfaces.interpreter import module_command
+from bodyschema.interfaces.records import FloatArray
 from kbmaps import ChainBelief, ChainTolerances, KBMap, OrientedChain, ResidualModel
 
 NICENESS = 5
@@ -126,7 +126,7 @@ class SolverProcess:
     def start(self, task: Task, robot: int = 0) -> None:
         """Forget all pairs and begin a new task."""
         if self._child is None:
-            command = module_command("daemon.solver_process")
+            command = module_command("bodyschema.daemon.solver_process")
             environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
             # In a process group of its own: Ctrl-C in a terminal is the parent's to handle.
             try:

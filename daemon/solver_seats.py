@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 
-from daemon.learning import Solved, Task
-from daemon.solver_process import SolverLostError, SolverProcess
-from interfaces.records import FloatArray
+from bodyschema.daemon.learning import Solved, Task
+from bodyschema.daemon.solver_process import SolverLostError, SolverProcess
+from bodyschema.interfaces.records import FloatArray
 
 
 class SharedSolver:

@@ -7,9 +7,9 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-from interfaces.camera import StereoCalibration
-from interfaces.protocols import Clock, JointSource, MarkerSource, Source
-from interfaces.records import FloatArray
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.protocols import Clock, JointSource, MarkerSource, Source
+from bodyschema.interfaces.records import FloatArray
 from kbmaps import RigidChain
 
 

@@ -13,7 +13,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from interfaces.errors import BusError, RequestError
+from bodyschema.interfaces.errors import BusError, RequestError
 
 from .bus import Bus
 from .config import Config

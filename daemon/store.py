@@ -17,8 +17,8 @@ from typing import Any, Self
 import msgspec
 import numpy as np
 
-from interfaces.errors import StoreError, StoreUnwritable
-from interfaces.records import FloatArray, MarkerFix, Pair, frozen_array
+from bodyschema.interfaces.errors import StoreError, StoreUnwritable
+from bodyschema.interfaces.records import FloatArray, MarkerFix, Pair, frozen_array
 
 from . import store_schema
 from .retention import Keep, delete_until

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from interfaces.errors import StoreError, StoreUnwritable
+from bodyschema.interfaces.errors import StoreError, StoreUnwritable
 
 NOTHING_CHANGED = "Nothing was changed"
 # What SQLite says when the disk takes nothing now.

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from interfaces.covariance import Upper, upper_triangle
-from interfaces.records import FloatArray, Pair, frozen_array
+from bodyschema.interfaces.covariance import Upper, upper_triangle
+from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
 
 # The columns of each table that a checksum covers, in its order.
 COLUMNS = {

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import msgspec
 
-from interfaces.errors import StoreError
+from bodyschema.interfaces.errors import StoreError
 
 from .store_file import NOTHING_CHANGED, damaged, is_damage
 from .store_rows import COLUMNS, DamagedRow, checksum, decoded

@@ -6,9 +6,9 @@ import logging
 from collections.abc import Callable
 from typing import TypeVar
 
-from interfaces.errors import StoreUnwritable
-from interfaces.protocols import Clock
-from interfaces.records import FloatArray, MarkerFix, Pair
+from bodyschema.interfaces.errors import StoreUnwritable
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.records import FloatArray, MarkerFix, Pair
 
 from .store import PairStore
 

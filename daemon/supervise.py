@@ -9,8 +9,8 @@ import subprocess
 import time
 from collections.abc import Sequence
 
-from daemon.signals import with_parent
-from interfaces.errors import BodyschemaError
+from bodyschema.daemon.signals import with_parent
+from bodyschema.interfaces.errors import BodyschemaError
 
 log = logging.getLogger(__name__)
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from effects import KINDS, Motion, Simulation
-from interfaces.camera import StereoCalibration
-from interfaces.errors import ConfigError, RecordingError
-from interfaces.recording import Recording
-from interfaces.records import FloatArray
+from bodyschema.effects import KINDS, Motion, Simulation
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.errors import ConfigError, RecordingError
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import FloatArray
 from kbmaps import KBMapsError
 
 

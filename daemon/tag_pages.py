@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from interfaces.errors import ConfigError
-from vision.cluster.page import FACE_SIDES, shape_page, tags_page
-from vision.cluster.shapes import Shape, cube, plate
-from vision.cluster.tables import cluster_tables, tag_tables
-from vision.tag_config import Dictionary
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.vision.cluster.page import FACE_SIDES, shape_page, tags_page
+from bodyschema.vision.cluster.shapes import Shape, cube, plate
+from bodyschema.vision.cluster.tables import cluster_tables, tag_tables
+from bodyschema.vision.tag_config import Dictionary
 
 from .pages import write_page
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections import Counter, deque
 
-from interfaces.protocols import Clock
-from interfaces.records import FloatArray, Reason
-from interfaces.rejections import REMEDIES
-from interfaces.robot import RobotDescription
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.records import FloatArray, Reason
+from bodyschema.interfaces.rejections import REMEDIES
+from bodyschema.interfaces.robot import RobotDescription
 
 from .status import JointRange
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from interfaces.recording import Recording
-from interfaces.records import FloatArray
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import FloatArray
 from kbmaps import ChainBelief, ChainParameters, RigidLearner
 
 # On either side of a change there have to be so many pairs, and it has to explain so much of all residuals.

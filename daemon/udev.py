@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from interfaces.errors import ConfigError
+from bodyschema.interfaces.errors import ConfigError
 
 FILE = Path("etc/udev/rules.d/60-bodyschema.rules")
 ROOT = Path("/")

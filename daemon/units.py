@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from interfaces.errors import ConfigError
-from interfaces.interpreter import module_command
-from interfaces.plugins import PluginConfig
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.interpreter import module_command
+from bodyschema.interfaces.plugins import PluginConfig
 
 from .config import Config
 from .identity import is_local
@@ -161,7 +161,7 @@ class Installed:
     def here(cls, systemd: int) -> Installed:
         """The one that runs."""
         folders = (Path(sys.prefix), Path(sys.base_prefix), Path(__file__).parents[1])
-        return cls(module_command("daemon"), folders, systemd)
+        return cls(module_command("bodyschema"), folders, systemd)
 
 
 def template(process: str, installed: Installed) -> str:

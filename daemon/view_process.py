@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from daemon.signals import with_parent
-from interfaces.interpreter import module_command
+from bodyschema.daemon.signals import with_parent
+from bodyschema.interfaces.interpreter import module_command
 
 log = logging.getLogger(__name__)
 
@@ -24,7 +24,7 @@ def shown(robot_file: Path, port: int = PORT) -> Iterator[subprocess.Popen[bytes
 
     What becomes of the page is no matter of life for whoever is shown: a port that is taken is a line in the log.
     """
-    command = module_command("daemon", "view", "--robot", str(robot_file), "--port", str(port))
+    command = module_command("bodyschema", "view", "--robot", str(robot_file), "--port", str(port))
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, env=os.environ | with_parent(), process_group=0)
     try:
         yield process

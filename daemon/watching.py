@@ -10,16 +10,16 @@ from typing import Protocol, Self
 
 import cv2
 
-from interfaces.clock import SystemClock
-from interfaces.errors import ConfigError, SourceEnded
-from interfaces.protocols import Clock, Source
-from interfaces.records import ImageArray
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import ConfigError, SourceEnded
+from bodyschema.interfaces.protocols import Clock, Source
+from bodyschema.interfaces.records import ImageArray
 
 QUALITY = 85
 
 
 class Pictures(Source, Protocol):
-    """Pictures of cameras; see `vision.cameras.watched.WatchedCamera`."""
+    """Pictures of cameras; see `bodyschema.vision.cameras.watched.WatchedCamera`."""
 
     @property
     def said(self) -> str: ...

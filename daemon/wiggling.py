@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from interfaces.clock import SystemClock
-from interfaces.errors import RecordingError, SourceEnded
-from interfaces.limited import read_at_most
-from interfaces.records import JointReading, MarkerFix, MarkerMiss
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import RecordingError, SourceEnded
+from bodyschema.interfaces.limited import read_at_most
+from bodyschema.interfaces.records import JointReading, MarkerFix, MarkerMiss
 
 from .latency import LATEST_S, LatencyError, Wiggle
 from .sources import Sources

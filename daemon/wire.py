@@ -13,11 +13,11 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from interfaces.covariance import from_upper, upper_triangle
-from interfaces.errors import RequestError
-from interfaces.recording_columns import QUATERNION_TOLERANCE
-from interfaces.records import FARTHEST_M, LARGEST_Q, FloatArray, Pair, frozen_array
-from interfaces.suggest import with_choices
+from bodyschema.interfaces.covariance import from_upper, upper_triangle
+from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.recording_columns import QUATERNION_TOLERANCE
+from bodyschema.interfaces.records import FARTHEST_M, LARGEST_Q, FloatArray, Pair, frozen_array
+from bodyschema.interfaces.suggest import with_choices
 
 from .command_names import CommandName
 
@@ -34,7 +34,7 @@ _msgpack_encoder = msgspec.msgpack.Encoder()
 
 
 class PairMessage(msgspec.Struct, frozen=True):
-    """One pair: units and frames as in `interfaces.records.Pair`.
+    """One pair: units and frames as in `bodyschema.interfaces.records.Pair`.
 
     `cov` [m²] and `cov_R` [rad²] are upper triangles, row by row.
     """

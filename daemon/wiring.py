@@ -11,18 +11,18 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from drivers.dynamixel.config import DynamixelConfig
-from drivers.feetech.config import FeetechConfig
-from drivers.ros2.config import Ros2Config
-from drivers.serial_lines.config import SerialLinesConfig
-from drivers.serial_lines.joints import SerialLineJoints
-from interfaces.camera import StereoCalibration
-from interfaces.clock import SystemClock
-from interfaces.errors import ConfigError, StoreError
-from interfaces.plugins import PluginConfig, load
-from interfaces.protocols import Clock, JointSource
-from interfaces.records import MarkerFix, StereoFrame
-from interfaces.rejections import WORDS
+from bodyschema.drivers.dynamixel.config import DynamixelConfig
+from bodyschema.drivers.feetech.config import FeetechConfig
+from bodyschema.drivers.ros2.config import Ros2Config
+from bodyschema.drivers.serial_lines.config import SerialLinesConfig
+from bodyschema.drivers.serial_lines.joints import SerialLineJoints
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import ConfigError, StoreError
+from bodyschema.interfaces.plugins import PluginConfig, load
+from bodyschema.interfaces.protocols import Clock, JointSource
+from bodyschema.interfaces.records import MarkerFix, StereoFrame
+from bodyschema.interfaces.rejections import WORDS
 from kbmaps import RigidChain
 
 from .bench_wiring import require_bench, through_bench
@@ -34,9 +34,9 @@ from .sources import Head, MarkerTopic, Powered, Sources, StampedJoints
 from .store import PairReader
 
 if TYPE_CHECKING:
-    from drivers.ros2.joints import Ros2Joints
-    from sim_backend.config import CameraConfig, SimConfig, SimTag
-    from vision.config import VisionConfig
+    from bodyschema.drivers.ros2.joints import Ros2Joints
+    from bodyschema.sim_backend.config import CameraConfig, SimConfig, SimTag
+    from bodyschema.vision.config import VisionConfig
 
 log = logging.getLogger(__name__)
 
@@ -103,12 +103,12 @@ def driver_of(hardware: Hardware, config: Config, clock: Clock, *, last_pose: li
     limits = list(zip(config.robot.lower.tolist(), config.robot.upper.tolist(), strict=True))
     match hardware:
         case DynamixelConfig():
-            from drivers.dynamixel.joints import DynamixelJoints
+            from bodyschema.drivers.dynamixel.joints import DynamixelJoints
 
             drives = open_drives(config, hardware, clock)
             return DynamixelJoints(hardware, joints, clock, limits=limits, last_pose=last_pose, drives=drives)
         case FeetechConfig():
-            from drivers.feetech.joints import FeetechJoints
+            from bodyschema.drivers.feetech.joints import FeetechJoints
 
             return FeetechJoints(hardware, joints, clock, limits=limits, last_pose=last_pose)
         case SerialLinesConfig():
@@ -120,7 +120,7 @@ def driver_of(hardware: Hardware, config: Config, clock: Clock, *, last_pose: li
 
 
 def _ros2_joints(config: Config, robot: Ros2Config, clock: Clock) -> Ros2Joints:
-    from drivers.ros2.joints import Ros2Joints
+    from bodyschema.drivers.ros2.joints import Ros2Joints
 
     return Ros2Joints(robot, config.robot.joints, clock, prismatic=config.robot.chain.prismatic.tolist())
 
@@ -133,7 +133,7 @@ def open_marker_topic(config: Config, clock: Clock) -> tuple[StampedJoints, Mark
     robot = config.tables.drivers.ros2
     if robot is None or robot.marker is None:
         return None
-    from drivers.ros2.marker import MarkerPublisher
+    from bodyschema.drivers.ros2.marker import MarkerPublisher
 
     return _ros2_joints(config, robot, clock), MarkerPublisher(robot, robot.marker)
 
@@ -176,7 +176,7 @@ def _require_source(config: Config, *, sim: bool) -> None:
 
 def connected_cameras() -> list[str]:
     """Return the cameras of this machine, by the names that stay."""
-    from vision.cameras.serials import connected
+    from bodyschema.vision.cameras.serials import connected
 
     return connected()
 
@@ -193,14 +193,14 @@ def require_simulation() -> None:
 
 def demonstration_model() -> Path:
     """The robot.toml of the humanoid upper body that ships with the simulation, its URDF beside it."""
-    from sim_backend.models import model_file
+    from bodyschema.sim_backend.models import model_file
 
     return model_file("upper_body")
 
 
 def _real(config: Config) -> Sources:
-    from vision.tracked_camera import TrackedCamera
-    from vision.trackers import tracker_of
+    from bodyschema.vision.tracked_camera import TrackedCamera
+    from bodyschema.vision.trackers import tracker_of
 
     from .camera_wiring import camera_of, open_eyes
 
@@ -224,10 +224,10 @@ def _real(config: Config) -> Sources:
 @contextmanager
 def _simulated(config: Config) -> Iterator[Sources]:
     require_simulation()
-    from sim_backend import SimWorld
-    from sim_backend.guided_path import exact_encoders
-    from vision.tracked_camera import TrackedCamera
-    from vision.trackers import tracker_of
+    from bodyschema.sim_backend import SimWorld
+    from bodyschema.sim_backend.guided_path import exact_encoders
+    from bodyschema.vision.tracked_camera import TrackedCamera
+    from bodyschema.vision.trackers import tracker_of
 
     on_bench = config.tables.sim.servo_bench
     settings = simulation_settings(config)
@@ -244,7 +244,7 @@ def simulation_settings(config: Config) -> SimConfig:
     Raises:
         ConfigError: the tracker does not find what the simulation would show.
     """
-    from sim_backend.config import CameraConfig
+    from bodyschema.sim_backend.config import CameraConfig
 
     sim, vision = config.tables.sim, config.tables.vision
     usual, marker = CameraConfig(), {} if sim.camera.tags else _marker(vision)
@@ -258,7 +258,7 @@ def simulation_settings(config: Config) -> SimConfig:
 def _marker(vision: VisionConfig) -> dict[str, Any]:
     """Return the keys of [sim.camera] that show the marker of [vision]."""
     if vision.marker in ("tag", "cluster"):
-        from vision.tag_dictionary import DICTIONARIES
+        from bodyschema.vision.tag_dictionary import DICTIONARIES
 
         return {"tags": _tags(vision), "tag_dictionary": DICTIONARIES[vision.tag.dictionary]}
     ball = {"ball_radius_m": vision.radius_m}
@@ -275,8 +275,8 @@ def _marker(vision: VisionConfig) -> dict[str, Any]:
 
 def _require_found(config: Config, calibration: StereoCalibration, camera: CameraConfig) -> None:
     """ConfigError where the tracker does not even find the marker by itself before a plain wall."""
-    from sim_backend.eye import portraits
-    from vision.trackers import tracker_of
+    from bodyschema.sim_backend.eye import portraits
+    from bodyschema.vision.trackers import tracker_of
 
     tracker, reasons = tracker_of(calibration, config.tables.vision), []
     for t, images in enumerate(portraits(calibration, camera)):
@@ -294,8 +294,8 @@ def _require_found(config: Config, calibration: StereoCalibration, camera: Camer
 
 
 def _tags(vision: VisionConfig) -> tuple[SimTag, ...]:
-    from sim_backend.config import SimTag
-    from vision.tag_config import PlacedTag
+    from bodyschema.sim_backend.config import SimTag
+    from bodyschema.vision.tag_config import PlacedTag
 
     placed = (PlacedTag(id=vision.tag.id),) if vision.marker == "tag" else vision.cluster.tags
     return tuple(SimTag(id=tag.id, xyz=tag.xyz, rpy=tag.rpy, side_m=tag.side_m or vision.tag.side_m) for tag in placed)
@@ -314,10 +314,10 @@ def open_postures(config: Config, count: int) -> Iterator[Sources]:
         ConfigError: the simulation cannot be made of this description.
     """
     require_simulation()
-    from sim_backend.posed import PosedWorld
-    from sim_backend.postures import visible_postures
-    from vision.tracked_camera import TrackedCamera
-    from vision.trackers import tracker_of
+    from bodyschema.sim_backend.posed import PosedWorld
+    from bodyschema.sim_backend.postures import visible_postures
+    from bodyschema.vision.tracked_camera import TrackedCamera
+    from bodyschema.vision.trackers import tracker_of
 
     settings = simulation_settings(config)
     postures = visible_postures(config.robot, settings, count, config.simulation)
@@ -328,14 +328,14 @@ def open_postures(config: Config, count: int) -> Iterator[Sources]:
 
 def simulated_truth(config: Config) -> RigidChain:
     """The true chain of the robot that the simulation makes of this description, for judges."""
-    from sim_backend import true_chain
+    from bodyschema.sim_backend import true_chain
 
     return true_chain(config.robot, config.tables.sim, extension=config.simulation)
 
 
 def _recorded(config: Config, file: Path) -> Sources:
-    from drivers.replay import Replay
-    from interfaces.recording import Recording
+    from bodyschema.drivers.replay import Replay
+    from bodyschema.interfaces.recording import Recording
 
     drivers = config.tables.drivers
     replay = Replay(

@@ -8,8 +8,8 @@ from typing import Any
 
 import msgspec
 
-from interfaces.errors import ConfigError
-from interfaces.toml_file import line_of
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.toml_file import line_of
 
 from .access import Names, Subjects, access_control
 from .identity import SECURE, Identity, LoginConfig, Route, TlsConfig, is_local

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from effects import Effect
+from bodyschema.effects import Effect
 
 from .diagnosis import Diagnosis
 from .nameless import Nameless

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from effects import Effect, Simulation
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
+from bodyschema.effects import Effect, Simulation
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
 
 from .fit import Fit, fitted
 from .observations import Observations

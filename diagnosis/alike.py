@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from effects import Effect
-from interfaces.records import FloatArray
+from bodyschema.effects import Effect
+from bodyschema.interfaces.records import FloatArray
 
 from .fit import Fit
 from .scan import Candidate, Scan

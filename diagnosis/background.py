@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from effects import Effect, Simulated, Simulation
-from interfaces.records import FloatArray
+from bodyschema.effects import Effect, Simulated, Simulation
+from bodyschema.interfaces.records import FloatArray
 
 # What workshops tolerate: of a link's length, of an axis or a zero, and of a drive over a turn [m, rad].
 LENGTH_M, ANGLE_RAD, DRIVE_RAD = 0.3e-3, float(np.radians(0.06)), float(np.radians(0.01))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from effects import Effect
-from interfaces.records import FloatArray
+from bodyschema.effects import Effect
+from bodyschema.interfaces.records import FloatArray
 
 from .advice import advice
 from .background import ANGLE_RAD, DRIVE_RAD, LENGTH_M

@@ -9,9 +9,9 @@ from functools import cached_property, partial
 import numpy as np
 from scipy import stats
 
-from effects import Effect, Identity, Simulation
-from interfaces.recording import Recording
-from interfaces.records import FloatArray
+from bodyschema.effects import Effect, Identity, Simulation
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import FloatArray
 
 from .alignment import aligned
 from .alike import Alike, alike

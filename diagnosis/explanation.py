@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from effects import Effect
-from interfaces.records import FloatArray
+from bodyschema.effects import Effect
+from bodyschema.interfaces.records import FloatArray
 
 from .fit import Fit
 from .search import NAMED, Search, named

@@ -9,9 +9,9 @@ from typing import Literal
 
 import numpy as np
 
-from effects import Effect, Simulated
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray
+from bodyschema.effects import Effect, Simulated
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray
 from kbmaps.rotations import cross_matrix
 
 from .eyes import by_turn, undone

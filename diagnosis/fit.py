@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from effects import Effect, Simulated, Simulation
-from interfaces.records import FloatArray
+from bodyschema.effects import Effect, Simulated, Simulation
+from bodyschema.interfaces.records import FloatArray
 
 from .background import Background, Scales
 from .observations import Observations

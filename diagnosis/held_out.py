@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from effects import Effect
-from interfaces.records import FloatArray
+from bodyschema.effects import Effect
+from bodyschema.interfaces.records import FloatArray
 
 from .fit import LARGEST, Fit, solved
 from .observations import IntArray

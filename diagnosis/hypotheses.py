@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from effects import KINDS, Effect, Kind, Simulation
+from bodyschema.effects import KINDS, Effect, Kind, Simulation
 
 from .observations import Observations
 

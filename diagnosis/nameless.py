@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from effects import Effect, Motion
-from interfaces.records import FloatArray
+from bodyschema.effects import Effect, Motion
+from bodyschema.interfaces.records import FloatArray
 
 from .explanation import cost_of_names
 from .fit import Fit, amount_columns

@@ -8,10 +8,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from effects import Motion, Simulation
-from interfaces.camera import StereoCalibration
-from interfaces.recording import Recording
-from interfaces.records import FloatArray
+from bodyschema.effects import Motion, Simulation
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import FloatArray
 
 IntArray = NDArray[np.intp]
 

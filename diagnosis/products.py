@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from effects import Effect
-from interfaces.records import FloatArray
+from bodyschema.effects import Effect
+from bodyschema.interfaces.records import FloatArray
 
 from .fit import ROUNDED, Fit
 

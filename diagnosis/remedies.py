@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from effects import KINDS, corrected_file
-from effects.poses import transforms
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
-from interfaces.rpy import rpy_of
+from bodyschema.effects import KINDS, corrected_file
+from bodyschema.effects.poses import transforms
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.interfaces.rpy import rpy_of
 
 from .numbers import named, rival_named
 from .result import Cause, DiagnosisFile

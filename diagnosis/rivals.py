@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from effects import Effect, Motion
-from interfaces.records import FloatArray
+from bodyschema.effects import Effect, Motion
+from bodyschema.interfaces.records import FloatArray
 
 from .fit import Fit, amount_columns
 from .held_out import Blocks

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from effects import Effect
-from effects.moments import settled
-from interfaces.records import FloatArray
+from bodyschema.effects import Effect
+from bodyschema.effects.moments import settled
+from bodyschema.interfaces.records import FloatArray
 
 from .fit import LARGEST, SHORTEST_DRIFT, Fit
 from .products import Products, System

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from effects import Effect, Motion
-from interfaces.records import FloatArray
+from bodyschema.effects import Effect, Motion
+from bodyschema.interfaces.records import FloatArray
 
 from .fit import Fit
 

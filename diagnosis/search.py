@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from scipy import stats
 
-from effects import Effect, Identity
+from bodyschema.effects import Effect, Identity
 
 from .fit import Fit, improved
 from .held_out import Blocks, block_p_value

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from effects import Simulated
-from interfaces.records import FloatArray
+from bodyschema.effects import Simulated
+from bodyschema.interfaces.records import FloatArray
 
 from .families import Family
 

@@ -13,8 +13,8 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 
-from effects import Motion, Simulated, Unexplained, place_map, smooth_map
-from interfaces.records import FloatArray
+from bodyschema.effects import Motion, Simulated, Unexplained, place_map, smooth_map
+from bodyschema.interfaces.records import FloatArray
 
 from .families import Family
 from .fit import Fit, solved

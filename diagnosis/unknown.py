@@ -13,7 +13,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from scipy import stats
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 from .background import weighted_products
 from .families import Family, families

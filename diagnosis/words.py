@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from msgspec.structs import replace
 
-from effects import KINDS
-from effects.unexplained import PLACE
+from bodyschema.effects import KINDS
+from bodyschema.effects.unexplained import PLACE
 
 from .numbers import told_values
 from .result import Alike, Cause, Errors, Gain, Interval, Tolerances, Unexplained, Verdict

@@ -9,9 +9,9 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from interfaces.errors import ConfigError
-from interfaces.plugins import PluginConfig
-from interfaces.toml_file import line_of
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.plugins import PluginConfig
+from bodyschema.interfaces.toml_file import line_of
 
 from .dynamixel.config import DynamixelConfig
 from .feetech.config import FeetechConfig

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from typing import Protocol
 
-from interfaces.protocols import Clock
+from bodyschema.interfaces.protocols import Clock
 
 log = logging.getLogger(__name__)
 

@@ -10,11 +10,11 @@ from typing import Self
 
 import numpy as np
 
-from interfaces.camera import StereoCalibration
-from interfaces.clock import SystemClock
-from interfaces.errors import SourceEnded, SourceError
-from interfaces.recording import Recording
-from interfaces.records import FloatArray, JointReading, MarkerFix, frozen_array
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import SourceEnded, SourceError
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import FloatArray, JointReading, MarkerFix, frozen_array
 
 DEFAULT_SIGMA_M = 1e-3
 AHEAD = 8  # rows by which one source may lead the other

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from interfaces.errors import SourceError
-from interfaces.protocols import Clock
+from bodyschema.interfaces.errors import SourceError
+from bodyschema.interfaces.protocols import Clock
 
 from .echo import without_echo
 from .serial_line import DEFAULT_LATENCY_S, SerialLine

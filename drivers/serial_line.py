@@ -13,7 +13,7 @@ from pathlib import Path
 
 import serial
 
-from interfaces.errors import SourceError, SourceLost
+from bodyschema.interfaces.errors import SourceError, SourceLost
 
 RETRY_S = 0.2  # how soon a port that went away is looked for again
 DEFAULT_LATENCY_S = 4e-3  # of adapters that do not say

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import Protocol
 
-from interfaces.errors import SourceLost
+from bodyschema.interfaces.errors import SourceLost
 
 from .turns import nearest_turn
 

@@ -8,10 +8,10 @@ from typing import Any, Self
 
 import numpy as np
 
-from interfaces.errors import RobotError
-from interfaces.records import FloatArray, frozen_array
-from interfaces.robot import RobotDescription
-from interfaces.suggest import did_you_mean
+from bodyschema.interfaces.errors import RobotError
+from bodyschema.interfaces.records import FloatArray, frozen_array
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.interfaces.suggest import did_you_mean
 
 from .kinds import KINDS, Kind
 from .parameter import Parameter

@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from interfaces.records import FloatArray, frozen_array
+from bodyschema.interfaces.records import FloatArray, frozen_array
 
 from .motion import Motion
 from .parameter import Parameter

@@ -26,13 +26,13 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from interfaces.calibrated_files import tables_elsewhere
-from interfaces.errors import ConfigError, RobotError
-from interfaces.limited import read_at_most
-from interfaces.robot import FARTHEST_CAMERA_M, LONGEST_TOOL_M, RobotDescription, Vector3
-from interfaces.suggest import did_you_mean
-from interfaces.toml_file import convert, line_in_entry, line_of, read_toml
-from interfaces.toml_text import toml_text
+from bodyschema.interfaces.calibrated_files import tables_elsewhere
+from bodyschema.interfaces.errors import ConfigError, RobotError
+from bodyschema.interfaces.limited import read_at_most
+from bodyschema.interfaces.robot import FARTHEST_CAMERA_M, LONGEST_TOOL_M, RobotDescription, Vector3
+from bodyschema.interfaces.suggest import did_you_mean
+from bodyschema.interfaces.toml_file import convert, line_in_entry, line_of, read_toml
+from bodyschema.interfaces.toml_text import toml_text
 from kbmaps import ModelFormatError
 
 from .effect import Effect

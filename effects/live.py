@@ -6,7 +6,7 @@ from collections import deque
 
 import numpy as np
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 from .effect import Effect
 from .encoder import Backlash, Place, Play, Settling

@@ -8,8 +8,8 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from interfaces.recording import Recording
-from interfaces.records import FloatArray, frozen_array
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import FloatArray, frozen_array
 
 _EARLIER_KEPT = 16
 

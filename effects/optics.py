@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray
 
 
 @dataclass(frozen=True, slots=True)

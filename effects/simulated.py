@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from interfaces.records import FloatArray
-from interfaces.urdf import inverse
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.urdf import inverse
 from kbmaps import RigidChain
 
 from .effect import Effect

@@ -12,9 +12,9 @@ from typing import Protocol
 
 import numpy as np
 
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
-from interfaces.urdf import inverse
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.interfaces.urdf import inverse
 from kbmaps import RigidChain
 
 from .effect import Effect

@@ -12,8 +12,8 @@ from functools import reduce
 
 import numpy as np
 
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
 from kbmaps import JointBasis, KBMap
 
 from .unexplained import PLACE, Unexplained

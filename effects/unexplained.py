@@ -9,10 +9,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from interfaces.errors import RobotError
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
-from interfaces.suggest import did_you_mean
+from bodyschema.interfaces.errors import RobotError
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.interfaces.suggest import did_you_mean
 from kbmaps import KBMap, KBMapsError, KernelLearner, ModelFormatError, ResidualModel, TensorTrain
 
 # The marker's coordinates, in the place of a joint.

@@ -25,7 +25,7 @@ from .toml_text import toml_text
 CAMERA_LINK = "calibrated_camera"
 MARKER_LINK = "calibrated_marker"
 ROBOT_FILE = "robot.toml"
-# What an extended.toml adds to robot.toml: `effects.files` reads and writes it.
+# What an extended.toml adds to robot.toml: `bodyschema.effects.files` reads and writes it.
 EXTENSIONS = ("effects", "background", "unexplained")
 _ROUNDING = 1e-12
 # What is next to nothing for a simulator, which would else give a link without a mass one of its own.

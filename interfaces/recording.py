@@ -1,4 +1,4 @@
-"""Recordings: many pairs on disk, as CSV or Parquet (columns: `interfaces.recording_columns`)."""
+"""Recordings: many pairs on disk, as CSV or Parquet (columns: `bodyschema.interfaces.recording_columns`)."""
 
 from __future__ import annotations
 

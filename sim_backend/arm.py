@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 from .bullet import Body
 from .roles import JointRoles

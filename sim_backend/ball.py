@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 _AMBIENT, _DIFFUSE, _SPECULAR = 0.55, 0.4, 0.12
 _SHININESS = 20

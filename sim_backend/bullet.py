@@ -13,8 +13,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from interfaces.errors import ConfigError
-from interfaces.records import FloatArray
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.records import FloatArray
 
 from .geometry import cross_matrix
 from .physics_urdf import PhysicsUrdf

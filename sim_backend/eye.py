@@ -10,8 +10,8 @@ import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray, ImageArray
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray, ImageArray
 
 from .ball import cast_ball
 from .config import CameraConfig

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from interfaces.camera import StereoCalibration
-from interfaces.pointing import Pointing
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.pointing import Pointing
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
 from kbmaps import RigidChain
 
 _SOLVE_STEPS = 12

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 
 def transform(rotation: Rotation, translation: FloatArray) -> FloatArray:

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 
-from effects import Simulation
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
+from bodyschema.effects import Simulation
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
 
 from .config import EncoderConfig, SimConfig
 from .physics import Physics

@@ -11,8 +11,8 @@ from math import ceil
 
 import numpy as np
 
-from effects import LiveEncoders, Motion
-from interfaces.records import FloatArray
+from bodyschema.effects import LiveEncoders, Motion
+from bodyschema.interfaces.records import FloatArray
 
 from .truth import TrueRobot
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 from .mesh_file import LARGEST_MESH_BYTES, MESHES, MeshError, read_mesh, stl_bytes
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from interfaces.records import FloatArray, ImageArray
+from bodyschema.interfaces.records import FloatArray, ImageArray
 
 _WIDTH, _HEIGHT = 2048, 1024
 

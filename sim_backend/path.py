@@ -6,8 +6,8 @@ from typing import Protocol
 
 import numpy as np
 
-from interfaces.errors import ConfigError
-from interfaces.records import FloatArray
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.records import FloatArray
 
 # Postures of one tour. Few: the nearest of few is farther away, and the tour sees all of the range sooner.
 POSTURES = 50

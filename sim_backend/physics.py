@@ -9,8 +9,8 @@ from typing import Self
 
 import numpy as np
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray
 
 from .arm import TorqueFreeArm
 from .bullet import Body

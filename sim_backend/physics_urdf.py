@@ -14,11 +14,11 @@ import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from interfaces.errors import RobotError
-from interfaces.limited import read_at_most
-from interfaces.records import FloatArray
-from interfaces.rpy import rpy_of
-from interfaces.urdf import MOVING, UrdfJoint, UrdfTree
+from bodyschema.interfaces.errors import RobotError
+from bodyschema.interfaces.limited import read_at_most
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.rpy import rpy_of
+from bodyschema.interfaces.urdf import MOVING, UrdfJoint, UrdfTree
 
 from .meshes import LARGEST_M, Meshes
 from .roles import root_link

@@ -10,11 +10,11 @@ from typing import Self
 
 import numpy as np
 
-from effects import Motion, Simulation
-from interfaces.clock import SystemClock
-from interfaces.errors import SourceEnded
-from interfaces.records import FloatArray, JointReading, StereoFrame, frozen_array
-from interfaces.robot import RobotDescription
+from bodyschema.effects import Motion, Simulation
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import SourceEnded
+from bodyschema.interfaces.records import FloatArray, JointReading, StereoFrame, frozen_array
+from bodyschema.interfaces.robot import RobotDescription
 from kbmaps import RigidChain
 
 from .bullet import Body

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from effects import Simulation
-from interfaces.errors import ConfigError
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
+from bodyschema.effects import Simulation
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
 
 from .bullet import Body
 from .config import SimConfig

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray, ImageArray
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray, ImageArray
 
 _NEAR_M, _FAR_M = 0.05, 8.0
 # Optical frame (x right, y down, z forward) to OpenGL's eye frame (x right, y up, z backward).

@@ -12,10 +12,10 @@ from typing import Self
 
 import numpy as np
 
-from interfaces.camera import StereoCalibration
-from interfaces.errors import SourceLost
-from interfaces.interpreter import module_command
-from interfaces.records import ImageArray
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.errors import SourceLost
+from bodyschema.interfaces.interpreter import module_command
+from bodyschema.interfaces.records import ImageArray
 
 from .config import SimConfig
 from .physics_urdf import PhysicsUrdf
@@ -131,7 +131,7 @@ class RenderProcess:
 
 def _start(memory: int, requests: int, answers: int) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
-        module_command("sim_backend.renderer", str(memory), str(requests), str(answers)),
+        module_command("bodyschema.sim_backend.renderer", str(memory), str(requests), str(answers)),
         pass_fds=(memory, requests, answers),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,

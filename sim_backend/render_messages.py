@@ -9,8 +9,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import ImageArray
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import ImageArray
 
 from .config import CameraConfig
 from .physics_urdf import PhysicsUrdf

@@ -1,4 +1,4 @@
-"""The renderer's process: `python -m sim_backend.renderer MEMORY REQUESTS ANSWERS` with three inherited descriptors.
+"""The renderer's process: `python -m bodyschema.sim_backend.renderer MEMORY REQUESTS ANSWERS` with three inherited descriptors.
 
 It ends when its parent closes the pipe, or when the parent is no more: then nobody reads what it paints.
 """
@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from interfaces.records import FloatArray, ImageArray
+from bodyschema.interfaces.records import FloatArray, ImageArray
 
 from .bullet import Body
 from .eye import TO_LIGHT, StereoEyes

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
-from interfaces.urdf import UrdfTree, chain_between
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.interfaces.urdf import UrdfTree, chain_between
 from kbmaps import RigidChain
 
 from .truth import TrueRobot, with_offsets

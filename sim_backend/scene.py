@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from effects import Motion, Simulation
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray
+from bodyschema.effects import Motion, Simulation
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray
 
 from .bullet import Body
 from .truth import TrueRobot

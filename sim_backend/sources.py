@@ -7,10 +7,10 @@ from datetime import datetime, timedelta
 from types import TracebackType
 from typing import Protocol, Self
 
-from interfaces.camera import StereoCalibration
-from interfaces.protocols import Clock
-from interfaces.records import JointReading, StereoFrame
-from interfaces.robot import RobotDescription
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.records import JointReading, StereoFrame
+from bodyschema.interfaces.robot import RobotDescription
 
 
 class World(Protocol):

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 from .config import SimTag
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from effects import Effect, Simulation
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray, frozen_array
-from interfaces.robot import RobotDescription
-from interfaces.urdf import MOVING, UrdfJoint, UrdfTree, chain_between
+from bodyschema.effects import Effect, Simulation
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray, frozen_array
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.interfaces.urdf import MOVING, UrdfJoint, UrdfTree, chain_between
 from kbmaps import RigidChain
 
 from .config import ErrorConfig, SimConfig

@@ -14,12 +14,12 @@ from typing import Self
 
 import numpy as np
 
-from effects import Simulation
-from interfaces.camera import StereoCalibration
-from interfaces.clock import SystemClock
-from interfaces.errors import ConfigError, SourceEnded, SourceError
-from interfaces.records import FloatArray, ImageArray, JointReading, StereoFrame, frozen_array
-from interfaces.robot import RobotDescription
+from bodyschema.effects import Simulation
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import ConfigError, SourceEnded, SourceError
+from bodyschema.interfaces.records import FloatArray, ImageArray, JointReading, StereoFrame, frozen_array
+from bodyschema.interfaces.robot import RobotDescription
 from kbmaps import RigidChain
 
 from .config import SimConfig

@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray, Reason
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray, Reason
 
 from .triangulate import Location, triangulate
 

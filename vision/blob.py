@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from interfaces.records import FloatArray, ImageArray, Reason
+from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
 
 from .colour import Gate
 from .config import VisionConfig

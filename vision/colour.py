@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from interfaces.records import ImageArray
+from bodyschema.interfaces.records import ImageArray
 
 from .config import HueBand, VisionConfig
 

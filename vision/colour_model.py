@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from interfaces.errors import BodyschemaError
-from interfaces.records import FloatArray, ImageArray
+from bodyschema.interfaces.errors import BodyschemaError
+from bodyschema.interfaces.records import FloatArray, ImageArray
 
 from .config import HueBand
 from .image_file import read_image

@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from interfaces.limited import read_at_most
-from interfaces.records import ImageArray
+from bodyschema.interfaces.limited import read_at_most
+from bodyschema.interfaces.records import ImageArray
 
 # The largest camera images, uncompressed, have half of it.
 MOST_BYTES = 2**28

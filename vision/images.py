@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from interfaces.camera import StereoCalibration
-from interfaces.errors import ConfigError, SourceError
-from interfaces.records import ImageArray, StereoFrame
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.errors import ConfigError, SourceError
+from bodyschema.interfaces.records import ImageArray, StereoFrame
 
 
 def check_images(frame: StereoFrame, calibration: StereoCalibration) -> None:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 Model = Literal["pinhole", "fisheye"]
 

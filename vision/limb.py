@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 from .colour import Float32Array, Gate
 from .limb_filters import STEP_PX, Filters, filters, places

@@ -19,7 +19,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 STEP_PX = 0.5
 # Half-widths of what is looked at, on the ball and beyond [px], for a blur of USUAL_BLUR_PX; more needs more room.

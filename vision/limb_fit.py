@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 from .colour import Float32Array, Gate
 from .limb import Limb, find_limb

@@ -9,8 +9,8 @@ from itertools import product
 
 import numpy as np
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import ImageArray, Reason
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import ImageArray, Reason
 
 from .blob import Disc
 from .config import VisionConfig

@@ -5,8 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray
 
 
 def first_pose(

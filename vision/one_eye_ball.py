@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, StereoFrame, frozen_array
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, StereoFrame, frozen_array
 
 from .ball_size import RADIUS_SIGMA
 from .blob import Disc, Region, find_patches, measure

@@ -17,7 +17,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 from .colour import Float32Array, Gate
 from .limb_fit import fit_limb

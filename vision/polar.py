@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from interfaces.records import FloatArray, frozen_array
+from bodyschema.interfaces.records import FloatArray, frozen_array
 
 from .colour import Float32Array, Gate
 

@@ -11,10 +11,10 @@ from typing import Self
 import cv2
 import numpy as np
 
-from interfaces.camera import StereoCalibration
-from interfaces.errors import SourceError
-from interfaces.protocols import StereoEyes
-from interfaces.records import FloatArray, ImageArray, StereoFrame
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.errors import SourceError
+from bodyschema.interfaces.protocols import StereoEyes
+from bodyschema.interfaces.records import FloatArray, ImageArray, StereoFrame
 
 from .lens import Lens
 from .rig import CalibrationError, OneEyeRig, Rig

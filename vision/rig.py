@@ -8,8 +8,8 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from interfaces.errors import BodyschemaError, SourceError
-from interfaces.records import FloatArray, frozen_array
+from bodyschema.interfaces.errors import BodyschemaError, SourceError
+from bodyschema.interfaces.records import FloatArray, frozen_array
 
 from .lens import DISTORTION_NAMES, Lens, Model
 

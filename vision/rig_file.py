@@ -10,11 +10,11 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from interfaces.camera import LARGEST_SIDE_PX
-from interfaces.errors import ConfigError
-from interfaces.records import FloatArray
-from interfaces.toml_file import convert, line_of, read_toml
-from interfaces.toml_text import toml_text
+from bodyschema.interfaces.camera import LARGEST_SIDE_PX
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.toml_file import convert, line_of, read_toml
+from bodyschema.interfaces.toml_text import toml_text
 
 from .lens import DISTORTION_NAMES, Lens, Model
 from .rig import Made, OneEyeRig, Rig, StereoRig, parameter_names

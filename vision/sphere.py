@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 # A cone that reaches past 80° from the optical axis has no usable image.
 _LARGEST_ANGLE = math.radians(80.0)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 from .rig import StereoRig
 

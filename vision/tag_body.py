@@ -8,8 +8,8 @@ from types import MappingProxyType
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from interfaces.errors import ConfigError
-from interfaces.records import FloatArray, frozen_array
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.records import FloatArray, frozen_array
 
 from .tag_config import ClusterConfig, PlacedTag, TagConfig
 

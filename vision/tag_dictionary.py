@@ -7,8 +7,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from interfaces.errors import ConfigError
-from interfaces.records import FloatArray
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.records import FloatArray
 
 from .tag_config import Dictionary
 from .tag_edge import MODULES

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from interfaces.records import FloatArray, ImageArray, Reason
+from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
 
 from .tag_config import TagConfig
 

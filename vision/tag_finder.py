@@ -7,7 +7,7 @@ from collections.abc import Collection
 import cv2
 import numpy as np
 
-from interfaces.records import FloatArray, ImageArray, Reason
+from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
 
 from .tag_config import TagConfig
 from .tag_dictionary import tags_of

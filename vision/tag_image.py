@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.fft import dct
 
-from interfaces.records import FloatArray, ImageArray, Reason
+from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
 
 from .tag_config import TagConfig
 from .tag_edge import LONGEST_REACH_PX, SHARPEST_PX, Edge, find_edge

@@ -10,8 +10,16 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame, frozen_array
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import (
+    FloatArray,
+    ImageArray,
+    MarkerFix,
+    MarkerMiss,
+    Reason,
+    StereoFrame,
+    frozen_array,
+)
 
 from .images import check_calibration, check_images
 from .one_eye import first_pose

@@ -6,8 +6,8 @@ from dataclasses import replace
 from types import TracebackType
 from typing import Protocol, Self
 
-from interfaces.protocols import StereoCamera
-from interfaces.records import MarkerFix, MarkerMiss, StereoFrame
+from bodyschema.interfaces.protocols import StereoCamera
+from bodyschema.interfaces.records import MarkerFix, MarkerMiss, StereoFrame
 
 
 class MarkerTracker(Protocol):

@@ -8,8 +8,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame, frozen_array
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import (
+    FloatArray,
+    ImageArray,
+    MarkerFix,
+    MarkerMiss,
+    Reason,
+    StereoFrame,
+    frozen_array,
+)
 
 from .ball_size import BallSize
 from .blob import Disc, Patch, Region, find_patches, measure, patch_at, roughly

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from interfaces.camera import StereoCalibration
-from interfaces.errors import ConfigError
-from interfaces.plugins import load
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.plugins import load
 
 from .config import VisionConfig
 from .one_eye_ball import OneEyeBallTracker

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray
 
 from .blob import Disc
 from .sphere import Pinhole

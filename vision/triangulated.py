@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 from .rig import StereoRig
 

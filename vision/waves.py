@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 # The slow waves are so many, or up to the one of radius / _WAVE_RADIUS_PX if that is more.
 _LEAST_WAVES, _WAVE_RADIUS_PX = 3, 3.0

@@ -16,9 +16,9 @@ from benchmarks.peers.problem import Problem
 from benchmarks.peers.tasks import Trial
 from benchmarks.rigid_learner import new_tool_error
 from benchmarks.rough_arm import ROUGH, RoughArm, rough_arm
-from daemon.config import LearnerConfig
-from daemon.learning import DirectSolver, Learning, NominalModel
-from interfaces.records import FloatArray, Pair, frozen_array
+from bodyschema.daemon.config import LearnerConfig
+from bodyschema.daemon.learning import DirectSolver, Learning, NominalModel
+from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
 from kbmaps import ChainTolerances
 
 _JOINTS = 6

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from daemon.commands.options import HERE, RobotFile, flag
+from bodyschema.daemon.commands.options import HERE, RobotFile, flag
 
 
 def backup(
@@ -30,9 +30,9 @@ def backup(
 
     from rich.console import Console
 
-    from daemon.backup import write_backup
-    from daemon.config import Config
-    from interfaces.clock import SystemClock
+    from bodyschema.daemon.backup import write_backup
+    from bodyschema.daemon.config import Config
+    from bodyschema.interfaces.clock import SystemClock
 
     config = Config.load(robot)
     if state_dir is not None:

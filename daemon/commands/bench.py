@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.options import HERE, RobotFile, flag, several
+from bodyschema.daemon.commands.options import HERE, RobotFile, flag, several
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from daemon.bench_run import BenchRun
+    from bodyschema.daemon.bench_run import BenchRun
 
 PORT = Path("bus")
 GLANCE_S = 0.1
@@ -47,9 +47,9 @@ def bench(
     """
     from rich.console import Console
 
-    from daemon.bench_run import FAULTS, BenchRun
-    from daemon.config import Config
-    from daemon.signals import on_termination
+    from bodyschema.daemon.bench_run import FAULTS, BenchRun
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.signals import on_termination
 
     console = Console(highlight=False, soft_wrap=True)
     if list_faults:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from daemon.commands.board_options import AS_DRAWN, DrawnBoard
+from bodyschema.daemon.commands.board_options import AS_DRAWN, DrawnBoard
 
 
 def board(
@@ -27,7 +27,7 @@ def board(
     """
     from rich.console import Console
 
-    from daemon.camera_calibration import write_board
+    from bodyschema.daemon.camera_calibration import write_board
 
     made = drawn.board()
     across, upright = write_board(made, paper, out)

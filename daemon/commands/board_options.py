@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.options import flag
+from bodyschema.daemon.commands.options import flag
 
 if TYPE_CHECKING:
-    from daemon.camera_calibration import Board, Images
+    from bodyschema.daemon.camera_calibration import Board, Images
 
 
 @Parameter(name="*")
@@ -36,7 +36,7 @@ class DrawnBoard:
 
     def board(self) -> Board:
         """The board; ConfigError where there is no such one."""
-        from daemon.camera_calibration import board_of
+        from bodyschema.daemon.camera_calibration import board_of
 
         return board_of(
             self.squares,
@@ -63,7 +63,7 @@ class PrintedBoard(DrawnBoard):
 
     def board(self) -> Board:
         """The board in its true size; ConfigError where there is no such one."""
-        from daemon.camera_calibration import as_printed
+        from bodyschema.daemon.camera_calibration import as_printed
 
         return as_printed(super().board(), self.ruler_mm)
 
@@ -80,7 +80,7 @@ class EyeFiles:
 
     def of(self, folder: Path) -> Images:
         """The images in `folder`."""
-        from daemon.camera_calibration import Images
+        from bodyschema.daemon.camera_calibration import Images
 
         return Images(folder, self.left, self.right, self.side_by_side, self.one)
 

@@ -9,9 +9,9 @@ import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.calibrate_cameras import cameras, check
-from daemon.commands.latency import latency
-from daemon.commands.options import SourceRobotFile, flag, robot_file
+from bodyschema.daemon.commands.calibrate_cameras import cameras, check
+from bodyschema.daemon.commands.latency import latency
+from bodyschema.daemon.commands.options import SourceRobotFile, flag, robot_file
 
 # Without a help of its own its page shows what `arm` says, beside the commands.
 calibrate = cyclopts.App(name="calibrate")
@@ -79,17 +79,17 @@ def arm(
 
     from rich.console import Console
 
-    from daemon import recordings
-    from daemon.calibration import Calibration, CalibrationError
-    from daemon.calibration_report import CalibrationReport
-    from daemon.calibration_view import two_tools, view
-    from daemon.config import Config
-    from daemon.plausibility.check import plausibility, told_sigma
-    from daemon.plausibility.limits import require_units
-    from daemon.present_tool import first_pair
-    from daemon.wire import encode
-    from interfaces.calibrated_files import write_calibrated
-    from interfaces.recording import Recording
+    from bodyschema.daemon import recordings
+    from bodyschema.daemon.calibration import Calibration, CalibrationError
+    from bodyschema.daemon.calibration_report import CalibrationReport
+    from bodyschema.daemon.calibration_view import two_tools, view
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.plausibility.check import plausibility, told_sigma
+    from bodyschema.daemon.plausibility.limits import require_units
+    from bodyschema.daemon.present_tool import first_pair
+    from bodyschema.daemon.wire import encode
+    from bodyschema.interfaces.calibrated_files import write_calibrated
+    from bodyschema.interfaces.recording import Recording
 
     config = Config.load(robot_file(robot, source))
     description, source = config.robot, source or config.store_file

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.board_options import AS_PRINTED, BY_NAME, EyeFiles, EyeImages, PrintedBoard
-from daemon.commands.options import HERE, RobotFile, flag
+from bodyschema.daemon.commands.board_options import AS_PRINTED, BY_NAME, EyeFiles, EyeImages, PrintedBoard
+from bodyschema.daemon.commands.options import HERE, RobotFile, flag
 
 if TYPE_CHECKING:
-    from daemon.camera_calibration import Board, Calibrated, CheckFile, Gathered, Wanted
-    from daemon.config import Config
+    from bodyschema.daemon.camera_calibration import Board, Calibrated, CheckFile, Gathered, Wanted
+    from bodyschema.daemon.config import Config
 
 CAMERAS = Path("cameras.toml")
 
@@ -65,11 +65,11 @@ def cameras(
     """
     from rich.console import Console
 
-    from daemon.camera_calibration import Wanted, figures, write_calibrated_cameras
-    from daemon.camera_calibration_view import cameras_view
-    from daemon.camera_wiring import calibration_file, names_calibration
-    from daemon.config import Config
-    from daemon.wire import encode
+    from bodyschema.daemon.camera_calibration import Wanted, figures, write_calibrated_cameras
+    from bodyschema.daemon.camera_calibration_view import cameras_view
+    from bodyschema.daemon.camera_wiring import calibration_file, names_calibration
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.wire import encode
 
     board = printed.board()
     wanted = Wanted((left_serial, right_serial), lens, 0.01 * scale_sigma_percent, baseline_mm)
@@ -122,11 +122,11 @@ def check(
     """
     from rich.console import Console
 
-    from daemon.camera_calibration import checked
-    from daemon.camera_calibration_view import check_view
-    from daemon.camera_wiring import calibration_file
-    from daemon.config import Config
-    from daemon.wire import encode
+    from bodyschema.daemon.camera_calibration import checked
+    from bodyschema.daemon.camera_calibration_view import check_view
+    from bodyschema.daemon.camera_wiring import calibration_file
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.wire import encode
 
     board = printed.board()
     if images is not None:
@@ -145,7 +145,7 @@ def check(
 def _of_images(images: Path, files: EyeFiles, board: Board, wanted: Wanted) -> tuple[Gathered, Calibrated]:
     from rich.console import Console
 
-    from daemon.camera_calibration import calibrated, from_images
+    from bodyschema.daemon.camera_calibration import calibrated, from_images
 
     progress = Console(stderr=True, highlight=False)
 
@@ -159,12 +159,12 @@ def _of_images(images: Path, files: EyeFiles, board: Board, wanted: Wanted) -> t
 def _live(config: Config, board: Board, wanted: Wanted, save: Path | None) -> tuple[Gathered, Calibrated]:
     from rich.console import Console
 
-    from daemon.camera_calibration import kept_in, live_views, of_cameras
-    from daemon.camera_wiring import open_eyes, require_cameras
-    from daemon.live_calibration import LiveCalibration
-    from daemon.live_calibration_view import guidance_on
-    from daemon.signals import on_termination
-    from interfaces.clock import SystemClock
+    from bodyschema.daemon.camera_calibration import kept_in, live_views, of_cameras
+    from bodyschema.daemon.camera_wiring import open_eyes, require_cameras
+    from bodyschema.daemon.live_calibration import LiveCalibration
+    from bodyschema.daemon.live_calibration_view import guidance_on
+    from bodyschema.daemon.signals import on_termination
+    from bodyschema.interfaces.clock import SystemClock
 
     clock, eyes = SystemClock(), require_cameras(config).eyes
     views = live_views(board, eyes)
@@ -179,11 +179,11 @@ def _live(config: Config, board: Board, wanted: Wanted, save: Path | None) -> tu
 def _checked_live(config: Config, file: Path, board: Board, seconds: float) -> tuple[CheckFile, str]:
     from rich.console import Console
 
-    from daemon.camera_calibration import check_figures
-    from daemon.camera_wiring import open_eyes
-    from daemon.live_calibration import LiveViews, checked_live
-    from daemon.live_calibration_view import guidance_on
-    from interfaces.clock import SystemClock
+    from bodyschema.daemon.camera_calibration import check_figures
+    from bodyschema.daemon.camera_wiring import open_eyes
+    from bodyschema.daemon.live_calibration import LiveViews, checked_live
+    from bodyschema.daemon.live_calibration_view import guidance_on
+    from bodyschema.interfaces.clock import SystemClock
 
     clock = SystemClock()
     with guidance_on(Console(stderr=True, highlight=False), board.name, clock) as show:

@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from daemon.command_names import BOTHS, SAMPLERS, CommandName
-from daemon.commands.options import HERE, RobotFile
+from bodyschema.daemon.command_names import BOTHS, SAMPLERS, CommandName
+from bodyschema.daemon.commands.options import HERE, RobotFile
 
 Process = Literal["sampler", "learner"]
 
@@ -37,11 +37,11 @@ def command(
     """
     from rich.console import Console
 
-    from daemon.bus import client
-    from daemon.config import Config
-    from daemon.keys import Keys
-    from daemon.wire import CommandReply, CommandRequest, decode, encode
-    from interfaces.errors import RequestError
+    from bodyschema.daemon.bus import client
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.keys import Keys
+    from bodyschema.daemon.wire import CommandReply, CommandRequest, decode, encode
+    from bodyschema.interfaces.errors import RequestError
 
     process: Process = to or ("sampler" if name in SAMPLERS else "learner")
     if process == "sampler" and name not in SAMPLERS:

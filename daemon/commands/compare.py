@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from daemon.commands.options import flag
+from bodyschema.daemon.commands.options import flag
 
 
 def compare(
@@ -33,11 +33,11 @@ def compare(
 
     from rich.console import Console
 
-    from daemon import recordings
-    from daemon.comparison import compared
-    from daemon.comparison_view import view
-    from daemon.wire import encode
-    from interfaces.robot import RobotDescription
+    from bodyschema.daemon import recordings
+    from bodyschema.daemon.comparison import compared
+    from bodyschema.daemon.comparison_view import view
+    from bodyschema.daemon.wire import encode
+    from bodyschema.interfaces.robot import RobotDescription
 
     joints = None if robot is None else RobotDescription.load(robot).joints
     one, other = (recordings.opened(file, joints) for file in (first, second))

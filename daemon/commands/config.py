@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 import cyclopts
 from cyclopts import Parameter
 
-from daemon.commands.options import HERE, RobotFile, flag
+from bodyschema.daemon.commands.options import HERE, RobotFile, flag
 
 if TYPE_CHECKING:
-    from daemon.config import Config
-    from effects import Effect
-    from interfaces.robot import RobotDescription
+    from bodyschema.daemon.config import Config
+    from bodyschema.effects import Effect
+    from bodyschema.interfaces.robot import RobotDescription
 
 config = cyclopts.App(
     name="config",
@@ -44,13 +44,13 @@ def init(
     Next: mend what is marked CHECK, then `bodyschema config check`. With --sim nothing is left to mend:
     `bodyschema run --sim`.
     """
-    from interfaces.errors import ConfigError
+    from bodyschema.interfaces.errors import ConfigError
 
     try:
         if sim:
             _copy_model(robot)
         else:
-            from daemon.robot_template import EXAMPLE, guess_from, robot_toml
+            from bodyschema.daemon.robot_template import EXAMPLE, guess_from, robot_toml
 
             write_new(robot, robot_toml(EXAMPLE if urdf is None else guess_from(urdf, robot)))
     except OSError as error:
@@ -66,9 +66,9 @@ def check(*, robot: RobotFile = HERE) -> None:
 
     Next: `bodyschema replay` for a recording that you have; `bodyschema run`.
     """
-    from daemon.config import Config
-    from daemon.synthesis import without_consequence
-    from interfaces.urdf import REVOLUTE
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.synthesis import without_consequence
+    from bodyschema.interfaces.urdf import REVOLUTE
 
     checked = Config.load(robot)
     checked.require_learnable()
@@ -116,7 +116,7 @@ def show(*, robot: RobotFile = HERE) -> None:
     """
     import msgspec
 
-    from daemon.config import Config
+    from bodyschema.daemon.config import Config
 
     checked = Config.load(robot)
     tables = msgspec.to_builtins(checked.tables)
@@ -140,14 +140,14 @@ def _numbers(values: Iterable[float]) -> str:
 def _camera_lines(config: Config) -> list[str]:
     if config.tables.vision.cameras is None:
         return []
-    from daemon.camera_wiring import camera_lines
+    from bodyschema.daemon.camera_wiring import camera_lines
 
     return list(camera_lines(config))
 
 
 def _standing_still(description: RobotDescription) -> list[str]:
     """Moving joints between camera and marker that are not learnt."""
-    from interfaces.urdf import MOVING
+    from bodyschema.interfaces.urdf import MOVING
 
     path = description.tree.path(description.camera.parent_link, description.robot.marker_link)
     return [joint.name for joint, _ in path if joint.kind in MOVING and joint.name not in description.joints]
@@ -162,7 +162,7 @@ def say(text: str) -> None:
 
 def write_new(file: Path, text: str) -> None:
     """Write a file that is not there yet; ConfigError when it is."""
-    from interfaces.errors import ConfigError
+    from bodyschema.interfaces.errors import ConfigError
 
     try:
         with file.open("x", encoding="utf-8") as stream:
@@ -172,7 +172,7 @@ def write_new(file: Path, text: str) -> None:
 
 
 def _copy_model(robot: Path) -> None:
-    from daemon.wiring import demonstration_model
+    from bodyschema.daemon.wiring import demonstration_model
 
     model = demonstration_model()
     write_new(robot, model.read_text(encoding="utf-8"))

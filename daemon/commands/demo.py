@@ -60,12 +60,12 @@ def demo(
     import numpy as np
     from rich.console import Console
 
-    from daemon import recordings
-    from daemon.demo.play import play
-    from daemon.demo.plot import plot_curve, write_curve
-    from daemon.demo.scene import prepare
-    from daemon.demo.view import show_outcome, shown_on
-    from daemon.wiring import require_simulation
+    from bodyschema.daemon import recordings
+    from bodyschema.daemon.demo.play import play
+    from bodyschema.daemon.demo.plot import plot_curve, write_curve
+    from bodyschema.daemon.demo.scene import prepare
+    from bodyschema.daemon.demo.view import show_outcome, shown_on
+    from bodyschema.daemon.wiring import require_simulation
 
     require_simulation()
     console = Console(highlight=False)

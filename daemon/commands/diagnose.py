@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.options import SourceRobotFile, flag, robot_file
+from bodyschema.daemon.commands.options import SourceRobotFile, flag, robot_file
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -51,9 +51,9 @@ def diagnose(
 
     from rich.console import Console
 
-    from daemon.config import Config
-    from daemon.diagnosis_run import Asked, measured, results_in, run, written
-    from daemon.diagnosis_view import view
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.diagnosis_run import Asked, measured, results_in, run, written
+    from bodyschema.daemon.diagnosis_view import view
 
     config = Config.load(robot_file(robot, recording))
     asked = Asked.of(effects, exclude, seed)

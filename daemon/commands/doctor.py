@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import Annotated
 
-from daemon.commands.options import HERE, RobotFile, flag
+from bodyschema.daemon.commands.options import HERE, RobotFile, flag
 
 
 def doctor(*, robot: RobotFile = HERE, json: Annotated[bool, flag("As JSON.")] = False) -> None:
@@ -20,9 +20,9 @@ def doctor(*, robot: RobotFile = HERE, json: Annotated[bool, flag("As JSON.")] =
     """
     from rich.console import Console
 
-    from daemon.config import Config
-    from daemon.doctor import as_json, run
-    from daemon.doctor_view import show
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.doctor import as_json, run
+    from bodyschema.daemon.doctor_view import show
 
     config = Config.load(robot)
     errors = Console(stderr=True, highlight=False)

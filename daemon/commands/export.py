@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from daemon.commands.options import HERE, RobotFile, flag
+from bodyschema.daemon.commands.options import HERE, RobotFile, flag
 
 
 def export(
@@ -30,9 +30,9 @@ def export(
     """
     from rich.console import Console
 
-    from daemon import recordings
-    from interfaces.recording import Recording
-    from interfaces.robot import RobotDescription
+    from bodyschema.daemon import recordings
+    from bodyschema.interfaces.recording import Recording
+    from bodyschema.interfaces.robot import RobotDescription
 
     recordings.check_target(out, force=force)
     if source.suffix.lower() in recordings.STORE_ENDINGS:

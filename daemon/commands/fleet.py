@@ -10,10 +10,10 @@ import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.options import HERE, VARIABLE, flag, several
+from bodyschema.daemon.commands.options import HERE, VARIABLE, flag, several
 
 if TYPE_CHECKING:
-    from daemon.fleet.roster import Place
+    from bodyschema.daemon.fleet.roster import Place
 
 fleet = cyclopts.App(
     name="fleet",
@@ -56,9 +56,9 @@ def list_robots(
     from rich.console import Console
     from rich.live import Live
 
-    from daemon.fleet.roster import Fleet
-    from daemon.fleet.roster_view import as_json, screen
-    from daemon.status_view import EVERY_S
+    from bodyschema.daemon.fleet.roster import Fleet
+    from bodyschema.daemon.fleet.roster_view import as_json, screen
+    from bodyschema.daemon.status_view import EVERY_S
 
     looked_at, console = _places(connect, robot), Console(highlight=False)
     with Fleet(looked_at) as robots:
@@ -100,11 +100,11 @@ def compare(
     """
     from rich.console import Console
 
-    from daemon.fleet.asking import compare_types
-    from daemon.fleet.comparison_view import view
-    from daemon.fleet.roster import Fleet
-    from daemon.wire import encode
-    from interfaces.errors import RequestError
+    from bodyschema.daemon.fleet.asking import compare_types
+    from bodyschema.daemon.fleet.comparison_view import view
+    from bodyschema.daemon.fleet.roster import Fleet
+    from bodyschema.daemon.wire import encode
+    from bodyschema.interfaces.errors import RequestError
 
     looked_at = _places(connect, robot)
     with Fleet(looked_at) as robots:
@@ -153,14 +153,14 @@ def diagnose(
     """
     from rich.console import Console
 
-    from daemon.diagnosis_run import Asked
-    from daemon.extras import require_extra
-    from daemon.fleet.diagnosing import diagnose_all
-    from daemon.fleet.diagnosing import workers as cluster
-    from daemon.fleet.recordings import jobs
-    from daemon.fleet.summary import summary
-    from daemon.fleet.summary_view import progress, view
-    from daemon.wire import encode
+    from bodyschema.daemon.diagnosis_run import Asked
+    from bodyschema.daemon.extras import require_extra
+    from bodyschema.daemon.fleet.diagnosing import diagnose_all
+    from bodyschema.daemon.fleet.diagnosing import workers as cluster
+    from bodyschema.daemon.fleet.recordings import jobs
+    from bodyschema.daemon.fleet.summary import summary
+    from bodyschema.daemon.fleet.summary_view import progress, view
+    from bodyschema.daemon.wire import encode
 
     require_extra("fleet", "diagnosing many recordings")
     wanted, asked = jobs(recordings, folder, robot), Asked.of(effects, exclude, seed)
@@ -184,14 +184,14 @@ def diagnose(
 def _places(connect: tuple[str, ...], robot: tuple[Path, ...]) -> list[Place]:
     import os
 
-    from daemon.fleet.roster import places
+    from bodyschema.daemon.fleet.roster import places
 
     described = robot or (() if connect else (Path(os.environ.get(VARIABLE, HERE)),))
     return places(connect, described)
 
 
 def _nobody(places: list[Place]) -> None:
-    from interfaces.errors import BusError
+    from bodyschema.interfaces.errors import BusError
 
     where = ", ".join(str(place.route) for place in places)
     raise BusError(

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from daemon.commands.options import HERE, RobotFile, flag
+from bodyschema.daemon.commands.options import HERE, RobotFile, flag
 
 if TYPE_CHECKING:
-    from daemon.config import Config
-    from daemon.wire import IkReply
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.wire import IkReply
 
 REASONS = {
     "reached": "reached",
@@ -44,11 +44,11 @@ def ik(
     """
     import math
 
-    from daemon.bus import client
-    from daemon.config import Config
-    from daemon.keys import Keys
-    from daemon.wire import IkReply, IkRequest, decode, encode
-    from interfaces.errors import RequestError
+    from bodyschema.daemon.bus import client
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.keys import Keys
+    from bodyschema.daemon.wire import IkReply, IkRequest, decode, encode
+    from bodyschema.interfaces.errors import RequestError
 
     config = Config.load(robot)
     if not all(map(math.isfinite, (x, y, z))):
@@ -71,7 +71,7 @@ def _show(reply: IkReply, config: Config, deg: bool) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from daemon.screen import two_digits
+    from bodyschema.daemon.screen import two_digits
 
     table = Table(box=None, pad_edge=False, header_style="bold", show_header=False)
     for name, value, slides in zip(config.robot.joints, reply.q, config.robot.chain.prismatic, strict=True):

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import cyclopts
 from cyclopts import Parameter
 
-from daemon.commands.options import HERE, VARIABLE, flag, several
+from bodyschema.daemon.commands.options import HERE, VARIABLE, flag, several
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from daemon.service_files import UnitFiles
-    from daemon.udev import Rules
+    from bodyschema.daemon.service_files import UnitFiles
+    from bodyschema.daemon.udev import Rules
 
 Root = Annotated[Path, Parameter(help="Of the file system, for images of other machines.")]
 
@@ -47,7 +47,7 @@ def udev(
     from rich.console import Console
     from rich.prompt import Confirm
 
-    from daemon.udev import Rules, rules
+    from bodyschema.daemon.udev import Rules, rules
 
     console = Console(highlight=False, soft_wrap=True)
     of_machine = Rules(root)
@@ -101,13 +101,13 @@ def service(
 
     Next: the `systemctl enable --now` that it prints; docs/operation.md has logs, upgrades and backups.
     """
-    from daemon.config import Config
-    from daemon.fleet.hosting import configs_of, descriptions
-    from daemon.learner_host import session_settings
-    from daemon.service_files import ServiceFiles, UnitFolder, make_state_folders, systemd_version, user_for
-    from daemon.units import PROCESSES, Installed
-    from daemon.wiring import check_sources
-    from interfaces.errors import ConfigError
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.fleet.hosting import configs_of, descriptions
+    from bodyschema.daemon.learner_host import session_settings
+    from bodyschema.daemon.service_files import ServiceFiles, UnitFolder, make_state_folders, systemd_version, user_for
+    from bodyschema.daemon.units import PROCESSES, Installed
+    from bodyschema.daemon.wiring import check_sources
+    from bodyschema.interfaces.errors import ConfigError
 
     files, folder = descriptions(robot or (Path(os.environ.get(VARIABLE, HERE)),)), UnitFolder(root)
     several_robots = len(files) > 1
@@ -156,9 +156,9 @@ def router(
 
     Next: the `systemctl enable --now` that it prints; `bodyschema doctor` on the machines that connect.
     """
-    from daemon.router import RouterConfig
-    from daemon.service_files import RouterFiles, UnitFolder, systemd_version, user_for
-    from daemon.units import Installed
+    from bodyschema.daemon.router import RouterConfig
+    from bodyschema.daemon.service_files import RouterFiles, UnitFolder, systemd_version, user_for
+    from bodyschema.daemon.units import Installed
 
     units = RouterFiles(UnitFolder(root))
     if uninstall:
@@ -173,7 +173,7 @@ def _install_units(units: UnitFiles, texts: dict[Path, str], *, yes: bool, dry_r
     from rich.console import Console
     from rich.prompt import Confirm
 
-    from daemon.service_files import missing
+    from bodyschema.daemon.service_files import missing
 
     console = Console(highlight=False, soft_wrap=True)
     changes = missing(texts)

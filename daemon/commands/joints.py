@@ -5,13 +5,13 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING, Annotated
 
-from daemon.commands.options import HERE, RobotFile, flag
+from bodyschema.daemon.commands.options import HERE, RobotFile, flag
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from daemon.joints_watch import JointsWatch, Seen
-    from daemon.sources import Powered
+    from bodyschema.daemon.joints_watch import JointsWatch, Seen
+    from bodyschema.daemon.sources import Powered
 
 SHOW_EVERY_S = 0.1
 PRINT_EVERY_S = 0.5
@@ -39,13 +39,13 @@ def joints(
     from rich.console import Console
     from rich.live import Live
 
-    from daemon.config import Config
-    from daemon.joints_view import as_json, screen
-    from daemon.joints_watch import JointsWatch, ServoJoints
-    from daemon.powered import find_powered
-    from daemon.signals import on_termination
-    from daemon.wiring import open_joints
-    from interfaces.clock import SystemClock
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.joints_view import as_json, screen
+    from bodyschema.daemon.joints_watch import JointsWatch, ServoJoints
+    from bodyschema.daemon.powered import find_powered
+    from bodyschema.daemon.signals import on_termination
+    from bodyschema.daemon.wiring import open_joints
+    from bodyschema.interfaces.clock import SystemClock
 
     clock = SystemClock()
     config = Config.load(robot)
@@ -88,7 +88,7 @@ def _first(watch: JointsWatch) -> Seen:
     """The first look that has all; SourceError when none comes."""
     import time
 
-    from interfaces.errors import SourceError
+    from bodyschema.interfaces.errors import SourceError
 
     end = time.monotonic() + FIRST_READING_S
     while time.monotonic() < end:

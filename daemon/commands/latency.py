@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.options import HERE, RobotFile, flag
+from bodyschema.daemon.commands.options import HERE, RobotFile, flag
 
 if TYPE_CHECKING:
-    from daemon.config import Config
-    from daemon.latency import Wiggle
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.latency import Wiggle
 
 SECONDS = 5.0
 
@@ -44,10 +44,10 @@ def latency(
     """
     from rich.console import Console
 
-    from daemon.config import Config
-    from daemon.latency import latency_of
-    from daemon.wiggling import write_wiggle
-    from daemon.wire import encode
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.latency import latency_of
+    from bodyschema.daemon.wiggling import write_wiggle
+    from bodyschema.daemon.wire import encode
 
     config = Config.load(robot)
     console = Console(highlight=False, soft_wrap=True)
@@ -71,9 +71,9 @@ def latency(
 def _wiggle(config: Config, recording: Path | None, seconds: float, *, sim: bool) -> Wiggle:
     from rich.console import Console
 
-    from daemon.wiggling import collected, read_wiggle
-    from daemon.wiring import open_sources
-    from interfaces.errors import BodyschemaError
+    from bodyschema.daemon.wiggling import collected, read_wiggle
+    from bodyschema.daemon.wiring import open_sources
+    from bodyschema.interfaces.errors import BodyschemaError
 
     if recording is not None and sim:
         raise BodyschemaError("give a recording or --sim, not both")

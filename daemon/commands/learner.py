@@ -9,7 +9,7 @@ from typing import Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.options import HERE, VARIABLE, flag, several
+from bodyschema.daemon.commands.options import HERE, VARIABLE, flag, several
 
 
 def learner(
@@ -39,14 +39,14 @@ def learner(
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from contextlib import nullcontext
 
-    from daemon import logs
-    from daemon.extras import require_extra
-    from daemon.fleet.hosting import configs_of, descriptions, spread
-    from daemon.learner_host import run_learners
-    from daemon.notify import Notifier
-    from daemon.signals import Wishes, on_termination
-    from daemon.view_process import shown
-    from interfaces.clock import SystemClock
+    from bodyschema.daemon import logs
+    from bodyschema.daemon.extras import require_extra
+    from bodyschema.daemon.fleet.hosting import configs_of, descriptions, spread
+    from bodyschema.daemon.learner_host import run_learners
+    from bodyschema.daemon.notify import Notifier
+    from bodyschema.daemon.signals import Wishes, on_termination
+    from bodyschema.daemon.view_process import shown
+    from bodyschema.interfaces.clock import SystemClock
 
     files = descriptions(robot or (Path(os.environ.get(VARIABLE, HERE)),))
     if view:

@@ -10,8 +10,8 @@ import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.board_options import BY_NAME, EyeFiles
-from daemon.commands.options import HERE, RobotFile, flag
+from bodyschema.daemon.commands.board_options import BY_NAME, EyeFiles
+from bodyschema.daemon.commands.options import HERE, RobotFile, flag
 
 marker = cyclopts.App(
     name="marker",
@@ -73,7 +73,7 @@ def print_tags(
     """
     from rich.console import Console
 
-    from daemon.tag_pages import Tags, as_printed, face_mm, tables, write_tags
+    from bodyschema.daemon.tag_pages import Tags, as_printed, face_mm, tables, write_tags
 
     drawn = Tags(shape, ids, family, side_mm, columns, rows, fold_deg)
     across, upright = write_tags(drawn, paper, out)
@@ -114,9 +114,9 @@ def cluster(
     """
     from rich.console import Console
 
-    from daemon.cluster_wiring import Wanted, figures, measured, said, sides_of, tables
-    from daemon.tag_pages import numbers_of
-    from daemon.wire import encode
+    from bodyschema.daemon.cluster_wiring import Wanted, figures, measured, said, sides_of, tables
+    from bodyschema.daemon.tag_pages import numbers_of
+    from bodyschema.daemon.wire import encode
 
     progress = Console(stderr=True, highlight=False, soft_wrap=True)
     numbers = None if ids is None else tuple(numbers_of(ids))
@@ -152,8 +152,8 @@ def learn(
 
     Next: put what was printed into robot.toml, in the place of `colour = ...`.
     """
-    from daemon.marker_wiring import learnt_colour_table
-    from interfaces.errors import BodyschemaError
+    from bodyschema.daemon.marker_wiring import learnt_colour_table
+    from bodyschema.interfaces.errors import BodyschemaError
 
     if auto == (at is not None) or (not images and not auto):
         raise BodyschemaError("give image files and --at COLUMN ROW, or --auto; the robot's own cameras need --auto")
@@ -163,10 +163,10 @@ def learn(
 def _learnt_live(robot: Path, seconds: float) -> str:
     from rich.console import Console
 
-    from daemon.camera_wiring import open_eyes
-    from daemon.config import Config
-    from daemon.marker_wiring import moving_colour_table
-    from interfaces.clock import SystemClock
+    from bodyschema.daemon.camera_wiring import open_eyes
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.marker_wiring import moving_colour_table
+    from bodyschema.interfaces.clock import SystemClock
 
     clock, console = SystemClock(), Console(stderr=True, highlight=False, soft_wrap=True)
     eyes = open_eyes(Config.load(robot), clock)

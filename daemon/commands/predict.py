@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from daemon.commands.options import HERE, RobotFile, flag
+from bodyschema.daemon.commands.options import HERE, RobotFile, flag
 
 if TYPE_CHECKING:
-    from daemon.config import Config
-    from daemon.wire import JointsRequest, PredictReply
-    from interfaces.records import FloatArray
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.wire import JointsRequest, PredictReply
+    from bodyschema.interfaces.records import FloatArray
 
 
 def predict(
@@ -34,10 +34,10 @@ def predict(
     import numpy as np
     from rich.console import Console
 
-    from daemon.bus import client
-    from daemon.config import Config
-    from daemon.keys import Keys
-    from daemon.wire import PredictReply, decode, encode
+    from bodyschema.daemon.bus import client
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.keys import Keys
+    from bodyschema.daemon.wire import PredictReply, decode, encode
 
     config = Config.load(robot)
     request = _request(q, config, deg)
@@ -55,7 +55,7 @@ def _notes(config: Config, q: FloatArray, deg: bool) -> Iterator[str]:
     """What is to be said of joint values q (n, d) [rad, m] that the arm cannot have."""
     import numpy as np
 
-    from daemon.plausibility.limits import beyond_limits, limits_text
+    from bodyschema.daemon.plausibility.limits import beyond_limits, limits_text
 
     beyond = beyond_limits(config.robot, q)
     for joint in np.flatnonzero(beyond.any(axis=0)):
@@ -73,8 +73,8 @@ def _request(values: tuple[float, ...], config: Config, deg: bool) -> JointsRequ
     """What to ask; RequestError when it is no vector of joint angles."""
     import numpy as np
 
-    from daemon.wire import JointsRequest, joint_angles
-    from interfaces.errors import RequestError
+    from bodyschema.daemon.wire import JointsRequest, joint_angles
+    from bodyschema.interfaces.errors import RequestError
 
     if values:
         request = JointsRequest(list(values))
@@ -92,8 +92,8 @@ def _request(values: tuple[float, ...], config: Config, deg: bool) -> JointsRequ
 
 
 def _from_standard_input(config: Config) -> JointsRequest:
-    from daemon.wire import JointsRequest, decode
-    from interfaces.errors import RequestError
+    from bodyschema.daemon.wire import JointsRequest, decode
+    from bodyschema.interfaces.errors import RequestError
 
     text = sys.stdin.buffer.read()
     names = ", ".join(config.robot.joints)
@@ -111,7 +111,7 @@ def _show(reply: PredictReply) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from daemon.screen import two_digits
+    from bodyschema.daemon.screen import two_digits
 
     table = Table(box=None, pad_edge=False, header_style="bold")
     for name in ("x", "y", "z", "1-sigma of x, y, z"):

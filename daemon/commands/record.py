@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.options import HERE, RobotFile, flag
+from bodyschema.daemon.commands.options import HERE, RobotFile, flag
 
 
 def record(
@@ -32,11 +32,11 @@ def record(
     """
     from rich.console import Console
 
-    from daemon import recordings
-    from daemon.bus import client
-    from daemon.config import Config
-    from daemon.recorder import History, copy_history, follow_history
-    from daemon.signals import Wishes, on_termination
+    from bodyschema.daemon import recordings
+    from bodyschema.daemon.bus import client
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.recorder import History, copy_history, follow_history
+    from bodyschema.daemon.signals import Wishes, on_termination
 
     recordings.check_target(out, force=force)
     config = Config.load(robot)

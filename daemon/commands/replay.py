@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.options import SourceRobotFile, flag, robot_file
+from bodyschema.daemon.commands.options import SourceRobotFile, flag, robot_file
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from daemon.status import LearnerStatus, SamplerStatus
+    from bodyschema.daemon.status import LearnerStatus, SamplerStatus
 
 LINE_EVERY_S = 2.0
 
@@ -58,17 +58,17 @@ def replay(
 
     from rich.console import Console
 
-    from daemon.config import Config
-    from daemon.evaluate import split_blocks
-    from daemon.learning import NominalModel
-    from daemon.plausibility.check import plausibility, told_sigma
-    from daemon.plausibility.limits import require_units
-    from daemon.replay.report import as_text
-    from daemon.replay.run import Job
-    from daemon.replay.run import replay as run_replay
-    from daemon.replay.steps import Steps, require_path
-    from daemon.wire import encode
-    from interfaces.recording import Recording
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.evaluate import split_blocks
+    from bodyschema.daemon.learning import NominalModel
+    from bodyschema.daemon.plausibility.check import plausibility, told_sigma
+    from bodyschema.daemon.plausibility.limits import require_units
+    from bodyschema.daemon.replay.report import as_text
+    from bodyschema.daemon.replay.run import Job
+    from bodyschema.daemon.replay.run import replay as run_replay
+    from bodyschema.daemon.replay.steps import Steps, require_path
+    from bodyschema.daemon.wire import encode
+    from bodyschema.interfaces.recording import Recording
 
     config = Config.load(robot_file(robot, recording))
     config.require_learnable()
@@ -102,7 +102,7 @@ def _ending_on_sigterm() -> Iterator[None]:
 
 
 def _make_folder(folder: Path) -> None:
-    from interfaces.errors import RecordingError
+    from bodyschema.interfaces.errors import RecordingError
 
     try:
         folder.mkdir(parents=True)
@@ -133,7 +133,7 @@ def _progress(console: Console) -> Iterator[Callable[[SamplerStatus, LearnerStat
 
 
 def _line(sampler: SamplerStatus, learner: LearnerStatus) -> str:
-    from daemon.screen import mm
+    from bodyschema.daemon.screen import mm
 
     error = learner.prequential_m.get(learner.answering)
     return (

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from daemon.commands.options import flag
+from bodyschema.daemon.commands.options import flag
 
 Name = Literal["fig4", "fig5", "fig6", "fig7", "exactness", "all"]
 
@@ -49,12 +49,12 @@ def reproduce(
     import numpy as np
     from rich.console import Console
 
-    from daemon.extras import require_extra
-    from daemon.progress import shown_on
-    from daemon.reproduce import EXPERIMENTS, Run
-    from daemon.reproduce.plot import plot
-    from daemon.reproduce.show import show
-    from interfaces.errors import ConfigError
+    from bodyschema.daemon.extras import require_extra
+    from bodyschema.daemon.progress import shown_on
+    from bodyschema.daemon.reproduce import EXPERIMENTS, Run
+    from bodyschema.daemon.reproduce.plot import plot
+    from bodyschema.daemon.reproduce.show import show
+    from bodyschema.interfaces.errors import ConfigError
 
     require_extra("plots", "a figure")
     if seed < 0:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from daemon.commands.options import HERE, flag
+from bodyschema.daemon.commands.options import HERE, flag
 
 
 def restore(
@@ -30,8 +30,8 @@ def restore(
     """
     from rich.console import Console
 
-    from daemon.backup import Backup
-    from daemon.restoring import restore as put_back
+    from bodyschema.daemon.backup import Backup
+    from bodyschema.daemon.restoring import restore as put_back
 
     console = Console(highlight=False, soft_wrap=True)
     with Backup(file) as opened:

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import cyclopts
 from cyclopts import Parameter
 
-from daemon.commands.options import HERE, flag, several
+from bodyschema.daemon.commands.options import HERE, flag, several
 
 if TYPE_CHECKING:
-    from daemon.servo_fitting import Candidate, Fitting
+    from bodyschema.daemon.servo_fitting import Candidate, Fitting
 
 robot = cyclopts.App(
     name="robot",
@@ -48,12 +48,12 @@ def new(
 
     Next: mend what is marked CHECK; `bodyschema joints` for signs and zeros; `bodyschema config check`.
     """
-    from daemon.commands.config import say, write_new
-    from daemon.config import Config
-    from daemon.robot_template import guess_from, robot_toml
-    from daemon.servo_fitting import first_of, fit, servo_tables
-    from daemon.wiring import connected_cameras
-    from interfaces.errors import BodyschemaError, ConfigError
+    from bodyschema.daemon.commands.config import say, write_new
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.robot_template import guess_from, robot_toml
+    from bodyschema.daemon.servo_fitting import first_of, fit, servo_tables
+    from bodyschema.daemon.wiring import connected_cameras
+    from bodyschema.interfaces.errors import BodyschemaError, ConfigError
 
     guess = guess_from(urdf, out)
     if out.exists():
@@ -77,10 +77,10 @@ def new(
 def _candidates(source: str, ports: Sequence[str], bauds: Sequence[int]) -> list[Candidate]:
     from rich.console import Console
 
-    from daemon import servo_wiring
-    from daemon.progress import shown_on
-    from daemon.scan_report import as_json, report_of
-    from daemon.servo_fitting import candidates_in, read_scan
+    from bodyschema.daemon import servo_wiring
+    from bodyschema.daemon.progress import shown_on
+    from bodyschema.daemon.scan_report import as_json, report_of
+    from bodyschema.daemon.servo_fitting import candidates_in, read_scan
 
     if source != SCAN:
         return read_scan(Path(source))

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from daemon.commands.options import flag
+from bodyschema.daemon.commands.options import flag
 
 
 def router(
@@ -26,11 +26,11 @@ def router(
 
     Next: `router` and `[zenoh.tls]` in each machine's robot.toml; `bodyschema doctor` there.
     """
-    from daemon import logs
-    from daemon.notify import Notifier
-    from daemon.router import RouterConfig, run_router
-    from daemon.signals import Wishes, on_termination
-    from interfaces.clock import SystemClock
+    from bodyschema.daemon import logs
+    from bodyschema.daemon.notify import Notifier
+    from bodyschema.daemon.router import RouterConfig, run_router
+    from bodyschema.daemon.signals import Wishes, on_termination
+    from bodyschema.interfaces.clock import SystemClock
 
     config = RouterConfig.load(file)
     if zenohd:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from daemon.commands.options import HERE, RobotFile, flag
+from bodyschema.daemon.commands.options import HERE, RobotFile, flag
 
 
 def run(
@@ -26,14 +26,14 @@ def run(
     """
     from contextlib import nullcontext
 
-    from daemon import logs
-    from daemon.config import Config
-    from daemon.extras import require_extra
-    from daemon.signals import on_termination
-    from daemon.supervise import Child, Supervisor
-    from daemon.view_process import shown
-    from daemon.wiring import check_sources
-    from interfaces.interpreter import module_command
+    from bodyschema.daemon import logs
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.extras import require_extra
+    from bodyschema.daemon.signals import on_termination
+    from bodyschema.daemon.supervise import Child, Supervisor
+    from bodyschema.daemon.view_process import shown
+    from bodyschema.daemon.wiring import check_sources
+    from bodyschema.interfaces.interpreter import module_command
 
     if view:
         require_extra("view", "the page")
@@ -43,8 +43,8 @@ def run(
     check_sources(config, sim=sim)
     options = ["--robot", str(robot), *(["--state-dir", str(state_dir)] if state_dir else [])]
     options += ["--verbose"] if verbose else []
-    sampler = Child("sampler", module_command("daemon", "sampler", *options, *(["--sim"] if sim else [])))
-    learner = Child("learner", module_command("daemon", "learner", *options))
+    sampler = Child("sampler", module_command("bodyschema", "sampler", *options, *(["--sim"] if sim else [])))
+    learner = Child("learner", module_command("bodyschema", "learner", *options))
     supervisor = Supervisor([sampler, learner])
     with shown(robot) if view else nullcontext(), on_termination(supervisor.stop):
         supervisor.run()

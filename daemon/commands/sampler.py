@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from daemon.commands.options import HERE, RobotFile, flag
+from bodyschema.daemon.commands.options import HERE, RobotFile, flag
 
 
 def sampler(
@@ -27,18 +27,18 @@ def sampler(
 
     Next: `bodyschema learner`, `bodyschema status --watch`.
     """
-    from daemon import logs
-    from daemon.bus import Bus
-    from daemon.config import Config
-    from daemon.notify import Notifier
-    from daemon.sampler import LOOPS, Sampler
-    from daemon.service import Service
-    from daemon.session import session_of
-    from daemon.signals import on_termination
-    from daemon.store import PairStore
-    from daemon.units import devices_of
-    from daemon.wiring import open_sources
-    from interfaces.clock import SystemClock
+    from bodyschema.daemon import logs
+    from bodyschema.daemon.bus import Bus
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.notify import Notifier
+    from bodyschema.daemon.sampler import LOOPS, Sampler
+    from bodyschema.daemon.service import Service
+    from bodyschema.daemon.session import session_of
+    from bodyschema.daemon.signals import on_termination
+    from bodyschema.daemon.store import PairStore
+    from bodyschema.daemon.units import devices_of
+    from bodyschema.daemon.wiring import open_sources
+    from bodyschema.interfaces.clock import SystemClock
 
     logs.set_up(verbose=verbose)
     notifier = Notifier.of_environment()

@@ -9,7 +9,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from daemon.commands.options import flag, several
+from bodyschema.daemon.commands.options import flag, several
 
 
 def scan(
@@ -34,11 +34,11 @@ def scan(
     """
     from rich.console import Console
 
-    from daemon import servo_wiring, wiring
-    from daemon.progress import shown_on
-    from daemon.scan_report import as_json, report_of
-    from daemon.scan_view import show
-    from interfaces.errors import ConfigError
+    from bodyschema.daemon import servo_wiring, wiring
+    from bodyschema.daemon.progress import shown_on
+    from bodyschema.daemon.scan_report import as_json, report_of
+    from bodyschema.daemon.scan_view import show
+    from bodyschema.interfaces.errors import ConfigError
 
     unknown = [rate for rate in baud if rate not in servo_wiring.scanned_bauds()]
     if unknown:
@@ -46,7 +46,7 @@ def scan(
         raise ConfigError(f"--baud {unknown[0]} is no rate of such servos", remedy=f"Give one of {known}")
     config = None
     if robot is not None:
-        from daemon.config import Config
+        from bodyschema.daemon.config import Config
 
         config = Config.load(robot)
         servo_wiring.require_servos(config)

@@ -10,16 +10,16 @@ import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.options import HERE, RobotFile, flag, several
+from bodyschema.daemon.commands.options import HERE, RobotFile, flag, several
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rich.console import Console
 
-    from daemon.eeprom_wiring import Wanted, Workbench
-    from daemon.servo_changes import Planned
-    from daemon.servo_log import ServoLog
+    from bodyschema.daemon.eeprom_wiring import Wanted, Workbench
+    from bodyschema.daemon.servo_changes import Planned
+    from bodyschema.daemon.servo_log import ServoLog
 
 servos = cyclopts.App(
     name="servos",
@@ -65,8 +65,8 @@ def show(
     """
     from rich.console import Console
 
-    from daemon.eeprom_wiring import settings_by_name
-    from daemon.servo_changes_view import settings_table
+    from bodyschema.daemon.eeprom_wiring import settings_by_name
+    from bodyschema.daemon.servo_changes_view import settings_table
 
     console = Console(highlight=False)
     wanted = _wanted(robot, joint, bus, port, id, baud)
@@ -102,8 +102,8 @@ def set_(
 
     Next: what it says of robot.toml; `bodyschema servos undo` takes it back.
     """
-    from daemon.servo_changes import assignments, plan
-    from interfaces.errors import ConfigError
+    from bodyschema.daemon.servo_changes import assignments, plan
+    from bodyschema.interfaces.errors import ConfigError
 
     wishes = assignments(settings)
     if not wishes:
@@ -137,8 +137,8 @@ def zero(
     """
     from rich.console import Console
 
-    from daemon.servo_changes import plan_zeros, zero_ticks
-    from daemon.servo_changes_view import zero_lines
+    from bodyschema.daemon.servo_changes import plan_zeros, zero_ticks
+    from bodyschema.daemon.servo_changes_view import zero_lines
 
     wanted = _wanted(robot, joint, None, None, None, RATE)
     with _workbench(wanted) as workbench:
@@ -161,9 +161,9 @@ def undo(*, dry_run: DryRun = False, yes: Yes = False, port: Port = None, robot:
     """
     from rich.console import Console
 
-    from daemon.eeprom_wiring import workbench_of
-    from daemon.servo_changes import plan_undo
-    from interfaces.errors import ConfigError
+    from bodyschema.daemon.eeprom_wiring import workbench_of
+    from bodyschema.daemon.servo_changes import plan_undo
+    from bodyschema.interfaces.errors import ConfigError
 
     log = _log(robot, port)
     entries = log.to_undo()
@@ -182,9 +182,9 @@ def undo(*, dry_run: DryRun = False, yes: Yes = False, port: Port = None, robot:
 def _wanted(
     robot: Path, joints: Sequence[str], bus: str | None, port: str | None, id: int | None, baud: int
 ) -> list[Wanted]:
-    from daemon.config import Config
-    from daemon.eeprom_wiring import configured, stranger
-    from interfaces.errors import ConfigError
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.eeprom_wiring import configured, stranger
+    from bodyschema.interfaces.errors import ConfigError
 
     if (port is None) != (id is None):
         raise ConfigError("--port and --id belong together", remedy="Give both, or --joint for a servo of robot.toml")
@@ -196,15 +196,15 @@ def _wanted(
 
 
 def _workbench(wanted: Sequence[Wanted]) -> Workbench:
-    from daemon.eeprom_wiring import workbench_of
+    from bodyschema.daemon.eeprom_wiring import workbench_of
 
     return workbench_of(wanted[0].table)
 
 
 def _log(robot: Path, port: str | None) -> ServoLog:
     """Beside the robot's pairs; of servos that no robot.toml knows, in a place of their own."""
-    from daemon.config import Config, state_home
-    from daemon.servo_log import ServoLog
+    from bodyschema.daemon.config import Config, state_home
+    from bodyschema.daemon.servo_log import ServoLog
 
     return ServoLog(state_home() if port is not None else Config.load(robot).state_dir)
 
@@ -220,9 +220,9 @@ def _carry_out(
 ) -> None:
     from rich.console import Console
 
-    from daemon.servo_changes import carry_out, is_well
-    from daemon.servo_changes_view import done_table, planned_table
-    from interfaces.clock import SystemClock
+    from bodyschema.daemon.servo_changes import carry_out, is_well
+    from bodyschema.daemon.servo_changes_view import done_table, planned_table
+    from bodyschema.interfaces.clock import SystemClock
 
     console = Console(highlight=False)
     if planned:

@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.options import SourceRobotFile, flag, robot_file
+from bodyschema.daemon.commands.options import SourceRobotFile, flag, robot_file
 
 
 def simulate(
@@ -37,10 +37,10 @@ def simulate(
     import numpy as np
     from rich.console import Console
 
-    from daemon import recordings
-    from daemon.plausibility.limits import require_units
-    from daemon.synthesis import simulated, with_noise, without_consequence
-    from effects import load_simulation
+    from bodyschema.daemon import recordings
+    from bodyschema.daemon.plausibility.limits import require_units
+    from bodyschema.daemon.synthesis import simulated, with_noise, without_consequence
+    from bodyschema.effects import load_simulation
 
     if out is not None:
         recordings.check_target(out, force=force)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import Annotated
 
-from daemon.commands.options import HERE, RobotFile, flag
+from bodyschema.daemon.commands.options import HERE, RobotFile, flag
 
 
 def status(
@@ -25,8 +25,8 @@ def status(
     from rich.console import Console
     from rich.live import Live
 
-    from daemon.config import Config
-    from daemon.status_view import Watcher, as_json, screen
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.status_view import Watcher, as_json, screen
 
     config = Config.load(robot)
     console = Console(highlight=False)

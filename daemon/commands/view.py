@@ -7,8 +7,8 @@ from typing import Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.options import HERE, RobotFile, flag
-from daemon.view_process import PORT
+from bodyschema.daemon.commands.options import HERE, RobotFile, flag
+from bodyschema.daemon.view_process import PORT
 
 
 def view(
@@ -31,12 +31,12 @@ def view(
     """
     from rich.console import Console
 
-    from daemon import logs
-    from daemon.config import Config
-    from daemon.extras import require_extra
+    from bodyschema.daemon import logs
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.extras import require_extra
 
     require_extra("view", "the page")
-    from daemon.view.server import serve
+    from bodyschema.daemon.view.server import serve
 
     logs.set_up(verbose=verbose)
     console = Console(highlight=False, soft_wrap=True)

@@ -10,7 +10,7 @@ import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from daemon.commands.options import HERE, RobotFile
+from bodyschema.daemon.commands.options import HERE, RobotFile
 
 watch = cyclopts.App(
     name="watch",
@@ -59,11 +59,11 @@ def cameras(
 
     from rich.console import Console
 
-    from daemon.camera_wiring import open_watched
-    from daemon.config import Config
-    from daemon.mjpeg import MjpegServer
-    from daemon.signals import on_termination
-    from daemon.watching import Watching
+    from bodyschema.daemon.camera_wiring import open_watched
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.mjpeg import MjpegServer
+    from bodyschema.daemon.signals import on_termination
+    from bodyschema.daemon.watching import Watching
 
     console = Console(highlight=False, soft_wrap=True)
     watched = open_watched(Config.load(robot))

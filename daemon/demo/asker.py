@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon.bus import Bus, client
-from daemon.config import Config
-from daemon.keys import Keys
-from daemon.wire import JointsRequest, PredictReply, decode, encode
-from interfaces.errors import BusError, RequestError
+from bodyschema.daemon.bus import Bus, client
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.keys import Keys
+from bodyschema.daemon.wire import JointsRequest, PredictReply, decode, encode
+from bodyschema.interfaces.errors import BusError, RequestError
 
 RATE_HZ = 20.0
 

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from daemon.bus import Bus
-from daemon.keys import Keys
-from daemon.wire import JointsRequest, PairsReply, PredictReply, decode, encode
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
+from bodyschema.daemon.bus import Bus
+from bodyschema.daemon.keys import Keys
+from bodyschema.daemon.wire import JointsRequest, PairsReply, PredictReply, decode, encode
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
 from kbmaps import RigidChain, nearest_rotation, rotation_matrices, rotation_vectors
 
 POSES = 300

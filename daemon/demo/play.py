@@ -10,13 +10,13 @@ from typing import Literal
 
 import numpy as np
 
-from daemon.bus import Bus
-from daemon.config import Config
-from daemon.keys import Keys
-from daemon.screen import rejected
-from daemon.status import LearnerStatus, Outlook, SamplerStatus
-from daemon.wire import CommandRequest, decode, encode
-from interfaces.errors import BusError
+from bodyschema.daemon.bus import Bus
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.keys import Keys
+from bodyschema.daemon.screen import rejected
+from bodyschema.daemon.status import LearnerStatus, Outlook, SamplerStatus
+from bodyschema.daemon.wire import CommandRequest, decode, encode
+from bodyschema.interfaces.errors import BusError
 
 from .judge import Judge, Verdict
 from .plot import CurveRow

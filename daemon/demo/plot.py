@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from diagnosis.report.plot import HEIGHT, WIDTH, Plot
+from bodyschema.diagnosis.report.plot import HEIGHT, WIDTH, Plot
 
 _HEADING = "Forward kinematics learnt while the arm is guided (simulation)"
 _TITLE, _LEGEND_LINE = 22, 14  # heights in the units of the plot, whose text is 10 to 11 high

@@ -13,10 +13,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import IO
 
-from daemon.bus import is_alive
-from daemon.signals import with_parent
-from interfaces.errors import BusError
-from interfaces.interpreter import module_command
+from bodyschema.daemon.bus import is_alive
+from bodyschema.daemon.signals import with_parent
+from bodyschema.interfaces.errors import BusError
+from bodyschema.interfaces.interpreter import module_command
 
 from .scene import Scene
 
@@ -52,7 +52,7 @@ class Daemon:
 @contextmanager
 def started_daemon(scene: Scene) -> Iterator[Daemon]:
     """Sampler and learner, from here to the end of the with statement."""
-    command = module_command("daemon", "run", "--sim", "--robot", str(scene.robot_file))
+    command = module_command("bodyschema", "run", "--sim", "--robot", str(scene.robot_file))
     with scene.log_file.open("wb") as log:
         environment = os.environ | with_parent()
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment)
@@ -84,7 +84,7 @@ class Asker:
 @contextmanager
 def started_asker(scene: Scene, seed: int) -> Iterator[Asker]:
     """A process that asks for predictions, from here to the end of the with statement."""
-    command = module_command("daemon.demo.asker", str(scene.robot_file), str(seed))
+    command = module_command("bodyschema.daemon.demo.asker", str(scene.robot_file), str(seed))
     lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
     assert process.stdout is not None

@@ -12,9 +12,9 @@ from typing import Literal
 
 import numpy as np
 
-from daemon.wiring import demonstration_model
-from interfaces.errors import ConfigError
-from interfaces.robot import RobotDescription
+from bodyschema.daemon.wiring import demonstration_model
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.robot import RobotDescription
 
 from .tags import cube_tables, tag_tables
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 # Side of the cube [m], and of the black squares on it as a share: the white margin of a tag is an eighth of its side.
 CUBE_M, SQUARE = 0.07, 0.8

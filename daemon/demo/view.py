@@ -14,9 +14,9 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from daemon.findings_view import outlook_sentence
-from daemon.screen import coverage_table, degrees, mm, rejected, titled_table
-from daemon.status import SamplerStatus
+from bodyschema.daemon.findings_view import outlook_sentence
+from bodyschema.daemon.screen import coverage_table, degrees, mm, rejected, titled_table
+from bodyschema.daemon.status import SamplerStatus
 
 from .play import Outcome, Snapshot
 from .scene import Scene

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from daemon.keys import Keys
-from daemon.wire import PredictReply, decode, encode
-from interfaces.errors import BusError, RequestError
-from interfaces.records import FloatArray
+from bodyschema.daemon.keys import Keys
+from bodyschema.daemon.wire import PredictReply, decode, encode
+from bodyschema.interfaces.errors import BusError, RequestError
+from bodyschema.interfaces.records import FloatArray
 
 from .comparison import Model, TypeComparison, common_poses, compared
 from .roster import Fleet, Member

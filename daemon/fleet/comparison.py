@@ -11,10 +11,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
-from daemon.comparison import Distances, laid_on
-from daemon.status import ChainCalibration, JointRange
-from interfaces.errors import RequestError
-from interfaces.records import FloatArray
+from bodyschema.daemon.comparison import Distances, laid_on
+from bodyschema.daemon.status import ChainCalibration, JointRange
+from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.records import FloatArray
 
 POSES = 400
 # Of two, nobody can say which is the odd one.

@@ -11,7 +11,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from daemon.screen import mm
+from bodyschema.daemon.screen import mm
 
 from .comparison import FEWEST_TO_JUDGE, Odd, TypeComparison, Unit
 

@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from daemon.config import Config
-from daemon.diagnosis_run import Asked, Found, Source, measured, require_writable, run, written
-from diagnosis.result import DiagnosisFile
-from interfaces.errors import BodyschemaError, ConfigError
-from interfaces.interpreter import safe_children
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.diagnosis_run import Asked, Found, Source, measured, require_writable, run, written
+from bodyschema.diagnosis.result import DiagnosisFile
+from bodyschema.interfaces.errors import BodyschemaError, ConfigError
+from bodyschema.interfaces.interpreter import safe_children
 
 from .recordings import Job
 

@@ -7,13 +7,13 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from daemon.config import Config
-from daemon.learner_host import session_settings
-from daemon.signals import on_termination
-from daemon.supervise import Child, Supervisor
-from interfaces.errors import ConfigError
-from interfaces.interpreter import module_command
-from interfaces.limited import read_at_most
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.learner_host import session_settings
+from bodyschema.daemon.signals import on_termination
+from bodyschema.daemon.supervise import Child, Supervisor
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.interpreter import module_command
+from bodyschema.interfaces.limited import read_at_most
 
 
 def descriptions(named: Sequence[Path]) -> list[Path]:
@@ -88,7 +88,7 @@ def spread(configs: Sequence[Config], processes: int, options: Sequence[str]) ->
     children: list[Child] = []
     for number, share in enumerate(shares(configs, processes), 1):
         session_settings(share)  # refuses here what would end the process
-        command = module_command("daemon", "learner", *options)
+        command = module_command("bodyschema", "learner", *options)
         for config in share:
             command += ["--robot", str(config.file)]
         if share[0].given_state_dir is not None:

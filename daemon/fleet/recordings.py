@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from daemon.commands.options import robot_file
-from daemon.recordings import STORE_ENDINGS
-from interfaces.errors import RecordingError, RequestError
-from interfaces.recording import CSV, PARQUET
+from bodyschema.daemon.commands.options import robot_file
+from bodyschema.daemon.recordings import STORE_ENDINGS
+from bodyschema.interfaces.errors import RecordingError, RequestError
+from bodyschema.interfaces.recording import CSV, PARQUET
 
 ENDINGS = (CSV, PARQUET, *STORE_ENDINGS)
 

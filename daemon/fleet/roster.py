@@ -9,14 +9,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self, TypeVar
 
-from daemon.bus import Bus
-from daemon.config import Config
-from daemon.identity import SECURE, Route
-from daemon.keys import Keys
-from daemon.status import LearnerStatus, SamplerStatus
-from daemon.wire import decode
-from daemon.zenoh_config import ENDPOINT, PROCESSES
-from interfaces.errors import BusError, RequestError
+from bodyschema.daemon.bus import Bus
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.identity import SECURE, Route
+from bodyschema.daemon.keys import Keys
+from bodyschema.daemon.status import LearnerStatus, SamplerStatus
+from bodyschema.daemon.wire import decode
+from bodyschema.daemon.zenoh_config import ENDPOINT, PROCESSES
+from bodyschema.interfaces.errors import BusError, RequestError
 
 ANSWER_LIMIT_S = 2.0
 EVERYBODY = "*"

@@ -11,9 +11,9 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from daemon.remedies import as_typed
-from daemon.screen import mm
-from daemon.zenoh_config import PROCESSES
+from bodyschema.daemon.remedies import as_typed
+from bodyschema.daemon.screen import mm
+from bodyschema.daemon.zenoh_config import PROCESSES
 
 from .roster import Member
 

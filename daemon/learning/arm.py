@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 from kbmaps import ChainBelief, ChainTolerances, ResidualModel
 
 # How far another tool may hold the marker from where the last one did, and a marker whose place is not known from where

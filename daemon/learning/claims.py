@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 from kbmaps import ChainBelief, Contest, JointBasis, Recent, ResidualModel, SupportSet
 
 from .members import INSTANT, PRIOR, RESIDUAL, RIGID, SOLVED, TRUSTED

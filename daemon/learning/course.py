@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from daemon.config import LearnerConfig
-from interfaces.errors import RequestError
-from interfaces.records import Pair
+from bodyschema.daemon.config import LearnerConfig
+from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.records import Pair
 
 from .change import ChangeRecord
 from .curve import Curve

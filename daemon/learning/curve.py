@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from daemon.status import CurvePoint
+from bodyschema.daemon.status import CurvePoint
 
 LARGEST = 400
 

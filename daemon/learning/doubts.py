@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 from .gate import CHANGE, FEWEST_FOR_CHANGE, Gate
 from .memory import PairMemory

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 from kbmaps import ChainBelief, ChainTolerances, DegenerateDataError, KBMap, RigidChain
 
 from .nominal import PAIRS_TO_REFIT, NominalModel

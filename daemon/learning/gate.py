@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 # A pair this many times farther from the prediction than expected is doubted.
 DOUBT = 5.0

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from interfaces.errors import RequestError
-from interfaces.records import FARTHEST_M, LARGEST_Q, Pair
+from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.records import FARTHEST_M, LARGEST_Q, Pair
 
 from .state import Counters
 

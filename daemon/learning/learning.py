@@ -11,9 +11,9 @@ import threading
 
 import numpy as np
 
-from daemon.config import LearnerConfig
-from daemon.status import CurvePoint, OrientationStatus
-from interfaces.records import FloatArray, Pair
+from bodyschema.daemon.config import LearnerConfig
+from bodyschema.daemon.status import CurvePoint, OrientationStatus
+from bodyschema.interfaces.records import FloatArray, Pair
 from kbmaps import ChainBelief, Recent
 
 from .change import ChangeRecord

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 from kbmaps import NLMS, KBMap, NonFiniteError
 
 from .learnt import LearntModel

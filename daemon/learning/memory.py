@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 IntArray = NDArray[np.intp]
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 from kbmaps.robust import OUTLIER_SIGMAS
 
 # What is smaller than so many of its standard errors may be chance.

@@ -10,10 +10,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.config import LearnerConfig
-from effects import Motion, Simulation
-from interfaces.records import FloatArray, frozen_array
-from interfaces.robot import RobotDescription
+from bodyschema.daemon.config import LearnerConfig
+from bodyschema.effects import Motion, Simulation
+from bodyschema.interfaces.records import FloatArray, frozen_array
+from bodyschema.interfaces.robot import RobotDescription
 from kbmaps import (
     ChainBelief,
     ChainParameters,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 from kbmaps import (
     ChainBelief,
     ExactLearner,

@@ -7,7 +7,7 @@ import math
 import msgspec
 import numpy as np
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 # Weight of the error one pair back: the memory is about 50 pairs long.
 DISCOUNT = 0.98

@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from interfaces.errors import RequestError
-from interfaces.records import FloatArray
+from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.records import FloatArray
 from kbmaps import KBMap, SupportSet, quaternions
 
 from .claims import Claim

@@ -10,7 +10,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 from kbmaps import (
     ChainBelief,
     ChainTolerances,

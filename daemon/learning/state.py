@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from daemon.status import CurvePoint
-from interfaces.errors import BodyschemaError
-from interfaces.records import FARTHEST_M, LARGEST_Q, FloatArray
+from bodyschema.daemon.status import CurvePoint
+from bodyschema.interfaces.errors import BodyschemaError
+from bodyschema.interfaces.records import FARTHEST_M, LARGEST_Q, FloatArray
 
 from .change import ChangeRecord
 from .claims import ClaimsState

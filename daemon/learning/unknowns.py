@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 from kbmaps import ChainBelief, JointBasis, ResidualModel, SupportSet
 
 from .memory import IntArray

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from interfaces.records import FloatArray, Pair
+from bodyschema.interfaces.records import FloatArray, Pair
 from kbmaps import ChainBelief, ChangeDetector, ChangeKind, KBMap, ResidualModel, SharedNoise, Suspicion, WhiteNoise
 from kbmaps.changes.detector import MOST_SURPRISES
 from kbmaps.changes.white_noise import inverse_roots

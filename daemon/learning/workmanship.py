@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 from kbmaps import ChainBelief, ChainTolerances
 
 # Tilt of an axis [rad] and its shift [m], 1-sigma, from a milled arm to a kit.

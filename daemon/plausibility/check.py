@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from interfaces.errors import RecordingError
-from interfaces.recording import Recording
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
+from bodyschema.interfaces.errors import RecordingError
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
 from kbmaps import DegenerateDataError, RigidChain, align
 from kbmaps.chains.placement import place
 

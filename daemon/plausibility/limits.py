@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from interfaces.errors import RecordingError
-from interfaces.recording import Recording
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
-from interfaces.urdf import REVOLUTE
+from bodyschema.interfaces.errors import RecordingError
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.interfaces.urdf import REVOLUTE
 from kbmaps import RigidChain
 
 BoolArray = NDArray[np.bool_]

@@ -13,10 +13,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from daemon.bus import is_alive
-from daemon.signals import with_parent
-from interfaces.errors import BusError
-from interfaces.interpreter import module_command
+from bodyschema.daemon.bus import is_alive
+from bodyschema.daemon.signals import with_parent
+from bodyschema.interfaces.errors import BusError
+from bodyschema.interfaces.interpreter import module_command
 
 START_LIMIT_S = 60.0
 END_LIMIT_S = 15.0
@@ -67,7 +67,7 @@ def started(name: str, arguments: list[str], environment: Mapping[str, str], log
     with log.open("wb") as stream:
         # In a process group of its own: Ctrl-C in a terminal is the parent's to handle.
         popen = subprocess.Popen(
-            module_command("daemon", name, *arguments),
+            module_command("bodyschema", name, *arguments),
             stdin=subprocess.DEVNULL,
             stdout=stream,
             stderr=stream,

@@ -8,11 +8,11 @@ import textwrap
 import msgspec
 import numpy as np
 
-from daemon.evaluate import BLOCKS, ErrorFigures
-from daemon.findings_view import outlook_sentence
-from daemon.screen import mm
-from daemon.status import Outlook
-from interfaces.records import FloatArray
+from bodyschema.daemon.evaluate import BLOCKS, ErrorFigures
+from bodyschema.daemon.findings_view import outlook_sentence
+from bodyschema.daemon.screen import mm
+from bodyschema.daemon.status import Outlook
+from bodyschema.interfaces.records import FloatArray
 
 
 class Figures(msgspec.Struct, frozen=True):

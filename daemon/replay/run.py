@@ -11,15 +11,15 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon.bus import Bus, client
-from daemon.config import Config
-from daemon.evaluate import ErrorFigures, Split, aligned_chain, coverage
-from daemon.keys import Keys
-from daemon.status import LearnerStatus, SamplerStatus
-from daemon.wire import JointsRequest, PredictReply, decode, encode
-from interfaces.errors import BusError, RecordingError
-from interfaces.recording import Recording
-from interfaces.records import FloatArray
+from bodyschema.daemon.bus import Bus, client
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.evaluate import ErrorFigures, Split, aligned_chain, coverage
+from bodyschema.daemon.keys import Keys
+from bodyschema.daemon.status import LearnerStatus, SamplerStatus
+from bodyschema.daemon.wire import JointsRequest, PredictReply, decode, encode
+from bodyschema.interfaces.errors import BusError, RecordingError
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import FloatArray
 from kbmaps import rotation_matrices, rotation_vectors
 
 from .processes import Process, free_endpoint, override, started

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from daemon.align import joint_difference
-from daemon.config import DaemonConfig
-from interfaces.errors import RecordingError
-from interfaces.recording import Recording
-from interfaces.robot import RobotDescription
+from bodyschema.daemon.align import joint_difference
+from bodyschema.daemon.config import DaemonConfig
+from bodyschema.interfaces.errors import RecordingError
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.robot import RobotDescription
 
 MOST = 0.5
 

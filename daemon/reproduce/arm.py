@@ -9,12 +9,12 @@ import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from daemon.config import Config, DaemonConfig, Tables
-from daemon.wiring import demonstration_model
-from effects import Simulation
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
-from interfaces.toml_file import read_toml
+from bodyschema.daemon.config import Config, DaemonConfig, Tables
+from bodyschema.daemon.wiring import demonstration_model
+from bodyschema.effects import Simulation
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.interfaces.toml_file import read_toml
 from kbmaps import ChainTolerances, RigidChain
 
 # Head and arm joints by their number, in the order from camera to marker; each has at least two of the head.

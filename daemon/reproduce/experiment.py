@@ -9,8 +9,8 @@ from typing import Literal
 
 import numpy as np
 
-from daemon.progress import Say
-from interfaces.records import FloatArray
+from bodyschema.daemon.progress import Say
+from bodyschema.interfaces.records import FloatArray
 
 # The mean length of a noise vector with a unit standard deviation per axis: 2 √(2/π).
 MEAN_NOISE = 2.0 * math.sqrt(2.0 / math.pi)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from daemon.progress import counted
-from interfaces.records import FloatArray
+from bodyschema.daemon.progress import counted
+from bodyschema.interfaces.records import FloatArray
 from kbmaps import RigidChain
 
 from .arm import CRUDE, JOINTS, arm, crude_estimate, uniform

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 from kbmaps import ChainTolerances, RigidChain
 
 from .arm import JOINTS, arm, beside, longer_tool

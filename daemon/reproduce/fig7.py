@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 from kbmaps import RigidChain
 
 from .arm import CRUDE, JOINTS, arm, beside, crude_estimate

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon.config import DaemonConfig
-from daemon.progress import Say
-from daemon.wiring import open_postures, open_sources, simulated_truth
-from interfaces.records import FloatArray
+from bodyschema.daemon.config import DaemonConfig
+from bodyschema.daemon.progress import Say
+from bodyschema.daemon.wiring import open_postures, open_sources, simulated_truth
+from bodyschema.interfaces.records import FloatArray
 from kbmaps import RigidChain
 
 from .arm import JOINTS

@@ -8,8 +8,8 @@ from math import inf
 
 import numpy as np
 
-from daemon.progress import Say, counted, quiet
-from interfaces.records import FloatArray
+from bodyschema.daemon.progress import Say, counted, quiet
+from bodyschema.interfaces.records import FloatArray
 from kbmaps import (
     ChainTolerances,
     JointBasis,

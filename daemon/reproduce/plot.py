@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 from .experiment import Curve, Experiment, Panel
 

@@ -9,17 +9,17 @@ from typing import Self
 
 import numpy as np
 
-from daemon.bus import Bus
-from daemon.config import Config
-from daemon.progress import TELL_EVERY_S, Say
-from daemon.sampler import Sampler
-from daemon.session import session_of
-from daemon.sources import Sources
-from daemon.store import PairReader, PairStore
-from interfaces.clock import SystemClock
-from interfaces.errors import SourceEnded, SourceError
-from interfaces.protocols import MarkerSource
-from interfaces.records import FloatArray, MarkerFix, MarkerMiss
+from bodyschema.daemon.bus import Bus
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.progress import TELL_EVERY_S, Say
+from bodyschema.daemon.sampler import Sampler
+from bodyschema.daemon.session import session_of
+from bodyschema.daemon.sources import Sources
+from bodyschema.daemon.store import PairReader, PairStore
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import SourceEnded, SourceError
+from bodyschema.interfaces.protocols import MarkerSource
+from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss
 
 
 class _Enough:

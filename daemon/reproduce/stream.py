@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.config import LearnerConfig
-from daemon.learning import DirectSolver, Learning, NominalModel
-from daemon.progress import Say, counted
-from interfaces.records import FloatArray, Pair, frozen_array
+from bodyschema.daemon.config import LearnerConfig
+from bodyschema.daemon.learning import DirectSolver, Learning, NominalModel
+from bodyschema.daemon.progress import Say, counted
+from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
 from kbmaps import NLMS, JointBasis, KBMap, RigidChain
 
 from .experiment import Curve, Tests, distances

@@ -11,11 +11,11 @@ from typing import Self
 
 import numpy as np
 
-from daemon.config import DaemonConfig
-from daemon.progress import Say, quiet
-from daemon.sources import Sources
-from interfaces.clock import SystemClock
-from interfaces.records import FloatArray, JointReading, MarkerFix, frozen_array
+from bodyschema.daemon.config import DaemonConfig
+from bodyschema.daemon.progress import Say, quiet
+from bodyschema.daemon.sources import Sources
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.records import FloatArray, JointReading, MarkerFix, frozen_array
 from kbmaps import RigidChain
 
 from .arm import configuration

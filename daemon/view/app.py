@@ -16,9 +16,9 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import Receive, Scope, Send
 
-from daemon.command_names import CommandName
-from daemon.wire import CommandReply, decode, encode
-from interfaces.errors import BusError, RequestError
+from bodyschema.daemon.command_names import CommandName
+from bodyschema.daemon.wire import CommandReply, decode, encode
+from bodyschema.interfaces.errors import BusError, RequestError
 
 from .documents import Process
 from .guard import Guard

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from daemon.status import Change as LastChange
-from daemon.status import LearnerStatus
+from bodyschema.daemon.status import Change as LastChange
+from bodyschema.daemon.status import LearnerStatus
 
 from .documents import Change, CourseDocument, SeriesDocument, Version
 

@@ -15,14 +15,14 @@ from typing import Self
 
 import msgspec
 
-from daemon import recordings
-from daemon.diagnosis_run import DIAGNOSIS, REPORT
-from daemon.recorder import History
-from daemon.signals import with_parent
-from diagnosis.result import DiagnosisFile
-from interfaces.errors import BodyschemaError, RecordingError, RequestError
-from interfaces.interpreter import module_command
-from interfaces.records import Pair
+from bodyschema.daemon import recordings
+from bodyschema.daemon.diagnosis_run import DIAGNOSIS, REPORT
+from bodyschema.daemon.recorder import History
+from bodyschema.daemon.signals import with_parent
+from bodyschema.diagnosis.result import DiagnosisFile
+from bodyschema.interfaces.errors import BodyschemaError, RecordingError, RequestError
+from bodyschema.interfaces.interpreter import module_command
+from bodyschema.interfaces.records import Pair
 
 from .documents import DiagnosisDocument
 
@@ -135,7 +135,7 @@ class Diagnoses:
 
     def _diagnose(self, out: Path, number: int) -> None:
         command = module_command(
-            "daemon", "diagnose", str(out / RECORDING), "--robot", str(self._robot_file), "--out", str(out)
+            "bodyschema", "diagnose", str(out / RECORDING), "--robot", str(self._robot_file), "--out", str(out)
         )
         with self._lock:
             if self._stopping:

@@ -9,7 +9,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from daemon.local_web import HEADERS, host_refusal
+from bodyschema.daemon.local_web import HEADERS, host_refusal
 
 _READING = ("GET", "HEAD")
 _HEADERS = HEADERS | {

@@ -5,10 +5,10 @@ from __future__ import annotations
 import threading
 from typing import Any, Generic, TypeVar
 
-from daemon.status import LearnerStatus, SamplerStatus
-from daemon.wire import decode
-from interfaces.errors import RequestError
-from interfaces.protocols import Clock
+from bodyschema.daemon.status import LearnerStatus, SamplerStatus
+from bodyschema.daemon.wire import decode
+from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.protocols import Clock
 
 from .documents import ProcessDocument
 

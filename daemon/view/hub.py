@@ -7,7 +7,7 @@ import threading
 
 import msgspec
 
-from interfaces.errors import BodyschemaError
+from bodyschema.interfaces.errors import BodyschemaError
 
 MOST_FOLLOWERS = 32
 

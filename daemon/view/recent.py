@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from daemon.wire import PredictReply
-from interfaces.errors import RequestError
-from interfaces.records import Pair
+from bodyschema.daemon.wire import PredictReply
+from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.records import Pair
 
 from .documents import CloudDocument, Segment
 

@@ -9,10 +9,10 @@ from collections.abc import Callable
 
 import uvicorn
 
-from daemon.config import Config
-from daemon.local_web import LOOPBACK
-from daemon.signals import on_termination
-from interfaces.errors import ConfigError
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.local_web import LOOPBACK
+from bodyschema.daemon.signals import on_termination
+from bodyschema.interfaces.errors import ConfigError
 
 from .app import application
 from .diagnosing import Diagnoses

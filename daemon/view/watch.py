@@ -10,18 +10,18 @@ from importlib.metadata import version
 from types import TracebackType
 from typing import Self
 
-from daemon.bus import Bus
-from daemon.command_names import CommandName
-from daemon.config import Config
-from daemon.findings_view import outlook_sentence
-from daemon.identity import Route
-from daemon.keys import Keys
-from daemon.recorder import History
-from daemon.status import LearnerStatus, SamplerStatus
-from daemon.wire import CommandReply, CommandRequest, JointsRequest, PredictReply, decode, encode
-from interfaces.clock import SystemClock
-from interfaces.errors import BusError, RecordingError, RequestError
-from interfaces.protocols import Clock
+from bodyschema.daemon.bus import Bus
+from bodyschema.daemon.command_names import CommandName
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.findings_view import outlook_sentence
+from bodyschema.daemon.identity import Route
+from bodyschema.daemon.keys import Keys
+from bodyschema.daemon.recorder import History
+from bodyschema.daemon.status import LearnerStatus, SamplerStatus
+from bodyschema.daemon.wire import CommandReply, CommandRequest, JointsRequest, PredictReply, decode, encode
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import BusError, RecordingError, RequestError
+from bodyschema.interfaces.protocols import Clock
 
 from .course import Course, Series
 from .documents import Process, RobotDocument

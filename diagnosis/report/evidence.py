@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from effects import Effect, Motion
-from effects.moments import after
-from interfaces.records import FloatArray
+from bodyschema.effects import Effect, Motion
+from bodyschema.effects.moments import after
+from bodyschema.interfaces.records import FloatArray
 
 from .panels import Panel
 from .plot import Plot, span

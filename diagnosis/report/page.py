@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from diagnosis.diagnosis import Diagnosis
-from diagnosis.numbers import chance, mm, share, told_values
-from diagnosis.result import Cause, DiagnosisFile, Verdict
-from diagnosis.words import beside_geometry, finding, made_to, modelled
-from effects import Effect
+from bodyschema.diagnosis.diagnosis import Diagnosis
+from bodyschema.diagnosis.numbers import chance, mm, share, told_values
+from bodyschema.diagnosis.result import Cause, DiagnosisFile, Verdict
+from bodyschema.diagnosis.words import beside_geometry, finding, made_to, modelled
+from bodyschema.effects import Effect
 
 from . import tables
 from .evidence import evidence_panels, outlier_panel

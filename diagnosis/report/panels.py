@@ -9,7 +9,7 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 from .plot import ASPECT, Plot, round_up, span
 from .residuals import POINTS, Residuals, binned, structure

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from diagnosis.diagnosis import Diagnosis
-from effects import Effect, Simulation
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray
+from bodyschema.diagnosis.diagnosis import Diagnosis
+from bodyschema.effects import Effect, Simulation
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray
 
 # So many points are drawn in a plot, and arrows in a projection.
 POINTS, ARROWS = 450, 220

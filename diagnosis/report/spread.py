@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 from .panels import Panel
 from .plot import Plot, round_up

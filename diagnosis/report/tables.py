@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from diagnosis.numbers import Number, chance, mm, numbers_of, percent, place, rival_named, share, telling
-from diagnosis.result import Cause, DiagnosisFile, Indistinguishable, Rejected
+from bodyschema.diagnosis.numbers import Number, chance, mm, numbers_of, percent, place, rival_named, share, telling
+from bodyschema.diagnosis.result import Cause, DiagnosisFile, Indistinguishable, Rejected
 
 # What says nothing new where it is the same as another.
 _SAME_AS = {"aligned": "nominal", "extended": "aligned"}

@@ -6,8 +6,8 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from random import Random
 
-from interfaces.errors import ConfigError
-from interfaces.suggest import did_you_mean
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.suggest import did_you_mean
 
 from .device import Fault, Reply
 from .faults import corrupt, garbage, half, late, mute, wrong_checksum

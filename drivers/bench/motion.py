@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from interfaces.records import FloatArray, frozen_array
+from bodyschema.interfaces.records import FloatArray, frozen_array
 
 Angle = Callable[[float], float]
 

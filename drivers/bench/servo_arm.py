@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import msgspec
 
-from drivers.servos.config import ServoConfig, ServosConfig
+from bodyschema.drivers.servos.config import ServoConfig, ServosConfig
 
 from .asked_faults import AskedFault, FaultKinds, WireFaults
 from .chain import AnyServo, ServoChain

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
 
-from drivers.servos.health import BusHealth, ServoHealth
-from interfaces.protocols import JointSource
-from interfaces.records import JointReading, frozen_array
+from bodyschema.drivers.servos.health import BusHealth, ServoHealth
+from bodyschema.interfaces.protocols import JointSource
+from bodyschema.interfaces.records import JointReading, frozen_array
 
 from .dry_run import Angle
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from drivers.servos.bus import Answer, Exchange, Request, Trouble, spare_after
-from drivers.servos.bus import Bus as ServoBus
-from drivers.servos.model import Layout, Register
-from drivers.servos.packets import Packets
+from bodyschema.drivers.servos.bus import Answer, Exchange, Request, Trouble, spare_after
+from bodyschema.drivers.servos.bus import Bus as ServoBus
+from bodyschema.drivers.servos.model import Layout, Register
+from bodyschema.drivers.servos.packets import Packets
 
 from .packets import PACKETS2, packets_of
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import struct
 
-from drivers.device_clock import DeviceClock
-from drivers.servos.bus import Answer
-from drivers.servos.channel import Channel as ServoChannel
-from drivers.servos.channel import Sample
-from drivers.servos.handshake import FittedServo
+from bodyschema.drivers.device_clock import DeviceClock
+from bodyschema.drivers.servos.bus import Answer
+from bodyschema.drivers.servos.channel import Channel as ServoChannel
+from bodyschema.drivers.servos.channel import Sample
+from bodyschema.drivers.servos.handshake import FittedServo
 
 from .models import TICK_S, TICKS
 from .packets import ALERT

@@ -8,10 +8,10 @@ from typing import ClassVar, Literal
 
 import msgspec
 
-from drivers.servos.config import NonNegative, ServoConfig, ServosConfig
-from drivers.servos.model import Model
-from interfaces.errors import ConfigError
-from interfaces.toml_file import line_of
+from bodyschema.drivers.servos.config import NonNegative, ServoConfig, ServosConfig
+from bodyschema.drivers.servos.model import Model
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.toml_file import line_of
 
 from .models import BY_NAME, UNSUPPORTED
 from .powered_config import GazeConfig, ZeroForceConfig

@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from drivers.servos.channel import Sample
-from drivers.servos.handshake import FittedServo
-from interfaces.errors import RequestError
-from interfaces.protocols import Clock
-from interfaces.records import FloatArray, frozen_array
+from bodyschema.drivers.servos.channel import Sample
+from bodyschema.drivers.servos.handshake import FittedServo
+from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.records import FloatArray, frozen_array
 
 from .guard import Drop, Guard, GuardLimits
 from .powered import PoweredJoints

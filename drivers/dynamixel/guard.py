@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from interfaces.records import FloatArray, frozen_array
+from bodyschema.interfaces.records import FloatArray, frozen_array
 
 SHORTEST_BASE_S = 0.02  # over which a speed is taken from positions: one tick is 4°/s at most
 CURRENT_SLACK, CURRENT_SLACK_A = 0.15, 0.05  # what a current may be over its limit: the servo's own regulation

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from drivers.serial_line import adapter_latency_s
-from drivers.servos.drive import Drive
-from drivers.servos.joints import OpenPort, ServoJoints
-from drivers.servos.make import Make
-from drivers.servos.port import Port
-from interfaces.protocols import Clock
+from bodyschema.drivers.serial_line import adapter_latency_s
+from bodyschema.drivers.servos.drive import Drive
+from bodyschema.drivers.servos.joints import OpenPort, ServoJoints
+from bodyschema.drivers.servos.make import Make
+from bodyschema.drivers.servos.port import Port
+from bodyschema.interfaces.protocols import Clock
 
 from .bus import Bus
 from .channel import Channel

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Literal
 
-from drivers.servos.model import Layout, Model, Register
+from bodyschema.drivers.servos.model import Layout, Model, Register
 
 __all__ = ["BY_NAME", "BY_NUMBER", "MODELS", "UNSUPPORTED", "Layout", "Model", "Register"]
 

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import dynamixel_sdk as sdk
 
-from drivers.servos.packets import Garbled, Packets, Status, take_summed
+from bodyschema.drivers.servos.packets import Garbled, Packets, Status, take_summed
 
 from .crc16 import crc16
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from drivers.servos.bus import Bus
-from drivers.servos.handshake import FittedServo
-from drivers.servos.model import Layout
-from drivers.servos.plan import Way
+from bodyschema.drivers.servos.bus import Bus
+from bodyschema.drivers.servos.handshake import FittedServo
+from bodyschema.drivers.servos.model import Layout
+from bodyschema.drivers.servos.plan import Way
 
 from .bus import sync_request
 from .config import BusConfig

@@ -8,8 +8,8 @@ from typing import Literal
 
 import dynamixel_sdk as sdk
 
-from drivers.serial_line import SerialLine
-from drivers.servos.port import Port
+from bodyschema.drivers.serial_line import SerialLine
+from bodyschema.drivers.servos.port import Port
 
 __all__ = ["Port", "SafePort"]
 

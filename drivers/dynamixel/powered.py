@@ -13,13 +13,13 @@ from typing import Literal
 
 import numpy as np
 
-from drivers.servos.bus import Bus as ServoBus
-from drivers.servos.channel import Sample
-from drivers.servos.handshake import FittedServo, switch_torque_off
-from drivers.servos.model import Register
-from interfaces.errors import RequestError
-from interfaces.protocols import Clock
-from interfaces.records import FloatArray, JointReading
+from bodyschema.drivers.servos.bus import Bus as ServoBus
+from bodyschema.drivers.servos.channel import Sample
+from bodyschema.drivers.servos.handshake import FittedServo, switch_torque_off
+from bodyschema.drivers.servos.model import Register
+from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.records import FloatArray, JointReading
 
 from .bus import Bus
 from .guard import Drop, Guard, Motion, ServoState

@@ -9,9 +9,9 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from drivers.servos.config import Positive, ServoConfig
-from drivers.servos.model import Model
-from interfaces.suggest import did_you_mean
+from bodyschema.drivers.servos.config import Positive, ServoConfig
+from bodyschema.drivers.servos.model import Model
+from bodyschema.interfaces.suggest import did_you_mean
 
 from .torque_constants import torque_constant
 

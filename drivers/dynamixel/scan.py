@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from drivers.scan import ScannedPort
-from drivers.servos.bus import BITS_PER_BYTE
-from drivers.servos.scan import HOST_S, IDS, Kind, PingScanner, heard
-from interfaces.protocols import Clock
+from bodyschema.drivers.scan import ScannedPort
+from bodyschema.drivers.servos.bus import BITS_PER_BYTE
+from bodyschema.drivers.servos.scan import HOST_S, IDS, Kind, PingScanner, heard
+from bodyschema.interfaces.protocols import Clock
 
 from .bus import Bus
 from .models import BY_NUMBER, HARDWARE_ERRORS, UNSUPPORTED

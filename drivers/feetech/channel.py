@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from drivers.servos.bus import Answer
-from drivers.servos.channel import Channel as ServoChannel
-from drivers.servos.channel import Sample
+from bodyschema.drivers.servos.bus import Answer
+from bodyschema.drivers.servos.channel import Channel as ServoChannel
+from bodyschema.drivers.servos.channel import Sample
 
 from .models import HARDWARE_ERRORS
 

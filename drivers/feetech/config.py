@@ -7,8 +7,8 @@ from typing import ClassVar, Literal
 
 import msgspec
 
-from drivers.servos.config import NonNegative, ServoConfig, ServosConfig
-from drivers.servos.model import Model
+from bodyschema.drivers.servos.config import NonNegative, ServoConfig, ServosConfig
+from bodyschema.drivers.servos.model import Model
 
 from .models import BY_NAME
 

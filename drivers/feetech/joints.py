@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from drivers.serial_line import SerialLine, adapter_latency_s
-from drivers.servos.bus import Bus as ServoBus
-from drivers.servos.bus import Request, spare_after
-from drivers.servos.handshake import FittedServo
-from drivers.servos.joints import OpenPort, ServoJoints
-from drivers.servos.make import Make
-from drivers.servos.packets import Packets
-from drivers.servos.plan import Way
-from drivers.servos.port import Port
-from interfaces.protocols import Clock
+from bodyschema.drivers.serial_line import SerialLine, adapter_latency_s
+from bodyschema.drivers.servos.bus import Bus as ServoBus
+from bodyschema.drivers.servos.bus import Request, spare_after
+from bodyschema.drivers.servos.handshake import FittedServo
+from bodyschema.drivers.servos.joints import OpenPort, ServoJoints
+from bodyschema.drivers.servos.make import Make
+from bodyschema.drivers.servos.packets import Packets
+from bodyschema.drivers.servos.plan import Way
+from bodyschema.drivers.servos.port import Port
+from bodyschema.interfaces.protocols import Clock
 
 from .channel import Channel
 from .config import BusConfig, FeetechConfig

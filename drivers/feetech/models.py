@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Literal
 
-from drivers.servos.model import Layout, Model, Register
+from bodyschema.drivers.servos.model import Layout, Model, Register
 
 STS, SCS = 0, 1  # Feetech's own numbers of the byte orders
 Order = Literal["little", "big"]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from drivers.servos.packets import HEADER, Status, take_summed
+from bodyschema.drivers.servos.packets import HEADER, Status, take_summed
 
 BROADCAST = 0xFE
 PING, READ, WRITE, SYNC_READ = 1, 2, 3, 0x82

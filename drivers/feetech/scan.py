@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from drivers.servos.scan import Kind
+from bodyschema.drivers.servos.scan import Kind
 
 from .joints import Bus
 from .models import BAUDS, BY_NUMBER, HARDWARE_ERRORS, STS

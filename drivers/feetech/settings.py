@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
-from drivers.servos.model import Model, Register
-from drivers.servos.settings import BAUD, HOMING_OFFSET, ID, Setting
+from bodyschema.drivers.servos.model import Model, Register
+from bodyschema.drivers.servos.settings import BAUD, HOMING_OFFSET, ID, Setting
 
 from .models import BAUDS, STS
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 
-from drivers.checks import Check
-from interfaces.errors import SourceError
-from interfaces.protocols import Clock
+from bodyschema.drivers.checks import Check
+from bodyschema.interfaces.errors import SourceError
+from bodyschema.interfaces.protocols import Clock
 
 from .config import Ros2Config
 from .joints import SILENT_AFTER_S, Ros2Joints

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from types import TracebackType
 from typing import Self
 
-from interfaces.errors import SourceError, SourceLost
-from interfaces.protocols import Clock
-from interfaces.records import JointReading, frozen_array
+from bodyschema.interfaces.errors import SourceError, SourceLost
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.records import JointReading, frozen_array
 
 from . import rmw
 from .cdr import Malformed

@@ -10,8 +10,8 @@ from typing import Any, Protocol
 
 import zenoh
 
-from interfaces.errors import SourceLost
-from interfaces.protocols import Clock
+from bodyschema.interfaces.errors import SourceLost
+from bodyschema.interfaces.protocols import Clock
 
 from . import rmw
 from .config import Ros2Config

@@ -10,8 +10,8 @@ from typing import Self
 
 import zenoh
 
-from interfaces.errors import SourceError
-from interfaces.records import FloatArray
+from bodyschema.interfaces.errors import SourceError
+from bodyschema.interfaces.records import FloatArray
 
 from . import rmw
 from .config import MarkerTopic, Ros2Config

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from enum import StrEnum
 
-from drivers.turns import SpeedGate
+from bodyschema.drivers.turns import SpeedGate
 
 from .stamps import StampClock
 

@@ -6,7 +6,7 @@ import math
 from collections import deque
 from statistics import median
 
-from drivers.device_clock import DeviceClock
+from bodyschema.drivers.device_clock import DeviceClock
 
 TICK_S = 1e-9
 TICKS = 1 << 62  # 146 years: stamps do not wrap

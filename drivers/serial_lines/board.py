@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-from drivers.device_clock import StreamClock
+from bodyschema.drivers.device_clock import StreamClock
 
 from .lines import LONGEST, SEQUENCES, STAMP_S, STAMPS, GarbledLine, Header, Reading, parse
 

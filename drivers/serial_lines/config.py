@@ -9,9 +9,9 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from interfaces.errors import ConfigError
-from interfaces.suggest import did_you_mean
-from interfaces.toml_file import line_in_entry, line_of
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.suggest import did_you_mean
+from bodyschema.interfaces.toml_file import line_in_entry, line_of
 
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]

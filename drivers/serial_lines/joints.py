@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
-from drivers.serial_line import RETRY_S, SerialLine
-from drivers.servos.port import Port
-from drivers.turn_count import TurnCount
-from drivers.turns import SpeedGate
-from interfaces.errors import SourceError, SourceLost
-from interfaces.protocols import Clock
-from interfaces.records import JointReading, frozen_array
+from bodyschema.drivers.serial_line import RETRY_S, SerialLine
+from bodyschema.drivers.servos.port import Port
+from bodyschema.drivers.turn_count import TurnCount
+from bodyschema.drivers.turns import SpeedGate
+from bodyschema.interfaces.errors import SourceError, SourceLost
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.records import JointReading, frozen_array
 
 from .board import Board, Counts, Timed
 from .config import TABLE, EncoderConfig, SerialLinesConfig

@@ -11,7 +11,7 @@ from enum import StrEnum
 from itertools import chain
 from typing import TypeVar
 
-from interfaces.protocols import Clock
+from bodyschema.interfaces.protocols import Clock
 
 from .model import Layout, Model, Register
 from .packets import Garbled, Packets, Status

@@ -8,10 +8,10 @@ from itertools import pairwise, zip_longest
 from statistics import median, quantiles
 from typing import Any
 
-from drivers.checks import Check
-from drivers.echo import without_echo
-from interfaces.errors import SourceError
-from interfaces.protocols import Clock
+from bodyschema.drivers.checks import Check
+from bodyschema.drivers.echo import without_echo
+from bodyschema.interfaces.errors import SourceError
+from bodyschema.interfaces.protocols import Clock
 
 from .bus import Bus, Request
 from .config import ServosConfig

@@ -9,9 +9,9 @@ from typing import Annotated, ClassVar, Generic, Literal, Protocol, TypeVar
 import msgspec
 from msgspec import Meta
 
-from interfaces.errors import ConfigError
-from interfaces.suggest import did_you_mean
-from interfaces.toml_file import line_in_entry, line_of
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.suggest import did_you_mean
+from bodyschema.interfaces.toml_file import line_in_entry, line_of
 
 from .model import Model, no_driver
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
-from interfaces.records import JointReading
+from bodyschema.interfaces.records import JointReading
 
 from .bus import Bus
 from .channel import Sample

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
-from interfaces.errors import SourceError, SourceLost
+from bodyschema.interfaces.errors import SourceError, SourceLost
 
 from .bus import Bus, Exchange, Request, Trouble
 from .config import ServoConfig

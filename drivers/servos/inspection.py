@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from interfaces.errors import SourceLost
-from interfaces.protocols import Clock
+from bodyschema.interfaces.errors import SourceLost
+from bodyschema.interfaces.protocols import Clock
 
 from .bus import Bus, Exchange, Request
 from .drive import Drive

@@ -10,12 +10,12 @@ from itertools import zip_longest
 from types import TracebackType
 from typing import Any, Self
 
-from drivers.echo import without_echo
-from drivers.turn_count import TurnCount
-from drivers.turns import SpeedGate
-from interfaces.errors import SourceError, SourceLost
-from interfaces.protocols import Clock
-from interfaces.records import JointReading, frozen_array
+from bodyschema.drivers.echo import without_echo
+from bodyschema.drivers.turn_count import TurnCount
+from bodyschema.drivers.turns import SpeedGate
+from bodyschema.interfaces.errors import SourceError, SourceLost
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.records import JointReading, frozen_array
 
 from .bus import Bus, Counts, Request
 from .channel import Channel, Punctuality, Sample, middle

@@ -6,7 +6,7 @@ from typing import Protocol
 
 
 class Port(Protocol):
-    """An open serial port; `drivers.serial_line.SerialLine`, or a bench's."""
+    """An open serial port; `bodyschema.drivers.serial_line.SerialLine`, or a bench's."""
 
     @property
     def baud(self) -> int:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from drivers.scan import FoundServo, ScannedPort
-from interfaces.protocols import Clock
+from bodyschema.drivers.scan import FoundServo, ScannedPort
+from bodyschema.interfaces.protocols import Clock
 
 from .bus import BITS_PER_BYTE, SLOWEST_DELAY_S, Bus, Exchange, Request, Trouble
 from .model import Model, Register, no_driver

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from interfaces.errors import ConfigError
-from interfaces.suggest import did_you_mean
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.suggest import did_you_mean
 
 from .model import Register
 

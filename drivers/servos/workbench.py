@@ -9,9 +9,9 @@ from enum import StrEnum
 from types import TracebackType
 from typing import Self
 
-from drivers.echo import without_echo
-from interfaces.errors import SourceError
-from interfaces.protocols import Clock
+from bodyschema.drivers.echo import without_echo
+from bodyschema.interfaces.errors import SourceError
+from bodyschema.interfaces.protocols import Clock
 
 from .bus import Bus, Trouble
 from .config import ServoConfig

@@ -5,8 +5,8 @@ from __future__ import annotations
 from importlib.resources import files
 from pathlib import Path
 
-from interfaces.errors import ConfigError
-from interfaces.suggest import did_you_mean
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.suggest import did_you_mean
 
 
 def model_file(name: str) -> Path:

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from effects import Motion, load_simulation
-from interfaces.recording import Recording
+from bodyschema.effects import Motion, load_simulation
+from bodyschema.interfaces.recording import Recording
 
 
 def main(extended: Path, recording: Path, out: Path) -> None:

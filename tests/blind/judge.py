@@ -10,12 +10,12 @@ from functools import cached_property
 
 import numpy as np
 
-from diagnosis.conclusion import conclusion
-from diagnosis.diagnosis import Diagnosis, diagnose
-from diagnosis.result import Cause, DiagnosisFile, Indistinguishable, Interval
-from effects import Effect, Motion, Simulation
-from interfaces.recording import Recording
-from interfaces.robot import RobotDescription
+from bodyschema.diagnosis.conclusion import conclusion
+from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
+from bodyschema.diagnosis.result import Cause, DiagnosisFile, Indistinguishable, Interval
+from bodyschema.effects import Effect, Motion, Simulation
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.robot import RobotDescription
 
 from .arrays import FloatArray
 from .cases import HiddenCase

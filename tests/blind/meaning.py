@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from effects import Effect
-from interfaces.robot import RobotDescription
+from bodyschema.effects import Effect
+from bodyschema.interfaces.robot import RobotDescription
 
 from .hidden import Hidden, Parameters
 from .kinds import SHIFT, SIX

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from effects import KINDS, Effect, Motion, Simulation
-from interfaces.robot import RobotDescription
+from bodyschema.effects import KINDS, Effect, Motion, Simulation
+from bodyschema.interfaces.robot import RobotDescription
 
 from .arrays import FloatArray
 

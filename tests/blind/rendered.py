@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import MarkerFix, StereoFrame
-from vision.tracker import StereoTracker
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import MarkerFix, StereoFrame
+from bodyschema.vision.tracker import StereoTracker
 
 from .arrays import BoolArray, FloatArray
 from .eyes import TrueEyes

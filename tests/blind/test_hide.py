@@ -12,8 +12,8 @@ import pytest
 
 pytest.importorskip("pybullet")
 
-from interfaces.recording import Recording
-from interfaces.robot import RobotDescription
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.robot import RobotDescription
 
 from .arms import ARMS
 from .bullet import bullet

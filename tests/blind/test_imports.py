@@ -10,7 +10,9 @@ import pytest
 
 HERE = Path(__file__).parent
 OURS = {"kbmaps", "interfaces", "drivers", "vision", "sim_backend", "effects", "diagnosis", "daemon", "benchmarks"}
-INSTRUMENT = {"rendered.py": {"interfaces.camera", "interfaces.records", "vision.tracker"}}  # it looks at images
+INSTRUMENT = {
+    "rendered.py": {"bodyschema.interfaces.camera", "bodyschema.interfaces.records", "bodyschema.vision.tracker"}
+}  # it looks at images
 JUDGE = {
     "judge.py",
     "judgement.py",
@@ -51,5 +53,7 @@ def test_the_generator_imports_nothing_of_its_judge(file: Path) -> None:
 
 def test_the_check_sees_imports_inside_functions(tmp_path: Path) -> None:
     file = tmp_path / "sly.py"
-    file.write_text("def late():\n    from effects.stages import backlash\n    return backlash\n", encoding="utf-8")
-    assert list(imported(file)) == ["effects.stages"]
+    file.write_text(
+        "def late():\n    from bodyschema.effects.stages import backlash\n    return backlash\n", encoding="utf-8"
+    )
+    assert list(imported(file)) == ["bodyschema.effects.stages"]

@@ -9,10 +9,19 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from diagnosis.result import Cause, DiagnosisFile, Errors, Gain, Indistinguishable, Interval, Pairs, Unexplained
-from effects import Motion
-from interfaces.recording import Recording
-from interfaces.robot import RobotDescription
+from bodyschema.diagnosis.result import (
+    Cause,
+    DiagnosisFile,
+    Errors,
+    Gain,
+    Indistinguishable,
+    Interval,
+    Pairs,
+    Unexplained,
+)
+from bodyschema.effects import Motion
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.robot import RobotDescription
 
 from .cases import HiddenCase, hide
 from .figures import Rate, calibration, confusion, coverage, error_of_probability, failures, goals

@@ -1,4 +1,4 @@
-"""The laws of `interfaces.protocols.Clock`."""
+"""The laws of `bodyschema.interfaces.protocols.Clock`."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from importlib.util import find_spec
 
 import pytest
 
-from interfaces.clock import SystemClock
-from interfaces.protocols import Clock
-from interfaces.robot import RobotDescription
-from sim_backend import SimConfig, SimWorld, model_file
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.sim_backend import SimConfig, SimWorld, model_file
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""The laws of `interfaces.protocols`, held to every source that the sampler may read."""
+"""The laws of `bodyschema.interfaces.protocols`, held to every source that the sampler may read."""
 
 from __future__ import annotations
 
@@ -20,52 +20,52 @@ import pytest
 from fake_capture import SIZE_PX, FakeCapture
 from scripted_sources import COV, Scripted
 
-from daemon.bench_wiring import through_bench
-from daemon.config import Config
-from daemon.demo.tags import cube_tables
-from daemon.wiring import driver_of
-from drivers.bench.device import Faults
-from drivers.bench.virtual_port import VirtualClock, VirtualPort
-from drivers.dynamixel.bench.chain import Chain, no_faults
-from drivers.dynamixel.bench.servo import Servo
-from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
-from drivers.dynamixel.joints import DynamixelJoints
-from drivers.dynamixel.models import BY_NAME
-from drivers.feetech.bench.chain import Chain as FeetechChain
-from drivers.feetech.bench.servo import Servo as FeetechServo
-from drivers.feetech.config import BusConfig as FeetechBus
-from drivers.feetech.config import FeetechConfig
-from drivers.feetech.joints import FeetechJoints
-from drivers.feetech.models import BY_NAME as FEETECH_MODELS
-from drivers.replay import Replay
-from drivers.ros2.bench.faults import Send, intact
-from drivers.ros2.bench.node import Node
-from drivers.ros2.bench.virtual_link import VirtualLink
-from drivers.ros2.config import Ros2Config
-from drivers.ros2.joints import Ros2Joints
-from drivers.serial_lines.bench.board import EncoderBoard
-from drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
-from drivers.serial_lines.joints import SerialLineJoints
-from interfaces.camera import StereoCalibration
-from interfaces.clock import SystemClock
-from interfaces.errors import SourceEnded, SourceError
-from interfaces.protocols import JointSource, MarkerSource, StereoCamera, StereoEyes
-from interfaces.recording import Recording
-from interfaces.records import JointReading, MarkerFix, MarkerMiss, StereoFrame, frozen_array
-from interfaces.robot import RobotDescription
-from sim_backend import CameraConfig, SimConfig, SimWorld, model_file
-from sim_backend.config import SimTag
-from vision.cameras.config import CamerasConfig
-from vision.cameras.device import OpenCapture
-from vision.cameras.ideal import IdealCamera
-from vision.cameras.opened import eyes_of
-from vision.config import VisionConfig
-from vision.lens import Lens
-from vision.rectified import RectifiedCamera
-from vision.rig import Made, StereoRig
-from vision.tracked_camera import TrackedCamera
-from vision.tracker import StereoTracker
-from vision.trackers import tracker_of
+from bodyschema.daemon.bench_wiring import through_bench
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.demo.tags import cube_tables
+from bodyschema.daemon.wiring import driver_of
+from bodyschema.drivers.bench.device import Faults
+from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
+from bodyschema.drivers.dynamixel.bench.chain import Chain, no_faults
+from bodyschema.drivers.dynamixel.bench.servo import Servo
+from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from bodyschema.drivers.dynamixel.joints import DynamixelJoints
+from bodyschema.drivers.dynamixel.models import BY_NAME
+from bodyschema.drivers.feetech.bench.chain import Chain as FeetechChain
+from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
+from bodyschema.drivers.feetech.config import BusConfig as FeetechBus
+from bodyschema.drivers.feetech.config import FeetechConfig
+from bodyschema.drivers.feetech.joints import FeetechJoints
+from bodyschema.drivers.feetech.models import BY_NAME as FEETECH_MODELS
+from bodyschema.drivers.replay import Replay
+from bodyschema.drivers.ros2.bench.faults import Send, intact
+from bodyschema.drivers.ros2.bench.node import Node
+from bodyschema.drivers.ros2.bench.virtual_link import VirtualLink
+from bodyschema.drivers.ros2.config import Ros2Config
+from bodyschema.drivers.ros2.joints import Ros2Joints
+from bodyschema.drivers.serial_lines.bench.board import EncoderBoard
+from bodyschema.drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
+from bodyschema.drivers.serial_lines.joints import SerialLineJoints
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import SourceEnded, SourceError
+from bodyschema.interfaces.protocols import JointSource, MarkerSource, StereoCamera, StereoEyes
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import JointReading, MarkerFix, MarkerMiss, StereoFrame, frozen_array
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.sim_backend import CameraConfig, SimConfig, SimWorld, model_file
+from bodyschema.sim_backend.config import SimTag
+from bodyschema.vision.cameras.config import CamerasConfig
+from bodyschema.vision.cameras.device import OpenCapture
+from bodyschema.vision.cameras.ideal import IdealCamera
+from bodyschema.vision.cameras.opened import eyes_of
+from bodyschema.vision.config import VisionConfig
+from bodyschema.vision.lens import Lens
+from bodyschema.vision.rectified import RectifiedCamera
+from bodyschema.vision.rig import Made, StereoRig
+from bodyschema.vision.tracked_camera import TrackedCamera
+from bodyschema.vision.tracker import StereoTracker
+from bodyschema.vision.trackers import tracker_of
 
 LIMIT_S = 500.0
 WAIT_S = 0.005

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from daemon.config import LearnerConfig
-from daemon.learning import DirectSolver, Learning, NominalModel
-from interfaces.records import FloatArray, Pair, frozen_array
+from bodyschema.daemon.config import LearnerConfig
+from bodyschema.daemon.learning import DirectSolver, Learning, NominalModel
+from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
 from kbmaps import RigidChain
 
 JOINTS = 4

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.align import JointBuffer, joint_difference
-from interfaces.records import JointReading, Reason, frozen_array
+from bodyschema.daemon.align import JointBuffer, joint_difference
+from bodyschema.interfaces.records import JointReading, Reason, frozen_array
 
 LIMIT_S = 500.0
 REVOLUTE = np.array([False, False])

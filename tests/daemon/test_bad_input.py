@@ -19,16 +19,16 @@ import pytest
 import warm
 from small_arm import ROBOT, URDF, write_long_arm, write_small_arm
 
-from daemon.bus import Bus, client
-from daemon.cli import main
-from daemon.config import Config
-from daemon.keys import Keys
-from daemon.status import LearnerStatus
-from daemon.wire import decode
-from interfaces.errors import BusError, RequestError
+from bodyschema.daemon.bus import Bus, client
+from bodyschema.daemon.cli import main
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.keys import Keys
+from bodyschema.daemon.status import LearnerStatus
+from bodyschema.daemon.wire import decode
+from bodyschema.interfaces.errors import BusError, RequestError
 
 LIMIT_S = 500.0
-DAEMON = ("-m", "daemon")
+DAEMON = ("-m", "bodyschema")
 PROCESSES = ("sampler", "learner", "run")
 KEYS = Keys("arm")
 RECORDING = "waist,shoulder,x,y,z\n" + "".join(f"{0.03 * k},0.1,0.3,0.0{k},0.5\n" for k in range(1, 9))
@@ -36,7 +36,7 @@ RECORDING = "waist,shoulder,x,y,z\n" + "".join(f"{0.03 * k},0.1,0.3,0.0{k},0.5\n
 WITHOUT_ROOTS_RIGHTS = """import ctypes, os, sys
 PR_CAPBSET_DROP, CAP_DAC_OVERRIDE = 24, 1
 ctypes.CDLL(None).prctl(PR_CAPBSET_DROP, CAP_DAC_OVERRIDE, 0, 0, 0)
-os.execv(sys.executable, [sys.executable, "-m", "daemon", *sys.argv[1:]])"""
+os.execv(sys.executable, [sys.executable, "-m", "bodyschema", *sys.argv[1:]])"""
 # SQLite says of a file that may not grow what it says of a disk that is full.
 
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.bench_run import FAULTS, BenchRun
-from daemon.cli import app
-from daemon.config import Config
-from daemon.wiring import open_joints
-from interfaces.clock import SystemClock
-from interfaces.errors import ConfigError
+from bodyschema.daemon.bench_run import FAULTS, BenchRun
+from bodyschema.daemon.cli import app
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.wiring import open_joints
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import ConfigError
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "desk_arm"
 

@@ -8,10 +8,10 @@ from queue import Queue
 
 import pytest
 
-from daemon.bus import Bus, Request, client
-from daemon.identity import Route
-from daemon.wire import JSON, MSGPACK, ErrorReply, decode
-from interfaces.errors import BusError, RequestError
+from bodyschema.daemon.bus import Bus, Request, client
+from bodyschema.daemon.identity import Route
+from bodyschema.daemon.wire import JSON, MSGPACK, ErrorReply, decode
+from bodyschema.interfaces.errors import BusError, RequestError
 
 LIMIT_S = 500.0
 KEY = "bodyschema/arm/status/sampler"
@@ -184,7 +184,7 @@ def test_a_closed_session_says_so(endpoint) -> None:
 
 def test_a_process_ends_although_its_handlers_are_still_declared(endpoint) -> None:
     code = (
-        "import sys; from daemon.bus import Bus\n"
+        "import sys; from bodyschema.daemon.bus import Bus\n"
         "with Bus(listen=sys.argv[1]) as bus:\n"
         "    bus.answer('a/b', lambda r: b''); bus.subscribe('a/c', print); bus.watch('a/d', print)\n"
         "    raise SystemExit(7)"

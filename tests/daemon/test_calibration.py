@@ -12,30 +12,30 @@ import msgspec
 import numpy as np
 import pytest
 
-from daemon.calibration import Calibration, CalibrationError
-from daemon.calibration_report import CalibrationReport
-from daemon.calibration_view import sentences
-from daemon.checkpoint import write_checkpoint
-from daemon.cli import app
-from daemon.config import Config
-from daemon.learning import DirectSolver, Learning, NominalModel
-from daemon.plausibility.check import Plausibility
-from daemon.recordings import of_robot
-from daemon.session import session_of
-from daemon.store import PairStore
-from interfaces.calibrated import CalibratedGeometry
-from interfaces.calibrated_files import write_calibrated
-from interfaces.clock import SystemClock
-from interfaces.errors import RecordingError
-from interfaces.recording import Recording
-from interfaces.records import MarkerFix
-from interfaces.robot import RobotDescription
-from interfaces.rpy import rpy_of
+from bodyschema.daemon.calibration import Calibration, CalibrationError
+from bodyschema.daemon.calibration_report import CalibrationReport
+from bodyschema.daemon.calibration_view import sentences
+from bodyschema.daemon.checkpoint import write_checkpoint
+from bodyschema.daemon.cli import app
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.learning import DirectSolver, Learning, NominalModel
+from bodyschema.daemon.plausibility.check import Plausibility
+from bodyschema.daemon.recordings import of_robot
+from bodyschema.daemon.session import session_of
+from bodyschema.daemon.store import PairStore
+from bodyschema.interfaces.calibrated import CalibratedGeometry
+from bodyschema.interfaces.calibrated_files import write_calibrated
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import RecordingError
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import MarkerFix
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.interfaces.rpy import rpy_of
+from bodyschema.sim_backend import SimConfig, model_file
+from bodyschema.sim_backend.config import ErrorConfig
+from bodyschema.sim_backend.physics import Physics
+from bodyschema.sim_backend.truth import TrueRobot
 from kbmaps import ChainParameters, ChainTolerances
-from sim_backend import SimConfig, model_file
-from sim_backend.config import ErrorConfig
-from sim_backend.physics import Physics
-from sim_backend.truth import TrueRobot
 
 DESK_ARM = Path(__file__).parents[2] / "examples" / "desk_arm" / "robot.toml"
 ZEROS_RAD = 0.05

@@ -13,12 +13,12 @@ import pytest
 from board_renderer import Photographer, Printed, Taken
 from shown_board import photographed
 
-from daemon.camera_calibration import CamerasFile, CheckFile
-from daemon.cli import app
-from interfaces.errors import ConfigError
-from interfaces.interval import to_its_interval
-from vision.rig import CalibrationError
-from vision.rig_file import read_rig
+from bodyschema.daemon.camera_calibration import CamerasFile, CheckFile
+from bodyschema.daemon.cli import app
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.interval import to_its_interval
+from bodyschema.vision.rig import CalibrationError
+from bodyschema.vision.rig_file import read_rig
 
 
 def called(*arguments: object) -> None:

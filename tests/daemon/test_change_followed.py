@@ -10,16 +10,16 @@ import pytest
 from guided_arm import NOW_AND_THEN, Scene, built_chain, measured, new_learning, path, teach
 from scipy.spatial.transform import Rotation
 
-from daemon.config import LearnerConfig
-from daemon.learning import Learning, LearningState
-from daemon.learning.adaptation import Origin
-from daemon.learning.arm import KnownArm
-from daemon.learning.claims import Claim
-from daemon.learning.nominal import chain_tolerances
-from daemon.learning.state import LearningHeader
-from daemon.learning.watch import Noticed, Reference
-from interfaces.errors import RequestError
-from interfaces.records import FloatArray
+from bodyschema.daemon.config import LearnerConfig
+from bodyschema.daemon.learning import Learning, LearningState
+from bodyschema.daemon.learning.adaptation import Origin
+from bodyschema.daemon.learning.arm import KnownArm
+from bodyschema.daemon.learning.claims import Claim
+from bodyschema.daemon.learning.nominal import chain_tolerances
+from bodyschema.daemon.learning.state import LearningHeader
+from bodyschema.daemon.learning.watch import Noticed, Reference
+from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.records import FloatArray
 from kbmaps import ChainBelief, ChainParameters, RigidChain, change_kinds, learning_bases
 
 SIGMA, TAUGHT, SINCE = 0.002, 180, 40

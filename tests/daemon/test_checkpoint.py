@@ -11,9 +11,16 @@ import numpy as np
 import pytest
 from guided_arm import Scene, new_learning, teach
 
-from daemon.checkpoint import LARGEST_BYTES, CheckpointError, generations, read_checkpoint, set_aside, write_checkpoint
-from daemon.going_on import go_on
-from daemon.learning import LearningState
+from bodyschema.daemon.checkpoint import (
+    LARGEST_BYTES,
+    CheckpointError,
+    generations,
+    read_checkpoint,
+    set_aside,
+    write_checkpoint,
+)
+from bodyschema.daemon.going_on import go_on
+from bodyschema.daemon.learning import LearningState
 
 UTC = "2026-11-21T12:00:00.000+00:00"
 

@@ -12,16 +12,16 @@ import warm
 from cyclopts import CycloptsError
 from small_arm import URDF, write_small_arm
 
-from daemon.cli import COMMANDS, app, command_line
-from daemon.config import Config
-from daemon.screen import two_digits
-from interfaces.errors import BusError, ConfigError
+from bodyschema.daemon.cli import COMMANDS, app, command_line
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.screen import two_digits
+from bodyschema.interfaces.errors import BusError, ConfigError
 
 LIMIT_S = 500.0
 
 
 def run(*arguments: object, cwd: Path, environment: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:
-    return warm.run("-m", "daemon", *arguments, cwd=cwd, env=os.environ | (environment or {}))
+    return warm.run("-m", "bodyschema", *arguments, cwd=cwd, env=os.environ | (environment or {}))
 
 
 def called(*arguments: object) -> None:
@@ -38,7 +38,7 @@ def robot(tmp_path: Path, free_endpoint) -> Path:
 
 def test_help_loads_nothing_that_takes_long(tmp_path) -> None:
     shown = subprocess.run(
-        [sys.executable, "-X", "importtime", "-m", "daemon", "--help"],
+        [sys.executable, "-X", "importtime", "-m", "bodyschema", "--help"],
         capture_output=True, text=True, timeout=LIMIT_S, check=True, cwd=tmp_path,
     )  # fmt: skip
     loaded = {line.split("|")[-1].strip().split(".")[0] for line in shown.stderr.splitlines()}
@@ -56,7 +56,7 @@ def test_help_names_every_command(tmp_path) -> None:
 )
 def test_each_command_says_what_it_needs_and_what_is_next(command, capsys) -> None:
     # As in a process of its own: a summary given to the same page before would be shown in its place.
-    sys.modules.pop(f"daemon.commands.{command.split()[0]}", None)
+    sys.modules.pop(f"bodyschema.daemon.commands.{command.split()[0]}", None)
     command_line(command.split()[0])([*command.split(), "--help"], exit_on_error=False, result_action="return_value")
     beginnings = [line.split(" ")[0] for line in capsys.readouterr().out.splitlines()]
     assert ("Needs:" in beginnings, "Next:" in beginnings) == (True, True)

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from small_arm import ROBOT, write_small_arm
 
-from daemon.config import Config, ZenohConfig
-from interfaces.errors import ConfigError, RobotError
+from bodyschema.daemon.config import Config, ZenohConfig
+from bodyschema.interfaces.errors import ConfigError, RobotError
 
 
 def load(folder: Path, tables: str = "", environment: dict[str, str] | None = None) -> Config:

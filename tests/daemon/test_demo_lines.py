@@ -7,9 +7,9 @@ from typing import cast
 import pytest
 from rich.console import Console
 
-from daemon.demo import view
-from daemon.demo.play import Snapshot, stalled
-from daemon.status import SamplerStatus
+from bodyschema.daemon.demo import view
+from bodyschema.daemon.demo.play import Snapshot, stalled
+from bodyschema.daemon.status import SamplerStatus
 
 
 def snapshot(pairs: int, angle_rad: float | None = None) -> Snapshot:

@@ -17,18 +17,18 @@ import pytest
 from rich.console import Console
 from walked import DESK_ARM, walked
 
-from daemon.bus import Bus, Request
-from daemon.cli import main
-from daemon.config import Config
-from daemon.diagnosis_run import Asked, Source, run
-from daemon.diagnosis_view import view
-from daemon.keys import Keys
-from daemon.wire import PairsReply, encode, pair_to_wire
-from diagnosis.result import DiagnosisFile, Indistinguishable, Unexplained
-from effects import Effect
-from interfaces.recording import Recording
-from interfaces.records import Pair
-from interfaces.robot import RobotDescription
+from bodyschema.daemon.bus import Bus, Request
+from bodyschema.daemon.cli import main
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.diagnosis_run import Asked, Source, run
+from bodyschema.daemon.diagnosis_view import view
+from bodyschema.daemon.keys import Keys
+from bodyschema.daemon.wire import PairsReply, encode, pair_to_wire
+from bodyschema.diagnosis.result import DiagnosisFile, Indistinguishable, Unexplained
+from bodyschema.effects import Effect
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import Pair
+from bodyschema.interfaces.robot import RobotDescription
 
 FEW = ("--effects", "joint_scale,backlash")
 KEYS = {"schema", "verdict", "pairs", "mean_mm", "rms_mm", "gain", "causes", "rejected", "unexplained", "advice"}

@@ -14,21 +14,21 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from daemon import doctor
-from daemon.bench_run import BenchRun
-from daemon.bus import Bus
-from daemon.cli import app
-from daemon.config import Config
-from daemon.doctor_view import show
-from daemon.identity import Route
-from daemon.keys import Keys
-from daemon.servo_wiring import Check
-from daemon.status import SamplerStatus
-from daemon.store import PairStore, Session
-from daemon.wire import encode
-from drivers import checks
-from drivers.checks import Holder
-from interfaces.records import MarkerFix
+from bodyschema.daemon import doctor
+from bodyschema.daemon.bench_run import BenchRun
+from bodyschema.daemon.bus import Bus
+from bodyschema.daemon.cli import app
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.doctor_view import show
+from bodyschema.daemon.identity import Route
+from bodyschema.daemon.keys import Keys
+from bodyschema.daemon.servo_wiring import Check
+from bodyschema.daemon.status import SamplerStatus
+from bodyschema.daemon.store import PairStore, Session
+from bodyschema.daemon.wire import encode
+from bodyschema.drivers import checks
+from bodyschema.drivers.checks import Holder
+from bodyschema.interfaces.records import MarkerFix
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "desk_arm" / "servos.toml"
 LONGEST_S = 5.0
@@ -122,7 +122,7 @@ def test_a_port_that_is_not_there_is_told_once(capsys) -> None:
 def test_the_running_sampler_tells_of_the_servos_itself(tmp_path, monkeypatch, capsys) -> None:
     with BenchRun(Config.load(EXAMPLE), tmp_path / "bus") as run:
         config = Config.load(run.robot_file)
-        holder = Holder(4711, "/usr/bin/python -m daemon sampler --robot robot.toml")
+        holder = Holder(4711, "/usr/bin/python -m bodyschema sampler --robot robot.toml")
         monkeypatch.setattr(checks, "holders", lambda *_: [holder])
         with Bus(listen=config.tables.zenoh.sampler) as bus:
             keys = Keys(config.robot.name)

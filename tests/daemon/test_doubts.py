@@ -5,12 +5,12 @@ import itertools
 import numpy as np
 from guided_arm import Scene, nominal_model
 
-from daemon.config import LearnerConfig
-from daemon.learning.arm import KnownArm
-from daemon.learning.claims import Claims
-from daemon.learning.doubts import Doubts
-from daemon.learning.era import Era
-from daemon.learning.gate import CHANGE
+from bodyschema.daemon.config import LearnerConfig
+from bodyschema.daemon.learning.arm import KnownArm
+from bodyschema.daemon.learning.claims import Claims
+from bodyschema.daemon.learning.doubts import Doubts
+from bodyschema.daemon.learning.era import Era
+from bodyschema.daemon.learning.gate import CHANGE
 from kbmaps import ChainTolerances
 
 NEAR, LIMIT, FAR = 0.001, 0.01, 0.1

@@ -10,22 +10,22 @@ import numpy as np
 import pytest
 from small_arm import write_small_arm
 
-from daemon import store_schema
-from daemon.backup import Backup
-from daemon.config import Config
-from daemon.identity import Identity, TlsConfig
-from daemon.servo_fitting import read_scan
-from daemon.store import PairReader
-from daemon.wiggling import read_wiggle
-from effects.files import load_simulation
-from interfaces import recording_csv
-from interfaces.errors import BodyschemaError, ConfigError, RecordingError, StoreError
-from interfaces.limited import UnfitFile, read_at_most
-from interfaces.recording import Recording
-from interfaces.toml_file import read_toml
-from interfaces.urdf import UrdfTree
-from vision.cameras.film import read_times
-from vision.image_file import read_image
+from bodyschema.daemon import store_schema
+from bodyschema.daemon.backup import Backup
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.identity import Identity, TlsConfig
+from bodyschema.daemon.servo_fitting import read_scan
+from bodyschema.daemon.store import PairReader
+from bodyschema.daemon.wiggling import read_wiggle
+from bodyschema.effects.files import load_simulation
+from bodyschema.interfaces import recording_csv
+from bodyschema.interfaces.errors import BodyschemaError, ConfigError, RecordingError, StoreError
+from bodyschema.interfaces.limited import UnfitFile, read_at_most
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.toml_file import read_toml
+from bodyschema.interfaces.urdf import UrdfTree
+from bodyschema.vision.cameras.film import read_times
+from bodyschema.vision.image_file import read_image
 
 JOINTS = ("waist", "shoulder")
 HEADER = b"waist,shoulder,x,y,z\n"

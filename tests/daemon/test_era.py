@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from guided_arm import Scene, make_pair, nominal_model
 
-from daemon.config import LearnerConfig
-from daemon.learning import Solved
-from daemon.learning.arm import KnownArm
-from daemon.learning.claims import Claims
-from daemon.learning.era import Era
-from daemon.learning.learnt import LearntModel
-from daemon.learning.members import EXACT, PRIOR, RESIDUAL, RIGID
-from daemon.learning.solver import fitted_residual
+from bodyschema.daemon.config import LearnerConfig
+from bodyschema.daemon.learning import Solved
+from bodyschema.daemon.learning.arm import KnownArm
+from bodyschema.daemon.learning.claims import Claims
+from bodyschema.daemon.learning.era import Era
+from bodyschema.daemon.learning.learnt import LearntModel
+from bodyschema.daemon.learning.members import EXACT, PRIOR, RESIDUAL, RIGID
+from bodyschema.daemon.learning.solver import fitted_residual
 from kbmaps import ChainTolerances, KBMap
 
 NOMINAL = nominal_model()

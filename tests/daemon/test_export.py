@@ -11,12 +11,12 @@ import pytest
 import warm
 from small_arm import JOINTS, ROBOT, URDF, write_small_arm
 
-from daemon.cli import app
-from daemon.mcap_export import write_mcap
-from daemon.store import PairStore, Session
-from interfaces.errors import ConfigError, RecordingError, StoreError
-from interfaces.recording import Recording
-from interfaces.records import MarkerFix
+from bodyschema.daemon.cli import app
+from bodyschema.daemon.mcap_export import write_mcap
+from bodyschema.daemon.store import PairStore, Session
+from bodyschema.interfaces.errors import ConfigError, RecordingError, StoreError
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import MarkerFix
 
 
 @pytest.fixture
@@ -181,7 +181,7 @@ def test_an_unreadable_recording_leaves_nothing_behind(tmp_path: Path, robot: Pa
 def test_the_command_ends_with_exit_code_1_and_one_line(tmp_path: Path, robot: Path) -> None:
     source = tmp_path / "a.csv"
     source.write_text("waist,shoulder,x,y,z\n0,0,1,2,3\n0,0,1,two,3\n")
-    ended = warm.run("-m", "daemon", "export", source, tmp_path / "b.csv", "--robot", robot)
+    ended = warm.run("-m", "bodyschema", "export", source, tmp_path / "b.csv", "--robot", robot)
     assert ended.returncode == 1
     assert ended.stderr == (
         f"bodyschema: {source}, line 3, column y: 'two' is not a number. Write it like -0.5 or 1e-3, without quotes\n"

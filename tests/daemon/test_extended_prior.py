@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from walked import DESK_ARM
 
-from daemon.config import Config, LearnerConfig
-from daemon.learning import DirectSolver, Learning, NominalModel
-from daemon.learning.nominal import chain_tolerances
-from effects import Effect, Motion, Simulation, write_extended
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
+from bodyschema.daemon.config import Config, LearnerConfig
+from bodyschema.daemon.learning import DirectSolver, Learning, NominalModel
+from bodyschema.daemon.learning.nominal import chain_tolerances
+from bodyschema.effects import Effect, Motion, Simulation, write_extended
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
 
 LINK, TURN = [0.005, 0.003, -0.004, 0.02, 0.01, -0.02], [0.03, 0.02]
 RIGID: Mapping[str, list[float]] = {"link_geometry": LINK, "joint_offset": [0.03]}

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from guided_arm import STORE, Scene, make_pair, new_learning
 
-from daemon.feed import RETRY_S, WAITING, PairFeed
-from daemon.history import Page, read_page
-from daemon.learning import Learning
-from daemon.wire import PairMessage, PairsReply, encode, pair_to_wire
-from interfaces.errors import BusError, RequestError
-from interfaces.records import Pair
+from bodyschema.daemon.feed import RETRY_S, WAITING, PairFeed
+from bodyschema.daemon.history import Page, read_page
+from bodyschema.daemon.learning import Learning
+from bodyschema.daemon.wire import PairMessage, PairsReply, encode, pair_to_wire
+from bodyschema.interfaces.errors import BusError, RequestError
+from bodyschema.interfaces.records import Pair
 
 PAGE = 7
 PAIRS = Scene.draw(0, 40).pairs

@@ -11,11 +11,11 @@ import sys
 import pytest
 from guided_arm import nominal_model
 
-from daemon import cli
-from daemon.cli import allow_enough_files
-from daemon.learning import Task
-from daemon.solver_process import SolverLostError, SolverProcess
-from interfaces.errors import ConfigError
+from bodyschema.daemon import cli
+from bodyschema.daemon.cli import allow_enough_files
+from bodyschema.daemon.learning import Task
+from bodyschema.daemon.solver_process import SolverLostError, SolverProcess
+from bodyschema.interfaces.errors import ConfigError
 from kbmaps import ChainTolerances
 
 NOMINAL = nominal_model()

@@ -15,16 +15,16 @@ from scipy.spatial.transform import Rotation
 from small_arm import write_small_arm
 from told_statuses import LEARNER, SAMPLER
 
-from daemon.bus import Bus, Request
-from daemon.cli import app
-from daemon.fleet.comparison import Model, common_poses, compared
-from daemon.fleet.comparison_view import sentences
-from daemon.fleet.roster import Fleet, places
-from daemon.keys import Keys
-from daemon.status import ChainCalibration, JointRange, JointZero, LearnerStatus, LearntFigure, SamplerStatus
-from daemon.wire import JointsRequest, PredictReply, decode, encode
-from interfaces.errors import BusError, RequestError
-from interfaces.records import FloatArray
+from bodyschema.daemon.bus import Bus, Request
+from bodyschema.daemon.cli import app
+from bodyschema.daemon.fleet.comparison import Model, common_poses, compared
+from bodyschema.daemon.fleet.comparison_view import sentences
+from bodyschema.daemon.fleet.roster import Fleet, places
+from bodyschema.daemon.keys import Keys
+from bodyschema.daemon.status import ChainCalibration, JointRange, JointZero, LearnerStatus, LearntFigure, SamplerStatus
+from bodyschema.daemon.wire import JointsRequest, PredictReply, decode, encode
+from bodyschema.interfaces.errors import BusError, RequestError
+from bodyschema.interfaces.records import FloatArray
 
 JOINTS = ("waist", "shoulder")
 

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.config import DaemonConfig
-from daemon.gate import Accepted, Gate
-from interfaces.records import Pair, Reason, frozen_array
+from bodyschema.daemon.config import DaemonConfig
+from bodyschema.daemon.gate import Accepted, Gate
+from bodyschema.interfaces.records import Pair, Reason, frozen_array
 
 FRAME_S = 1 / 30
 TWO_REVOLUTE = np.array([False, False])

@@ -21,23 +21,23 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from small_arm import JOINTS, URDF, write_small_arm
 
-from daemon import checkpoint, wire
-from daemon.answers import Answers
-from daemon.bus import Request
-from daemon.checkpoint import CheckpointError
-from daemon.config import Config, LearnerConfig
-from daemon.going_on import DOES_NOT_FIT
-from daemon.history import answer_pairs
-from daemon.learning import DirectSolver, Learning, NominalModel, StateError
-from daemon.router import RouterConfig
-from daemon.status import LearnerStatus, SamplerStatus
-from effects import Simulation
-from interfaces.errors import BodyschemaError, ConfigError, RecordingError, RequestError
-from interfaces.recording import Recording, joints_in
-from interfaces.robot import RobotDescription
-from interfaces.urdf import UrdfTree
+from bodyschema.daemon import checkpoint, wire
+from bodyschema.daemon.answers import Answers
+from bodyschema.daemon.bus import Request
+from bodyschema.daemon.checkpoint import CheckpointError
+from bodyschema.daemon.config import Config, LearnerConfig
+from bodyschema.daemon.going_on import DOES_NOT_FIT
+from bodyschema.daemon.history import answer_pairs
+from bodyschema.daemon.learning import DirectSolver, Learning, NominalModel, StateError
+from bodyschema.daemon.router import RouterConfig
+from bodyschema.daemon.status import LearnerStatus, SamplerStatus
+from bodyschema.effects import Simulation
+from bodyschema.interfaces.errors import BodyschemaError, ConfigError, RecordingError, RequestError
+from bodyschema.interfaces.recording import Recording, joints_in
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.interfaces.urdf import UrdfTree
+from bodyschema.vision.rig_file import read_rig
 from kbmaps import KBMapsError
-from vision.rig_file import read_rig
 
 MOST_BYTES = 200 * 2**20  # of memory that reading a small file may take
 quick = settings(
@@ -398,8 +398,8 @@ def test_a_forged_checkpoint_is_restored_or_refused(tmp_path: Path, stored, plac
 @quick
 @given(st.lists(st.binary(max_size=60) | st.just(b"{}"), max_size=5))
 def test_published_bytes_that_are_no_pair_are_counted_and_learning_goes_on(payloads: list[bytes]) -> None:
-    from daemon.feed import PairFeed
-    from interfaces.clock import SystemClock
+    from bodyschema.daemon.feed import PairFeed
+    from bodyschema.interfaces.clock import SystemClock
 
     def no_history(_begin: int) -> wire.PairsReply:
         raise RequestError("nobody")

@@ -7,10 +7,10 @@ import re
 
 import pytest
 
-from daemon import udev
-from daemon.cli import command_line
-from daemon.udev import ADAPTERS, FILE, Rules, rules
-from interfaces.errors import ConfigError
+from bodyschema.daemon import udev
+from bodyschema.daemon.cli import command_line
+from bodyschema.daemon.udev import ADAPTERS, FILE, Rules, rules
+from bodyschema.interfaces.errors import ConfigError
 
 # One key, operator and value of a rule; see udev(7).
 TERM = re.compile(r'[A-Z_]+(\{[A-Za-z_]+\})?(==|=|\+=)"[^"]*"')

@@ -12,11 +12,11 @@ import pytest
 from security_recipe import ROOT, SEVERAL, carried_out
 from small_arm import write_small_arm
 
-from daemon.cli import command_line
-from daemon.identity import Identity
-from daemon.router import RouterConfig
-from daemon.units import FOLDER, Installed, of_router
-from interfaces.errors import ConfigError
+from bodyschema.daemon.cli import command_line
+from bodyschema.daemon.identity import Identity
+from bodyschema.daemon.router import RouterConfig
+from bodyschema.daemon.units import FOLDER, Installed, of_router
+from bodyschema.interfaces.errors import ConfigError
 
 EXPOSURE = 2.0
 analyze = pytest.mark.skipif(

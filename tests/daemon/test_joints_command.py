@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from daemon.bench_run import BenchRun
-from daemon.cli import app
-from daemon.config import Config
-from daemon.joints_view import screen
-from daemon.joints_watch import JointState, JointsWatch, Seen, SignCheck, Speeds, signs_in
-from daemon.wiring import open_joints
-from drivers.bench.dry_run import DryRun
-from drivers.dynamixel.bench.arm import DynamixelArm
-from interfaces.clock import SystemClock
+from bodyschema.daemon.bench_run import BenchRun
+from bodyschema.daemon.cli import app
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.joints_view import screen
+from bodyschema.daemon.joints_watch import JointState, JointsWatch, Seen, SignCheck, Speeds, signs_in
+from bodyschema.daemon.wiring import open_joints
+from bodyschema.drivers.bench.dry_run import DryRun
+from bodyschema.drivers.dynamixel.bench.arm import DynamixelArm
+from bodyschema.interfaces.clock import SystemClock
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "desk_arm" / "servos.toml"
 YAW, PITCH, ELBOW, ROLL = range(4)

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from guided_arm import JOINTS, NOW_AND_THEN, Scene, built_chain, make_pair, measured, nominal_model, path, teach
 
-from daemon.config import LearnerConfig
-from daemon.learning import DirectSolver, Learning, NominalModel
-from daemon.learning.arm import KnownArm
-from daemon.learning.claims import Claims
-from daemon.learning.course import MOST_TOGETHER
-from daemon.learning.era import Era
-from daemon.learning.members import INSTANT
-from daemon.learning.scores import ErrorMemory
-from interfaces.records import Pair
+from bodyschema.daemon.config import LearnerConfig
+from bodyschema.daemon.learning import DirectSolver, Learning, NominalModel
+from bodyschema.daemon.learning.arm import KnownArm
+from bodyschema.daemon.learning.claims import Claims
+from bodyschema.daemon.learning.course import MOST_TOGETHER
+from bodyschema.daemon.learning.era import Era
+from bodyschema.daemon.learning.members import INSTANT
+from bodyschema.daemon.learning.scores import ErrorMemory
+from bodyschema.interfaces.records import Pair
 from kbmaps import NLMS, ChainTolerances
 
 TOGETHER_S = 1.0

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from daemon.latency import EARLIEST_S, LATEST_S, STEP_S, LatencyError, Wiggle, latency_of
-from daemon.wiggling import read_wiggle, wiggle_of, write_wiggle
-from interfaces.errors import RecordingError
-from interfaces.robot import RobotDescription
+from bodyschema.daemon.latency import EARLIEST_S, LATEST_S, STEP_S, LatencyError, Wiggle, latency_of
+from bodyschema.daemon.wiggling import read_wiggle, wiggle_of, write_wiggle
+from bodyschema.interfaces.errors import RecordingError
+from bodyschema.interfaces.robot import RobotDescription
 from kbmaps import RigidChain
 
 ARM = RobotDescription.load(Path(__file__).parents[2] / "examples" / "desk_arm" / "robot.toml")

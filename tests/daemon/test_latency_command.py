@@ -10,13 +10,13 @@ import pytest
 from scripted_sources import Walk
 from small_arm import write_small_arm
 
-from daemon.cli import app
-from daemon.latency import LatencyError
-from daemon.sources import Sources
-from daemon.wiggling import collected
-from interfaces.errors import BodyschemaError
-from interfaces.records import MarkerFix, MarkerMiss
-from interfaces.robot import RobotDescription
+from bodyschema.daemon.cli import app
+from bodyschema.daemon.latency import LatencyError
+from bodyschema.daemon.sources import Sources
+from bodyschema.daemon.wiggling import collected
+from bodyschema.interfaces.errors import BodyschemaError
+from bodyschema.interfaces.records import MarkerFix, MarkerMiss
+from bodyschema.interfaces.robot import RobotDescription
 
 
 def seen(folder: Path, every: int) -> Sources:

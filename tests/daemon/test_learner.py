@@ -11,15 +11,24 @@ import pytest
 from guided_arm import make_pair
 from small_arm import write_small_arm
 
-from daemon.bus import Bus, Request
-from daemon.config import Config
-from daemon.keys import Keys
-from daemon.learner import Learner
-from daemon.learning import DirectSolver
-from daemon.status import LearnerStatus
-from daemon.wire import JSON, CommandReply, CommandRequest, PairsReply, PredictReply, decode, encode, pair_to_wire
-from interfaces.errors import BusError
-from interfaces.records import Pair
+from bodyschema.daemon.bus import Bus, Request
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.keys import Keys
+from bodyschema.daemon.learner import Learner
+from bodyschema.daemon.learning import DirectSolver
+from bodyschema.daemon.status import LearnerStatus
+from bodyschema.daemon.wire import (
+    JSON,
+    CommandReply,
+    CommandRequest,
+    PairsReply,
+    PredictReply,
+    decode,
+    encode,
+    pair_to_wire,
+)
+from bodyschema.interfaces.errors import BusError
+from bodyschema.interfaces.records import Pair
 
 KEYS = Keys("arm")
 

@@ -14,23 +14,23 @@ from guided_arm import JOINTS, nominal_model
 from small_arm import write_small_arm
 from told_statuses import LEARNER
 
-from daemon.background import Background
-from daemon.bus import client
-from daemon.config import Config
-from daemon.fleet.hosting import configs_of, descriptions, shares
-from daemon.keys import Keys
-from daemon.learner import Learner
-from daemon.learner_host import attend, run_learners, session_settings
-from daemon.learning import Solved, Task
-from daemon.notify import Notifier
-from daemon.service import Service
-from daemon.signals import Wishes
-from daemon.solver_process import SolverLostError
-from daemon.solver_seats import SharedSolver
-from daemon.status import LearnerStatus
-from daemon.wire import decode
-from interfaces.clock import SystemClock
-from interfaces.errors import BusError, ConfigError
+from bodyschema.daemon.background import Background
+from bodyschema.daemon.bus import client
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.fleet.hosting import configs_of, descriptions, shares
+from bodyschema.daemon.keys import Keys
+from bodyschema.daemon.learner import Learner
+from bodyschema.daemon.learner_host import attend, run_learners, session_settings
+from bodyschema.daemon.learning import Solved, Task
+from bodyschema.daemon.notify import Notifier
+from bodyschema.daemon.service import Service
+from bodyschema.daemon.signals import Wishes
+from bodyschema.daemon.solver_process import SolverLostError
+from bodyschema.daemon.solver_seats import SharedSolver
+from bodyschema.daemon.status import LearnerStatus
+from bodyschema.daemon.wire import decode
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import BusError, ConfigError
 from kbmaps import ChainTolerances
 
 NOMINAL = nominal_model()

@@ -8,13 +8,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from daemon.config import LARGEST_MAP, DaemonConfig, LearnerConfig
-from daemon.learning.gate import CHANGE, DOUBT, FEWEST_FOR_CHANGE
-from daemon.learning.learning import REGION_RAD
-from daemon.learning.members import TRUSTED
-from daemon.learning.nominal import PAIRS_TO_REFIT
-from daemon.learning.snapshot import IN_SUPPORT
-from daemon.learning.solver import KEPT, LARGEST_NET, WINDOW
+from bodyschema.daemon.config import LARGEST_MAP, DaemonConfig, LearnerConfig
+from bodyschema.daemon.learning.gate import CHANGE, DOUBT, FEWEST_FOR_CHANGE
+from bodyschema.daemon.learning.learning import REGION_RAD
+from bodyschema.daemon.learning.members import TRUSTED
+from bodyschema.daemon.learning.nominal import PAIRS_TO_REFIT
+from bodyschema.daemon.learning.snapshot import IN_SUPPORT
+from bodyschema.daemon.learning.solver import KEPT, LARGEST_NET, WINDOW
 from kbmaps.contest import CLEARLY, SHORTEST
 
 PAGE = (Path(__file__).parents[2] / "docs" / "learner.md").read_text(encoding="utf-8")

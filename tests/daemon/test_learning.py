@@ -22,11 +22,11 @@ from guided_arm import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.config import LearnerConfig
-from daemon.learning import DirectSolver, Learning, Solved
-from daemon.learning.members import SOLVED
-from interfaces.errors import RequestError
-from interfaces.records import Pair
+from bodyschema.daemon.config import LearnerConfig
+from bodyschema.daemon.learning import DirectSolver, Learning, Solved
+from bodyschema.daemon.learning.members import SOLVED
+from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.records import Pair
 from kbmaps import NLMS
 from kbmaps.contest import LISTED
 

@@ -15,20 +15,20 @@ from rich.console import Console
 from shown_board import BOARD, SIZE, KnownCorners, corner_views, known_rig, photographed, shot
 from small_arm import write_small_arm
 
-from daemon.camera_calibration import CheckFile, Wanted, kept_in, of_cameras
-from daemon.cli import app
-from daemon.live_calibration import LiveCalibration, Shown, checked_live
-from daemon.live_calibration_view import Lines, guidance_on, screen
-from interfaces.clock import SystemClock
-from interfaces.errors import ConfigError, SourceEnded, SourceLost
-from interfaces.records import StereoFrame
-from vision.calibration.calibrate import Calibrated
-from vision.calibration.gather import Gathered
-from vision.calibration.images import pair_files
-from vision.calibration.live import LiveViews
-from vision.calibration.view import View
-from vision.rig import CalibrationError
-from vision.rig_file import read_rig, write_rig
+from bodyschema.daemon.camera_calibration import CheckFile, Wanted, kept_in, of_cameras
+from bodyschema.daemon.cli import app
+from bodyschema.daemon.live_calibration import LiveCalibration, Shown, checked_live
+from bodyschema.daemon.live_calibration_view import Lines, guidance_on, screen
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import ConfigError, SourceEnded, SourceLost
+from bodyschema.interfaces.records import StereoFrame
+from bodyschema.vision.calibration.calibrate import Calibrated
+from bodyschema.vision.calibration.gather import Gathered
+from bodyschema.vision.calibration.images import pair_files
+from bodyschema.vision.calibration.live import LiveViews
+from bodyschema.vision.calibration.view import View
+from bodyschema.vision.rig import CalibrationError
+from bodyschema.vision.rig_file import read_rig, write_rig
 
 RIGHT = ("A1", "B2")
 
@@ -68,7 +68,7 @@ def views() -> list[View]:
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("daemon.reopen.FIRST_WAIT_S", 0.0)
+    monkeypatch.setattr("bodyschema.daemon.reopen.FIRST_WAIT_S", 0.0)
 
 
 def held(views: list[View], places: Iterable[int] | None = None) -> tuple[LiveViews, list[StereoFrame]]:

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from small_arm import write_small_arm
 
-from daemon.cli import app
-from interfaces.errors import BodyschemaError, ConfigError
-from vision.config import VisionConfig
-from vision.tag_body import TagBody
+from bodyschema.daemon.cli import app
+from bodyschema.interfaces.errors import BodyschemaError, ConfigError
+from bodyschema.vision.config import VisionConfig
+from bodyschema.vision.tag_body import TagBody
 
 
 def called(*arguments: object) -> None:

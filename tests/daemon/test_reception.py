@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from daemon.reception import EVERYBODYS, LIMITS, Limits, Reception
-from interfaces.errors import RequestError
+from bodyschema.daemon.reception import EVERYBODYS, LIMITS, Limits, Reception
+from bodyschema.interfaces.errors import RequestError
 
 
 class Watch:

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from small_arm import JOINTS, write_small_arm
 
-from daemon.bus import Bus, Request, client
-from daemon.cli import app
-from daemon.keys import Keys
-from daemon.recorder import History, follow_history
-from daemon.wire import PairsReply, encode, pair_to_wire
-from interfaces.errors import BusError, RecordingError
-from interfaces.recording import Recording
-from interfaces.records import Pair
-from interfaces.robot import RobotDescription
+from bodyschema.daemon.bus import Bus, Request, client
+from bodyschema.daemon.cli import app
+from bodyschema.daemon.keys import Keys
+from bodyschema.daemon.recorder import History, follow_history
+from bodyschema.daemon.wire import PairsReply, encode, pair_to_wire
+from bodyschema.interfaces.errors import BusError, RecordingError
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import Pair
+from bodyschema.interfaces.robot import RobotDescription
 
 PAGE = 2
 
@@ -169,7 +169,7 @@ def test_another_store_is_not_mixed_in(history: History, sampler: FakeSampler, t
 
 def test_a_followed_recording_ends_in_order_on_a_signal(sampler: FakeSampler, robot: Path, tmp_path: Path) -> None:
     sampler.pairs = [pair(1)]
-    command = [sys.executable, "-m", "daemon", "record", str(tmp_path / "a.csv"), "--robot", str(robot), "--follow"]
+    command = [sys.executable, "-m", "bodyschema", "record", str(tmp_path / "a.csv"), "--robot", str(robot), "--follow"]
     environment = os.environ | {"PYTHONUNBUFFERED": "1"}
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
         assert process.stdout is not None

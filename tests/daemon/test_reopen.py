@@ -8,10 +8,10 @@ from board_renderer import webcams
 from scripted_sources import Scripted
 from shown_board import SIZE, known_rig
 
-from daemon.reopen import Reopening
-from interfaces.errors import SourceError, SourceLost
-from interfaces.records import JointReading, StereoFrame, frozen_array
-from vision.rectified import RectifiedCamera
+from bodyschema.daemon.reopen import Reopening
+from bodyschema.interfaces.errors import SourceError, SourceLost
+from bodyschema.interfaces.records import JointReading, StereoFrame, frozen_array
+from bodyschema.vision.rectified import RectifiedCamera
 
 READING = JointReading(1.0, frozen_array([0.0]))
 

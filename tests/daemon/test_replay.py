@@ -12,15 +12,15 @@ import pytest
 import warm
 from small_arm import JOINTS, write_small_arm
 
-from daemon.cli import app
-from daemon.config import Config, DaemonConfig
-from daemon.evaluate import EvaluationError, split_blocks
-from daemon.replay.report import AngleFigures, Figures, ReplayReport, as_text
-from daemon.replay.run import Job
-from daemon.replay.steps import Steps, require_path
-from interfaces.errors import ConfigError, RecordingError
-from interfaces.recording import Recording
-from interfaces.robot import RobotDescription
+from bodyschema.daemon.cli import app
+from bodyschema.daemon.config import Config, DaemonConfig
+from bodyschema.daemon.evaluate import EvaluationError, split_blocks
+from bodyschema.daemon.replay.report import AngleFigures, Figures, ReplayReport, as_text
+from bodyschema.daemon.replay.run import Job
+from bodyschema.daemon.replay.steps import Steps, require_path
+from bodyschema.interfaces.errors import ConfigError, RecordingError
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.robot import RobotDescription
 
 # The limit only ends a replay that would never end; on a busy machine it takes longer, and passes.
 LIMIT_S = 300
@@ -53,7 +53,7 @@ def replay(*arguments: object) -> None:
 
 
 def command_line(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return warm.run("-m", "daemon", "replay", *arguments)
+    return warm.run("-m", "bodyschema", "replay", *arguments)
 
 
 def test_a_guided_path_is_one() -> None:
@@ -218,7 +218,7 @@ def processes_naming(text: str) -> list[str]:
 def test_ending_the_replay_ends_its_two_processes(tmp_path: Path, robot: Path) -> None:
     guided(robot).write_csv(tmp_path / "a.csv")
     kept = str(tmp_path / "kept")
-    command = [sys.executable, "-m", "daemon", "replay", str(tmp_path / "a.csv"), "--keep", kept]
+    command = [sys.executable, "-m", "bodyschema", "replay", str(tmp_path / "a.csv"), "--keep", kept]
     with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL) as process:
         assert process.stderr is not None
         process.stderr.readline()

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from small_arm import JOINTS
 
-from daemon import recordings
-from daemon.rerun_export import runs
-from interfaces.errors import RecordingError
-from interfaces.recording import Recording
+from bodyschema.daemon import recordings
+from bodyschema.daemon.rerun_export import runs
+from bodyschema.interfaces.errors import RecordingError
+from bodyschema.interfaces.recording import Recording
 
 
 @pytest.fixture

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from guided_arm import NOW_AND_THEN, Scene, make_pair, measured, new_learning, nominal_model, teach
 
-from daemon.config import LearnerConfig
-from daemon.learning import DirectSolver, Learning, Solved, StateError
-from daemon.learning.memory import Permutations
-from daemon.learning.snapshot import Prediction
-from interfaces.records import FloatArray, Pair
+from bodyschema.daemon.config import LearnerConfig
+from bodyschema.daemon.learning import DirectSolver, Learning, Solved, StateError
+from bodyschema.daemon.learning.memory import Permutations
+from bodyschema.daemon.learning.snapshot import Prediction
+from bodyschema.interfaces.records import FloatArray, Pair
 
 TAUGHT, LATER = 100, 40
 

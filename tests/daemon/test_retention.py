@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.bus import Request
-from daemon.history import answer_pairs
-from daemon.retention import AT_ONCE, Keep, used_bytes
-from daemon.store import PairReader, PairStore, Session
-from daemon.wire import JSON, PairsReply, decode
-from interfaces.records import MarkerFix, frozen_array
+from bodyschema.daemon.bus import Request
+from bodyschema.daemon.history import answer_pairs
+from bodyschema.daemon.retention import AT_ONCE, Keep, used_bytes
+from bodyschema.daemon.store import PairReader, PairStore, Session
+from bodyschema.daemon.wire import JSON, PairsReply, decode
+from bodyschema.interfaces.records import MarkerFix, frozen_array
 
 NOW = "2026-11-21T12:00:00.000+00:00"
 SESSION = Session(("waist", "shoulder"), NOW, "[robot]", "<robot/>", "{}", "0", "host")

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from daemon.bench_run import BenchRun
-from daemon.cli import command_line
-from daemon.config import Config
-from daemon.servo_wiring import servos_of
-from interfaces.errors import ConfigError
+from bodyschema.daemon.bench_run import BenchRun
+from bodyschema.daemon.cli import command_line
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.servo_wiring import servos_of
+from bodyschema.interfaces.errors import ConfigError
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "desk_arm"
 JOINTS = ("base_yaw", "shoulder_pitch", "elbow_pitch", "wrist_roll")

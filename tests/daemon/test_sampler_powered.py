@@ -15,13 +15,13 @@ from scripted_sources import Scripted, Walk
 from small_arm import write_small_arm
 from test_sampler import command, running, sample, status_when
 
-from daemon import powered
-from daemon.config import Config
-from daemon.sources import Sources
-from daemon.wiring import demonstration_model
-from interfaces.clock import SystemClock
-from interfaces.errors import ConfigError, RequestError
-from interfaces.records import frozen_array
+from bodyschema.daemon import powered
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.sources import Sources
+from bodyschema.daemon.wiring import demonstration_model
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import ConfigError, RequestError
+from bodyschema.interfaces.records import frozen_array
 
 LIMIT_S = 500.0
 

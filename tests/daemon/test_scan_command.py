@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from daemon.bench_run import BenchRun
-from daemon.cli import app
-from daemon.config import Config
-from daemon.scan_report import ScanReport, as_json, report_of
-from daemon.scan_view import show
-from drivers.scan import FoundServo, ScannedBus
-from interfaces.errors import ConfigError
+from bodyschema.daemon.bench_run import BenchRun
+from bodyschema.daemon.cli import app
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.scan_report import ScanReport, as_json, report_of
+from bodyschema.daemon.scan_view import show
+from bodyschema.drivers.scan import FoundServo, ScannedBus
+from bodyschema.interfaces.errors import ConfigError
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "desk_arm" / "servos.toml"
 JOINTS = ("base_yaw", "shoulder_pitch", "elbow_pitch", "wrist_roll")

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.config import Config
-from daemon.demo.scene import prepare
-from daemon.demo.tags import CUBE_M
-from interfaces.errors import ConfigError
-from vision.tag_body import TagBody
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.demo.scene import prepare
+from bodyschema.daemon.demo.tags import CUBE_M
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.vision.tag_body import TagBody
 
 STICK_RADIUS_M = 0.005
 

@@ -17,14 +17,14 @@ import zenoh
 from security_recipe import PAGE, SEVERAL, TWO, blocks, carried_out
 from small_arm import write_small_arm
 
-from daemon.access import ROLES
-from daemon.bus import Bus, Request, client
-from daemon.config import Config
-from daemon.identity import Identity, Route, TlsConfig
-from daemon.keys import Keys
-from daemon.reception import LIMITS
-from daemon.router import RouterConfig
-from interfaces.errors import BusError, ConfigError, RequestError
+from bodyschema.daemon.access import ROLES
+from bodyschema.daemon.bus import Bus, Request, client
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.identity import Identity, Route, TlsConfig
+from bodyschema.daemon.keys import Keys
+from bodyschema.daemon.reception import LIMITS
+from bodyschema.daemon.router import RouterConfig
+from bodyschema.interfaces.errors import BusError, ConfigError, RequestError
 
 LIMIT_S = 500.0
 SILENCE_S = 0.3  # in which what was dropped would have arrived

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from daemon.notify import START_LIMIT_S, Notifier
-from daemon.service import SETTLED_S, SIGNS_PER_WATCHDOG, Service, with_health
-from interfaces.clock import SystemClock
+from bodyschema.daemon.notify import START_LIMIT_S, Notifier
+from bodyschema.daemon.service import SETTLED_S, SIGNS_PER_WATCHDOG, Service, with_health
+from bodyschema.interfaces.clock import SystemClock
 
 WATCHDOG_S = 8.0
 LOOPS = ("encoders", "frames")

@@ -11,12 +11,12 @@ import dynamixel_sdk as sdk
 import msgspec
 import pytest
 
-from daemon.bench_wiring import Motion, bench_robot_file, open_bench
-from daemon.cli import command_line
-from daemon.config import Config
-from daemon.servo_log import FILE, LoggedWrite, ServoLog
-from drivers.bench.dry_run import DryRun
-from interfaces.errors import BodyschemaError, ConfigError, SourceError
+from bodyschema.daemon.bench_wiring import Motion, bench_robot_file, open_bench
+from bodyschema.daemon.cli import command_line
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.servo_log import FILE, LoggedWrite, ServoLog
+from bodyschema.drivers.bench.dry_run import DryRun
+from bodyschema.interfaces.errors import BodyschemaError, ConfigError, SourceError
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "desk_arm" / "servos.toml"
 ELBOW = ("--joint", "elbow_pitch")
@@ -156,6 +156,6 @@ def test_a_log_whose_last_line_a_crash_cut_off_is_read(bench) -> None:
 
 def test_the_page_names_the_commands() -> None:
     told = subprocess.run(
-        [sys.executable, "-m", "daemon", "servos", "--help"], check=True, capture_output=True, text=True
+        [sys.executable, "-m", "bodyschema", "servos", "--help"], check=True, capture_output=True, text=True
     ).stdout
     assert all(name in told for name in ("show", "set", "zero", "undo"))

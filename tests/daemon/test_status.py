@@ -14,15 +14,15 @@ from scripted_sources import Walk
 from small_arm import write_small_arm
 from told_statuses import LEARNER, SAMPLER
 
-from daemon.bus import Bus
-from daemon.cli import app
-from daemon.config import Config
-from daemon.keys import Keys
-from daemon.sampler import Sampler
-from daemon.session import session_of
-from daemon.status_view import Seen, Watcher, as_json, screen
-from daemon.store import PairStore
-from interfaces.clock import SystemClock
+from bodyschema.daemon.bus import Bus
+from bodyschema.daemon.cli import app
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.keys import Keys
+from bodyschema.daemon.sampler import Sampler
+from bodyschema.daemon.session import session_of
+from bodyschema.daemon.status_view import Seen, Watcher, as_json, screen
+from bodyschema.daemon.store import PairStore
+from bodyschema.interfaces.clock import SystemClock
 
 LIMIT_S = 500.0
 

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 import warm
 
-from daemon.supervise import Child, Supervisor
-from interfaces.errors import BodyschemaError
+from bodyschema.daemon.supervise import Child, Supervisor
+from bodyschema.interfaces.errors import BodyschemaError
 
 LIMIT_S = 500.0
 # Writes its process id, then waits for SIGTERM to end it.
@@ -81,7 +81,7 @@ def test_stopping_ends_every_child(tmp_path) -> None:
 
 
 def test_a_child_that_does_not_end_is_killed(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("daemon.supervise.END_LIMIT_S", 0.1)
+    monkeypatch.setattr("bodyschema.daemon.supervise.END_LIMIT_S", 0.1)
     supervisor = Supervisor([child(STUBBORN, tmp_path / "pids")])
     thread = threading.Thread(target=supervisor.run)
     thread.start()
@@ -99,7 +99,7 @@ def test_a_child_that_refuses_to_start_ends_the_others(tmp_path) -> None:
 
 
 def test_a_child_that_fails_after_it_had_settled_is_started_again(tmp_path, monkeypatch, supervise) -> None:
-    monkeypatch.setattr("daemon.supervise.SETTLED_AFTER_S", 0.0)
+    monkeypatch.setattr("bodyschema.daemon.supervise.SETTLED_AFTER_S", 0.0)
     code = WAITING.replace("signal.pause()", "sys.stdin.read(); __import__('time').sleep(0.3); raise SystemExit(1)")
     supervise(child(code, tmp_path / "pids"))
     wait_until(lambda: len(started(tmp_path / "pids")) == 2)
@@ -125,7 +125,7 @@ def test_a_killed_run_takes_both_processes_with_it(tmp_path, free_endpoint) -> N
 def test_the_command_run_with_a_port_in_use_ends_with_its_message(tmp_path, free_endpoint) -> None:
     taken = free_endpoint()
     with socket.create_server(("127.0.0.1", int(taken.rpartition(":")[2]))):
-        done = warm.run("-m", "daemon", "run", "--robot", _robot(tmp_path, taken, free_endpoint()))
+        done = warm.run("-m", "bodyschema", "run", "--robot", _robot(tmp_path, taken, free_endpoint()))
     assert done.returncode == 1
     assert "is in use. Stop the other bodyschema" in done.stderr
 
@@ -134,7 +134,7 @@ def test_the_command_run_with_a_port_in_use_ends_with_its_message(tmp_path, free
 def running(robot: Path, log: Path) -> Iterator[warm.Child]:
     """`bodyschema run`, with both processes at work."""
     with log.open("wb") as stream:
-        run = warm.Child("-m", "daemon", "run", "--robot", robot, stderr=stream)
+        run = warm.Child("-m", "bodyschema", "run", "--robot", robot, stderr=stream)
     try:
         wait_until(lambda: log.read_bytes().count(b" answers on ") == 2)
         yield run

@@ -8,12 +8,12 @@ import msgspec
 import numpy as np
 from told_statuses import LEARNER
 
-from daemon.status import Change, LearnerStatus
-from daemon.view.course import LARGEST_SERIES, Course, Series
-from daemon.view.recent import KEPT, LARGEST_CLOUD, RecentPairs, cloud
-from daemon.wire import PredictReply
-from interfaces.errors import RequestError
-from interfaces.records import Pair, frozen_array
+from bodyschema.daemon.status import Change, LearnerStatus
+from bodyschema.daemon.view.course import LARGEST_SERIES, Course, Series
+from bodyschema.daemon.view.recent import KEPT, LARGEST_CLOUD, RecentPairs, cloud
+from bodyschema.daemon.wire import PredictReply
+from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.records import Pair, frozen_array
 
 
 def learner(pairs: int, **changed: Any) -> LearnerStatus:

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from small_arm import write_small_arm
 
-from daemon.config import Config
-from daemon.view.diagnosing import Diagnoses
-from daemon.view.documents import DiagnosisDocument
-from interfaces.errors import BusError, RequestError
-from interfaces.records import Pair, frozen_array
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.view.diagnosing import Diagnoses
+from bodyschema.daemon.view.documents import DiagnosisDocument
+from bodyschema.interfaces.errors import BusError, RequestError
+from bodyschema.interfaces.records import Pair, frozen_array
 
 # The limit only ends what would never end.
 LIMIT_S = 500.0

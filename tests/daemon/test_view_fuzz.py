@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 pytest.importorskip("starlette")
 
-from daemon.view.app import application
-from daemon.view.hub import Hub
-from interfaces.errors import BusError, RequestError
+from bodyschema.daemon.view.app import application
+from bodyschema.daemon.view.hub import Hub
+from bodyschema.interfaces.errors import BusError, RequestError
 
 LIMIT_S = 5.0
 HOST = b"127.0.0.1:8420"
@@ -33,7 +33,7 @@ bodies = st.sampled_from([b'{"process": "sampler", "command": "pause"}', b"[" * 
 @pytest.fixture(scope="module", autouse=True)
 def short_heartbeat() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("daemon.view.app.HEARTBEAT_S", 0.01)
+        patch.setattr("bodyschema.daemon.view.app.HEARTBEAT_S", 0.01)
         yield
 
 

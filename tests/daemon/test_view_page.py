@@ -12,9 +12,9 @@ import pytest
 httpx = pytest.importorskip("httpx")
 pytest.importorskip("starlette")
 
-from daemon.view.app import LARGEST_BODY, STATIC, application  # noqa: E402
-from daemon.view.hub import MOST_FOLLOWERS, Hub  # noqa: E402
-from interfaces.errors import BusError, RequestError  # noqa: E402
+from bodyschema.daemon.view.app import LARGEST_BODY, STATIC, application  # noqa: E402
+from bodyschema.daemon.view.hub import MOST_FOLLOWERS, Hub  # noqa: E402
+from bodyschema.interfaces.errors import BusError, RequestError  # noqa: E402
 
 HERE = "http://127.0.0.1:8420"
 PAUSE = {"process": "sampler", "command": "pause"}

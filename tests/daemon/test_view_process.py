@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from small_arm import write_small_arm
 
-from daemon import extras
-from daemon.cli import app
-from daemon.view_process import shown
-from interfaces.errors import ConfigError
+from bodyschema.daemon import extras
+from bodyschema.daemon.cli import app
+from bodyschema.daemon.view_process import shown
+from bodyschema.interfaces.errors import ConfigError
 
 pytest.importorskip("uvicorn")
 LIMIT_S = 500.0

@@ -15,13 +15,13 @@ import pytest
 from small_arm import write_small_arm
 from told_statuses import LEARNER, SAMPLER
 
-from daemon.bus import Bus
-from daemon.config import Config
-from daemon.keys import Keys
-from daemon.view.hub import Hub
-from daemon.view.watch import Watch
-from daemon.wire import CommandReply, CommandRequest, PairMessage, PairsReply, PredictReply, decode, encode
-from interfaces.errors import BusError, RequestError
+from bodyschema.daemon.bus import Bus
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.keys import Keys
+from bodyschema.daemon.view.hub import Hub
+from bodyschema.daemon.view.watch import Watch
+from bodyschema.daemon.wire import CommandReply, CommandRequest, PairMessage, PairsReply, PredictReply, decode, encode
+from bodyschema.interfaces.errors import BusError, RequestError
 
 LIMIT_S = 500.0
 KEYS = Keys("arm")

@@ -13,14 +13,14 @@ from board_renderer import webcams
 from shown_board import known_rig
 from small_arm import write_small_arm
 
-from daemon.camera_wiring import camera_checks
-from daemon.cli import app
-from daemon.config import Config
-from daemon.mjpeg import MOST_VIEWERS, MjpegServer
-from daemon.robot_template import EXAMPLE, robot_toml
-from daemon.wiring import check_sources
-from interfaces.errors import ConfigError
-from vision.rig_file import write_rig
+from bodyschema.daemon.camera_wiring import camera_checks
+from bodyschema.daemon.cli import app
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.mjpeg import MOST_VIEWERS, MjpegServer
+from bodyschema.daemon.robot_template import EXAMPLE, robot_toml
+from bodyschema.daemon.wiring import check_sources
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.vision.rig_file import write_rig
 
 STEREO = """
 focal_px = 300.0

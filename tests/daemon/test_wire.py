@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.wire import (
+from bodyschema.daemon.wire import (
     JSON,
     LARGEST_BATCH,
     MSGPACK,
@@ -18,8 +18,8 @@ from daemon.wire import (
     pair_from_wire,
     pair_to_wire,
 )
-from interfaces.errors import RequestError
-from interfaces.records import Pair, frozen_array
+from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.records import Pair, frozen_array
 
 JOINTS = ("waist", "shoulder", "elbow")
 finite = st.floats(allow_nan=False, allow_infinity=False)

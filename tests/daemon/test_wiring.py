@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from small_arm import write_small_arm
 
-from daemon.config import Config
-from daemon.wiring import (
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.wiring import (
     check_sources,
     demonstration_model,
     open_joints,
@@ -16,9 +16,9 @@ from daemon.wiring import (
     require_simulation,
     simulation_settings,
 )
-from interfaces.clock import SystemClock
-from interfaces.errors import ConfigError, RecordingError, SourceLost
-from interfaces.records import MarkerFix
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import ConfigError, RecordingError, SourceLost
+from bodyschema.interfaces.records import MarkerFix
 
 
 def load(folder: Path, tables: str = "") -> Config:
@@ -135,7 +135,7 @@ def test_small_green_balls_make_fixes_in_the_simulation(tmp_path) -> None:
 
 
 def test_without_pybullet_the_simulation_names_the_extra(monkeypatch) -> None:
-    monkeypatch.setattr("daemon.extras.find_spec", lambda _name: None)
+    monkeypatch.setattr("bodyschema.daemon.extras.find_spec", lambda _name: None)
     with pytest.raises(ConfigError, match=r"Type: pip install 'bodyschema\[sim\]'"):
         require_simulation()
 

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 from guided_arm import Scene, nominal_model
 
-from daemon.config import LearnerConfig
-from daemon.learning import Solved
-from daemon.learning.eras import Eras
-from daemon.learning.members import RIGID
-from daemon.learning.workmanship import Made, best_made
+from bodyschema.daemon.config import LearnerConfig
+from bodyschema.daemon.learning import Solved
+from bodyschema.daemon.learning.eras import Eras
+from bodyschema.daemon.learning.members import RIGID
+from bodyschema.daemon.learning.workmanship import Made, best_made
 from kbmaps import ChainTolerances, RigidLearner
 
 NOMINAL, SCENE = nominal_model(), Scene.draw(0, 40)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from daemon.calibration import Calibration
-from interfaces.recording import Recording
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
-from interfaces.toml_file import read_toml
+from bodyschema.daemon.calibration import Calibration
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.interfaces.toml_file import read_toml
 
 DESK_ARM = Path(__file__).parents[2] / "examples" / "desk_arm" / "robot.toml"
 SIGMA = np.diag([0.05e-3, 0.05e-3, 0.5e-3])

@@ -20,20 +20,20 @@ import warm
 from scripted_sources import Walk
 from small_arm import write_small_arm
 
-from daemon import history, simulation, status, wire
-from daemon.bus import Bus, client
-from daemon.cli import app
-from daemon.config import Config
-from daemon.keys import Keys
-from daemon.learning import curve
-from daemon.sampler import Sampler
-from daemon.session import session_of
-from daemon.sources import Sources
-from daemon.store import PairStore
-from daemon.wire import MSGPACK, IkReply, IkRequest, JointsRequest, PredictReply, decode, encode
-from interfaces.clock import SystemClock
-from interfaces.errors import RequestError
-from interfaces.records import FARTHEST_M, Reason
+from bodyschema.daemon import history, simulation, status, wire
+from bodyschema.daemon.bus import Bus, client
+from bodyschema.daemon.cli import app
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.keys import Keys
+from bodyschema.daemon.learning import curve
+from bodyschema.daemon.sampler import Sampler
+from bodyschema.daemon.session import session_of
+from bodyschema.daemon.sources import Sources
+from bodyschema.daemon.store import PairStore
+from bodyschema.daemon.wire import MSGPACK, IkReply, IkRequest, JointsRequest, PredictReply, decode, encode
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.records import FARTHEST_M, Reason
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "zenoh.md").read_text(encoding="utf-8")
@@ -109,7 +109,7 @@ def learner(tmp_path_factory, free_endpoint) -> Iterator[Config]:
     robot = write_small_arm(folder, zenoh + '[daemon]\nstate_dir = "state"\n')
     config, up = Config.load(robot, {}), threading.Event()
     with (folder / "log").open("wb") as log, Bus(connect=config.tables.zenoh.learner) as bus:
-        process = warm.Child("-m", "daemon", "learner", "--robot", robot, stderr=log)
+        process = warm.Child("-m", "bodyschema", "learner", "--robot", robot, stderr=log)
         try:
             bus.watch(KEYS.alive("learner"), lambda _: up.set())
             assert up.wait(LIMIT_S), (folder / "log").read_text()
@@ -137,7 +137,7 @@ def test_the_example_ends_with_what_the_learner_says_is_wrong(learner: Config) -
 
 
 def test_the_command_predict_prints_the_same(learner: Config) -> None:
-    done = warm.run("-m", "daemon", "predict", "--robot", learner.file, "--", "0.0", "0.0")
+    done = warm.run("-m", "bodyschema", "predict", "--robot", learner.file, "--", "0.0", "0.0")
     assert done.stdout.splitlines()[0].split("]")[:3] == ["x [mm", "  y [mm", "  z [mm"]
     assert done.stdout.splitlines()[1].split()[:3] == ["300.0", "0.0", "0.0"]
 
@@ -178,7 +178,7 @@ def test_a_position_out_of_reach_is_answered_with_the_nearest_and_its_distance(l
 
 
 def test_the_command_ik_ends_with_1_where_the_position_is_not_reached(learner: Config) -> None:
-    command = ("-m", "daemon", "ik", "--deg", "--robot", learner.file, "--")
+    command = ("-m", "bodyschema", "ik", "--deg", "--robot", learner.file, "--")
     inside, outside = (warm.run(*command, x, "0", "0") for x in ("0.3", "0.8"))
     assert (inside.returncode, inside.stdout.splitlines()[2]) == (0, "reached")
     assert inside.stdout.splitlines()[0].split() == ["waist", "0.00", "deg"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from daemon.status import (
+from bodyschema.daemon.status import (
     ChainCalibration,
     Change,
     JointRange,

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from effects import Effect, Motion, Simulation
-from interfaces.recording import Recording
-from interfaces.robot import RobotDescription
+from bodyschema.effects import Effect, Motion, Simulation
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.robot import RobotDescription
 
 DESK_ARM = Path(__file__).parents[2] / "examples" / "desk_arm" / "robot.toml"
 PAIRS, SIGMA_M = 300, 3e-4

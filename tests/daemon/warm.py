@@ -28,7 +28,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO
 
-RARELY_NEEDED = ("daemon.view", "daemon.fleet", "daemon.reproduce", "daemon.rerun", "daemon.__main__")
+RARELY_NEEDED = (
+    "bodyschema.daemon.view",
+    "bodyschema.daemon.fleet",
+    "bodyschema.daemon.reproduce",
+    "daemon.rerun",
+    "bodyschema.daemon.__main__",
+)
 PR_SET_PDEATHSIG = 1
 LONGEST_REQUEST = 1 << 17
 _ASKING = threading.Lock()
@@ -120,7 +126,7 @@ def _server() -> socket.socket:
 
 
 def _import_all() -> None:
-    import daemon
+    import bodyschema.daemon
 
     for module in pkgutil.walk_packages(daemon.__path__, "daemon."):
         if not module.name.startswith(RARELY_NEEDED):

@@ -8,13 +8,13 @@ from collections.abc import Mapping
 import numpy as np
 from walked import DESK_ARM
 
-from diagnosis.alignment import aligned
-from diagnosis.fit import Fit
-from diagnosis.observations import Observations
-from effects import Effect, Motion, Simulation
-from interfaces.recording import Recording
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
+from bodyschema.diagnosis.alignment import aligned
+from bodyschema.diagnosis.fit import Fit
+from bodyschema.diagnosis.observations import Observations
+from bodyschema.effects import Effect, Motion, Simulation
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
 
 SIGMA_M = 3e-4
 INTERVAL_S = 0.25

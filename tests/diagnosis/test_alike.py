@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from planted_cases import ELBOW, SHOULDER, desk_arm, start_of, walk
 
-from diagnosis.alike import alike
-from diagnosis.hypotheses import Hypotheses
-from diagnosis.result import Alike, Errors
-from diagnosis.words import beside_geometry
-from effects import Effect
+from bodyschema.diagnosis.alike import alike
+from bodyschema.diagnosis.hypotheses import Hypotheses
+from bodyschema.diagnosis.result import Alike, Errors
+from bodyschema.diagnosis.words import beside_geometry
+from bodyschema.effects import Effect
 
 HELD = {'"torque_free"': '"held"'}
 

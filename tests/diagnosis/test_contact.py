@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from planted_cases import INTERVAL_S, SHOULDER, desk_arm, measured, motion_of, seen, walk
 
-from diagnosis.alignment import aligned
-from diagnosis.contact import before_contact, before_rest
-from diagnosis.fit import Fit
-from diagnosis.observations import Observations
-from effects import Effect, Motion, Simulation
-from interfaces.robot import RobotDescription
+from bodyschema.diagnosis.alignment import aligned
+from bodyschema.diagnosis.contact import before_contact, before_rest
+from bodyschema.diagnosis.fit import Fit
+from bodyschema.diagnosis.observations import Observations
+from bodyschema.effects import Effect, Motion, Simulation
+from bodyschema.interfaces.robot import RobotDescription
 
 RUN, UNSEEN = 20, 4
 

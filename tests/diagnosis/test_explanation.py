@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from planted_cases import ELBOW, SHOULDER, SIGMA_M, desk_arm, measured, motion_of, start_of, walk
 
-from diagnosis import explanation
-from diagnosis.alignment import aligned
-from diagnosis.explanation import Explanation, explain
-from diagnosis.families import families
-from diagnosis.fit import Fit
-from diagnosis.observations import Observations
-from diagnosis.search import NAMED
-from diagnosis.unknown import Unknowns, Way
-from effects import Effect, Simulation
+from bodyschema.diagnosis import explanation
+from bodyschema.diagnosis.alignment import aligned
+from bodyschema.diagnosis.explanation import Explanation, explain
+from bodyschema.diagnosis.families import families
+from bodyschema.diagnosis.fit import Fit
+from bodyschema.diagnosis.observations import Observations
+from bodyschema.diagnosis.search import NAMED
+from bodyschema.diagnosis.unknown import Unknowns, Way
+from bodyschema.effects import Effect, Simulation
 
 
 class Believing:

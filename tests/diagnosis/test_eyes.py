@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from planted_cases import SIGMA_M, measured, surveyed_arm, walk
 from scipy.spatial.transform import Rotation
 
-from diagnosis.conclusion import conclusion
-from diagnosis.diagnosis import diagnose
-from diagnosis.eyes import by_turn, reported, undone
-from diagnosis.result import DiagnosisFile
-from effects import Effect, Simulation
-from interfaces.records import FloatArray
+from bodyschema.diagnosis.conclusion import conclusion
+from bodyschema.diagnosis.diagnosis import diagnose
+from bodyschema.diagnosis.eyes import by_turn, reported, undone
+from bodyschema.diagnosis.result import DiagnosisFile
+from bodyschema.effects import Effect, Simulation
+from bodyschema.interfaces.records import FloatArray
 
 TURNS = st.lists(st.floats(-0.01, 0.01), min_size=3, max_size=3).map(np.array)
 ROBOT = surveyed_arm()

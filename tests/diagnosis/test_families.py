@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from planted_cases import desk_arm, start_of, walk
 
-from diagnosis.families import Family, families
-from diagnosis.fit import Fit
-from diagnosis.unknown import Way
-from interfaces.robot import RobotDescription
-from sim_backend import model_file
+from bodyschema.diagnosis.families import Family, families
+from bodyschema.diagnosis.fit import Fit
+from bodyschema.diagnosis.unknown import Way
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.sim_backend import model_file
 
 
 @pytest.fixture(scope="module")

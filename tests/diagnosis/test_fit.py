@@ -9,14 +9,14 @@ import pytest
 from planted_cases import BASE, ELBOW, SHOULDER, at_rest, desk_arm, observed, start_of, walk
 from scipy import stats
 
-from diagnosis.alignment import aligned
-from diagnosis.fit import Fit, improved
-from diagnosis.observations import Observations, stereo_covariances
-from diagnosis.scan import Scan
-from effects import Effect, Simulation
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
+from bodyschema.diagnosis.alignment import aligned
+from bodyschema.diagnosis.fit import Fit, improved
+from bodyschema.diagnosis.observations import Observations, stereo_covariances
+from bodyschema.diagnosis.scan import Scan
+from bodyschema.effects import Effect, Simulation
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
 
 SEEDS = range(40)
 # Of a bound that a right build breaks by chance.

@@ -21,14 +21,14 @@ from planted_cases import (
 )
 from scipy import stats
 
-from diagnosis.alignment import aligned
-from diagnosis.fit import Fit, fitted
-from diagnosis.held_out import Blocks, block_p_value, gain_percent, held_out_errors
-from diagnosis.observations import Observations
-from diagnosis.scan import Scan
-from effects import Effect, Motion, Simulation
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
+from bodyschema.diagnosis.alignment import aligned
+from bodyschema.diagnosis.fit import Fit, fitted
+from bodyschema.diagnosis.held_out import Blocks, block_p_value, gain_percent, held_out_errors
+from bodyschema.diagnosis.observations import Observations
+from bodyschema.diagnosis.scan import Scan
+from bodyschema.effects import Effect, Motion, Simulation
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
 
 CHANCE = 1e-4
 SEEDS, MANY_SEEDS = range(100), range(300)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from planted_cases import ELBOW, SHOULDER, desk_arm, motion_of, observed, surveyed_arm, walk
 
-from diagnosis.hypotheses import Hypotheses
-from diagnosis.observations import Observations
-from effects import KINDS, Motion, Simulation
-from interfaces.robot import RobotDescription
+from bodyschema.diagnosis.hypotheses import Hypotheses
+from bodyschema.diagnosis.observations import Observations
+from bodyschema.effects import KINDS, Motion, Simulation
+from bodyschema.interfaces.robot import RobotDescription
 
 STEREO = """focal_px = 600.0                # from the stereo calibration
 principal_point_px = [319.5, 239.5]

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from planted_cases import SHOULDER, Motion, desk_arm, seen, walk
 
-from diagnosis.conclusion import conclusion
-from diagnosis.diagnosis import Diagnosis, diagnose
-from effects import Effect, Simulation
+from bodyschema.diagnosis.conclusion import conclusion
+from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
+from bodyschema.effects import Effect, Simulation
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from diagnosis.low_rank import low_rank, numbers_of
-from interfaces.records import FloatArray
+from bodyschema.diagnosis.low_rank import low_rank, numbers_of
+from bodyschema.interfaces.records import FloatArray
 
 MOVES, AMOUNTS = 6, 7
 RANKS = st.integers(1, MOVES)

@@ -10,13 +10,22 @@ import numpy as np
 import pytest
 from walked import DESK_ARM
 
-from diagnosis.numbers import number, numbers_of, percent, telling
-from diagnosis.remedies import remedies
-from diagnosis.result import Cause, DiagnosisFile, Errors, Gain, Indistinguishable, Interval, Pairs, Unexplained
-from diagnosis.words import finding
-from effects import Effect, Motion, Simulation
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
+from bodyschema.diagnosis.numbers import number, numbers_of, percent, telling
+from bodyschema.diagnosis.remedies import remedies
+from bodyschema.diagnosis.result import (
+    Cause,
+    DiagnosisFile,
+    Errors,
+    Gain,
+    Indistinguishable,
+    Interval,
+    Pairs,
+    Unexplained,
+)
+from bodyschema.diagnosis.words import finding
+from bodyschema.effects import Effect, Motion, Simulation
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
 
 ERRORS = Errors(1.0, 1.0, 1.0, 1.0, 1.0)
 SIX = {"x_m": 0.004, "y_m": -0.003, "z_m": 0.002, "rx_rad": 0.01, "ry_rad": -0.02, "rz_rad": 0.015}

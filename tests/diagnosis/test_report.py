@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 from walked import DESK_ARM, walked
 
-from diagnosis.conclusion import conclusion
-from diagnosis.diagnosis import Diagnosis, diagnose
-from diagnosis.observations import ticks
-from diagnosis.remedies import remedies
-from diagnosis.report import About, page
-from diagnosis.report.evidence import evidence_panels
-from diagnosis.report.plot import round_up
-from diagnosis.report.plot import ticks as axis_ticks
-from diagnosis.report.residuals import Residuals, binned, structure
-from diagnosis.result import DiagnosisFile, Interval
-from effects import KINDS, Effect, Simulation
-from interfaces.robot import RobotDescription
+from bodyschema.diagnosis.conclusion import conclusion
+from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
+from bodyschema.diagnosis.observations import ticks
+from bodyschema.diagnosis.remedies import remedies
+from bodyschema.diagnosis.report import About, page
+from bodyschema.diagnosis.report.evidence import evidence_panels
+from bodyschema.diagnosis.report.plot import round_up
+from bodyschema.diagnosis.report.plot import ticks as axis_ticks
+from bodyschema.diagnosis.report.residuals import Residuals, binned, structure
+from bodyschema.diagnosis.result import DiagnosisFile, Interval
+from bodyschema.effects import KINDS, Effect, Simulation
+from bodyschema.interfaces.robot import RobotDescription
 
 ABOUT = About("<pairs> & more.csv", "desk", "1.2.3")
 VOID = {"meta", "br", "rect", "path", "line", "polyline", "polygon", "circle"}

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from planted_cases import BASE, SHOULDER, desk_arm, motion_of, seen, surveyed_arm, walk
 
-from diagnosis.conclusion import conclusion
-from diagnosis.diagnosis import Diagnosis, diagnose
-from effects import Effect, Motion, Simulation
-from interfaces.robot import RobotDescription
+from bodyschema.diagnosis.conclusion import conclusion
+from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
+from bodyschema.effects import Effect, Motion, Simulation
+from bodyschema.interfaces.robot import RobotDescription
 
 ROWS = 200
 ADVISED = re.compile(r"move joint (\w+) through its whole range \((-?\d+)° to (-?\d+)°\)")

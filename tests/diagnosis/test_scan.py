@@ -7,9 +7,9 @@ import pytest
 from planted_cases import BASE, ELBOW, SHOULDER, desk_arm, start_of, walk
 from scipy import stats
 
-from diagnosis.scan import Candidate, Scan
-from effects import Effect
-from interfaces.robot import RobotDescription
+from bodyschema.diagnosis.scan import Candidate, Scan
+from bodyschema.effects import Effect
+from bodyschema.interfaces.robot import RobotDescription
 
 CHANCE = 1e-4
 SEEDS = range(20)

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from planted_cases import ELBOW, desk_arm, measured, motion_of
 
-from diagnosis.alignment import aligned
-from diagnosis.fit import Fit
-from diagnosis.held_out import Blocks, block_p_value
-from diagnosis.observations import Observations
-from diagnosis.rivals import standings
-from diagnosis.scatter import instruments
-from diagnosis.search import NAMED, Search, nats
-from effects import Effect, Motion, Simulation
-from interfaces.robot import RobotDescription
+from bodyschema.diagnosis.alignment import aligned
+from bodyschema.diagnosis.fit import Fit
+from bodyschema.diagnosis.held_out import Blocks, block_p_value
+from bodyschema.diagnosis.observations import Observations
+from bodyschema.diagnosis.rivals import standings
+from bodyschema.diagnosis.scatter import instruments
+from bodyschema.diagnosis.search import NAMED, Search, nats
+from bodyschema.effects import Effect, Motion, Simulation
+from bodyschema.interfaces.robot import RobotDescription
 
 ROWS, SIGMA_M, SCATTER_RAD = 1200, 5e-5, np.radians(0.04)
 # Probabilities of no memory at all.

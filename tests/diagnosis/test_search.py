@@ -7,11 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from planted_cases import BASE, ELBOW, INTERVAL_S, SHOULDER, at_rest, desk_arm, start_of, surveyed_arm, walk
 
-from diagnosis.fit import Fit
-from diagnosis.scan import Scan
-from diagnosis.search import NAMED, Search, nats, rise_for, simplicity
-from effects import Effect
-from interfaces.robot import RobotDescription
+from bodyschema.diagnosis.fit import Fit
+from bodyschema.diagnosis.scan import Scan
+from bodyschema.diagnosis.search import NAMED, Search, nats, rise_for, simplicity
+from bodyschema.effects import Effect
+from bodyschema.interfaces.robot import RobotDescription
 
 GAINS = st.floats(0.0, 1e5)
 NUMBERS = st.integers(1, 12)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from planted_cases import BASE, ELBOW, SHOULDER, desk_arm, scattered
 
-from diagnosis.families import Family
-from diagnosis.sensitivity import joints_of
-from effects import Simulated, Simulation
-from interfaces.records import FloatArray
+from bodyschema.diagnosis.families import Family
+from bodyschema.diagnosis.sensitivity import joints_of
+from bodyschema.effects import Simulated, Simulation
+from bodyschema.interfaces.records import FloatArray
 
 HOLDING = {0.02: {SHOULDER}, 0.1: {SHOULDER, ELBOW}}
 

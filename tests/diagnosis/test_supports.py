@@ -9,12 +9,12 @@ import pytest
 from planted_cases import DESK_ARM, ELBOW, SHOULDER, SIGMA_M, measured, seen, walk
 from scipy.spatial.transform import Rotation
 
-from diagnosis.conclusion import conclusion
-from diagnosis.diagnosis import diagnose
-from diagnosis.result import DiagnosisFile
-from effects import Effect, Simulation
-from interfaces.recording import Recording
-from interfaces.robot import RobotDescription
+from bodyschema.diagnosis.conclusion import conclusion
+from bodyschema.diagnosis.diagnosis import diagnose
+from bodyschema.diagnosis.result import DiagnosisFile
+from bodyschema.effects import Effect, Simulation
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.robot import RobotDescription
 
 MASSES = {"turret": 0.6, "upper_arm": 0.5, "forearm": 0.35, "wrist": 0.15, "gripper": 0.1}
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from planted_cases import SIGMA_M, desk_arm, measured, walk
 
-from diagnosis.alignment import aligned
-from diagnosis.instrument import instrument_factor
-from diagnosis.observations import Observations, ticks
-from effects import Simulation
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
+from bodyschema.diagnosis.alignment import aligned
+from bodyschema.diagnosis.instrument import instrument_factor
+from bodyschema.diagnosis.observations import Observations, ticks
+from bodyschema.effects import Simulation
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
 
 TICK_RAD = 2.0 * np.pi / 4096
 # A coarser encoder: what its readings add to the noise is about as large as the instrument's own.

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from planted_cases import ELBOW, SHOULDER, measured, motion_of, surveyed_arm
 
-from diagnosis.conclusion import conclusion
-from diagnosis.diagnosis import diagnose
-from diagnosis.result import DiagnosisFile
-from effects import Effect, Simulation, load_simulation, write_extended
-from interfaces.errors import ConfigError
-from interfaces.robot import RobotDescription
+from bodyschema.diagnosis.conclusion import conclusion
+from bodyschema.diagnosis.diagnosis import diagnose
+from bodyschema.diagnosis.result import DiagnosisFile
+from bodyschema.effects import Effect, Simulation, load_simulation, write_extended
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.robot import RobotDescription
 
 NOISE_M, ROWS = 1e-4, 150
 LENGTH_M, ANGLE_RAD, DRIVE_RAD = 4e-4, 1.2e-3, 2e-4

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from planted_cases import ELBOW, SHOULDER, SIGMA_M, desk_arm, measured, motion_of, seen, surveyed_arm, walk
 
-from diagnosis.conclusion import conclusion
-from diagnosis.diagnosis import Diagnosis, diagnose
-from diagnosis.result import DiagnosisFile
-from diagnosis.words import modelled
-from effects import Effect, Motion, Simulation, load_simulation, write_extended
-from interfaces.recording import Recording
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
+from bodyschema.diagnosis.conclusion import conclusion
+from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
+from bodyschema.diagnosis.result import DiagnosisFile
+from bodyschema.diagnosis.words import modelled
+from bodyschema.effects import Effect, Motion, Simulation, load_simulation, write_extended
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
 
 PER_RAD = 0.03
 

@@ -7,13 +7,13 @@ from typing import Literal
 
 from servo_arm import Path, ServoArm
 
-from drivers.bench.virtual_port import VirtualPort
-from drivers.dynamixel.bench.chain import Chain
-from drivers.dynamixel.bench.frames import Code, instructions_in
-from drivers.dynamixel.bench.servo import Servo
-from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
-from drivers.dynamixel.joints import DynamixelJoints
-from drivers.dynamixel.models import BY_NAME
+from bodyschema.drivers.bench.virtual_port import VirtualPort
+from bodyschema.drivers.dynamixel.bench.chain import Chain
+from bodyschema.drivers.dynamixel.bench.frames import Code, instructions_in
+from bodyschema.drivers.dynamixel.bench.servo import Servo
+from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from bodyschema.drivers.dynamixel.joints import DynamixelJoints
+from bodyschema.drivers.dynamixel.models import BY_NAME
 
 
 class HeardPort(VirtualPort):

@@ -7,13 +7,13 @@ from typing import Literal
 
 from servo_arm import Path, ServoArm
 
-from drivers.bench.virtual_port import VirtualPort
-from drivers.feetech.bench.chain import Chain
-from drivers.feetech.bench.frames import Code, Instruction, instructions_in
-from drivers.feetech.bench.servo import Servo
-from drivers.feetech.config import BusConfig, FeetechConfig, ServoConfig
-from drivers.feetech.joints import FeetechJoints
-from drivers.feetech.models import BY_NAME
+from bodyschema.drivers.bench.virtual_port import VirtualPort
+from bodyschema.drivers.feetech.bench.chain import Chain
+from bodyschema.drivers.feetech.bench.frames import Code, Instruction, instructions_in
+from bodyschema.drivers.feetech.bench.servo import Servo
+from bodyschema.drivers.feetech.config import BusConfig, FeetechConfig, ServoConfig
+from bodyschema.drivers.feetech.joints import FeetechJoints
+from bodyschema.drivers.feetech.models import BY_NAME
 
 
 class HeardPort(VirtualPort):

@@ -9,16 +9,16 @@ from collections.abc import Sequence
 import numpy as np
 from bench_arm import HeardPort
 
-from drivers.bench.faults import Planned
-from drivers.bench.virtual_port import VirtualClock
-from drivers.dynamixel.bench.chain import Chain
-from drivers.dynamixel.bench.servo import CURRENT_MODE, Servo
-from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
-from drivers.dynamixel.joints import DynamixelJoints
-from drivers.dynamixel.models import BY_NAME
-from drivers.dynamixel.powered_config import FloatingJoint, ZeroForceConfig
-from drivers.dynamixel.torque_constants import torque_constant
-from drivers.dynamixel.zero_force import ZeroForce
+from bodyschema.drivers.bench.faults import Planned
+from bodyschema.drivers.bench.virtual_port import VirtualClock
+from bodyschema.drivers.dynamixel.bench.chain import Chain
+from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE, Servo
+from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from bodyschema.drivers.dynamixel.joints import DynamixelJoints
+from bodyschema.drivers.dynamixel.models import BY_NAME
+from bodyschema.drivers.dynamixel.powered_config import FloatingJoint, ZeroForceConfig
+from bodyschema.drivers.dynamixel.torque_constants import torque_constant
+from bodyschema.drivers.dynamixel.zero_force import ZeroForce
 
 MODEL = "XM430-W350"
 CONSTANT = torque_constant(MODEL) or math.nan

@@ -7,21 +7,21 @@ import math
 import numpy as np
 from bench_arm import HeardPort
 
-from daemon.gaze_loop import GazeLoop, HandModel
-from daemon.wiring import demonstration_model
-from drivers.bench.faults import Planned
-from drivers.bench.virtual_port import VirtualClock
-from drivers.dynamixel.bench.chain import Chain
-from drivers.dynamixel.bench.driven_shaft import DrivenShaft
-from drivers.dynamixel.bench.servo import Servo
-from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
-from drivers.dynamixel.gaze import Gaze
-from drivers.dynamixel.joints import DynamixelJoints
-from drivers.dynamixel.models import BY_NAME
-from drivers.dynamixel.powered_config import GazeConfig
-from interfaces.errors import BusError
-from interfaces.pointing import Pointing
-from interfaces.robot import RobotDescription
+from bodyschema.daemon.gaze_loop import GazeLoop, HandModel
+from bodyschema.daemon.wiring import demonstration_model
+from bodyschema.drivers.bench.faults import Planned
+from bodyschema.drivers.bench.virtual_port import VirtualClock
+from bodyschema.drivers.dynamixel.bench.chain import Chain
+from bodyschema.drivers.dynamixel.bench.driven_shaft import DrivenShaft
+from bodyschema.drivers.dynamixel.bench.servo import Servo
+from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from bodyschema.drivers.dynamixel.gaze import Gaze
+from bodyschema.drivers.dynamixel.joints import DynamixelJoints
+from bodyschema.drivers.dynamixel.models import BY_NAME
+from bodyschema.drivers.dynamixel.powered_config import GazeConfig
+from bodyschema.interfaces.errors import BusError
+from bodyschema.interfaces.pointing import Pointing
+from bodyschema.interfaces.robot import RobotDescription
 from kbmaps import RigidChain
 
 MODEL = "XM430-W350"

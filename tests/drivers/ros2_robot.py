@@ -6,13 +6,13 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from random import Random
 
-from drivers.bench.virtual_port import VirtualClock
-from drivers.ros2.bench.faults import Fault, Planned
-from drivers.ros2.bench.node import Node
-from drivers.ros2.bench.virtual_link import VirtualLink, at_once
-from drivers.ros2.config import Ros2Config
-from drivers.ros2.joints import Ros2Joints
-from interfaces.records import JointReading
+from bodyschema.drivers.bench.virtual_port import VirtualClock
+from bodyschema.drivers.ros2.bench.faults import Fault, Planned
+from bodyschema.drivers.ros2.bench.node import Node
+from bodyschema.drivers.ros2.bench.virtual_link import VirtualLink, at_once
+from bodyschema.drivers.ros2.config import Ros2Config
+from bodyschema.drivers.ros2.joints import Ros2Joints
+from bodyschema.interfaces.records import JointReading
 
 PATHS: dict[str, Callable[[float], float]] = {
     "pan": lambda t: 1.2 * math.sin(0.7 * t),

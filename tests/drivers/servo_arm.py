@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 from random import Random
 from typing import Any
 
-from drivers.bench.chain import ServoChain
-from drivers.bench.faults import Planned
-from drivers.bench.virtual_port import VirtualClock, VirtualPort, at_once
-from drivers.servos.config import ServosConfig
-from drivers.servos.joints import ServoJoints
+from bodyschema.drivers.bench.chain import ServoChain
+from bodyschema.drivers.bench.faults import Planned
+from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort, at_once
+from bodyschema.drivers.servos.config import ServosConfig
+from bodyschema.drivers.servos.joints import ServoJoints
 
 TICK = 2 * math.pi / 4096
 Path = Callable[[float], float]

@@ -12,22 +12,22 @@ from bench_arm import Arm
 from feetech_arm import FeetechArm
 from servo_arm import TICK
 
-from drivers.bench.device import Device, OnlyAnswers, Reply
-from drivers.bench.virtual_port import VirtualClock, VirtualPort
-from drivers.dynamixel.bench import faults
-from drivers.dynamixel.bench.chain import Chain
-from drivers.dynamixel.bench.servo import Servo
-from drivers.dynamixel.bus import Bus
-from drivers.dynamixel.joints import DYNAMIXEL
-from drivers.dynamixel.models import BY_NAME
-from drivers.feetech.bench.chain import Chain as FeetechChain
-from drivers.feetech.bench.servo import Servo as FeetechServo
-from drivers.feetech.joints import Bus as FeetechBus
-from drivers.feetech.models import BY_NAME as FEETECH_MODELS
-from drivers.scan import scan_port
-from drivers.scanners import SCANNERS
-from drivers.servos.workbench import Workbench
-from interfaces.errors import SourceLost
+from bodyschema.drivers.bench.device import Device, OnlyAnswers, Reply
+from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
+from bodyschema.drivers.dynamixel.bench import faults
+from bodyschema.drivers.dynamixel.bench.chain import Chain
+from bodyschema.drivers.dynamixel.bench.servo import Servo
+from bodyschema.drivers.dynamixel.bus import Bus
+from bodyschema.drivers.dynamixel.joints import DYNAMIXEL
+from bodyschema.drivers.dynamixel.models import BY_NAME
+from bodyschema.drivers.feetech.bench.chain import Chain as FeetechChain
+from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
+from bodyschema.drivers.feetech.joints import Bus as FeetechBus
+from bodyschema.drivers.feetech.models import BY_NAME as FEETECH_MODELS
+from bodyschema.drivers.scan import scan_port
+from bodyschema.drivers.scanners import SCANNERS
+from bodyschema.drivers.servos.workbench import Workbench
+from bodyschema.interfaces.errors import SourceLost
 
 Change = Callable[[bytes, list[Reply], float], list[Reply]]
 MAKES: dict[str, Callable[[], Any]] = {

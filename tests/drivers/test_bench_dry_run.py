@@ -14,27 +14,27 @@ import msgspec
 import numpy as np
 import pytest
 
-from drivers.bench.asked_faults import AskedFault, FaultKinds, WireFaults
-from drivers.bench.device import Reply
-from drivers.bench.dry_run import DryRun
-from drivers.bench.motion import played, swinging
-from drivers.bench.through_driver import Behind, ThroughDriver
-from drivers.dynamixel.bench.arm import KINDS, DynamixelArm
-from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
-from drivers.dynamixel.joints import DynamixelJoints
-from drivers.dynamixel.powered_config import GazeConfig
-from drivers.feetech.bench.arm import KINDS as FEETECH_KINDS
-from drivers.feetech.bench.arm import FeetechArm
-from drivers.feetech.config import BusConfig as FeetechBus
-from drivers.feetech.config import FeetechConfig
-from drivers.feetech.joints import FeetechJoints
-from drivers.serial_lines.bench.arm import KINDS as LINE_KINDS
-from drivers.serial_lines.bench.arm import EncoderArm
-from drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
-from drivers.serial_lines.joints import SerialLineJoints
-from interfaces.clock import SystemClock
-from interfaces.errors import ConfigError, SourceError
-from interfaces.records import JointReading
+from bodyschema.drivers.bench.asked_faults import AskedFault, FaultKinds, WireFaults
+from bodyschema.drivers.bench.device import Reply
+from bodyschema.drivers.bench.dry_run import DryRun
+from bodyschema.drivers.bench.motion import played, swinging
+from bodyschema.drivers.bench.through_driver import Behind, ThroughDriver
+from bodyschema.drivers.dynamixel.bench.arm import KINDS, DynamixelArm
+from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from bodyschema.drivers.dynamixel.joints import DynamixelJoints
+from bodyschema.drivers.dynamixel.powered_config import GazeConfig
+from bodyschema.drivers.feetech.bench.arm import KINDS as FEETECH_KINDS
+from bodyschema.drivers.feetech.bench.arm import FeetechArm
+from bodyschema.drivers.feetech.config import BusConfig as FeetechBus
+from bodyschema.drivers.feetech.config import FeetechConfig
+from bodyschema.drivers.feetech.joints import FeetechJoints
+from bodyschema.drivers.serial_lines.bench.arm import KINDS as LINE_KINDS
+from bodyschema.drivers.serial_lines.bench.arm import EncoderArm
+from bodyschema.drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
+from bodyschema.drivers.serial_lines.joints import SerialLineJoints
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import ConfigError, SourceError
+from bodyschema.interfaces.records import JointReading
 
 JOINTS = ("waist", "shoulder", "elbow")
 LIMITS = [(-3.0, 3.0)] * 3

@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from drivers.bench.pty_shell import PtyShell
-from drivers.dynamixel.bench.chain import Chain as DynamixelChain
-from drivers.dynamixel.bench.servo import Servo as DynamixelServo
-from drivers.dynamixel.models import BY_NAME as DYNAMIXEL
-from drivers.feetech.bench.chain import Chain as FeetechChain
-from drivers.feetech.bench.servo import Servo as FeetechServo
-from drivers.feetech.models import BY_NAME as FEETECH
+from bodyschema.drivers.bench.pty_shell import PtyShell
+from bodyschema.drivers.dynamixel.bench.chain import Chain as DynamixelChain
+from bodyschema.drivers.dynamixel.bench.servo import Servo as DynamixelServo
+from bodyschema.drivers.dynamixel.models import BY_NAME as DYNAMIXEL
+from bodyschema.drivers.feetech.bench.chain import Chain as FeetechChain
+from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
+from bodyschema.drivers.feetech.models import BY_NAME as FEETECH
 
 rustypot = pytest.importorskip("rustypot")
 

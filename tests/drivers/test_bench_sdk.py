@@ -8,12 +8,12 @@ import termios
 import dynamixel_sdk as sdk
 import pytest
 
-from drivers.bench.faults import Planned, half, mute, wrong_checksum
-from drivers.bench.pty_shell import PtyShell
-from drivers.bench.virtual_port import VirtualClock, VirtualPort
-from drivers.dynamixel.bench.chain import Chain
-from drivers.dynamixel.bench.servo import Servo
-from drivers.dynamixel.models import BY_NAME
+from bodyschema.drivers.bench.faults import Planned, half, mute, wrong_checksum
+from bodyschema.drivers.bench.pty_shell import PtyShell
+from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
+from bodyschema.drivers.dynamixel.bench.chain import Chain
+from bodyschema.drivers.dynamixel.bench.servo import Servo
+from bodyschema.drivers.dynamixel.models import BY_NAME
 
 XM, AX, MX1, PH = BY_NAME["XM430-W350"], BY_NAME["AX-12A"], BY_NAME["MX-28"], BY_NAME["PH54-200-S500"]
 ANGLES = {1: 0.5, 2: -1.0, 3: 7.0}

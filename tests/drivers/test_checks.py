@@ -7,21 +7,21 @@ from pathlib import Path
 
 import pytest
 
-from drivers import checks
-from drivers.bench.asked_faults import AskedFault
-from drivers.bench.dry_run import DryRun
-from drivers.checks import Check, holders, port_checks
-from drivers.dynamixel.bench.arm import DynamixelArm
-from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
-from drivers.dynamixel.joints import DYNAMIXEL
-from drivers.dynamixel.joints import open_serial as open_dynamixel
-from drivers.feetech.bench.arm import FeetechArm
-from drivers.feetech.config import BusConfig as FeetechBus
-from drivers.feetech.config import FeetechConfig
-from drivers.feetech.joints import FEETECH
-from drivers.feetech.joints import open_serial as open_feetech
-from drivers.servos.checks import servo_checks
-from interfaces.clock import SystemClock
+from bodyschema.drivers import checks
+from bodyschema.drivers.bench.asked_faults import AskedFault
+from bodyschema.drivers.bench.dry_run import DryRun
+from bodyschema.drivers.checks import Check, holders, port_checks
+from bodyschema.drivers.dynamixel.bench.arm import DynamixelArm
+from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from bodyschema.drivers.dynamixel.joints import DYNAMIXEL
+from bodyschema.drivers.dynamixel.joints import open_serial as open_dynamixel
+from bodyschema.drivers.feetech.bench.arm import FeetechArm
+from bodyschema.drivers.feetech.config import BusConfig as FeetechBus
+from bodyschema.drivers.feetech.config import FeetechConfig
+from bodyschema.drivers.feetech.joints import FEETECH
+from bodyschema.drivers.feetech.joints import open_serial as open_feetech
+from bodyschema.drivers.servos.checks import servo_checks
+from bodyschema.interfaces.clock import SystemClock
 
 JOINTS = ("waist", "elbow")
 CONFIG = DynamixelConfig(

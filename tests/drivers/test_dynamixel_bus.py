@@ -5,13 +5,13 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.bench.virtual_port import VirtualClock
-from drivers.dynamixel.bench.frames import status_packet
-from drivers.dynamixel.bus import Answer, Bus, Trouble, sync_request
-from drivers.dynamixel.channel import Channel
-from drivers.dynamixel.models import BY_NAME
-from drivers.dynamixel.packets import Status
-from drivers.servos.handshake import FittedServo
+from bodyschema.drivers.bench.virtual_port import VirtualClock
+from bodyschema.drivers.dynamixel.bench.frames import status_packet
+from bodyschema.drivers.dynamixel.bus import Answer, Bus, Trouble, sync_request
+from bodyschema.drivers.dynamixel.channel import Channel
+from bodyschema.drivers.dynamixel.models import BY_NAME
+from bodyschema.drivers.dynamixel.packets import Status
+from bodyschema.drivers.servos.handshake import FittedServo
 
 DATA = bytes(range(16))
 PIECES = st.lists(

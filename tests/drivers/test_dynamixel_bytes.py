@@ -11,14 +11,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.bench.device import Reply
-from drivers.bench.faults import corrupt
-from drivers.dynamixel.bench.chain import Chain
-from drivers.dynamixel.bench.frames import fast_block, fast_header, instructions_in, status_packet
-from drivers.dynamixel.bench.servo import Servo
-from drivers.dynamixel.crc16 import crc16
-from drivers.dynamixel.models import BY_NAME, MODELS, baud_of, baud_value
-from drivers.dynamixel.packets import PACKETS1, PACKETS2, Garbled, packets_of
+from bodyschema.drivers.bench.device import Reply
+from bodyschema.drivers.bench.faults import corrupt
+from bodyschema.drivers.dynamixel.bench.chain import Chain
+from bodyschema.drivers.dynamixel.bench.frames import fast_block, fast_header, instructions_in, status_packet
+from bodyschema.drivers.dynamixel.bench.servo import Servo
+from bodyschema.drivers.dynamixel.crc16 import crc16
+from bodyschema.drivers.dynamixel.models import BY_NAME, MODELS, baud_of, baud_value
+from bodyschema.drivers.dynamixel.packets import PACKETS1, PACKETS2, Garbled, packets_of
 
 HEADERS = st.sampled_from([b"\xff\xff\xfd\x00", b"\xff\xff\xfd", b"\xff\xff", b"\xfd"])
 NOISE = st.lists(st.one_of(st.binary(max_size=12), HEADERS)).map(b"".join)

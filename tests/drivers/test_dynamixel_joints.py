@@ -12,16 +12,16 @@ import pytest
 from bench_arm import Arm
 from servo_arm import TICK, swing
 
-from drivers.bench.faults import corrupt, garbage, half, late, mute, wrong_checksum
-from drivers.bench.virtual_port import VirtualClock, VirtualPort
-from drivers.dynamixel.bench.chain import Chain
-from drivers.dynamixel.bench.faults import storm, swapped
-from drivers.dynamixel.bench.servo import Servo
-from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
-from drivers.dynamixel.joints import DynamixelJoints
-from drivers.dynamixel.models import BY_NAME
-from interfaces.errors import SourceError, SourceLost
-from interfaces.records import JointReading
+from bodyschema.drivers.bench.faults import corrupt, garbage, half, late, mute, wrong_checksum
+from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
+from bodyschema.drivers.dynamixel.bench.chain import Chain
+from bodyschema.drivers.dynamixel.bench.faults import storm, swapped
+from bodyschema.drivers.dynamixel.bench.servo import Servo
+from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from bodyschema.drivers.dynamixel.joints import DynamixelJoints
+from bodyschema.drivers.dynamixel.models import BY_NAME
+from bodyschema.interfaces.errors import SourceError, SourceLost
+from bodyschema.interfaces.records import JointReading
 
 FAULTS = [mute, late(0.02), wrong_checksum, corrupt(), half, garbage(), swapped]
 MIXED = ("XM430-W350", "PH54-200-S500", "MX-28", "AX-12A", "MX-64(2.0)", "XL330-M288")

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from servo_arm import swing
 
-from drivers.bench.pty_shell import PtyShell
-from drivers.dynamixel.bench.chain import Chain
-from drivers.dynamixel.bench.servo import Servo
-from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
-from drivers.dynamixel.joints import DynamixelJoints
-from drivers.dynamixel.models import BY_NAME
-from interfaces.clock import SystemClock
-from interfaces.records import JointReading
+from bodyschema.drivers.bench.pty_shell import PtyShell
+from bodyschema.drivers.dynamixel.bench.chain import Chain
+from bodyschema.drivers.dynamixel.bench.servo import Servo
+from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from bodyschema.drivers.dynamixel.joints import DynamixelJoints
+from bodyschema.drivers.dynamixel.models import BY_NAME
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.records import JointReading
 
 SIX = range(1, 7)
 LIMIT_S = 300.0
@@ -25,7 +25,7 @@ LIMIT_S = 300.0
 @pytest.fixture
 def shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     # Bench and driver share this process: on a busy machine the bench itself may be silent for a while.
-    monkeypatch.setattr("drivers.servos.joints.LOST_AFTER_S", LIMIT_S)
+    monkeypatch.setattr("bodyschema.drivers.servos.joints.LOST_AFTER_S", LIMIT_S)
     servos = [Servo(BY_NAME["XM430-W350"], id, swing(id), return_delay_s=0, booted_s=id * 0.1234) for id in SIX]
     with PtyShell(Chain(servos), tmp_path / "bus") as shell:
         yield shell

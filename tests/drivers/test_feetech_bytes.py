@@ -9,17 +9,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_dynamixel_bus import TalkingPort
 
-from drivers.bench.virtual_port import VirtualClock
-from drivers.feetech.bench.chain import Chain
-from drivers.feetech.bench.frames import Code, instructions_in, status_packet
-from drivers.feetech.bench.servo import CALIBRATE, Servo
-from drivers.feetech.channel import Channel
-from drivers.feetech.joints import PACKETS, Bus
-from drivers.feetech.models import BY_NAME, MODELS
-from drivers.servos.bus import Answer, Request
-from drivers.servos.handshake import FittedServo
-from drivers.servos.model import Register
-from drivers.servos.packets import Garbled, Status
+from bodyschema.drivers.bench.virtual_port import VirtualClock
+from bodyschema.drivers.feetech.bench.chain import Chain
+from bodyschema.drivers.feetech.bench.frames import Code, instructions_in, status_packet
+from bodyschema.drivers.feetech.bench.servo import CALIBRATE, Servo
+from bodyschema.drivers.feetech.channel import Channel
+from bodyschema.drivers.feetech.joints import PACKETS, Bus
+from bodyschema.drivers.feetech.models import BY_NAME, MODELS
+from bodyschema.drivers.servos.bus import Answer, Request
+from bodyschema.drivers.servos.handshake import FittedServo
+from bodyschema.drivers.servos.model import Register
+from bodyschema.drivers.servos.packets import Garbled, Status
 
 BAUD = 1_000_000
 NOISE = st.lists(st.one_of(st.binary(max_size=12), st.sampled_from([b"\xff\xff", b"\xff"]))).map(b"".join)

@@ -14,13 +14,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from servo_arm import TICK, swing
 
-from drivers.bench.faults import corrupt, garbage, half, late, mute, wrong_checksum
-from drivers.feetech.bench.faults import storm, swapped
-from drivers.feetech.bench.servo import Servo
-from drivers.feetech.models import BY_NAME
-from drivers.servos.channel import Punctuality
-from interfaces.errors import SourceError, SourceLost
-from interfaces.records import JointReading
+from bodyschema.drivers.bench.faults import corrupt, garbage, half, late, mute, wrong_checksum
+from bodyschema.drivers.feetech.bench.faults import storm, swapped
+from bodyschema.drivers.feetech.bench.servo import Servo
+from bodyschema.drivers.feetech.models import BY_NAME
+from bodyschema.drivers.servos.channel import Punctuality
+from bodyschema.interfaces.errors import SourceError, SourceLost
+from bodyschema.interfaces.records import JointReading
 
 FAULTS = [mute, late(0.02), wrong_checksum, corrupt(), half, garbage(), swapped]
 MIXED = ("STS3215", "SCS0009", "STS3250", "SM8512BL")

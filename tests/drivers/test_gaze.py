@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from gazing_robot import HEAD, GazingRobot
 
-from daemon.wire import JointsRequest, PredictReply, decode, encode
-from drivers.dynamixel.bench.servo import CURRENT_MODE
-from interfaces.errors import RequestError
-from interfaces.robot import RobotDescription
+from bodyschema.daemon.wire import JointsRequest, PredictReply, decode, encode
+from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE
+from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.robot import RobotDescription
 
 TORQUE = 64
 PATH_S = 8.0

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.dynamixel.guard import Currents, Drop, Guard, GuardLimits, Motion, ServoState
-from interfaces.records import frozen_array
+from bodyschema.drivers.dynamixel.guard import Currents, Drop, Guard, GuardLimits, Motion, ServoState
+from bodyschema.interfaces.records import frozen_array
 
 JOINTS = ("a", "b")
 SPEED, CURRENT, HEARTBEAT_S, DOUBTS = 1.5, 1.0, 0.1, 4

@@ -9,15 +9,15 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from daemon.bench_run import FAULTS
-from daemon.cli import command_line
-from drivers.config import DriversConfig
-from drivers.dynamixel.bench.arm import KINDS as DYNAMIXEL_KINDS
-from drivers.dynamixel.models import BY_NAME, Register
-from drivers.feetech.bench.arm import KINDS as FEETECH_KINDS
-from drivers.feetech.models import LAYOUT_SCS, LAYOUT_STS
-from drivers.serial_lines.bench.arm import KINDS as LINE_KINDS
-from drivers.serial_lines.lines import Header, Reading, parse
+from bodyschema.daemon.bench_run import FAULTS
+from bodyschema.daemon.cli import command_line
+from bodyschema.drivers.config import DriversConfig
+from bodyschema.drivers.dynamixel.bench.arm import KINDS as DYNAMIXEL_KINDS
+from bodyschema.drivers.dynamixel.models import BY_NAME, Register
+from bodyschema.drivers.feetech.bench.arm import KINDS as FEETECH_KINDS
+from bodyschema.drivers.feetech.models import LAYOUT_SCS, LAYOUT_STS
+from bodyschema.drivers.serial_lines.bench.arm import KINDS as LINE_KINDS
+from bodyschema.drivers.serial_lines.lines import Header, Reading, parse
 
 PAGE = (Path(__file__).parents[2] / "docs" / "hardware.md").read_text()
 SHOWN = ("XM430-W350", "PH54-200-S500", "MX-28")
@@ -88,7 +88,7 @@ def test_the_defaults_that_are_shown_are_the_defaults() -> None:
 
 
 def type_of_table():
-    from drivers.dynamixel.config import DynamixelConfig
+    from bodyschema.drivers.dynamixel.config import DynamixelConfig
 
     return DynamixelConfig
 

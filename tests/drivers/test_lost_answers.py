@@ -14,17 +14,17 @@ from feetech_arm import FeetechArm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.bench.device import Reply
-from drivers.bench.faults import Planned, Storm, mute
-from drivers.bench.virtual_port import VirtualClock, VirtualPort
-from drivers.dynamixel.bench.chain import Chain
-from drivers.dynamixel.bench.servo import Servo
-from drivers.dynamixel.bus import Bus
-from drivers.dynamixel.models import BY_NAME
-from drivers.feetech.bench.chain import Chain as FeetechChain
-from drivers.feetech.bench.servo import Servo as FeetechServo
-from drivers.feetech.joints import Bus as FeetechBus
-from drivers.feetech.models import BY_NAME as FEETECH_MODELS
+from bodyschema.drivers.bench.device import Reply
+from bodyschema.drivers.bench.faults import Planned, Storm, mute
+from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
+from bodyschema.drivers.dynamixel.bench.chain import Chain
+from bodyschema.drivers.dynamixel.bench.servo import Servo
+from bodyschema.drivers.dynamixel.bus import Bus
+from bodyschema.drivers.dynamixel.models import BY_NAME
+from bodyschema.drivers.feetech.bench.chain import Chain as FeetechChain
+from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
+from bodyschema.drivers.feetech.joints import Bus as FeetechBus
+from bodyschema.drivers.feetech.models import BY_NAME as FEETECH_MODELS
 
 SYNC_READ, FAST_SYNC_READ = 0x82, 0x8A
 MAKES = {

@@ -9,23 +9,23 @@ from pathlib import Path
 
 import pytest
 
-from drivers.bench.device import Faults, OnlyAnswers, Reply, no_faults
-from drivers.bench.pty_shell import PtyShell
-from drivers.bench.virtual_port import VirtualClock, VirtualPort
-from drivers.dynamixel.bench.chain import Chain
-from drivers.dynamixel.bench.frames import Code, Error, instructions_in
-from drivers.dynamixel.bench.servo import Servo
-from drivers.dynamixel.models import BY_NAME
-from drivers.dynamixel.scan import LIKELY_FIRST
-from drivers.feetech.bench.chain import Chain as FeetechChain
-from drivers.feetech.bench.servo import Servo as FeetechServo
-from drivers.feetech.models import BAUDS as FEETECH_BAUDS
-from drivers.feetech.models import BY_NAME as FEETECH
-from drivers.feetech.packets import FeetechPackets
-from drivers.scan import FoundServo, ScannedBus, scan_port, serial_ports
-from drivers.scanners import SCANNERS
-from interfaces.clock import SystemClock
-from interfaces.errors import SourceError
+from bodyschema.drivers.bench.device import Faults, OnlyAnswers, Reply, no_faults
+from bodyschema.drivers.bench.pty_shell import PtyShell
+from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
+from bodyschema.drivers.dynamixel.bench.chain import Chain
+from bodyschema.drivers.dynamixel.bench.frames import Code, Error, instructions_in
+from bodyschema.drivers.dynamixel.bench.servo import Servo
+from bodyschema.drivers.dynamixel.models import BY_NAME
+from bodyschema.drivers.dynamixel.scan import LIKELY_FIRST
+from bodyschema.drivers.feetech.bench.chain import Chain as FeetechChain
+from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
+from bodyschema.drivers.feetech.models import BAUDS as FEETECH_BAUDS
+from bodyschema.drivers.feetech.models import BY_NAME as FEETECH
+from bodyschema.drivers.feetech.packets import FeetechPackets
+from bodyschema.drivers.scan import FoundServo, ScannedBus, scan_port, serial_ports
+from bodyschema.drivers.scanners import SCANNERS
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import SourceError
 
 
 def servo(model: str, id: int, baud: int = 1_000_000, **more) -> Servo:

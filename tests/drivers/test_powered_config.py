@@ -8,10 +8,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from drivers.config import DriversConfig
-from drivers.dynamixel.models import BY_NAME, MODELS
-from drivers.dynamixel.torque_constants import TORQUE_AT_CURRENT, torque_constant
-from interfaces.errors import ConfigError
+from bodyschema.drivers.config import DriversConfig
+from bodyschema.drivers.dynamixel.models import BY_NAME, MODELS
+from bodyschema.drivers.dynamixel.torque_constants import TORQUE_AT_CURRENT, torque_constant
+from bodyschema.interfaces.errors import ConfigError
 
 SERVOS = """
 [drivers.dynamixel]

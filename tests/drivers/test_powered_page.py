@@ -9,8 +9,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from drivers.dynamixel.models import LAYOUT_P, LAYOUT_X
-from drivers.dynamixel.powered_config import GazeConfig, ZeroForceConfig
+from bodyschema.drivers.dynamixel.models import LAYOUT_P, LAYOUT_X
+from bodyschema.drivers.dynamixel.powered_config import GazeConfig, ZeroForceConfig
 
 FILES = ("powered.py", "zero_force.py", "gaze.py", "guard.py")
 ROOT = Path(__file__).parents[2]

@@ -13,25 +13,25 @@ import numpy as np
 import pytest
 from servo_arm import swing
 
-from daemon.reopen import Reopening
-from drivers.bench.pty_shell import PtyShell
-from drivers.dynamixel.bench.chain import Chain as DynamixelChain
-from drivers.dynamixel.bench.servo import Servo as DynamixelServo
-from drivers.dynamixel.config import BusConfig as DynamixelBus
-from drivers.dynamixel.config import DynamixelConfig
-from drivers.dynamixel.joints import DynamixelJoints
-from drivers.dynamixel.models import BY_NAME as DYNAMIXEL
-from drivers.feetech.bench.chain import Chain
-from drivers.feetech.bench.servo import Servo
-from drivers.feetech.config import BusConfig, FeetechConfig, ServoConfig
-from drivers.feetech.joints import FeetechJoints
-from drivers.feetech.models import BY_NAME
-from drivers.serial_lines.bench.board import EncoderBoard
-from drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
-from drivers.serial_lines.joints import SerialLineJoints
-from interfaces.clock import SystemClock
-from interfaces.errors import SourceError
-from interfaces.records import JointReading
+from bodyschema.daemon.reopen import Reopening
+from bodyschema.drivers.bench.pty_shell import PtyShell
+from bodyschema.drivers.dynamixel.bench.chain import Chain as DynamixelChain
+from bodyschema.drivers.dynamixel.bench.servo import Servo as DynamixelServo
+from bodyschema.drivers.dynamixel.config import BusConfig as DynamixelBus
+from bodyschema.drivers.dynamixel.config import DynamixelConfig
+from bodyschema.drivers.dynamixel.joints import DynamixelJoints
+from bodyschema.drivers.dynamixel.models import BY_NAME as DYNAMIXEL
+from bodyschema.drivers.feetech.bench.chain import Chain
+from bodyschema.drivers.feetech.bench.servo import Servo
+from bodyschema.drivers.feetech.config import BusConfig, FeetechConfig, ServoConfig
+from bodyschema.drivers.feetech.joints import FeetechJoints
+from bodyschema.drivers.feetech.models import BY_NAME
+from bodyschema.drivers.serial_lines.bench.board import EncoderBoard
+from bodyschema.drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
+from bodyschema.drivers.serial_lines.joints import SerialLineJoints
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import SourceError
+from bodyschema.interfaces.records import JointReading
 
 LIMIT_S = 300.0
 IDS = range(1, 7)
@@ -82,7 +82,7 @@ def wait_for_reading(source: Any) -> JointReading:
 @EACH
 def test_readings_are_right_with_wire_time(make: Make, tmp_path, monkeypatch) -> None:
     # Bench and driver share this process: on a busy machine the bench itself may be silent for a while.
-    monkeypatch.setattr("drivers.servos.joints.LOST_AFTER_S", LIMIT_S)
+    monkeypatch.setattr("bodyschema.drivers.servos.joints.LOST_AFTER_S", LIMIT_S)
     with make(tmp_path) as (_, driver), driver() as joints:
         readings = [wait_for_reading(joints) for _ in range(50)]
     off = [np.abs(reading.q - [swing(id)(reading.t) for id in IDS]).max() for reading in readings]

@@ -6,12 +6,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from drivers.replay import AHEAD, Replay
-from interfaces.camera import StereoCalibration
-from interfaces.errors import SourceEnded, SourceError
-from interfaces.protocols import JointSource, MarkerSource
-from interfaces.recording import RESET_GAP_S, Recording
-from interfaces.records import JointReading, MarkerFix
+from bodyschema.drivers.replay import AHEAD, Replay
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.errors import SourceEnded, SourceError
+from bodyschema.interfaces.protocols import JointSource, MarkerSource
+from bodyschema.interfaces.recording import RESET_GAP_S, Recording
+from bodyschema.interfaces.records import JointReading, MarkerFix
 
 STEREO = StereoCalibration(
     focal_px=700.0, principal_point_px=(320.0, 240.0), baseline_m=0.2, image_size_px=(640, 480), pixel_sigma=0.2

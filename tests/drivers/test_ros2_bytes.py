@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.ros2 import rmw
-from drivers.ros2.cdr import LARGEST_MESSAGE, CdrReader, CdrWriter, Malformed
-from drivers.ros2.messages import (
+from bodyschema.drivers.ros2 import rmw
+from bodyschema.drivers.ros2.cdr import LARGEST_MESSAGE, CdrReader, CdrWriter, Malformed
+from bodyschema.drivers.ros2.messages import (
     JOINT_STATE,
     NANO,
     POINT_STAMPED,

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 from ros2_robot import PATHS, Robot
 
-from drivers.checks import Check
-from drivers.ros2.bench.faults import Fault
-from drivers.ros2.bench.node import Node
-from drivers.ros2.checks import joint_state_checks
-from drivers.ros2.config import Ros2Config
-from interfaces.errors import SourceLost
+from bodyschema.drivers.checks import Check
+from bodyschema.drivers.ros2.bench.faults import Fault
+from bodyschema.drivers.ros2.bench.node import Node
+from bodyschema.drivers.ros2.checks import joint_state_checks
+from bodyschema.drivers.ros2.config import Ros2Config
+from bodyschema.interfaces.errors import SourceLost
 
 JOINTS = ("elbow", "pan", "lift")
 

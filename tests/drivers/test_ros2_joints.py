@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from ros2_robot import PATHS, Robot
 
-from drivers.ros2 import rmw
-from drivers.ros2.bench.faults import Fault
-from drivers.ros2.bench.node import Node
-from drivers.ros2.link import Sample
-from drivers.ros2.messages import JOINT_STATE, POINT_STAMPED, Header, JointState, encode_joint_state
-from drivers.ros2.senders import Refusal
-from interfaces.errors import SourceError, SourceLost
+from bodyschema.drivers.ros2 import rmw
+from bodyschema.drivers.ros2.bench.faults import Fault
+from bodyschema.drivers.ros2.bench.node import Node
+from bodyschema.drivers.ros2.link import Sample
+from bodyschema.drivers.ros2.messages import JOINT_STATE, POINT_STAMPED, Header, JointState, encode_joint_state
+from bodyschema.drivers.ros2.senders import Refusal
+from bodyschema.interfaces.errors import SourceError, SourceLost
 
 FASTEST = 1.2 * 0.7  # [rad/s]
 CLOCKS = dict.fromkeys(PATHS, lambda t: t)  # joints that tell the time

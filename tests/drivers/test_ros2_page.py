@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from drivers.config import DriversConfig
+from bodyschema.drivers.config import DriversConfig
 
 ROOT = Path(__file__).parents[2]
 SECTION = (ROOT / "docs" / "hardware.md").read_text().split("\n## ROS 2 robots\n")[1].split("\n## ")[0]

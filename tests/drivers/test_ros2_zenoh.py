@@ -10,17 +10,17 @@ import pytest
 import zenoh
 from ros2_robot import PATHS
 
-from drivers.ros2 import rmw
-from drivers.ros2.bench.node import EPOCH_NS, Node
-from drivers.ros2.bench.zenoh_robot import ZenohRobot
-from drivers.ros2.config import MarkerTopic, Ros2Config
-from drivers.ros2.joints import Ros2Joints
-from drivers.ros2.link import open_session
-from drivers.ros2.marker import MarkerPublisher
-from drivers.ros2.messages import POINT_STAMPED, POSE_WITH_COVARIANCE_STAMPED, Header, encode_point
-from drivers.ros2.senders import Refusal
-from interfaces.clock import SystemClock
-from interfaces.errors import SourceLost
+from bodyschema.drivers.ros2 import rmw
+from bodyschema.drivers.ros2.bench.node import EPOCH_NS, Node
+from bodyschema.drivers.ros2.bench.zenoh_robot import ZenohRobot
+from bodyschema.drivers.ros2.config import MarkerTopic, Ros2Config
+from bodyschema.drivers.ros2.joints import Ros2Joints
+from bodyschema.drivers.ros2.link import open_session
+from bodyschema.drivers.ros2.marker import MarkerPublisher
+from bodyschema.drivers.ros2.messages import POINT_STAMPED, POSE_WITH_COVARIANCE_STAMPED, Header, encode_point
+from bodyschema.drivers.ros2.senders import Refusal
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import SourceLost
 
 LIMIT_S = 300.0
 NAMES = ("pan", "lift", "elbow")

@@ -18,19 +18,19 @@ from free_ports import free_endpoint
 from servo_arm import TICK
 from test_serial_lines import BoardArm
 
-from drivers.bench.motion import Angle, played
-from drivers.bench.virtual_port import VirtualClock
-from drivers.ros2.bench.node import Node
-from drivers.ros2.bench.zenoh_robot import ZenohRobot
-from drivers.ros2.config import Ros2Config
-from drivers.ros2.joints import Ros2Joints
-from drivers.ros2.link import Link, Sample, open_zenoh
-from interfaces.protocols import JointSource
-from interfaces.records import FloatArray, JointReading
-from interfaces.robot import RobotDescription
+from bodyschema.drivers.bench.motion import Angle, played
+from bodyschema.drivers.bench.virtual_port import VirtualClock
+from bodyschema.drivers.ros2.bench.node import Node
+from bodyschema.drivers.ros2.bench.zenoh_robot import ZenohRobot
+from bodyschema.drivers.ros2.config import Ros2Config
+from bodyschema.drivers.ros2.joints import Ros2Joints
+from bodyschema.drivers.ros2.link import Link, Sample, open_zenoh
+from bodyschema.interfaces.protocols import JointSource
+from bodyschema.interfaces.records import FloatArray, JointReading
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.sim_backend import SimConfig, SimWorld
+from bodyschema.sim_backend.guided_path import guided_path
 from kbmaps import ExactLearner, JointBasis, KBMap
-from sim_backend import SimConfig, SimWorld
-from sim_backend.guided_path import guided_path
 
 pytestmark = pytest.mark.skipif(find_spec("pybullet") is None, reason="no pybullet; to run it: pip install -e '.[sim]'")
 

@@ -18,14 +18,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from servo_arm import swing
 
-from drivers.bench.device import Reply
-from drivers.bench.faults import Planned, corrupt, garbage, half, late, mute, storm, wrong_checksum
-from drivers.bench.virtual_port import VirtualClock, VirtualPort, at_once
-from drivers.serial_lines.bench.board import EncoderBoard
-from drivers.serial_lines.board import Board
-from drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
-from drivers.serial_lines.joints import SerialLineJoints
-from drivers.serial_lines.lines import (
+from bodyschema.drivers.bench.device import Reply
+from bodyschema.drivers.bench.faults import Planned, corrupt, garbage, half, late, mute, storm, wrong_checksum
+from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort, at_once
+from bodyschema.drivers.serial_lines.bench.board import EncoderBoard
+from bodyschema.drivers.serial_lines.board import Board
+from bodyschema.drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
+from bodyschema.drivers.serial_lines.joints import SerialLineJoints
+from bodyschema.drivers.serial_lines.lines import (
     INITIAL,
     LONGEST,
     POLYNOMIAL,
@@ -37,8 +37,8 @@ from drivers.serial_lines.lines import (
     parse,
     with_checksum,
 )
-from interfaces.errors import SourceError, SourceLost
-from interfaces.records import JointReading
+from bodyschema.interfaces.errors import SourceError, SourceLost
+from bodyschema.interfaces.records import JointReading
 
 TICK = 2 * math.pi / 4096
 HEADER = "H,1,7,2,shoulder,4096,elbow,16384"

@@ -9,9 +9,9 @@ from bench_arm import Arm
 from feetech_arm import FeetechArm
 from servo_arm import swing
 
-from drivers.dynamixel.bench.servo import Servo
-from drivers.feetech.bench.servo import Servo as FeetechServo
-from interfaces.errors import SourceError, SourceLost
+from bodyschema.drivers.dynamixel.bench.servo import Servo
+from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
+from bodyschema.interfaces.errors import SourceError, SourceLost
 
 MAKES = [Arm, FeetechArm]
 

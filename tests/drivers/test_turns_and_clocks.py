@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.device_clock import DeviceClock, StreamClock
-from drivers.serial_line import DEFAULT_LATENCY_S, adapter_latency_s
-from drivers.turns import SpeedGate, nearest_turn
+from bodyschema.drivers.device_clock import DeviceClock, StreamClock
+from bodyschema.drivers.serial_line import DEFAULT_LATENCY_S, adapter_latency_s
+from bodyschema.drivers.turns import SpeedGate, nearest_turn
 
 
 @given(st.integers(-(10**6), 10**6), st.floats(-1e6, 1e6))

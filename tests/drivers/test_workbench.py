@@ -7,22 +7,22 @@ from importlib.resources import files
 
 import pytest
 
-from drivers.bench.device import Reply
-from drivers.bench.faults import mute
-from drivers.bench.virtual_port import VirtualClock, VirtualPort, at_once
-from drivers.dynamixel.bench.chain import Chain as DynamixelChain
-from drivers.dynamixel.bench.servo import Servo as DynamixelServo
-from drivers.dynamixel.joints import DYNAMIXEL
-from drivers.dynamixel.models import BY_NAME as DYNAMIXELS
-from drivers.dynamixel.models import MODELS
-from drivers.dynamixel.settings import settings_of
-from drivers.feetech.bench.chain import Chain as FeetechChain
-from drivers.feetech.bench.servo import Servo as FeetechServo
-from drivers.feetech.joints import FEETECH
-from drivers.feetech.models import BY_NAME as FEETECHS
-from drivers.servos.config import ServoConfig
-from drivers.servos.workbench import Change, Outcome, Workbench
-from interfaces.errors import ConfigError, SourceError
+from bodyschema.drivers.bench.device import Reply
+from bodyschema.drivers.bench.faults import mute
+from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort, at_once
+from bodyschema.drivers.dynamixel.bench.chain import Chain as DynamixelChain
+from bodyschema.drivers.dynamixel.bench.servo import Servo as DynamixelServo
+from bodyschema.drivers.dynamixel.joints import DYNAMIXEL
+from bodyschema.drivers.dynamixel.models import BY_NAME as DYNAMIXELS
+from bodyschema.drivers.dynamixel.models import MODELS
+from bodyschema.drivers.dynamixel.settings import settings_of
+from bodyschema.drivers.feetech.bench.chain import Chain as FeetechChain
+from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
+from bodyschema.drivers.feetech.joints import FEETECH
+from bodyschema.drivers.feetech.models import BY_NAME as FEETECHS
+from bodyschema.drivers.servos.config import ServoConfig
+from bodyschema.drivers.servos.workbench import Change, Outcome, Workbench
+from bodyschema.interfaces.errors import ConfigError, SourceError
 
 RATE = 1_000_000
 ARMS = [("XM430-W350", "XM430-W350"), ("MX-28", "MX-28"), ("STS3215", "STS3215"), ("SCS0009", "SCS0009")]

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from floating_arm import CONSTANT, INERTIA, WEIGHT_N_M, FloatingArm, holding
 
-from drivers.bench.faults import mute
-from drivers.bench.virtual_port import VirtualClock, VirtualPort
-from drivers.dynamixel.bench.chain import Chain
-from drivers.dynamixel.bench.frames import Code
-from drivers.dynamixel.bench.servo import CURRENT_MODE, POSITION_MODE, Servo
-from drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
-from drivers.dynamixel.joints import DynamixelJoints
-from drivers.dynamixel.models import BY_NAME
-from drivers.dynamixel.powered_config import FloatingJoint, ZeroForceConfig
-from drivers.dynamixel.zero_force import ZeroForce
-from interfaces.errors import RequestError, SourceError, SourceLost
+from bodyschema.drivers.bench.faults import mute
+from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
+from bodyschema.drivers.dynamixel.bench.chain import Chain
+from bodyschema.drivers.dynamixel.bench.frames import Code
+from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE, POSITION_MODE, Servo
+from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from bodyschema.drivers.dynamixel.joints import DynamixelJoints
+from bodyschema.drivers.dynamixel.models import BY_NAME
+from bodyschema.drivers.dynamixel.powered_config import FloatingJoint, ZeroForceConfig
+from bodyschema.drivers.dynamixel.zero_force import ZeroForce
+from bodyschema.interfaces.errors import RequestError, SourceError, SourceLost
 
 DRIFT_RAD = math.radians(0.5)  # what the arm may drift in ten seconds after it is let go
 LATE_S = 0.015  # from too fast to torque off: the servo's measuring, a cycle, and the way

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from test_zero_force_process import write_robot
 
-from daemon.config import Config
-from daemon.powered_wiring import open_drives
-from drivers.bench.virtual_port import VirtualClock, VirtualPort
-from drivers.dynamixel.bench.chain import Chain
-from drivers.dynamixel.bench.servo import CURRENT_MODE, Servo
-from drivers.dynamixel.joints import DynamixelJoints
-from drivers.dynamixel.models import BY_NAME
-from drivers.dynamixel.torque_constants import torque_constant
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.powered_wiring import open_drives
+from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
+from bodyschema.drivers.dynamixel.bench.chain import Chain
+from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE, Servo
+from bodyschema.drivers.dynamixel.joints import DynamixelJoints
+from bodyschema.drivers.dynamixel.models import BY_NAME
+from bodyschema.drivers.dynamixel.torque_constants import torque_constant
 
 pybullet = pytest.importorskip("pybullet")
 

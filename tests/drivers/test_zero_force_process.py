@@ -15,13 +15,13 @@ from pathlib import Path
 import pytest
 import warm
 
-from daemon.config import Config
-from daemon.wiring import open_joints
-from drivers.bench.dry_run import DryRun
-from drivers.dynamixel.bench.arm import DynamixelArm
-from drivers.dynamixel.bench.servo import CURRENT_MODE, POSITION_MODE
-from interfaces.clock import SystemClock
-from interfaces.errors import ConfigError
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.wiring import open_joints
+from bodyschema.drivers.bench.dry_run import DryRun
+from bodyschema.drivers.dynamixel.bench.arm import DynamixelArm
+from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE, POSITION_MODE
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import ConfigError
 
 HEARTBEAT_S = 0.5  # generous: bench, driver and test share the machine with others
 ANGLES = {"shoulder": 0.3, "elbow": -0.5}
@@ -96,7 +96,7 @@ class Floating:
         ours, its = os.pipe()
         self._said, self._errors = os.fdopen(ours), tempfile.TemporaryFile("w+")  # noqa: SIM115
         with os.fdopen(its, "w") as out:
-            self.process = warm.Child("-m", "daemon", *words, cwd=folder, stdout=out, stderr=self._errors)
+            self.process = warm.Child("-m", "bodyschema", *words, cwd=folder, stdout=out, stderr=self._errors)
 
     def __enter__(self) -> Floating:
         return self

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from effects import KINDS, Effect, Motion
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
+from bodyschema.effects import KINDS, Effect, Motion
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
 
 LINKS = {
     "base": (20.0, "0 0 0.2"),

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from effect_arms import ALL, SLIDE, arm, everywhere, sized, walk
 
-from effects import Effect, Simulation, corrected_file, write_corrected
-from effects.simulation import RIGID
-from interfaces.calibrated_files import CAMERA_LINK, MARKER_LINK
-from interfaces.robot import RobotDescription
-from interfaces.urdf import UrdfTree, chain_between
+from bodyschema.effects import Effect, Simulation, corrected_file, write_corrected
+from bodyschema.effects.simulation import RIGID
+from bodyschema.interfaces.calibrated_files import CAMERA_LINK, MARKER_LINK
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.interfaces.urdf import UrdfTree, chain_between
 
 HEADING = "made by a test"
 

@@ -8,7 +8,7 @@ from effect_arms import arm, everywhere, sized, walk
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from effects import KINDS, Simulation
+from bodyschema.effects import KINDS, Simulation
 
 # Of the largest derivative. That a spring's deflection changes its own load is left out.
 EXACT, AT_A_KNOT, TO_FIRST_ORDER = 1e-5, 1e-3, 0.02

@@ -9,10 +9,10 @@ from effect_arms import SLIDE, STEREO, arm, everywhere, sized, walk
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from effects import Effect, Simulation, Unexplained, load_simulation, write_extended
-from effects.files import MODEL_FILE
-from interfaces.errors import ConfigError, RobotError
-from interfaces.robot import RobotDescription
+from bodyschema.effects import Effect, Simulation, Unexplained, load_simulation, write_extended
+from bodyschema.effects.files import MODEL_FILE
+from bodyschema.interfaces.errors import ConfigError, RobotError
+from bodyschema.interfaces.robot import RobotDescription
 from kbmaps import JointBasis, KernelLearner, RigidChain, TensorTrain
 
 HEADING = "Extended by a test"

@@ -6,12 +6,12 @@ from effect_arms import ALL, LINKS, arm, walk
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from effects import GravityLoad
-from effects.gravity import GRAVITY_M_S2
-from sim_backend import ErrorConfig, SimConfig
-from sim_backend.bullet import Body
-from sim_backend.physics_urdf import physics_urdf
-from sim_backend.truth import TrueRobot
+from bodyschema.effects import GravityLoad
+from bodyschema.effects.gravity import GRAVITY_M_S2
+from bodyschema.sim_backend import ErrorConfig, SimConfig
+from bodyschema.sim_backend.bullet import Body
+from bodyschema.sim_backend.physics_urdf import physics_urdf
+from bodyschema.sim_backend.truth import TrueRobot
 
 NO_ERRORS = ErrorConfig(
     joint_offset_rad=0, link_length_m=0, link_axis_rad=0, camera_position_m=0, camera_rotation_rad=0, tool_m=0

@@ -8,8 +8,8 @@ from effect_arms import arm, everywhere, sized, walk
 from hypothesis import given
 from hypothesis import strategies as st
 
-from effects import Effect, LiveEncoders, Motion, Simulation
-from effects.encoder import ENCODER_EFFECTS, played
+from bodyschema.effects import Effect, LiveEncoders, Motion, Simulation
+from bodyschema.effects.encoder import ENCODER_EFFECTS, played
 
 PATHS = st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=60).map(np.array)
 WIDTHS = st.floats(1e-4, 0.5)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from effect_arms import arm, walk
 
-from effects import KINDS, Simulation, Unexplained, load_simulation
-from interfaces.recording import Recording
+from bodyschema.effects import KINDS, Simulation, Unexplained, load_simulation
+from bodyschema.interfaces.recording import Recording
 from kbmaps import JointBasis, RigidChain
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "effects.md").read_text(encoding="utf-8")

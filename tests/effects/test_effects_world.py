@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from effect_arms import arm, everywhere, sized, walk
 
-from effects import KINDS, Motion, Simulation
-from sim_backend import ErrorConfig, SimConfig
-from sim_backend.posed import PERIOD_S, PosedWorld
-from sim_backend.truth import GEOMETRY
+from bodyschema.effects import KINDS, Motion, Simulation
+from bodyschema.sim_backend import ErrorConfig, SimConfig
+from bodyschema.sim_backend.posed import PERIOD_S, PosedWorld
+from bodyschema.sim_backend.truth import GEOMETRY
 
 CLOSE_M = 1e-6
 NO_ERRORS = ErrorConfig(
@@ -35,7 +35,7 @@ def robot(tmp_path_factory):
 
 def shown(simulation: Simulation, postures, monkeypatch):
     """What an ideal tracker would measure in the posed world (n, 3)."""
-    monkeypatch.setattr("sim_backend.posed.RenderProcess", NoRenderer)
+    monkeypatch.setattr("bodyschema.sim_backend.posed.RenderProcess", NoRenderer)
     with PosedWorld(simulation.robot, SimConfig(errors=NO_ERRORS), postures, simulation) as world:
         return np.array([world.scene(number).x_seen for number in range(len(postures))])
 
@@ -70,7 +70,7 @@ class Wave:
 
 
 def test_the_true_chain_has_geometric_effects_and_drawn_errors_in_it(robot, monkeypatch) -> None:
-    monkeypatch.setattr("sim_backend.posed.RenderProcess", NoRenderer)
+    monkeypatch.setattr("bodyschema.sim_backend.posed.RenderProcess", NoRenderer)
     postures = walk(5).q[:20]
     places = [place for place in everywhere(robot) if place[0] in GEOMETRY]
     simulation = Simulation(robot, tuple(sized(robot, place, 1.0, k) for k, place in enumerate(places)))

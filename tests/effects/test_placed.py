@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from effect_arms import STEREO, arm, walk
 
-from effects import Effect, Simulation, load_simulation, place_map, write_extended
-from interfaces.robot import RobotDescription
+from bodyschema.effects import Effect, Simulation, load_simulation, place_map, write_extended
+from bodyschema.interfaces.robot import RobotDescription
 
 POSE, SHIFT = [0.03, -0.02, 0.05, 0.2, -0.1, 0.3], [0.01, 0.02, -0.03]
 

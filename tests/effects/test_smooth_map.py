@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from effect_arms import ALL, arm, walk
 
-from effects import Effect, Motion, Simulation, load_simulation, place_map, smooth_map, write_extended
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
+from bodyschema.effects import Effect, Motion, Simulation, load_simulation, place_map, smooth_map, write_extended
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
 
 TOLERANCE_M = 1e-6
 

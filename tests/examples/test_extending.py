@@ -13,18 +13,18 @@ import msgspec
 import numpy as np
 import pytest
 
-from daemon.config import Config
-from daemon.wiring import open_joints
-from interfaces.camera import StereoCalibration
-from interfaces.clock import SystemClock
-from interfaces.errors import ConfigError, SourceLost
-from interfaces.plugins import PluginConfig
-from interfaces.recording import Recording
-from interfaces.records import MarkerFix, MarkerMiss, Reason, StereoFrame
-from interfaces.robot import RobotDescription
-from vision.config import VisionConfig
-from vision.tracked_camera import MarkerTracker
-from vision.trackers import tracker_of
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.wiring import open_joints
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import ConfigError, SourceLost
+from bodyschema.interfaces.plugins import PluginConfig
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import MarkerFix, MarkerMiss, Reason, StereoFrame
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.vision.config import VisionConfig
+from bodyschema.vision.tracked_camera import MarkerTracker
+from bodyschema.vision.trackers import tracker_of
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
@@ -138,7 +138,7 @@ def test_the_effect_is_found_where_it_is_hidden_and_told_in_its_words(packages: 
     x = robot.chain.positions(turned) + 5e-4 * rng.normal(size=(len(q), 3))
     Recording(robot.joints, q, x).write_csv(robot_toml.parent / "measured.csv")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(packages), str(ROOT)])}
-    command = [sys.executable, "-m", "daemon", "diagnose", "measured.csv", "--json"]
+    command = [sys.executable, "-m", "bodyschema", "diagnose", "measured.csv", "--json"]
     run = subprocess.run(
         command, capture_output=True, timeout=LIMIT_S, check=True, cwd=robot_toml.parent, env=environment
     )

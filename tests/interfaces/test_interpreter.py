@@ -12,8 +12,8 @@ import pytest
 from hostile_folder import FIRST_PARTY, HostileFolder
 from small_arm import write_small_arm
 
-from interfaces.interpreter import module_command, safe_children
-from interfaces.robot import RobotDescription
+from bodyschema.interfaces.interpreter import module_command, safe_children
+from bodyschema.interfaces.robot import RobotDescription
 
 ROOT = Path(__file__).parents[2]
 LIMIT_S = 300.0
@@ -23,7 +23,7 @@ SILENT = '[zenoh]\nsampler = "tcp/127.0.0.1:9"\nlearner = "tcp/127.0.0.1:10"\n'
 
 def test_a_child_imports_nothing_from_the_current_folder(tmp_path: Path) -> None:
     hostile = HostileFolder(tmp_path)
-    command = module_command("daemon", "--version")
+    command = module_command("bodyschema", "--version")
     done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, cwd=tmp_path, check=True)
     assert (hostile.executed, done.stderr) == ([], "")
 
@@ -49,7 +49,7 @@ def test_a_users_own_vision_folder_is_not_ours(tmp_path: Path) -> None:
     for package in FIRST_PARTY - {"daemon"}:
         (tmp_path / package).mkdir()
         (tmp_path / package / "__init__.py").write_text("raise ImportError(__file__)")
-    command = [sys.executable, "-m", "daemon", "predict", "--robot", "no.toml", "0"]
+    command = [sys.executable, "-m", "bodyschema", "predict", "--robot", "no.toml", "0"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, cwd=tmp_path, check=False)
     assert done.stderr.startswith("bodyschema: no.toml: there is no such file")
 

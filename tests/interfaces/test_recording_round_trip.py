@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from interfaces.errors import RecordingError
-from interfaces.recording import Recording
+from bodyschema.interfaces.errors import RecordingError
+from bodyschema.interfaces.recording import Recording
 
 JOINTS = ("waist", "shoulder")
 numbers = st.floats(allow_nan=False, allow_infinity=False, width=64)

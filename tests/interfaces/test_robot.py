@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from interfaces.errors import ConfigError, RobotError
-from interfaces.robot import RobotDescription
-from interfaces.urdf import UrdfTree
+from bodyschema.interfaces.errors import ConfigError, RobotError
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.interfaces.urdf import UrdfTree
 
 URDF = """<robot name="arm">
   <link name="base"/><link name="upper"/><link name="hand"/><link name="tip"/>

@@ -14,11 +14,11 @@ import pytest
 import warm
 from scipy.spatial.transform import Rotation
 
-from daemon.cli import command_line
-from daemon.config import Config
-from interfaces.errors import BodyschemaError
-from interfaces.recording import Recording
-from interfaces.robot import CameraSection, RobotDescription, RobotSection
+from bodyschema.daemon.cli import command_line
+from bodyschema.daemon.config import Config
+from bodyschema.interfaces.errors import BodyschemaError
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.robot import CameraSection, RobotDescription, RobotSection
 from kbmaps import RigidChain
 
 ROOT = Path(__file__).parents[2]
@@ -51,7 +51,7 @@ def desk(tmp_path: Path) -> Path:
 
 def typed(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
     environment = {"XDG_STATE_HOME": "/home/you/.local/state", "PATH": "/usr/bin:/bin", "OPENBLAS_NUM_THREADS": "1"}
-    return warm.run("-m", "daemon", *shlex.split(command)[1:], cwd=folder, env=environment)
+    return warm.run("-m", "bodyschema", *shlex.split(command)[1:], cwd=folder, env=environment)
 
 
 def test_the_page_shows_the_example_s_robot_toml() -> None:

@@ -56,8 +56,8 @@ def test_a_client_imports_neither_scipy_nor_opencv() -> None:
     code = f"""
 import sys
 from pathlib import Path
-import daemon.bus, daemon.commands.predict, daemon.commands.status, daemon.plausibility.limits, daemon.status_view
-from daemon.config import Config
+import bodyschema.daemon.bus, bodyschema.daemon.commands.predict, bodyschema.daemon.commands.status, bodyschema.daemon.plausibility.limits, bodyschema.daemon.status_view
+from bodyschema.daemon.config import Config
 assert Config.load(Path({str(robot)!r})).robot.chain.joints == 4
 print("heavy:", [name for name in ("scipy", "cv2", "pybullet", "matplotlib") if f"{{name}}.version" in sys.modules])
 """

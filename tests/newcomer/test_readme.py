@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from daemon.bench_run import BenchRun
-from daemon.cli import COMMANDS, command_line
-from daemon.config import Config
+from bodyschema.daemon.bench_run import BenchRun
+from bodyschema.daemon.cli import COMMANDS, command_line
+from bodyschema.daemon.config import Config
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from interfaces.records import FloatArray
-from interfaces.robot import RobotDescription
-from interfaces.toml_file import read_toml
-from sim_backend import SimConfig, model_file
-from sim_backend.physics import Physics
-from sim_backend.scene import Scene
-from sim_backend.truth import TrueRobot
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.interfaces.toml_file import read_toml
+from bodyschema.sim_backend import SimConfig, model_file
+from bodyschema.sim_backend.physics import Physics
+from bodyschema.sim_backend.scene import Scene
+from bodyschema.sim_backend.truth import TrueRobot
 
 
 @dataclass(frozen=True)

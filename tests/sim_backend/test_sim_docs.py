@@ -5,7 +5,7 @@ from pathlib import Path
 
 import msgspec
 
-from sim_backend import SimConfig
+from bodyschema.sim_backend import SimConfig
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "simulation.md").read_text(encoding="utf-8")
 

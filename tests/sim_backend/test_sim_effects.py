@@ -1,4 +1,4 @@
-"""What the world shows is what `effects.Simulation` says that it shows, effect by effect."""
+"""What the world shows is what `bodyschema.effects.Simulation` says that it shows, effect by effect."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 from test_sim_truth import NO_ERRORS
 
-from effects import KINDS, Effect, Motion, Simulation
-from interfaces.records import MarkerFix
-from interfaces.robot import RobotDescription
-from interfaces.toml_file import read_toml
-from sim_backend import EncoderConfig, SimConfig, model_file
-from sim_backend.joints import JointPaths
-from sim_backend.physics import Physics
-from sim_backend.posed import PosedWorld
-from sim_backend.postures import visible_postures
-from sim_backend.truth import TrueRobot
-from vision.config import VisionConfig
-from vision.tracked_camera import TrackedCamera
-from vision.tracker import StereoTracker
+from bodyschema.effects import KINDS, Effect, Motion, Simulation
+from bodyschema.interfaces.records import MarkerFix
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.interfaces.toml_file import read_toml
+from bodyschema.sim_backend import EncoderConfig, SimConfig, model_file
+from bodyschema.sim_backend.joints import JointPaths
+from bodyschema.sim_backend.physics import Physics
+from bodyschema.sim_backend.posed import PosedWorld
+from bodyschema.sim_backend.postures import visible_postures
+from bodyschema.sim_backend.truth import TrueRobot
+from bodyschema.vision.config import VisionConfig
+from bodyschema.vision.tracked_camera import TrackedCamera
+from bodyschema.vision.tracker import StereoTracker
 
 CLOSE_M = 1e-6
 FRAME_STEPS = 8
@@ -167,7 +167,7 @@ class NoRenderer:
 
 @pytest.mark.parametrize("case", [case for case in EFFECTS if case[0] != "camera_latency"], ids=named)
 def test_the_posed_world_shows_what_the_simulation_says(case, monkeypatch) -> None:
-    monkeypatch.setattr("sim_backend.posed.RenderProcess", NoRenderer)
+    monkeypatch.setattr("bodyschema.sim_backend.posed.RenderProcess", NoRenderer)
     simulation = extended(case)
     robot = simulation.robot
     rng = np.random.default_rng(3)

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from guided_run import guide, learning, shipped, shipped_run, step_degrees
 
-from sim_backend import SimConfig, true_chain
-from sim_backend.arm import TorqueFreeArm
-from sim_backend.bullet import Body
-from sim_backend.config import CameraConfig, SimTag
-from sim_backend.physics_urdf import physics_urdf
-from sim_backend.roles import JointRoles
-from sim_backend.truth import TrueRobot
+from bodyschema.sim_backend import SimConfig, true_chain
+from bodyschema.sim_backend.arm import TorqueFreeArm
+from bodyschema.sim_backend.bullet import Body
+from bodyschema.sim_backend.config import CameraConfig, SimTag
+from bodyschema.sim_backend.physics_urdf import physics_urdf
+from bodyschema.sim_backend.roles import JointRoles
+from bodyschema.sim_backend.truth import TrueRobot
 
 SEEDS = (1, 2)
 

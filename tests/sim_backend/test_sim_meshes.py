@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from guided_run import described
 
-from interfaces.errors import RobotError
-from sim_backend import SimConfig, mesh_file, meshes
-from sim_backend.bullet import Body
-from sim_backend.mesh_file import MeshError, read_mesh, stl_bytes
-from sim_backend.meshes import MOST_TRIANGLES, Meshes
-from sim_backend.physics_urdf import MOST_LINKS, physics_urdf
-from sim_backend.truth import TrueRobot
+from bodyschema.interfaces.errors import RobotError
+from bodyschema.sim_backend import SimConfig, mesh_file, meshes
+from bodyschema.sim_backend.bullet import Body
+from bodyschema.sim_backend.mesh_file import MeshError, read_mesh, stl_bytes
+from bodyschema.sim_backend.meshes import MOST_TRIANGLES, Meshes
+from bodyschema.sim_backend.physics_urdf import MOST_LINKS, physics_urdf
+from bodyschema.sim_backend.truth import TrueRobot
 
 WEDGE = np.array([[[0, 0, 0], [0, 2, 0], [3, 0, 0]], [[0, 0, 0], [3, 0, 0], [0, 0, 5]]], dtype=float)
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from guided_run import described, guide, in_eye, step_degrees
 
-from interfaces.errors import ConfigError
-from sim_backend import SimConfig, SimWorld
-from sim_backend.physics import Physics
-from sim_backend.roles import JointRoles
-from sim_backend.truth import TrueRobot
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.sim_backend import SimConfig, SimWorld
+from bodyschema.sim_backend.physics import Physics
+from bodyschema.sim_backend.roles import JointRoles
+from bodyschema.sim_backend.truth import TrueRobot
 
 # A carriage on a rail with a two-joint arm, no inertias given, and a camera on a mast.
 URDF = """<robot name="carriage">

@@ -7,11 +7,11 @@ pytest.importorskip("pybullet")
 
 from guided_run import shipped
 
-from interfaces.errors import SourceEnded
-from interfaces.records import FloatArray, StereoFrame
-from sim_backend import SimConfig, true_chain
-from sim_backend.posed import PosedWorld
-from sim_backend.postures import visible_postures
+from bodyschema.interfaces.errors import SourceEnded
+from bodyschema.interfaces.records import FloatArray, StereoFrame
+from bodyschema.sim_backend import SimConfig, true_chain
+from bodyschema.sim_backend.posed import PosedWorld
+from bodyschema.sim_backend.postures import visible_postures
 
 LIMIT_S = 500.0
 POSTURES = 3

@@ -6,13 +6,13 @@ import pytest
 from guided_run import shipped
 from scipy.spatial.transform import Rotation
 
-from interfaces.camera import StereoCalibration
-from sim_backend import CameraConfig
-from sim_backend.bullet import load_pybullet
-from sim_backend.config import SimTag
-from sim_backend.eye import TO_LIGHT, StereoEyes
-from sim_backend.panorama import cluttered_room
-from sim_backend.raster import Grid, Raster
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.sim_backend import CameraConfig
+from bodyschema.sim_backend.bullet import load_pybullet
+from bodyschema.sim_backend.config import SimTag
+from bodyschema.sim_backend.eye import TO_LIGHT, StereoEyes
+from bodyschema.sim_backend.panorama import cluttered_room
+from bodyschema.sim_backend.raster import Grid, Raster
 
 PLAIN = CameraConfig(noise=0, clutter=0)
 UNTURNED = np.eye(3)

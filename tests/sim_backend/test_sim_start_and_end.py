@@ -11,16 +11,16 @@ import msgspec
 import pytest
 from guided_run import shipped
 
-from interfaces.errors import ConfigError
-from interfaces.robot import RobotDescription
-from interfaces.toml_file import read_toml
-from sim_backend import SimConfig, SimWorld, model_file
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.interfaces.toml_file import read_toml
+from bodyschema.sim_backend import SimConfig, SimWorld, model_file
 
 ROOT = Path(__file__).resolve().parents[2]
 HOLD_OPEN = """
 import select, signal, sys
-from interfaces.robot import RobotDescription
-from sim_backend import SimConfig, SimWorld, model_file
+from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.sim_backend import SimConfig, SimWorld, model_file
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 try:
     with SimWorld(RobotDescription.load(model_file("upper_body")), SimConfig()) as world, world.joints, world.camera:

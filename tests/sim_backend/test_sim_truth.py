@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from guided_run import learning, shipped
 
-from sim_backend import ErrorConfig, SimConfig, true_chain
-from sim_backend.bullet import Body
-from sim_backend.gaze import Gaze
-from sim_backend.physics_urdf import physics_urdf
-from sim_backend.roles import JointRoles
-from sim_backend.truth import TrueRobot
+from bodyschema.sim_backend import ErrorConfig, SimConfig, true_chain
+from bodyschema.sim_backend.bullet import Body
+from bodyschema.sim_backend.gaze import Gaze
+from bodyschema.sim_backend.physics_urdf import physics_urdf
+from bodyschema.sim_backend.roles import JointRoles
+from bodyschema.sim_backend.truth import TrueRobot
 
 NO_ERRORS = ErrorConfig(
     joint_offset_rad=0, link_length_m=0, link_axis_rad=0, camera_position_m=0, camera_rotation_rad=0, tool_m=0

@@ -9,9 +9,9 @@ import pytest
 from guided_run import shipped
 from test_sim_rendering import red_pixels
 
-from interfaces.errors import SourceEnded, SourceLost
-from interfaces.protocols import JointSource, StereoCamera
-from sim_backend import SimConfig, SimWorld, ToolChange
+from bodyschema.interfaces.errors import SourceEnded, SourceLost
+from bodyschema.interfaces.protocols import JointSource, StereoCamera
+from bodyschema.sim_backend import SimConfig, SimWorld, ToolChange
 
 WAIT_S = 300.0
 

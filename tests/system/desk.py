@@ -12,13 +12,13 @@ import sys
 import time
 from pathlib import Path
 
-from daemon.bus import client
-from daemon.config import Config
-from daemon.identity import Identity, Route
-from daemon.keys import Keys
-from daemon.view.hub import Hub
-from daemon.view.watch import Watch
-from interfaces.errors import BodyschemaError, BusError
+from bodyschema.daemon.bus import client
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.identity import Identity, Route
+from bodyschema.daemon.keys import Keys
+from bodyschema.daemon.view.hub import Hub
+from bodyschema.daemon.view.watch import Watch
+from bodyschema.interfaces.errors import BodyschemaError, BusError
 
 LIMIT_S = 400.0
 KEYS = Keys("arm")

@@ -15,10 +15,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from daemon import checkpoint
-from daemon.bus import Bus
-from daemon.cli import main
-from daemon.store import PairStore
+from bodyschema.daemon import checkpoint
+from bodyschema.daemon.bus import Bus
+from bodyschema.daemon.cli import main
+from bodyschema.daemon.store import PairStore
 
 NOWHERE = "at a random moment"  # from outside
 

@@ -15,17 +15,17 @@ import cv2
 import numpy as np
 import warm
 
-from daemon.bench_wiring import Motion, bench_robot_file, open_bench
-from daemon.bus import Bus
-from daemon.command_names import CommandName
-from daemon.config import Config
-from daemon.keys import Keys
-from daemon.status import SamplerStatus
-from daemon.store import PairReader
-from daemon.wire import CommandReply, CommandRequest, decode, encode
-from drivers.bench.dry_run import DryRun
-from interfaces.errors import BodyschemaError
-from interfaces.records import FloatArray, Pair
+from bodyschema.daemon.bench_wiring import Motion, bench_robot_file, open_bench
+from bodyschema.daemon.bus import Bus
+from bodyschema.daemon.command_names import CommandName
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.keys import Keys
+from bodyschema.daemon.status import SamplerStatus
+from bodyschema.daemon.store import PairReader
+from bodyschema.daemon.wire import CommandReply, CommandRequest, decode, encode
+from bodyschema.drivers.bench.dry_run import DryRun
+from bodyschema.interfaces.errors import BodyschemaError
+from bodyschema.interfaces.records import FloatArray, Pair
 
 LIMIT_S = 500.0
 
@@ -102,7 +102,7 @@ class SamplerProcess:
 @contextlib.contextmanager
 def sampling(config: Config, environment: dict[str, str] | None = None) -> Iterator[SamplerProcess]:
     """A sampler process."""
-    words = ["-m", "daemon", "sampler", "--robot", config.file]
+    words = ["-m", "bodyschema", "sampler", "--robot", config.file]
     log = config.file.with_suffix(".log")
     with log.open("w") as errors:
         if environment:  # it works on what starts

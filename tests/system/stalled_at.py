@@ -12,15 +12,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from daemon.cli import main
+from bodyschema.daemon.cli import main
 
 # What each loop does in its round.
 WORK = {
-    "encoders": ("daemon.reopen", "Reopening", "read", "the encoders"),
-    "frames": ("daemon.reopen", "Reopening", "read", "the cameras"),
-    "learning": ("daemon.feed", "PairFeed", "step", None),
-    "background": ("daemon.findings", "Findings", "renew", None),
-    "status": ("daemon.learner", "Learner", "status", None),
+    "encoders": ("bodyschema.daemon.reopen", "Reopening", "read", "the encoders"),
+    "frames": ("bodyschema.daemon.reopen", "Reopening", "read", "the cameras"),
+    "learning": ("bodyschema.daemon.feed", "PairFeed", "step", None),
+    "background": ("bodyschema.daemon.findings", "Findings", "renew", None),
+    "status": ("bodyschema.daemon.learner", "Learner", "status", None),
 }
 
 

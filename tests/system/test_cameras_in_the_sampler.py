@@ -16,9 +16,9 @@ import pytest
 from sampled import LIMIT_S, drawn, on_the_bench, pairs_of, sampling, until
 from v4l2_cameras import ShimCamera, preloaded
 
-from daemon.commands.latency import SECONDS
-from daemon.config import Config
-from interfaces.records import FloatArray
+from bodyschema.daemon.commands.latency import SECONDS
+from bodyschema.daemon.config import Config
+from bodyschema.interfaces.records import FloatArray
 
 ARM = Path(__file__).parents[2] / "examples" / "desk_arm"
 FPS, FRAMES = 30.0, 240
@@ -91,7 +91,7 @@ def test_a_hidden_latency_is_found_by_moving_the_arm(library, moving) -> None:
     config, _ = moving
     file = config.file
     file.write_text(file.read_text().replace(f"latency_s = {LATENCY_S}", "latency_s = 0.01"))
-    command = [sys.executable, "-m", "daemon", "calibrate", "latency", "--robot", str(file), "--json"]
+    command = [sys.executable, "-m", "bodyschema", "calibrate", "latency", "--robot", str(file), "--json"]
     for attempt in range(TRIES):  # a busy machine takes images late or too few, and says so: it has longer then
         longer = [*command, "--seconds", str(SECONDS * 2**attempt)]
         done = subprocess.run(

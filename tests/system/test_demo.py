@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from hostile_folder import HostileFolder
 
-from interfaces.recording import Recording
-from interfaces.robot import RobotDescription
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.robot import RobotDescription
 
 pytest.importorskip("pybullet")
 
@@ -86,7 +86,7 @@ def test_without_a_terminal_the_demo_prints_plain_lines(demo: Demo) -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_the_demo_reaches_its_figures_and_claims_what_is_true(tmp_path: Path, seed: int) -> None:
     """At most 20 mm after 600 pairs and 30 mm 300 pairs after the tool change; the claim is right within a factor 2."""
-    command = [sys.executable, "-m", "daemon", "demo", "--out", str(tmp_path / "out"), "--seed", str(seed)]
+    command = [sys.executable, "-m", "bodyschema", "demo", "--out", str(tmp_path / "out"), "--seed", str(seed)]
     done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=LIMIT_S)
     first, second = re.findall(r"│ +([\d.]+) mm │ +([\d.]+) mm │ +(\d+) % │", done.stdout)
     print(f"seed {seed}: {first}, {second}")
@@ -99,7 +99,7 @@ def test_the_demo_reaches_its_figures_and_claims_what_is_true(tmp_path: Path, se
 def test_the_demo_refuses_a_folder_that_is_not_its_own(tmp_path: Path) -> None:
     precious = tmp_path / "thesis.tex"
     precious.write_text("years of work")
-    command = [sys.executable, "-m", "daemon", "demo", "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "bodyschema", "demo", "--out", str(tmp_path)]
     result = subprocess.run(command, check=False, capture_output=True, text=True, timeout=LIMIT_S)
     assert result.returncode == 1
     assert "thesis.tex" in result.stderr
@@ -107,7 +107,7 @@ def test_the_demo_refuses_a_folder_that_is_not_its_own(tmp_path: Path) -> None:
 
 
 def test_the_demo_over_servos_learns_as_well(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "daemon", "demo", "--bus", "dynamixel", "--out", str(tmp_path / "out")]
+    command = [sys.executable, "-m", "bodyschema", "demo", "--bus", "dynamixel", "--out", str(tmp_path / "out")]
     command += ["--pairs", str(FIRST), "--pairs-after", "10", "--seed", "3"]
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=LIMIT_S)
     assert done.returncode == 0, done.stderr
@@ -123,7 +123,7 @@ def test_the_demo_over_servos_learns_as_well(tmp_path: Path) -> None:
 @pytest.mark.soak
 @pytest.mark.parametrize("seed", range(5))
 def test_the_demo_over_servos_reaches_the_figures_of_the_demo(tmp_path: Path, seed: int) -> None:
-    command = [sys.executable, "-m", "daemon", "demo", "--bus", "dynamixel", "--out", str(tmp_path / "out")]
+    command = [sys.executable, "-m", "bodyschema", "demo", "--bus", "dynamixel", "--out", str(tmp_path / "out")]
     done = subprocess.run([*command, "--seed", str(seed)], check=True, capture_output=True, text=True, timeout=LIMIT_S)
     first, second = re.findall(r"│ +([\d.]+) mm │ +([\d.]+) mm │ +\d+ % │", done.stdout)
     print(f"seed {seed}: {first}, {second}")

@@ -26,13 +26,13 @@ from two_processes import (
     write_robot,
 )
 
-from daemon.bus import client
-from daemon.checkpoint import generations
-from daemon.config import Config
-from daemon.status import LearnerStatus, SamplerStatus
-from daemon.store import PairReader
-from daemon.wire import CommandRequest, encode
-from interfaces.errors import BodyschemaError
+from bodyschema.daemon.bus import client
+from bodyschema.daemon.checkpoint import generations
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.status import LearnerStatus, SamplerStatus
+from bodyschema.daemon.store import PairReader
+from bodyschema.daemon.wire import CommandRequest, encode
+from bodyschema.interfaces.errors import BodyschemaError
 
 SOME, MORE = 20, 20
 

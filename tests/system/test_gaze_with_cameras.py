@@ -14,12 +14,12 @@ import pytest
 from sampled import LIMIT_S, SamplerProcess, drawn, on_the_bench, pairs_of, sampling, until
 from v4l2_cameras import LiveCamera, preloaded
 
-from daemon.config import Config
-from daemon.wiring import demonstration_model
-from drivers.bench.dry_run import DryRun
-from interfaces.pointing import Pointing
-from interfaces.records import FloatArray, Pair
-from interfaces.robot import RobotDescription
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.wiring import demonstration_model
+from bodyschema.drivers.bench.dry_run import DryRun
+from bodyschema.interfaces.pointing import Pointing
+from bodyschema.interfaces.records import FloatArray, Pair
+from bodyschema.interfaces.robot import RobotDescription
 
 HEAD = [0, 1]
 DIRECTIONS = [1, -1, 1, 1, 1, 1, 1]  # of the servos

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 from two_processes import KEYS, LIFE_LIMIT_S, answer, learner_with, running, status_when, write_robot
 
-from daemon import store_schema
-from daemon.bus import Bus
-from daemon.config import Config
-from daemon.history import answer_pairs
-from daemon.session import session_of
-from daemon.status import LearnerStatus
-from daemon.store import PairReader, PairStore
-from daemon.store_rows import COLUMNS, checksum
-from daemon.wire import JointsRequest, PredictReply, decode, encode, pair_to_wire
-from interfaces.clock import SystemClock
-from interfaces.records import MarkerFix, frozen_array
+from bodyschema.daemon import store_schema
+from bodyschema.daemon.bus import Bus
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.history import answer_pairs
+from bodyschema.daemon.session import session_of
+from bodyschema.daemon.status import LearnerStatus
+from bodyschema.daemon.store import PairReader, PairStore
+from bodyschema.daemon.store_rows import COLUMNS, checksum
+from bodyschema.daemon.wire import JointsRequest, PredictReply, decode, encode, pair_to_wire
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.records import MarkerFix, frozen_array
 from kbmaps import RigidChain
 
 PAIRS, SPOILT = 60, 30

@@ -17,12 +17,12 @@ from security_recipe import SEVERAL, carried_out
 from stalled_at import WORK
 from two_processes import KEYS, write_robot
 
-from daemon import learner, sampler
-from daemon.bus import client
-from daemon.config import Config
-from daemon.status import LearnerStatus, SamplerStatus
-from daemon.store import PairReader
-from daemon.wire import PairsReply, decode
+from bodyschema.daemon import learner, sampler
+from bodyschema.daemon.bus import client
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.status import LearnerStatus, SamplerStatus
+from bodyschema.daemon.store import PairReader
+from bodyschema.daemon.wire import PairsReply, decode
 
 LIMIT_S = 500.0
 WATCHDOG_S = 0.8
@@ -87,7 +87,7 @@ def started(
     config: Config, systemd: Systemd, process: str, *wrapper: object
 ) -> contextlib.AbstractContextManager[warm.Child]:
     """A process of ours under `systemd`, its log beside robot.toml."""
-    return running(systemd, log_of(config), *(wrapper or ("-m", "daemon")), process, "--robot", config.file)
+    return running(systemd, log_of(config), *(wrapper or ("-m", "bodyschema")), process, "--robot", config.file)
 
 
 @contextlib.contextmanager
@@ -113,7 +113,7 @@ def test_a_router_is_ready_when_it_takes_connections_and_lives_until_it_is_told_
     pki, port = carried_out(tmp_path), free_endpoint().rpartition(":")[2]
     file = pki / "router.toml"
     file.write_text((SEVERAL / "router.toml").read_text().replace("tls/192.0.2.10:7450", f"tls/127.0.0.1:{port}"))
-    with running(systemd, tmp_path / "log", "-m", "daemon", "router", file) as router:
+    with running(systemd, tmp_path / "log", "-m", "bodyschema", "router", file) as router:
         systemd.wait_for("READY=1")
         with socket.create_connection(("127.0.0.1", int(port)), timeout=LIMIT_S):
             systemd.wait_for("WATCHDOG=1")

@@ -95,7 +95,7 @@ def desk(network: Network, tmp_path_factory) -> Iterator[dict[str, Any]]:
     with ExitStack() as stack:
         for host, process in (("hub", "router"), ("robot", "sampler"), ("learner", "learner")):
             log = stack.enter_context((folders[host] / "log").open("wb"))
-            command = [*network.on(host), sys.executable, "-m", "daemon", process]
+            command = [*network.on(host), sys.executable, "-m", "bodyschema", process]
             running = stack.enter_context(subprocess.Popen(command, cwd=folders[host], stderr=log))
             stack.callback(running.terminate)
         command = [*network.on("desk"), sys.executable, str(DESK), f"tls/{HOSTS['hub']}:7450", str(PAIRS)]

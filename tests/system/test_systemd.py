@@ -23,10 +23,10 @@ from test_install_service import HARDWARE, PORT, STEREO
 from two_processes import write_robot
 from v4l2_cameras import ShimCamera
 
-from daemon.servo_wiring import configured_ports
+from bodyschema.daemon.servo_wiring import configured_ports
 
 pytestmark = pytest.mark.soak
-BODYSCHEMA = (sys.executable, "-P", "-m", "daemon")
+BODYSCHEMA = (sys.executable, "-P", "-m", "bodyschema")
 USER = "daemon"  # one that every Linux has
 SAMPLER, LEARNER = "bodyschema-sampler@arm.service", "bodyschema-learner@arm.service"
 ROUTER = "bodyschema-router.service"

@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 import warm
 
-from daemon.bus import is_alive
-from daemon.config import Config
-from daemon.demo.scene import prepare
-from daemon.keys import Keys
-from interfaces.recording import Recording
+from bodyschema.daemon.bus import is_alive
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.demo.scene import prepare
+from bodyschema.daemon.keys import Keys
+from bodyschema.interfaces.recording import Recording
 
 pytest.importorskip("uvicorn")
 playwright = pytest.importorskip("playwright.sync_api")
@@ -40,7 +40,7 @@ class PageServer:
     """`bodyschema view` on a port of its own, which can be ended and started again."""
 
     def __init__(self, robot: Path, port: str) -> None:
-        self._command = [sys.executable, "-m", "daemon", "view", "--robot", str(robot), "--port", port]
+        self._command = [sys.executable, "-m", "bodyschema", "view", "--robot", str(robot), "--port", port]
         self.address = f"http://127.0.0.1:{port}/"
         self.start()
 
@@ -76,7 +76,7 @@ def robot_file(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     text = file.read_text(encoding="utf-8").replace("[daemon]\n", "[daemon]\nany_step = true\n")
     file.write_text(f'{text}\n[drivers]\nrecording = "walk.csv"\n', encoding="utf-8")
     with scene.log_file.open("wb") as log:
-        daemon = warm.Child("-m", "daemon", "run", "--robot", file, stderr=log)
+        daemon = warm.Child("-m", "bodyschema", "run", "--robot", file, stderr=log)
     try:
         for process in ("sampler", "learner"):
             while not is_alive(getattr(config.tables.zenoh, process), Keys(config.robot.name).alive(process)):

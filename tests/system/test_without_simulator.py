@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from two_processes import running, status_when, write_robot
 
-from daemon.cli import COMMANDS
-from daemon.status import LearnerStatus
+from bodyschema.daemon.cli import COMMANDS
+from bodyschema.daemon.status import LearnerStatus
 
 ROOT = Path(__file__).parents[2]
 # As if they were not installed, wherever they are.
@@ -55,7 +55,7 @@ def test_the_guard_refuses_the_simulator(guarded: Path) -> None:
 
 
 def test_a_camera_command_names_the_extra(guarded: Path, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "daemon", "calibrate", "cameras", str(tmp_path)]
+    command = [sys.executable, "-m", "bodyschema", "calibrate", "cameras", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
     assert (done.returncode, done.stderr) == (
         1,
@@ -65,7 +65,7 @@ def test_a_camera_command_names_the_extra(guarded: Path, tmp_path: Path) -> None
 
 def test_every_command_but_the_simulator_s_can_be_loaded(guarded: Path) -> None:
     names = sorted(set(COMMANDS))
-    done = run(f"import importlib\nfor name in {names}: importlib.import_module('daemon.commands.' + name)")
+    done = run(f"import importlib\nfor name in {names}: importlib.import_module('bodyschema.daemon.commands.' + name)")
     assert done.stderr == ""
 
 
@@ -77,7 +77,7 @@ def test_sampler_and_learner_run(guarded: Path, tmp_path: Path, free_endpoint: C
 
 def test_the_simulation_says_what_to_install(guarded: Path, tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "daemon", "run", "--sim", "--robot", ROOT / "examples" / "desk_arm" / "robot.toml"],
+        [sys.executable, "-m", "bodyschema", "run", "--sim", "--robot", ROOT / "examples" / "desk_arm" / "robot.toml"],
         capture_output=True,
         text=True,
         check=False,

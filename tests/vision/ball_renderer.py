@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray, ImageArray, StereoFrame
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray, ImageArray, StereoFrame
 
 VGA = StereoCalibration(
     focal_px=600.0,

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.interpolate import RectBivariateSpline
 from scipy.spatial.transform import Rotation
 
-from interfaces.records import FloatArray, ImageArray, StereoFrame
+from bodyschema.interfaces.records import FloatArray, ImageArray, StereoFrame
 
 # A Fibonacci lattice on a pixel about its middle: evenly spread along every direction.
 LATTICE = (np.column_stack([np.arange(34) + 0.5, (np.arange(34) * 21 + 0.5) % 34]) / 34 - 0.5).astype(np.float32)

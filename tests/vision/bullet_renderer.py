@@ -7,8 +7,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray, ImageArray, StereoFrame
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray, ImageArray, StereoFrame
 
 NEAR_M, FAR_M = 0.05, 5.0
 BROWN, BRICK = (0.45, 0.28, 0.18, 1.0), (0.55, 0.22, 0.16, 1.0)

@@ -9,13 +9,13 @@ from board_renderer import Photographer, Printed, Taken, TrueRig, poses, webcams
 from scipy.spatial.transform import Rotation
 from shown_board import BOARD, SIZE, true_vector
 
-from interfaces.records import FloatArray
-from vision.calibration.calibrate import Asked, Calibrated, ModelChoice, calibrate
-from vision.calibration.gather import gathered
-from vision.calibration.images import ImagePair
-from vision.rig import CalibrationError
-from vision.spread import covariance_of
-from vision.triangulated import triangulated
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.vision.calibration.calibrate import Asked, Calibrated, ModelChoice, calibrate
+from bodyschema.vision.calibration.gather import gathered
+from bodyschema.vision.calibration.images import ImagePair
+from bodyschema.vision.rig import CalibrationError
+from bodyschema.vision.spread import covariance_of
+from bodyschema.vision.triangulated import triangulated
 
 VIEWS = 20
 DISTANCE_M = 0.6

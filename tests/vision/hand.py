@@ -5,8 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray
 
 SKIN_RGB = (0.72, 0.48, 0.38)
 _FINGERS, _FINGER_PX, _LENGTH = 3, 0.45, 4.0

@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from interfaces.records import FloatArray, ImageArray
+from bodyschema.interfaces.records import FloatArray, ImageArray
 
 PX_A_MM = 4
 

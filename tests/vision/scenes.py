@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from ball_renderer import SMALL, Look, Room, in_eyes, paint_ball, take
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, StereoFrame
-from vision.tracker import StereoTracker
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, StereoFrame
+from bodyschema.vision.tracker import StereoTracker
 
 RADIUS_M = 0.020
 PLAIN = Look(noise_sd=2.0)

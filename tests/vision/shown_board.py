@@ -9,13 +9,13 @@ import numpy as np
 from board_renderer import Photographer, Printed, Taken, TrueRig, poses, webcams
 from scipy.spatial.transform import Rotation
 
-from interfaces.errors import SourceEnded
-from interfaces.records import FloatArray, ImageArray, StereoFrame
-from vision.board import Board, Corners, NotFound
-from vision.calibration.images import ImagePair
-from vision.calibration.view import View
-from vision.lens import Model
-from vision.rig import Made, StereoRig, parameter_names, split
+from bodyschema.interfaces.errors import SourceEnded
+from bodyschema.interfaces.records import FloatArray, ImageArray, StereoFrame
+from bodyschema.vision.board import Board, Corners, NotFound
+from bodyschema.vision.calibration.images import ImagePair
+from bodyschema.vision.calibration.view import View
+from bodyschema.vision.lens import Model
+from bodyschema.vision.rig import Made, StereoRig, parameter_names, split
 
 SIZE = (640, 480)
 BOARD = Board()

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from ball_renderer import Look, backdrop, take
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray, StereoFrame
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray, StereoFrame
 
 BLACK, WHITE = 0.07, 0.85
 

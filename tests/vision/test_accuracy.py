@@ -9,10 +9,10 @@ from ball_renderer import SMALL, VGA, Look, clutter, render_pair
 from scenes import RADIUS_M, Errors, compare, measure_errors, place
 from scipy.stats import binom
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import MarkerFix
-from vision.limb import Limb
-from vision.tracker import StereoTracker
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import MarkerFix
+from bodyschema.vision.limb import Limb
+from bodyschema.vision.tracker import StereoTracker
 
 LOOKS = {
     "clean": Look(noise_sd=1.0),

@@ -8,12 +8,12 @@ import pytest
 from ball_renderer import SMALL, Look
 from tag_renderer import Sheet, photograph
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import MarkerFix, StereoFrame
-from vision.cameras.annotate import GREEN, RED, Annotator
-from vision.config import VisionConfig
-from vision.tag_config import TagConfig
-from vision.trackers import tracker_of
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import MarkerFix, StereoFrame
+from bodyschema.vision.cameras.annotate import GREEN, RED, Annotator
+from bodyschema.vision.config import VisionConfig
+from bodyschema.vision.tag_config import TagConfig
+from bodyschema.vision.trackers import tracker_of
 
 CAMERAS = StereoCalibration(
     focal_px=700.0, principal_point_px=(160.0, 120.0), baseline_m=0.12, image_size_px=(320, 240), pixel_sigma=0.2

@@ -8,12 +8,12 @@ import numpy as np
 from ball_renderer import SMALL, in_eyes
 from scenes import RADIUS_M, Ball, reason, stage
 
-from interfaces.records import MarkerFix, Reason
-from vision.ball_size import BallSize
-from vision.blob import Disc
-from vision.sphere import Pinhole
-from vision.tracker import StereoTracker
-from vision.triangulate import Location, locate
+from bodyschema.interfaces.records import MarkerFix, Reason
+from bodyschema.vision.ball_size import BallSize
+from bodyschema.vision.blob import Disc
+from bodyschema.vision.sphere import Pinhole
+from bodyschema.vision.tracker import StereoTracker
+from bodyschema.vision.triangulate import Location, locate
 
 X = np.array([0.02, 0.01, 0.8])
 CENTRE_SIGMA_PX = 0.01

@@ -13,11 +13,11 @@ from printed_page import PX_A_MM, from_pdf, from_svg, rasterised
 from scipy.spatial.transform import Rotation
 from shown_board import BOARD, photographed
 
-from interfaces.errors import ConfigError
-from interfaces.records import FloatArray, ImageArray
-from vision.board import Board, BoardDetector, Corners, NotFound
-from vision.board.page import page
-from vision.printing import pdf, svg
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.records import FloatArray, ImageArray
+from bodyschema.vision.board import Board, BoardDetector, Corners, NotFound
+from bodyschema.vision.board.page import page
+from bodyschema.vision.printing import pdf, svg
 
 BOARDS = [Board(), Board(7, 5, 0.025, dictionary="6X6_250"), Board(10, 7, 0.020, pattern="chessboard")]
 

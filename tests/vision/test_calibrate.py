@@ -13,15 +13,15 @@ from board_renderer import Photographer, Printed, Taken, poses, webcams
 from scipy.spatial.transform import Rotation
 from shown_board import BOARD, NOISE_PX, SIZE, corner_views, photographed, true_vector, view_of
 
-from interfaces.records import FloatArray
-from vision.board import Corners, NotFound
-from vision.calibration.calibrate import Asked, Fitted, calibrate, fit
-from vision.calibration.gather import Unusable, gathered, require_both, summarised
-from vision.calibration.guidance import Coverage
-from vision.calibration.images import ImagePair
-from vision.calibration.influence import covariance
-from vision.calibration.view import View
-from vision.rig import CalibrationError
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.vision.board import Corners, NotFound
+from bodyschema.vision.calibration.calibrate import Asked, Fitted, calibrate, fit
+from bodyschema.vision.calibration.gather import Unusable, gathered, require_both, summarised
+from bodyschema.vision.calibration.guidance import Coverage
+from bodyschema.vision.calibration.images import ImagePair
+from bodyschema.vision.calibration.influence import covariance
+from bodyschema.vision.calibration.view import View
+from bodyschema.vision.rig import CalibrationError
 
 ASKED = Asked(SIZE, ("A1", "B2"), "2026-01-01T00:00:00Z", scale_sigma=0.0)
 PINHOLE = replace(ASKED, model="pinhole")

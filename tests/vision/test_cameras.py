@@ -12,15 +12,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from interfaces.errors import ConfigError, SourceEnded, SourceError
-from vision.cameras.config import CamerasConfig, ImagesConfig, TwoConfig, VideosConfig
-from vision.cameras.images import ImageRoll
-from vision.cameras.look import of_image
-from vision.cameras.opened import eyes_of
-from vision.cameras.pairing import Pairing
-from vision.cameras.serials import connected, serial_of
-from vision.cameras.shot import Shot
-from vision.cameras.stamps import TRIALS, Stamps
+from bodyschema.interfaces.errors import ConfigError, SourceEnded, SourceError
+from bodyschema.vision.cameras.config import CamerasConfig, ImagesConfig, TwoConfig, VideosConfig
+from bodyschema.vision.cameras.images import ImageRoll
+from bodyschema.vision.cameras.look import of_image
+from bodyschema.vision.cameras.opened import eyes_of
+from bodyschema.vision.cameras.pairing import Pairing
+from bodyschema.vision.cameras.serials import connected, serial_of
+from bodyschema.vision.cameras.shot import Shot
+from bodyschema.vision.cameras.stamps import TRIALS, Stamps
 
 FILE = Path("robot.toml")
 BY_ID = "/dev/v4l/by-id/usb-A-video-index0"

@@ -7,11 +7,11 @@ import pytest
 from ball_renderer import SMALL
 from scenes import Ball, reason, sigmas_off, stage
 
-from interfaces.errors import ConfigError
-from interfaces.records import Reason
-from interfaces.toml_file import convert, read_toml
-from vision.config import NAMED_COLOURS, HueBand, VisionConfig
-from vision.tracker import StereoTracker
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.records import Reason
+from bodyschema.interfaces.toml_file import convert, read_toml
+from bodyschema.vision.config import NAMED_COLOURS, HueBand, VisionConfig
+from bodyschema.vision.tracker import StereoTracker
 
 FAR_SIGMAS = 5.0
 

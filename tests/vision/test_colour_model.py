@@ -9,12 +9,12 @@ import pytest
 from ball_renderer import SMALL, Look
 from scenes import Ball, Slab, sigmas_off, stage
 
-from daemon.marker_wiring import learnt_colour_table
-from interfaces.records import MarkerFix
-from vision.colour import ColourGate
-from vision.colour_model import ColourUnlearnt, colour_at, colour_of_the_moving, colour_table
-from vision.config import HueBand, VisionConfig
-from vision.tracker import StereoTracker
+from bodyschema.daemon.marker_wiring import learnt_colour_table
+from bodyschema.interfaces.records import MarkerFix
+from bodyschema.vision.colour import ColourGate
+from bodyschema.vision.colour_model import ColourUnlearnt, colour_at, colour_of_the_moving, colour_table
+from bodyschema.vision.config import HueBand, VisionConfig
+from bodyschema.vision.tracker import StereoTracker
 
 SKIN = (0.78, 0.55, 0.43)
 FAR_SIGMAS = 5.0

@@ -5,10 +5,10 @@ import pytest
 from ball_renderer import SMALL
 from scenes import Ball, Slab, reason, sigmas_off, stage
 
-from interfaces.errors import SourceLost
-from interfaces.records import MarkerFix, Reason
-from vision.tracked_camera import TrackedCamera
-from vision.tracker import StereoTracker
+from bodyschema.interfaces.errors import SourceLost
+from bodyschema.interfaces.records import MarkerFix, Reason
+from bodyschema.vision.tracked_camera import TrackedCamera
+from bodyschema.vision.tracker import StereoTracker
 
 FRAME_S = 1 / 30
 FAR_SIGMAS = 5.0

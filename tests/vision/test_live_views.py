@@ -9,10 +9,10 @@ import pytest
 from board_renderer import webcams
 from shown_board import BOARD, SIZE, KnownCorners, corner_views, photographed, shot
 
-from interfaces.records import StereoFrame
-from vision.board import Corners
-from vision.calibration.live import LiveViews, Outcome
-from vision.calibration.view import View
+from bodyschema.interfaces.records import StereoFrame
+from bodyschema.vision.board import Corners
+from bodyschema.vision.calibration.live import LiveViews, Outcome
+from bodyschema.vision.calibration.view import View
 
 
 @pytest.fixture(scope="module")

@@ -14,18 +14,18 @@ from ball_renderer import Look
 from scipy.spatial.transform import Rotation
 from tag_renderer import Sheet, photograph
 
-from daemon.cli import app
-from daemon.cluster_wiring import ClusterFile, Wanted, _require_tags, figures, said, sides_of
-from interfaces.camera import StereoCalibration
-from interfaces.errors import ConfigError
-from interfaces.records import FloatArray
-from vision.cluster.measure import ClusterView, MeasuredCluster, measure_cluster
-from vision.cluster.tables import cluster_tables
-from vision.lens import Lens
-from vision.rig import CalibrationError, Made, StereoRig, parameter_names
-from vision.rig_file import write_rig
-from vision.tag_config import PlacedTag
-from vision.tag_image import TagImage
+from bodyschema.daemon.cli import app
+from bodyschema.daemon.cluster_wiring import ClusterFile, Wanted, _require_tags, figures, said, sides_of
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.vision.cluster.measure import ClusterView, MeasuredCluster, measure_cluster
+from bodyschema.vision.cluster.tables import cluster_tables
+from bodyschema.vision.lens import Lens
+from bodyschema.vision.rig import CalibrationError, Made, StereoRig, parameter_names
+from bodyschema.vision.rig_file import write_rig
+from bodyschema.vision.tag_config import PlacedTag
+from bodyschema.vision.tag_image import TagImage
 
 EYES = StereoCalibration(600.0, (319.5, 239.5), 0.12, (640, 480), 0.0)
 SIDE_M = 0.04

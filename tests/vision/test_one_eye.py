@@ -14,21 +14,21 @@ from scipy.spatial.transform import Rotation
 from shown_board import BOARD, SIZE, corner_views
 from tag_renderer import Sheet, photograph
 
-from interfaces.camera import StereoCalibration
-from interfaces.errors import SourceError
-from interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, StereoFrame
-from vision.calibration.calibrate import Asked, Calibrated, calibrate
-from vision.calibration.guidance import Coverage
-from vision.calibration.view import ONE_EYE
-from vision.config import VisionConfig
-from vision.rectified import Rectification
-from vision.rig import OneEyeRig, OtherCameras
-from vision.rig_file import read_rig, write_rig
-from vision.tag_body import TagBody
-from vision.tag_config import ClusterConfig, PlacedTag, TagConfig
-from vision.tag_tracker import TagTracker
-from vision.tracked_camera import MarkerTracker
-from vision.trackers import tracker_of
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.errors import SourceError
+from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, StereoFrame
+from bodyschema.vision.calibration.calibrate import Asked, Calibrated, calibrate
+from bodyschema.vision.calibration.guidance import Coverage
+from bodyschema.vision.calibration.view import ONE_EYE
+from bodyschema.vision.config import VisionConfig
+from bodyschema.vision.rectified import Rectification
+from bodyschema.vision.rig import OneEyeRig, OtherCameras
+from bodyschema.vision.rig_file import read_rig, write_rig
+from bodyschema.vision.tag_body import TagBody
+from bodyschema.vision.tag_config import ClusterConfig, PlacedTag, TagConfig
+from bodyschema.vision.tag_tracker import TagTracker
+from bodyschema.vision.tracked_camera import MarkerTracker
+from bodyschema.vision.trackers import tracker_of
 
 SIDE_M = 0.03
 ONE: StereoCalibration = replace(SMALL, baseline_m=0.0)

@@ -12,16 +12,16 @@ import pytest
 from printed_page import PX_A_MM, from_pdf, from_svg, rasterised
 from scipy.spatial.transform import Rotation
 
-from interfaces.camera import StereoCalibration
-from interfaces.errors import ConfigError
-from interfaces.records import FloatArray, ImageArray, MarkerFix, StereoFrame
-from vision.cluster.page import FACE_SIDES, shape_page, tags_page
-from vision.cluster.shapes import Shape, cube, plate
-from vision.cluster.tables import cluster_tables, tag_tables
-from vision.config import VisionConfig
-from vision.printing import Page, pdf, svg
-from vision.tag_config import Dictionary
-from vision.trackers import tracker_of
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.records import FloatArray, ImageArray, MarkerFix, StereoFrame
+from bodyschema.vision.cluster.page import FACE_SIDES, shape_page, tags_page
+from bodyschema.vision.cluster.shapes import Shape, cube, plate
+from bodyschema.vision.cluster.tables import cluster_tables, tag_tables
+from bodyschema.vision.config import VisionConfig
+from bodyschema.vision.printing import Page, pdf, svg
+from bodyschema.vision.tag_config import Dictionary
+from bodyschema.vision.trackers import tracker_of
 
 EYES = StereoCalibration(900.0, (639.5, 479.5), 0.10, (1280, 960), 0.1)
 # Modules of 4 mm: whole pixels of the page as it is painted.

@@ -10,15 +10,15 @@ from board_renderer import Photographer, Printed, Taken, webcams
 from scipy.spatial.transform import Rotation
 from shown_board import BOARD, SIZE, Eyes, corner_views, known_rig
 
-from interfaces.errors import SourceError
-from interfaces.records import StereoFrame
-from vision.board import BoardDetector, Corners
-from vision.calibration.calibrate import Asked, calibrate
-from vision.calibration.check import check
-from vision.calibration.view import View
-from vision.rectified import Rectification, RectifiedCamera
-from vision.rig import CalibrationError, StereoRig
-from vision.triangulated import triangulated
+from bodyschema.interfaces.errors import SourceError
+from bodyschema.interfaces.records import StereoFrame
+from bodyschema.vision.board import BoardDetector, Corners
+from bodyschema.vision.calibration.calibrate import Asked, calibrate
+from bodyschema.vision.calibration.check import check
+from bodyschema.vision.calibration.view import View
+from bodyschema.vision.rectified import Rectification, RectifiedCamera
+from bodyschema.vision.rig import CalibrationError, StereoRig
+from bodyschema.vision.triangulated import triangulated
 
 
 @pytest.mark.parametrize("fisheye", [False, True], ids=["pinhole", "fisheye"])

@@ -9,16 +9,16 @@ from ball_renderer import SMALL, VGA, Look, clutter, in_eyes, paint_ball, random
 from hand import paint_fingers
 from scenes import RADIUS_M, Ball, Slab, place, reason, sigmas_off, stage
 
-from interfaces.camera import StereoCalibration
-from interfaces.errors import SourceError
-from interfaces.records import MarkerFix, Reason, StereoFrame
-from vision.blob import Disc, Region, find_patches, measure
-from vision.colour import gate_of
-from vision.config import VisionConfig
-from vision.match import StereoMatcher
-from vision.sphere import Pinhole
-from vision.tracker import StereoTracker
-from vision.triangulate import Location
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.errors import SourceError
+from bodyschema.interfaces.records import MarkerFix, Reason, StereoFrame
+from bodyschema.vision.blob import Disc, Region, find_patches, measure
+from bodyschema.vision.colour import gate_of
+from bodyschema.vision.config import VisionConfig
+from bodyschema.vision.match import StereoMatcher
+from bodyschema.vision.sphere import Pinhole
+from bodyschema.vision.tracker import StereoTracker
+from bodyschema.vision.triangulate import Location
 
 BALL = Ball((0.02, 0.01, 0.8))
 FAR_SIGMAS = 5.0

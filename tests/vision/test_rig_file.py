@@ -10,9 +10,9 @@ import pytest
 from board_renderer import webcams
 from shown_board import known_rig
 
-from interfaces.errors import ConfigError
-from vision.rig import CalibrationError, StereoRig
-from vision.rig_file import read_rig, write_rig
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.vision.rig import CalibrationError, StereoRig
+from bodyschema.vision.rig_file import read_rig, write_rig
 
 
 @pytest.fixture(params=[False, True], ids=["pinhole", "fisheye"])

@@ -11,11 +11,11 @@ from ball_renderer import VGA, Look, backdrop
 from scipy.spatial.transform import Rotation
 from tag_renderer import Sheet, photograph
 
-from interfaces.records import FloatArray, MarkerFix
+from bodyschema.interfaces.records import FloatArray, MarkerFix
+from bodyschema.vision.tag_body import TagBody
+from bodyschema.vision.tag_config import TagConfig
+from bodyschema.vision.tag_tracker import TagTracker
 from kbmaps import rotation_vectors
-from vision.tag_body import TagBody
-from vision.tag_config import TagConfig
-from vision.tag_tracker import TagTracker
 
 FRAMES = 120
 SIDE_M = 0.05

@@ -11,18 +11,18 @@ from scenes import reason
 from scipy.spatial.transform import Rotation
 from tag_renderer import Card, Sheet, photograph
 
-from interfaces.camera import StereoCalibration
-from interfaces.errors import ConfigError, SourceError
-from interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, StereoFrame
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.errors import ConfigError, SourceError
+from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, StereoFrame
+from bodyschema.vision.config import VisionConfig
+from bodyschema.vision.pose import PoseEstimator, Sighting, mirrored
+from bodyschema.vision.tag_body import TAG_CORNERS, TagBody
+from bodyschema.vision.tag_config import ClusterConfig, PlacedTag, TagConfig
+from bodyschema.vision.tag_image import TagImage, measure_tag
+from bodyschema.vision.tag_tracker import TagTracker
+from bodyschema.vision.tracker import StereoTracker
+from bodyschema.vision.trackers import tracker_of
 from kbmaps import rotation_vectors
-from vision.config import VisionConfig
-from vision.pose import PoseEstimator, Sighting, mirrored
-from vision.tag_body import TAG_CORNERS, TagBody
-from vision.tag_config import ClusterConfig, PlacedTag, TagConfig
-from vision.tag_image import TagImage, measure_tag
-from vision.tag_tracker import TagTracker
-from vision.tracker import StereoTracker
-from vision.trackers import tracker_of
 
 SIDE_M = 0.03
 CONFIG = TagConfig(side_m=SIDE_M)

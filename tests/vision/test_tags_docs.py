@@ -7,10 +7,10 @@ from pathlib import Path
 
 import msgspec
 
-from interfaces.records import Reason
-from vision.config import VisionConfig
-from vision.tag_body import TagBody
-from vision.tag_config import TagConfig
+from bodyschema.interfaces.records import Reason
+from bodyschema.vision.config import VisionConfig
+from bodyschema.vision.tag_body import TagBody
+from bodyschema.vision.tag_config import TagConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "tags.md").read_text(encoding="utf-8")

@@ -6,8 +6,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from interfaces.records import MarkerMiss, Reason
-from vision.config import NAMED_COLOURS, HueBand, VisionConfig
+from bodyschema.interfaces.records import MarkerMiss, Reason
+from bodyschema.vision.config import NAMED_COLOURS, HueBand, VisionConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "vision.md").read_text(encoding="utf-8")

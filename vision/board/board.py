@@ -10,8 +10,8 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from interfaces.errors import ConfigError
-from interfaces.records import FloatArray
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.records import FloatArray
 
 Pattern = Literal["charuco", "chessboard"]
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from interfaces.records import FloatArray, ImageArray
+from bodyschema.interfaces.records import FloatArray, ImageArray
 
 from .board import SIZES, Board, dictionary, smallest_size
 from .exposure import image_fault

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from interfaces.records import ImageArray
+from bodyschema.interfaces.records import ImageArray
 
 from .sharpness import sharpest_edge_px
 

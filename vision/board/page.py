@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from interfaces.errors import ConfigError
-from vision.printing.sheet import AROUND_MM, Page, Rectangle, pattern, sheets
-from vision.printing.sheet import page as drawn_page
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.vision.printing.sheet import AROUND_MM, Page, Rectangle, pattern, sheets
+from bodyschema.vision.printing.sheet import page as drawn_page
 
 from .board import Board, marker_bits
 

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from interfaces.records import FloatArray, ImageArray
+from bodyschema.interfaces.records import FloatArray, ImageArray
 
 from .board import Board
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from interfaces.records import FloatArray, ImageArray
+from bodyschema.interfaces.records import FloatArray, ImageArray
 
 from .board import Board
 

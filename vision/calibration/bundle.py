@@ -9,9 +9,9 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from interfaces.records import FloatArray
-from vision.lens import Lens, Model
-from vision.rig import CalibrationError, lens_of_one, split
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.vision.lens import Lens, Model
+from bodyschema.vision.rig import CalibrationError, lens_of_one, split
 
 from .view import EYES, Eye, View
 

@@ -9,10 +9,10 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from interfaces.records import FloatArray
-from vision.board import Board
-from vision.lens import Model
-from vision.rig import CalibrationError, Made, OneEyeRig, Rig, StereoRig, lens_of_one, split
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.vision.board import Board
+from bodyschema.vision.lens import Model
+from bodyschema.vision.rig import CalibrationError, Made, OneEyeRig, Rig, StereoRig, lens_of_one, split
 
 from .bundle import Bundle, solve
 from .guidance import Coverage

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.distance import pdist
 
-from interfaces.records import FloatArray
-from vision.board import Board
-from vision.rectified import Rectification
-from vision.rig import CalibrationError, StereoRig
-from vision.spread import covariance_of
-from vision.triangulated import triangulated
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.vision.board import Board
+from bodyschema.vision.rectified import Rectification
+from bodyschema.vision.rig import CalibrationError, StereoRig
+from bodyschema.vision.spread import covariance_of
+from bodyschema.vision.triangulated import triangulated
 
 from .view import View
 

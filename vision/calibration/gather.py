@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from interfaces.records import ImageArray
-from vision.board import OTHER_BOARD, Board, BoardDetector, Corners, NotFound
-from vision.rig import CalibrationError
+from bodyschema.interfaces.records import ImageArray
+from bodyschema.vision.board import OTHER_BOARD, Board, BoardDetector, Corners, NotFound
+from bodyschema.vision.rig import CalibrationError
 
 from .guidance import Coverage
 from .images import ImagePair, require_equal_sizes
@@ -23,7 +23,7 @@ _NUMBERS = re.compile(r"\d+(\.\d+)?")
 
 
 class Detector(Protocol):
-    """Finds one board; see `vision.board.BoardDetector`."""
+    """Finds one board; see `bodyschema.vision.board.BoardDetector`."""
 
     def find(self, image: ImageArray) -> Corners | NotFound: ...
 

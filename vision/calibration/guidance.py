@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from interfaces.records import FloatArray
-from vision.board import Board, Corners
-from vision.lens import Lens
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.vision.board import Board, Corners
+from bodyschema.vision.lens import Lens
 
 from .start import pose_of
 from .view import EYES, Eye, View, all_px, image_of, seen_by

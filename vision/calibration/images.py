@@ -9,9 +9,9 @@ from pathlib import Path
 
 import cv2
 
-from interfaces.records import ImageArray
-from vision.image_file import read_image
-from vision.rig import CalibrationError
+from bodyschema.interfaces.records import ImageArray
+from bodyschema.vision.image_file import read_image
+from bodyschema.vision.rig import CalibrationError
 
 _ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
 _EYE = re.compile(r"(?<![a-z])(left|right|l|r)(?![a-z])", re.IGNORECASE)

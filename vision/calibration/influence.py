@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 from .bundle import Bundle, seen_with_slopes
 from .view import View

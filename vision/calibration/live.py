@@ -9,8 +9,8 @@ from enum import StrEnum
 
 import numpy as np
 
-from interfaces.records import StereoFrame
-from vision.board import Board, BoardDetector
+from bodyschema.interfaces.records import StereoFrame
+from bodyschema.vision.board import Board, BoardDetector
 
 from .gather import Detector, Gathered, Unusable, eyes_of, looked_at
 from .guidance import CORNERS_A_CELL, cell_counts, rough_tilt_deg

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from interfaces.records import FloatArray
-from vision.rig import Rig, StereoRig
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.vision.rig import Rig, StereoRig
 
 from .guidance import Coverage, cell_name
 from .view import image_of

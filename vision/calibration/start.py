@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from interfaces.records import FloatArray
-from vision.board import Corners
-from vision.lens import DISTORTION_NAMES, Lens, Model
-from vision.rig import CalibrationError
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.vision.board import Corners
+from bodyschema.vision.lens import DISTORTION_NAMES, Lens, Model
+from bodyschema.vision.rig import CalibrationError
 
 from .view import EYES, Eye, View, seen_by
 

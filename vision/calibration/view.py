@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from interfaces.records import FloatArray
-from vision.board import Corners
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.vision.board import Corners
 
 Eye = Literal["left", "right"]
 EYES: tuple[Eye, Eye] = ("left", "right")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 from scipy.spatial.transform import Rotation
 
-from interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray
 
 from .bundle import Bundle
 from .influence import influences

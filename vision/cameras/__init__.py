@@ -1,1 +1,1 @@
-"""Cameras: devices, image folders and films as `interfaces.protocols.StereoEyes`; see docs/cameras.md."""
+"""Cameras: devices, image folders and films as `bodyschema.interfaces.protocols.StereoEyes`; see docs/cameras.md."""

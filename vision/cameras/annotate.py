@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame
-from interfaces.rejections import WORDS
-from vision.blob import Region, find_patches, measure
-from vision.colour import gate_of
-from vision.config import VisionConfig
-from vision.sphere import Pinhole
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame
+from bodyschema.interfaces.rejections import WORDS
+from bodyschema.vision.blob import Region, find_patches, measure
+from bodyschema.vision.colour import gate_of
+from bodyschema.vision.config import VisionConfig
+from bodyschema.vision.sphere import Pinhole
 
 from .annotate_tags import TagDrawing, TagSight, outline
 

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray, ImageArray, MarkerFix, Reason
-from vision.config import VisionConfig
-from vision.tag_body import TagBody
-from vision.tag_dictionary import tags_of
-from vision.tag_finder import TagFinder
-from vision.tag_image import measure_tag
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray, ImageArray, MarkerFix, Reason
+from bodyschema.vision.config import VisionConfig
+from bodyschema.vision.tag_body import TagBody
+from bodyschema.vision.tag_dictionary import tags_of
+from bodyschema.vision.tag_finder import TagFinder
+from bodyschema.vision.tag_image import measure_tag
 
 SUBPIXEL_BITS = 4
 AXES = ((60, 60, 255), (60, 220, 60), (255, 140, 60))  # x, y, z

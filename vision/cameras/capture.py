@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from types import TracebackType
 from typing import Self
 
-from interfaces.errors import SourceError
+from bodyschema.interfaces.errors import SourceError
 
 from .device import CameraDevice
 from .look import Look

@@ -9,9 +9,9 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from interfaces.camera import LARGEST_SIDE_PX
-from interfaces.errors import ConfigError
-from interfaces.toml_file import line_of
+from bodyschema.interfaces.camera import LARGEST_SIDE_PX
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.toml_file import line_of
 
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]

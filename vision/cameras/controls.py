@@ -9,7 +9,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from interfaces.errors import SourceError
+from bodyschema.interfaces.errors import SourceError
 
 from .config import SideBySideConfig, UvcSettings
 

@@ -10,9 +10,9 @@ from typing import Self
 import cv2
 import numpy as np
 
-from interfaces.errors import SourceError, SourceLost
-from interfaces.protocols import Clock
-from interfaces.records import ImageArray
+from bodyschema.interfaces.errors import SourceError, SourceLost
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.records import ImageArray
 
 from .config import UvcSettings
 from .controls import VideoCapture, apply, raw_size_px, sends_jpeg

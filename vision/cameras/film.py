@@ -10,10 +10,10 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from interfaces.errors import ConfigError, SourceEnded, SourceError
-from interfaces.limited import read_at_most
-from interfaces.protocols import Clock
-from interfaces.records import FloatArray, ImageArray, StereoFrame, frozen_array
+from bodyschema.interfaces.errors import ConfigError, SourceEnded, SourceError
+from bodyschema.interfaces.limited import read_at_most
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.records import FloatArray, ImageArray, StereoFrame, frozen_array
 
 from .look import of_image
 

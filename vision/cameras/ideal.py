@@ -5,10 +5,10 @@ from __future__ import annotations
 from types import TracebackType
 from typing import Self
 
-from interfaces.camera import StereoCalibration
-from interfaces.errors import ConfigError
-from interfaces.protocols import StereoEyes
-from interfaces.records import StereoFrame
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.protocols import StereoEyes
+from bodyschema.interfaces.records import StereoFrame
 
 
 class IdealCamera:

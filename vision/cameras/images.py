@@ -8,9 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from interfaces.errors import ConfigError, SourceError
-from interfaces.records import FloatArray, ImageArray, frozen_array
-from vision.image_file import read_image
+from bodyschema.interfaces.errors import ConfigError, SourceError
+from bodyschema.interfaces.records import FloatArray, ImageArray, frozen_array
+from bodyschema.vision.image_file import read_image
 
 from .config import ImagesConfig
 from .film import checked_times, read_times

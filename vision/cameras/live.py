@@ -13,9 +13,9 @@ from typing import Self
 
 import numpy as np
 
-from interfaces.errors import SourceError, SourceLost
-from interfaces.protocols import Clock
-from interfaces.records import StereoFrame
+from bodyschema.interfaces.errors import SourceError, SourceLost
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.records import StereoFrame
 
 from .capture import Capture
 from .config import CamerasConfig, OneConfig, SideBySideConfig, TwoConfig

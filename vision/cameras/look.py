@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from interfaces.records import ImageArray
+from bodyschema.interfaces.records import ImageArray
 
 EVERY_S = 0.5  # an image is looked at
 OVER_S = 3.0  # the frame rate is measured

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from interfaces.protocols import Clock
+from bodyschema.interfaces.protocols import Clock
 
 from .config import CamerasConfig, ImagesConfig, OneConfig, SideBySideConfig, TwoConfig, VideosConfig
 from .device import OpenCapture, open_v4l2

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from interfaces.records import ImageArray
+from bodyschema.interfaces.records import ImageArray
 
 
 @dataclass(frozen=True, slots=True)

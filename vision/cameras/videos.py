@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from interfaces.errors import ConfigError, SourceError
-from interfaces.records import FloatArray, ImageArray, frozen_array
+from bodyschema.interfaces.errors import ConfigError, SourceError
+from bodyschema.interfaces.records import FloatArray, ImageArray, frozen_array
 
 from .config import VideosConfig
 from .film import read_times

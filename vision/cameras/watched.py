@@ -7,11 +7,11 @@ from typing import Self
 
 import numpy as np
 
-from interfaces.protocols import StereoCamera, StereoEyes
-from interfaces.records import ImageArray, MarkerFix, Reason, StereoFrame
-from interfaces.rejections import REMEDIES, WORDS
-from vision.config import VisionConfig
-from vision.trackers import tracker_of
+from bodyschema.interfaces.protocols import StereoCamera, StereoEyes
+from bodyschema.interfaces.records import ImageArray, MarkerFix, Reason, StereoFrame
+from bodyschema.interfaces.rejections import REMEDIES, WORDS
+from bodyschema.vision.config import VisionConfig
+from bodyschema.vision.trackers import tracker_of
 
 from .annotate import Annotator
 

@@ -11,14 +11,14 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray
-from vision.pose import fitted_motion, projection_slopes, turned, whitening
-from vision.rig import CalibrationError
-from vision.tag_body import TAG_CORNERS
-from vision.tag_config import PlacedTag
-from vision.tag_image import TagImage
-from vision.triangulate import triangulate
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.vision.pose import fitted_motion, projection_slopes, turned, whitening
+from bodyschema.vision.rig import CalibrationError
+from bodyschema.vision.tag_body import TAG_CORNERS
+from bodyschema.vision.tag_config import PlacedTag
+from bodyschema.vision.tag_image import TagImage
+from bodyschema.vision.triangulate import triangulate
 
 from .shapes import rpy_of
 

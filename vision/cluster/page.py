@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from interfaces.errors import ConfigError
-from vision.printing.sheet import AROUND_MM, LINE_MM, Page, Rectangle, Text, page, pattern, sheets
-from vision.tag_config import Dictionary
-from vision.tag_dictionary import tag_modules
-from vision.tag_edge import MODULES
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.vision.printing.sheet import AROUND_MM, LINE_MM, Page, Rectangle, Text, page, pattern, sheets
+from bodyschema.vision.tag_config import Dictionary
+from bodyschema.vision.tag_dictionary import tag_modules
+from bodyschema.vision.tag_edge import MODULES
 
 from .shapes import Cell, Shape
 

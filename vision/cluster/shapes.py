@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from interfaces.errors import ConfigError
-from interfaces.records import FloatArray
-from vision.tag_config import PlacedTag
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.vision.tag_config import PlacedTag
 
 Cell = tuple[int, int]
 # Column and row of a face's neighbour on the sheet, and the axis of its frame (x right, y up) that they fold about:

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
-from interfaces.errors import ConfigError
-from interfaces.records import FloatArray
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.records import FloatArray
 
 PAPERS_MM = {
     "A4": (210.0, 297.0),

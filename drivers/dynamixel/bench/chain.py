@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from drivers.bench.chain import ServoChain, mixed
-from drivers.bench.device import Reply, Sampling, no_faults
+from bodyschema.drivers.bench.chain import ServoChain, mixed
+from bodyschema.drivers.bench.device import Reply, Sampling, no_faults
 
 from .frames import (
     ALERT,

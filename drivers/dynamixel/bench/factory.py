@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.dynamixel.models import LAYOUT_P, Model
+from bodyschema.drivers.dynamixel.models import LAYOUT_P, Model
 
 Values = tuple[tuple[int, int, int], ...]
 """Address, bytes, number."""

@@ -1,14 +1,14 @@
-"""What can go wrong with an answer on its way, of Dynamixel servos; see `drivers.bench.faults`."""
+"""What can go wrong with an answer on its way, of Dynamixel servos; see `bodyschema.drivers.bench.faults`."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from random import Random
 
-from drivers.bench import faults
-from drivers.bench.device import Reply
-from drivers.bench.faults import Storm
-from drivers.dynamixel.crc16 import crc16
+from bodyschema.drivers.bench import faults
+from bodyschema.drivers.bench.device import Reply
+from bodyschema.drivers.bench.faults import Storm
+from bodyschema.drivers.dynamixel.crc16 import crc16
 
 from .frames import HEADER2
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Literal
 
-from drivers.dynamixel.crc16 import crc16
+from bodyschema.drivers.dynamixel.crc16 import crc16
 
 HEADER1, HEADER2 = b"\xff\xff", b"\xff\xff\xfd\x00"
 BROADCAST = 0xFE

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 
-from drivers.dynamixel.models import TICK_S, TICKS, Model, baud_of, baud_value
+from bodyschema.drivers.dynamixel.models import TICK_S, TICKS, Model, baud_of, baud_value
 
 from .factory import factory_values, indirect_blocks
 from .frames import Error

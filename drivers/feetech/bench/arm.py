@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from drivers.bench.asked_faults import ON_THE_WIRE, FaultKinds
-from drivers.bench.device import Faults
-from drivers.bench.dry_run import Angle
-from drivers.bench.servo_arm import AT_THE_START, ServoArm
-from drivers.feetech.config import FeetechConfig, ServoConfig
-from drivers.feetech.models import BAUDS
+from bodyschema.drivers.bench.asked_faults import ON_THE_WIRE, FaultKinds
+from bodyschema.drivers.bench.device import Faults
+from bodyschema.drivers.bench.dry_run import Angle
+from bodyschema.drivers.bench.servo_arm import AT_THE_START, ServoArm
+from bodyschema.drivers.feetech.config import FeetechConfig, ServoConfig
+from bodyschema.drivers.feetech.models import BAUDS
 
 from .chain import Chain
 from .faults import swapped

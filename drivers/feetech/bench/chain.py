@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from drivers.bench.chain import ServoChain, mixed
-from drivers.bench.device import Reply, Sampling
+from bodyschema.drivers.bench.chain import ServoChain, mixed
+from bodyschema.drivers.bench.device import Reply, Sampling
 
 from .frames import BROADCAST, Code, Instruction, instructions_in, status_packet
 from .servo import Servo

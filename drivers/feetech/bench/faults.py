@@ -1,12 +1,12 @@
-"""What can go wrong with an answer on its way, of Feetech servos; see `drivers.bench.faults`."""
+"""What can go wrong with an answer on its way, of Feetech servos; see `bodyschema.drivers.bench.faults`."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from random import Random
 
-from drivers.bench import faults
-from drivers.bench.device import Reply
+from bodyschema.drivers.bench import faults
+from bodyschema.drivers.bench.device import Reply
 
 
 def swapped(reply: Reply, rng: Random) -> Reply:

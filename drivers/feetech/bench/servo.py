@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from drivers.feetech.models import BAUDS, SCS
-from drivers.servos.model import Model
+from bodyschema.drivers.feetech.models import BAUDS, SCS
+from bodyschema.drivers.servos.model import Model
 
 Angle = Callable[[float], float]
 

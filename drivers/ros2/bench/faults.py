@@ -7,7 +7,7 @@ from dataclasses import replace
 from enum import StrEnum
 from random import Random
 
-from drivers.ros2.messages import NANO, Header, JointState, encode_joint_state
+from bodyschema.drivers.ros2.messages import NANO, Header, JointState, encode_joint_state
 
 # How a node's message becomes bytes; None when it is not sent.
 Send = Callable[[JointState], bytes | None]

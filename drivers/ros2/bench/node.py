@@ -6,8 +6,8 @@ import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from drivers.ros2 import rmw
-from drivers.ros2.messages import NANO, Header, JointState
+from bodyschema.drivers.ros2 import rmw
+from bodyschema.drivers.ros2.messages import NANO, Header, JointState
 
 from .faults import Send, intact
 

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from heapq import heappop, heappush, heapreplace
 from typing import Protocol
 
-from drivers.ros2.link import Sample
-from interfaces.protocols import Clock
+from bodyschema.drivers.ros2.link import Sample
+from bodyschema.interfaces.protocols import Clock
 
 from .node import Node, Sent
 

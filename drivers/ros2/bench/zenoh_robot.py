@@ -11,8 +11,8 @@ from typing import Any, Self
 
 import zenoh
 
-from drivers.ros2 import rmw
-from drivers.ros2.messages import JOINT_STATE
+from bodyschema.drivers.ros2 import rmw
+from bodyschema.drivers.ros2.messages import JOINT_STATE
 
 from .node import Node
 

@@ -10,9 +10,9 @@ from typing import ClassVar
 
 import msgspec
 
-from drivers.bench.asked_faults import ON_THE_WIRE, AskedFault, FaultKinds, WireFaults
-from drivers.bench.dry_run import Angle, BenchArm
-from drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
+from bodyschema.drivers.bench.asked_faults import ON_THE_WIRE, AskedFault, FaultKinds, WireFaults
+from bodyschema.drivers.bench.dry_run import Angle, BenchArm
+from bodyschema.drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
 
 from .board import EncoderBoard
 

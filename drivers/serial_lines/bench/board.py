@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 
-from drivers.bench.device import Faults, Reply, byte_s, no_faults
-from drivers.serial_lines.lines import SEQUENCES, STAMP_S, STAMPS, VERSION, with_checksum
+from bodyschema.drivers.bench.device import Faults, Reply, byte_s, no_faults
+from bodyschema.drivers.serial_lines.lines import SEQUENCES, STAMP_S, STAMPS, VERSION, with_checksum
 
 HEADER_EVERY_S = 1.0
 Angle = Callable[[float], float]

@@ -6,9 +6,9 @@ import threading
 from types import TracebackType
 from typing import Self
 
-from interfaces.errors import BodyschemaError
-from interfaces.protocols import JointSource
-from interfaces.records import JointReading
+from bodyschema.interfaces.errors import BodyschemaError
+from bodyschema.interfaces.protocols import JointSource
+from bodyschema.interfaces.records import JointReading
 
 READ_S = 0.1
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from interfaces.camera import StereoCalibration
-from interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame
-from vision.triangulate import triangulate
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame
+from bodyschema.vision.triangulate import triangulate
 
 HALF_PX = 6
 SIGMA_PX = 0.1
@@ -17,7 +17,7 @@ ROWS_PX = 1.0
 
 
 class LaserDot:
-    """A `MarkerTracker`: see the Protocol in `vision.tracked_camera`."""
+    """A `MarkerTracker`: see the Protocol in `bodyschema.vision.tracked_camera`."""
 
     def __init__(self, calibration: StereoCalibration, settings: Mapping[str, Any]) -> None:
         self._calibration = calibration

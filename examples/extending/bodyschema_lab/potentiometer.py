@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from effects.encoder import EncoderEffect, Place
-from effects.motion import Motion
-from effects.parameter import Parameter
-from interfaces.records import FloatArray
+from bodyschema.effects.encoder import EncoderEffect, Place
+from bodyschema.effects.motion import Motion
+from bodyschema.effects.parameter import Parameter
+from bodyschema.interfaces.records import FloatArray
 
 TRAVEL_RAD = np.radians(300.0)
 

@@ -10,16 +10,16 @@ from typing import Any, Self
 
 import numpy as np
 
-from interfaces.errors import ConfigError, SourceError, SourceLost
-from interfaces.protocols import Clock
-from interfaces.records import JointReading, frozen_array
+from bodyschema.interfaces.errors import ConfigError, SourceError, SourceLost
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.records import JointReading, frozen_array
 
 LONGEST = 4096
 SILENT_S = 2.0
 
 
 class UdpJoints:
-    """A `JointSource`: see the Protocol in `interfaces.protocols`."""
+    """A `JointSource`: see the Protocol in `bodyschema.interfaces.protocols`."""
 
     def __init__(self, joints: Sequence[str], settings: Mapping[str, Any], clock: Clock) -> None:
         """Nothing is opened yet."""

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import msgspec
 
-from interfaces.clock import SystemClock
-from interfaces.errors import BodyschemaError
-from vision.cameras.config import CamerasConfig
-from vision.cameras.live import LiveEyes
-from vision.cameras.opened import eyes_of
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import BodyschemaError
+from bodyschema.vision.cameras.config import CamerasConfig
+from bodyschema.vision.cameras.live import LiveEyes
+from bodyschema.vision.cameras.opened import eyes_of
 
 
 def main() -> None:

@@ -8,14 +8,14 @@ from importlib.resources import files
 
 import numpy as np
 
-from interfaces.interval import to_its_interval
-from interfaces.records import FloatArray
-from vision.calibration.calibrate import Calibrated
-from vision.calibration.gather import Gathered
-from vision.calibration.report import pictures
-from vision.calibration.view import Eye, View, all_px, image_of
-from vision.rectified import Rectification
-from vision.rig import StereoRig
+from bodyschema.interfaces.interval import to_its_interval
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.vision.calibration.calibrate import Calibrated
+from bodyschema.vision.calibration.gather import Gathered
+from bodyschema.vision.calibration.report import pictures
+from bodyschema.vision.calibration.view import Eye, View, all_px, image_of
+from bodyschema.vision.rectified import Rectification
+from bodyschema.vision.rig import StereoRig
 
 _NORMAL_95 = 1.96
 _ARROW_SHARE = 0.04  # of the image's width: the arrow of a residual that is larger than 95 % of them
@@ -24,7 +24,7 @@ _ARROW_SHARE = 0.04  # of the image's width: the arrow of a residual that is lar
 def page(found: Calibrated, gathered: Gathered) -> str:
     """report.html of a calibration and the images that it was made of."""
     rig = found.rig
-    style = files("vision.calibration.report").joinpath("page.css").read_text(encoding="utf-8")
+    style = files("bodyschema.vision.calibration.report").joinpath("page.css").read_text(encoding="utf-8")
     head = (
         f"<h1>Cameras calibrated: views that were not fitted are foretold to {rig.made.held_out_px:.2f} px</h1>"
         f'<p class="of">{escape(rig.made.board)} · {escape(rig.made.date[:10])} '

@@ -7,10 +7,10 @@ import base64
 import cv2
 import numpy as np
 
-from interfaces.records import FloatArray, ImageArray
-from vision.board import Corners
-from vision.calibration.guidance import GRID
-from vision.calibration.view import Eye
+from bodyschema.interfaces.records import FloatArray, ImageArray
+from bodyschema.vision.board import Corners
+from bodyschema.vision.calibration.guidance import GRID
+from bodyschema.vision.calibration.view import Eye
 
 _WIDTH_PX = 400
 _QUALITY = 80
