@@ -17,6 +17,7 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 SOURCES = "kbmaps/csrc"
 LIBRARY = "kbmaps/_kernels.abi3.so"
+PACKAGE = "bodyschema"
 # The oldest Python whose limited API the sources use.
 ABI_TAG = "cp311-abi3"
 FLAGS = ["-O3", "-std=gnu11", "-fPIC", "-shared", "-fvisibility=hidden", "-fno-math-errno"]
@@ -24,10 +25,11 @@ TIMEOUT_S = 300.0
 
 
 class KernelBuildHook(BuildHookInterface):
-    """Adds the shared library to wheels; editable installs get it beside the sources."""
+    """Adds the shared library to wheels; editable installs get it beside the sources. Mends links that came as text."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         """Compiles, or says why not and leaves the wheel pure Python."""
+        mend_links(Path(self.root, PACKAGE))
         if os.environ.get("BODYSCHEMA_PURE", "") not in ("", "0"):
             return
         root = Path(self.root)
@@ -61,6 +63,16 @@ class KernelBuildHook(BuildHookInterface):
     def _scratch(self) -> str:
         self._directory = tempfile.TemporaryDirectory()
         return self._directory.name
+
+
+def mend_links(folder: Path) -> None:
+    """Make links of what a zip archive, or git without core.symlinks, has left as files with the link's target."""
+    for file in folder.iterdir():
+        if file.suffix or file.is_symlink() or not file.is_file():
+            continue
+        target = file.read_text(encoding="utf-8")
+        file.unlink()
+        file.symlink_to(target)
 
 
 def compile_kernels(root: Path, library: Path) -> str:

@@ -2,6 +2,7 @@
 
 Virtual time, so millions of transactions in minutes. Type: python -m benchmarks.fault_storm --transactions 10_000_000
 How many readings of six servos come in a second when answers are lost: python -m benchmarks.fault_storm --rates
+Servos that repeat their answer before the last: python -m benchmarks.fault_storm --stale 2 --transactions 36_000
 """
 
 from __future__ import annotations
@@ -9,9 +10,10 @@ from __future__ import annotations
 import argparse
 import math
 import time
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from random import Random
 from typing import Any
@@ -129,12 +131,43 @@ KINDS: dict[str, Make] = {
 }
 
 
-def run(make: Make, transactions: int, intensity: float, seed: int) -> str:
-    """So many transactions with so many answers struck; a line about them."""
+class Stale:
+    """A fault: a servo answers with data of an earlier answer of the same length, and a right checksum."""
+
+    def __init__(self, back: int) -> None:
+        self._back = back
+        self._given: dict[tuple[int, int], deque[bytes]] = {}
+
+    def __call__(self, reply: Any, rng: Random) -> Any:  # noqa: ARG002
+        """Return the reply with the data of the answer `back` before this one."""
+        return replace(reply, data=self._given[reply.id, len(reply.data)][0])
+
+    def storm(self, share: float, rng: Random) -> Storm:
+        """Return the faults of a device that answers so in a share of the cases."""
+        return _Remembered({"stale": (share, self)}, rng, self)
+
+    def keep(self, reply: Any) -> None:
+        """Remember what the servo would have answered."""
+        self._given.setdefault((reply.id, len(reply.data)), deque(maxlen=self._back + 1)).append(reply.data)
+
+
+class _Remembered(Storm):
+    def __init__(self, faults: Any, rng: Random, stale: Stale) -> None:
+        super().__init__(faults, rng)
+        self._stale = stale
+
+    def __call__(self, reply: Any) -> Any:
+        self._stale.keep(reply)
+        return super().__call__(reply)
+
+
+def run(make: Make, transactions: int, intensity: float, seed: int, back: int | None = None) -> str:
+    """Return a line about that many transactions, a share of whose answers is struck; `back`: by stale data alone."""
     clock, rng = VirtualClock(), Random(seed)
     rig = make(clock, rng, JOINTS)
     tolerance = rig.rad_per_tick + FASTEST * TIMING_S
-    rig.device.faults = faults = rig.storm(intensity, rng)
+    storm = rig.storm if back is None else Stale(back).storm
+    rig.device.faults = faults = storm(intensity, rng)
     believed = wrong = losses = 0
     worst = 0.0
     told = time.monotonic()
@@ -189,17 +222,20 @@ def main() -> None:
     parser.add_argument("--transactions", type=int, default=100_000, help="shared among the kinds of bus")
     parser.add_argument("--intensity", type=float, default=0.02, help="probability that an answer is struck")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--stale", type=int, metavar="BACK", help="answers with the data of that many answers before")
     parser.add_argument("--rates", action="store_true", help="readings per second by the share of answers lost")
     parser.add_argument("--seconds", type=float, default=20.0, help="of each rate, in virtual time")
     parser.add_argument("--only", choices=tuple(KINDS), help="this kind alone")
     given = parser.parse_args()
     kinds = KINDS if given.only is None else {given.only: KINDS[given.only]}
+    if given.stale is not None:
+        kinds = {name: make for name, make in kinds.items() if make is not lines}
     for name, make in kinds.items():
         if given.rates:
             print(f"{name}: {rates(make, given.seconds, given.seed)}", flush=True)
             continue
         begin = time.monotonic()
-        line = run(make, given.transactions // len(kinds), given.intensity, given.seed)
+        line = run(make, given.transactions // len(kinds), given.intensity, given.seed, given.stale)
         print(f"{name}: {line}, {time.monotonic() - begin:.0f} s", flush=True)
 
 

@@ -7,10 +7,13 @@ import math
 import msgspec
 import numpy as np
 
-from bodyschema.daemon.calibration import Calibration
+from bodyschema.daemon.calibration import Calibration, Trusted
+from bodyschema.daemon.chain_figures import ChainFigures
+from bodyschema.daemon.hand_eye import HandEye, covariance_of_turns
 from bodyschema.daemon.learning.workmanship import WORKMANSHIP
 from bodyschema.daemon.plausibility.check import Plausibility
 from bodyschema.daemon.tool_jump import tool_jump
+from bodyschema.interfaces.calibrated_files import CAMERA_LINK
 from bodyschema.interfaces.recording import Recording
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.interfaces.robot import RobotDescription
@@ -71,6 +74,12 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
         beyond: why the figures are of no arm as good as was told, or null: a part of `doubt`, for which nothing is
             written.
         undirected: joints of which the pairs do not show which way they count.
+        expected_mm, expected_p95_mm: mean distance on poses that were not learnt, and what 95 % of them stay within,
+            from blocks of rows that were held out; null of too few rows.
+        hand_eye: the camera's pose in SI, as ROS takes it.
+        tool_xyz_m: the marker in its link, with the covariance (3 x 3, row by row) in `tool_covariance` [m²].
+        trusted: what was held as the URDF has it.
+        free_expected_mm: `expected_mm` with nothing held, where something is; else null.
     """
 
     robot: str
@@ -99,21 +108,38 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
     doubt: str | None
     beyond: str | None = None
     undirected: list[str] = []
+    expected_mm: float | None
+    expected_p95_mm: float | None
+    hand_eye: HandEye
+    tool_xyz_m: list[float]
+    tool_covariance: list[float]
+    trusted: Trusted
+    free_expected_mm: float | None = None
     schema: int = 1
 
     @classmethod
-    def of(cls, calibration: Calibration, seen: Plausibility, source: str, first: int = 1) -> CalibrationReport:
+    def of(
+        cls,
+        calibration: Calibration,
+        seen: Plausibility,
+        source: str,
+        first: int = 1,
+        frame: str = CAMERA_LINK,
+        free: Calibration | None = None,
+    ) -> CalibrationReport:
         """The answers of `calibration`.
 
         Args:
             seen: what its recording looks like.
             source: what the recording is called.
             first: the number of its first row.
+            frame: what ROS calls the measurement frame.
+            free: the same with nothing held as the URDF has it, for comparison.
         """
         jump = tool_jump(calibration.learner, calibration.recording)
         robot, recording, learner = calibration.robot, calibration.recording, calibration.learner
         report, made, slides = learner.report(), calibration.workmanship, robot.chain.prismatic
-        named = calibration.figures
+        named, expected = calibration.figures, calibration.expected
         zeros = _zeros(calibration, named.values[9:], named.half_widths[9:])
         made_badly = _badly_made(calibration)
         beyond = [*_far_off(calibration, zeros, TOO_FAR_OFF), *made_badly]
@@ -154,7 +180,19 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
             doubt=" ".join(doubts) or None,
             beyond=" ".join(beyond) or None,
             undirected=list(seen.undirected),
+            expected_mm=None if expected is None else 1e3 * expected.mean_m,
+            expected_p95_mm=None if expected is None else 1e3 * expected.p95_m,
+            hand_eye=_hand_eye(robot, named, frame),
+            tool_xyz_m=named.geometry.marker_xyz.tolist(),
+            tool_covariance=named.covariance[6:9, 6:9].ravel().tolist(),
+            trusted=calibration.trusted,
+            free_expected_mm=None if free is None or free.expected is None else 1e3 * free.expected.mean_m,
         )
+
+
+def _hand_eye(robot: RobotDescription, figures: ChainFigures, frame: str) -> HandEye:
+    covariance = covariance_of_turns(figures.values[3:6], figures.covariance[:6, :6])
+    return HandEye.of(robot.camera.parent_link, frame, figures.geometry.T_parent_camera, covariance)
 
 
 def _zeros(calibration: Calibration, values: FloatArray, halves: FloatArray) -> list[Zero]:

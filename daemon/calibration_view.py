@@ -12,6 +12,9 @@ from bodyschema.daemon.calibration_report import CalibrationReport, Figure, Zero
 
 # Told noise that explains the residuals leaves less than this.
 MISFIT = 1.5
+# Errors on new poses that are so many times those of free links: the URDF is wrong by as much as is measured. What 5
+# blocks of a good arm show by chance stays below 1.1.
+WRONG_URDF = 1.25
 
 
 def view(report: CalibrationReport) -> Group:
@@ -33,15 +36,19 @@ def view(report: CalibrationReport) -> Group:
 
 def sentences(report: CalibrationReport) -> list[str]:
     """The report in words."""
-    said = [
+    said = [_expected(report)] if report.expected_mm is not None else []
+    said += [
         f"Mean distance to the pairs: {report.drawn_error_mm:.3f} mm for the drawn arm in its best place, "
         f"{report.learnt_error_mm:.3f} mm for the learnt one. {_noise(report)} {_outliers(report)}",
         _workmanship(report),
-        f"The pairs show {report.shown} of the {report.showable} numbers that positions can show of such an arm."
-        + _advice(report),
     ]
+    if report.trusted == "nothing":
+        said.append(
+            f"The pairs show {report.shown} of the {report.showable} numbers that positions can show of such an arm."
+            + _advice(report)
+        )
     hidden = [zero.joint for zero in report.zeros if zero.half_width is None]
-    if hidden:
+    if hidden and report.trusted != "urdf":
         said.append(
             f"Left as drawn: {', '.join(hidden)}. Nothing that was measured tells {_such_zeros(hidden)} from a turn of "
             "the camera, of the marker, or of a neighbouring joint, and nothing needs to: the positions are the same. "
@@ -82,7 +89,25 @@ def _noise(report: CalibrationReport) -> str:
     return f"{scatter}; as was told with them: {report.told_noise_mm:.3f} mm, on which the intervals rest."
 
 
+def _expected(report: CalibrationReport) -> str:
+    return (
+        f"Expect {report.expected_mm:.2g} mm on new poses, 95 % ≤ {report.expected_p95_mm:.2g} mm: predicted from the "
+        "other blocks of the recording, noise included."
+    )
+
+
+def _trusted(report: CalibrationReport) -> str:
+    what = "Links and zeros are" if report.trusted == "urdf" else "The links are"
+    said = f"{what} those of the URDF; the intervals hold if it is right."
+    free, expected = report.free_expected_mm, report.expected_mm
+    if free is None or expected is None or expected < WRONG_URDF * free:
+        return said
+    return f"{said} The recording says it is not: with nothing held, expect {free:.2g} mm on new poses."
+
+
 def _workmanship(report: CalibrationReport) -> str:
+    if report.trusted != "nothing":
+        return _trusted(report)
     if report.axes_deg is None or report.points_mm is None:
         return "These pairs do not tell how well the arm is made; the intervals hold for a good one and for a bad one."
     return (

@@ -65,19 +65,25 @@ class ChainFigures:
         return np.array([*camera.xyz, *rpy_of(camera.pose[:3, :3]), *marker, *np.zeros(len(self.robot.joints))])
 
     @cached_property
-    def half_widths(self) -> FloatArray:
-        """Half the 95 % intervals (9 + d,) of `values`, given that zeros which are not `shown` are right.
+    def covariance(self) -> FloatArray:
+        """Covariance (9 + d, 9 + d) of `values`, given that zeros which are not `shown` are right.
 
-        Not knowing how well the arm is made is part of them: they are of the mixture of the beliefs.
+        Not knowing how well the arm is made is part of it: it is of the mixture of the beliefs.
         """
-        variance = np.zeros(len(self.values))
+        covariance = np.zeros((len(self.values), len(self.values)))
         for belief, share in zip(self.beliefs, self.shares, strict=True):
             split = self._split(belief)
             jacobian = self._derivatives(split)
-            covariance = _given(belief.covariance, self._zeros[~self.shown])
             apart = _unwound(self._figures(belief.mean, split) - self.values)
-            variance += share * (np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian) + np.square(apart))
-        return HALF_WIDTH_95 * np.sqrt(np.maximum(variance, 0.0))  # of a zero that is given, rounding is left
+            inner = _given(belief.covariance, self._hidden)
+            covariance += share * (jacobian @ inner @ jacobian.T + np.outer(apart, apart))
+        return covariance
+
+    @property
+    def half_widths(self) -> FloatArray:
+        """Half the 95 % intervals (9 + d,) of `values`."""
+        variances = np.diagonal(self.covariance)
+        return HALF_WIDTH_95 * np.sqrt(np.maximum(variances, 0.0))  # of a zero that is given, rounding is left
 
     @cached_property
     def shown(self) -> BoolArray:
@@ -104,12 +110,17 @@ class ChainFigures:
 
     def _split(self, belief: ChainBelief) -> FloatArray:
         """The most probable change (size,) given that the zeros which nothing shows are as drawn."""
-        drawn = self._zeros[~self.shown]
+        drawn = self._hidden
         covariance = belief.covariance
         gain = np.linalg.solve(covariance[np.ix_(drawn, drawn)], covariance[drawn])
         split = belief.mean - belief.mean[drawn] @ gain
         split[drawn] = 0.0
         return split
+
+    @property
+    def _hidden(self) -> IntArray:
+        """Which zeros nothing shows; those that are held as drawn have nothing to show."""
+        return self._zeros[~self.shown & (_spread(self.prior, self._zeros) > 0.0)]
 
     @property
     def _zeros(self) -> IntArray:

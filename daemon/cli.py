@@ -15,40 +15,51 @@ from bodyschema.daemon.remedies import as_typed, printable
 from bodyschema.daemon.signals import end_with_parent
 from bodyschema.interfaces.errors import BodyschemaError, ConfigError
 
-COMMANDS = {
-    "demo": "Watch it all in simulation, about a minute. No hardware needed.",
-    "config": "Write, check or show robot.toml: begin here with your robot.",
-    "replay": "Learn a recording; prints the error before and after.",
-    "calibrate": "Camera, tool, joint zeros from pairs; or two cameras.",
-    "board": "The page to print that cameras are calibrated with.",
-    "diagnose": "What the simulation gets wrong, why, and how it gets better.",
-    "simulate": "What the simulation would have measured at the same angles.",
-    "compare": "How far two recordings are apart, row by row.",
-    "reproduce": "Run the paper's experiments again, its figures beside ours.",
-    "scan": "Which servos are there: all ports, rates and protocols.",
-    "doctor": "Ports, servos, disk, clock, zenoh: what to mend, and how.",
-    "install": "On this machine: services for systemd, rules for ports.",
-    "robot": "robot new: a robot.toml for the servos that were found.",
-    "marker": "Tags to print, a cluster measured, a ball's colour learnt.",
-    "joints": "Angles live while you move the arm: signs, ranges, health.",
-    "watch": "watch cameras: what they see, in a browser or as files.",
-    "servos": "What servos keep without power: show, set, zero, undo.",
-    "bench": "Your servos without the arm: a dry run of robot.toml.",
-    "run": "Start sampler and learner, and keep them running.",
-    "sampler": "Only the sampler: encoders and cameras in, pairs out.",
-    "learner": "Only the learner: pairs in, answers out. On any machine.",
-    "router": "Where machines meet: TLS, and who may do what.",
-    "status": "What both processes do and found, and if it is enough.",
-    "fleet": "Many robots: who is there, which unit is off, and why.",
-    "view": "A page: errors, where to move next, residuals, buttons.",
-    "predict": "Ask where the marker is at given joint angles.",
-    "ik": "Ask for joint angles that bring the marker to a position.",
-    "command": "Pause, resume, tell of a changed tool, reset, checkpoint.",
-    "record": "Copy the running sampler's pairs into a file.",
-    "export": "A store or a recording into CSV, Parquet, MCAP or Rerun.",
-    "backup": "Pairs, checkpoint and description in one file, while running.",
-    "restore": "Put a backup back, verified; overwrites nothing unasked.",
+GROUPS = {
+    "Start": {
+        "demo": "Learn a simulated arm from scratch, in about a minute.",
+        "config": "Write, check or show robot.toml: begin here.",
+        "robot": "Write robot.toml for the servos that a scan found.",
+        "doctor": "Check ports, servos, disk, clock and network.",
+    },
+    "Calibrate and diagnose": {
+        "calibrate": "Calibrate arm, hand-eye and tool, or stereo cameras.",
+        "diagnose": "Find what the simulation gets wrong, and the causes.",
+        "replay": "Learn from a recording; report the held-out error.",
+        "simulate": "Predict the marker for recorded joint angles.",
+        "compare": "Compare two recordings row by row.",
+        "board": "Print a board for camera calibration.",
+        "marker": "Print tags, measure a cluster, learn a ball's colour.",
+        "reproduce": "Run the paper's experiments again.",
+    },
+    "Run": {
+        "run": "Start sampler and learner, and keep them running.",
+        "sampler": "Run the sampler: encoders and cameras in, pairs out.",
+        "learner": "Run the learner: pairs in, predictions out.",
+        "status": "Show the state of sampler and learner.",
+        "view": "Serve a live page: errors, next poses, controls.",
+        "predict": "Predict the marker position at given joint angles.",
+        "ik": "Find joint angles that bring the marker to a position.",
+        "command": "Pause, resume, report a tool change, reset.",
+        "install": "Install systemd services, or udev rules.",
+        "router": "Run the zenoh router that connects several machines.",
+    },
+    "Hardware": {
+        "scan": "Find servos on all ports, rates and protocols.",
+        "joints": "Show joint angles live: signs, ranges, health.",
+        "watch": "Show what the cameras and the tracker see.",
+        "servos": "Read and write servo EEPROM settings, with undo.",
+        "bench": "Emulate the servos of robot.toml on a port.",
+    },
+    "Data and fleet": {
+        "record": "Save the running sampler's pairs to a file.",
+        "export": "Convert pairs or a robot: CSV, Parquet, MCAP, MJCF, URDF.",
+        "backup": "Save pairs, checkpoint and robot.toml to one file.",
+        "restore": "Restore a backup; nothing is overwritten unasked.",
+        "fleet": "Monitor and diagnose many robots.",
+    },
 }
+COMMANDS = {name: summary for group in GROUPS.values() for name, summary in group.items()}
 
 
 # Each paragraph is one line: the terminal's width breaks it.
@@ -73,9 +84,12 @@ def command_line(called: str | None = None) -> cyclopts.App:
         version=_version,
         help_format="markdown" if called in COMMANDS else "plaintext",  # rendering markdown takes 0.1 s of CPU
     )
-    for place, (name, summary) in enumerate(COMMANDS.items()):
-        own = None if name == called else summary
-        line.command(f"bodyschema.daemon.commands.{name}:{name}", name=name, help=own, sort_key=place)
+    line["--help"].group = line["--version"].group = cyclopts.Group("Options", sort_key=len(GROUPS))
+    for place, (title, commands) in enumerate(GROUPS.items()):
+        group = cyclopts.Group(title, sort_key=place)
+        for order, (name, summary) in enumerate(commands.items()):
+            own = None if name == called else summary
+            line.command(f"bodyschema.daemon.commands.{name}:{name}", name=name, help=own, group=group, sort_key=order)
     return line
 
 

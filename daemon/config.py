@@ -108,7 +108,7 @@ class LearnerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Tables(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """All tables of robot.toml; [robot] and [camera] are checked by `bodyschema.interfaces.robot`, the last three by `effects`."""
+    """All tables of robot.toml; `interfaces` checks [robot] and [camera], `effects` the last three."""
 
     robot: dict[str, Any]
     camera: dict[str, Any]

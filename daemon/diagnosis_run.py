@@ -23,6 +23,7 @@ from bodyschema.diagnosis.report import About, page
 from bodyschema.diagnosis.result import DiagnosisFile
 from bodyschema.diagnosis.words import modelled
 from bodyschema.effects import KINDS, write_corrected, write_extended
+from bodyschema.interfaces.calibrated_files import CAMERA_LINK
 from bodyschema.interfaces.errors import BodyschemaError, RecordingError, RequestError
 from bodyschema.interfaces.recording import Recording
 from bodyschema.interfaces.records import Pair
@@ -32,6 +33,7 @@ from bodyschema.interfaces.suggest import did_you_mean
 from . import recordings
 from .bus import client
 from .config import Config
+from .hand_eye import HandEye
 from .learning import NominalModel
 from .plausibility.check import plausibility, told_sigma
 from .plausibility.limits import require_units
@@ -93,8 +95,13 @@ class Source:
     name: str
 
 
-def measured(config: Config, file: Path | None, *, live: bool) -> Source:
+def measured(
+    config: Config, file: Path | None, opened: Callable[[Path], Recording] | None = None, *, live: bool
+) -> Source:
     """The pairs of a recording, of a store, or of the running sampler.
+
+    Args:
+        opened: reads `file`; by default as a recording or a store.
 
     Raises:
         RequestError: neither or both were asked for.
@@ -108,7 +115,7 @@ def measured(config: Config, file: Path | None, *, live: bool) -> Source:
         with client(config.route("sampler")) as bus:
             recording, name = _history(History(bus, config.robot, 1), joints), f"the sampler of {config.robot.name}"
     else:
-        recording, name = recordings.opened(file, joints), file.name
+        recording, name = recordings.opened(file, joints) if opened is None else opened(file), file.name
     require_units(config.robot, recording, file or Path(name))
     return Source(recording, name)
 
@@ -142,8 +149,15 @@ class Found:
 
     @property
     def json(self) -> str:
-        """diagnosis.json."""
-        return msgspec.json.format(msgspec.json.encode(self.file, enc_hook=float), indent=1).decode()
+        """diagnosis.json, with the camera's pose beside what was found."""
+        told = msgspec.to_builtins(self.file, enc_hook=float) | {"hand_eye": msgspec.to_builtins(self.hand_eye)}
+        return msgspec.json.format(msgspec.json.encode(told), indent=1).decode()
+
+    @property
+    def hand_eye(self) -> HandEye:
+        """The camera's pose with what was found in it; how sure it is, `bodyschema calibrate` tells."""
+        placed = self.diagnosis.extended.simulation.placed
+        return HandEye.of(self.robot.camera.parent_link, CAMERA_LINK, placed.robot.camera.pose @ placed.camera_pose)
 
     @property
     def timed(self) -> bool:
@@ -231,7 +245,7 @@ def written(found: Found, folder: Path) -> None:
     """
     about = About(found.source.name, found.robot.name, version("bodyschema"))
     heading = f"Found by bodyschema {about.version} in {len(found.source.recording)} pairs of {about.recording}"
-    extended = found.diagnosis.extended.simulation
+    extended = found.diagnosis.extended.written
     told = " ".join(filter(None, [f"{heading}.", modelled(found.file.unexplained)]))
     write_extended(extended, folder, told, replace=True)
     # Tolerances alone are put into a URDF where the recording shows them.

@@ -33,6 +33,7 @@ from .servo_wiring import (
 )
 from .status import SamplerStatus
 from .store import PairReader
+from .units import FOLDER
 from .wire import decode
 from .zenoh_config import PROCESSES
 
@@ -43,7 +44,9 @@ TIMEX_BYTES = 512  # more than struct timex has
 CONNECT_S = 0.3
 OPEN_S = 0.7
 
+# One that began before an update is called by the old name.
 SAMPLER = re.compile(r"(bodyschema|-m daemon) sampler\b")
+OLD_UNIT = re.compile(r"^ExecStart=.* -m daemon\b", re.MULTILINE)
 
 Step = tuple[str, Callable[[], Iterator[Check]]]
 
@@ -65,6 +68,7 @@ def steps(config: Config) -> Iterator[Step]:
     if config.store_file.exists():
         yield "store", lambda: store_checks(config.store_file)
     yield "clock", clock_checks
+    yield "service", unit_checks
     yield "zenoh", lambda: _zenoh(config)
 
 
@@ -180,6 +184,16 @@ def clock_checks(is_synchronised: Callable[[], bool | None] | None = None) -> It
         yield Check(
             "clock", "warning", "the wall clock is not kept right by the network", "sudo timedatectl set-ntp true"
         )
+
+
+def unit_checks(root: Path = Path("/")) -> Iterator[Check]:
+    """Units that an older bodyschema installed: they start `python -m daemon`, which is no more."""
+    files = [*(root / FOLDER).glob("bodyschema-*.service"), *(root / FOLDER).glob("bodyschema-*.service.d/*.conf")]
+    for file in sorted(files):
+        if OLD_UNIT.search(file.read_text(encoding="utf-8", errors="replace")):
+            mend = "install router" if "router" in file.name else "install service"
+            said = f"{file} starts `python -m daemon`, which this bodyschema does not have"
+            yield Check("service", "wrong", said, f'sudo "$(command -v bodyschema)" {mend}')
 
 
 def _is_synchronised() -> bool | None:

@@ -13,6 +13,7 @@ MODULES = {
     "plots": ("matplotlib",),
     "view": ("starlette", "uvicorn"),
     "fleet": ("distributed",),
+    "bags": ("rosbags",),
 }
 
 

@@ -1,8 +1,8 @@
 """How long before its time stamp an image was taken, from encoders and marker while the arm was moved.
 
-The marker is where the joint angles of the exposure's middle bring it. Nobody needs to know
-that function well: among all shifts in time the true one lets the positions follow most closely from the angles by a
-smooth function.
+The marker is where the joint angles at the middle of the exposure bring it. Among all shifts in time the true one lets
+the positions follow most closely from the angles. A smooth function of the angles tells the shift roughly, for any arm.
+The nominal chain, fitted with its tolerances, tells it more precisely, as it is less free to follow a wrong shift.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from scipy.optimize import minimize_scalar
 
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.records import FloatArray, frozen_array
-from kbmaps import RigidChain
+from kbmaps import ChainParameters, ChainTolerances, DegenerateDataError, RigidChain, align
 
 EARLIEST_S, LATEST_S = -0.05, 0.25  # that is looked for
 STEP_S = 0.004
@@ -35,6 +35,10 @@ SHORTEST_S = 3.0
 LEAST_TURN_RAD, LEAST_SLIDE_M = np.radians(1.0), 0.005  # of the joint that moves most
 FOLLOWS = 4.0  # RMS motion of the marker, over what of it does not go with the joints
 LITTLE_M = 0.01
+SETTLING = 5  # steps to where the chain is loosely fitted; from there two are enough
+# How an arm differs from its URDF, where the pairs do not tell: it only has to hold what they do not show.
+LOOSE = ChainTolerances(axes=0.02, points=0.005, zeros=0.1, tool=0.1, base_rotation=0.5, base_translation=0.5)
+REFINED_S = 0.024  # on both sides of what the smooth function says
 
 
 class LatencyError(BodyschemaError):
@@ -99,7 +103,7 @@ class Latency:
     Attributes:
         latency_s: from the exposure's middle to the time stamp, with its 1-sigma sigma_s [s].
         fixes: how many positions it was found with.
-        residual_m: RMS distance of these from the smooth function.
+        residual_m: RMS distance of these from where the angles bring the marker.
         speed_m_s: RMS speed of the marker.
     """
 
@@ -128,9 +132,8 @@ def latency_of(wiggle: Wiggle, chain: RigidChain) -> Latency:
     if best in (0, len(grid) - 1):
         raise LatencyError(_strange(fit, cost[best]))
     _require_one(grid, cost, best)
-    residual_m = math.sqrt(fit.cost(grid[best]) / len(fit.x))
-    fit = fit.whitened(grid[best])
-    lag = _minimum(fit, grid[best])
+    fit, near_s, residual_m = _nearest(fit, grid[best])
+    lag = _minimum(fit, near_s)
     sigma_s = _sigma(fit, lag)
     if sigma_s > LARGEST_SIGMA_S:
         raise LatencyError(
@@ -166,6 +169,11 @@ class _Fit:
         return cls(wiggle, chain, t[inside], wiggle.x[inside], centre, axes)
 
     @property
+    def unknowns(self) -> int:
+        """How many numbers are fitted."""
+        return 3 * self.terms(0.0).shape[1]
+
+    @property
     def motion_m(self) -> float:
         """RMS distance of the positions from their middle."""
         return math.sqrt(float(np.mean(np.sum((self.x - self.x.mean(axis=0)) ** 2, axis=1))))
@@ -188,15 +196,118 @@ class _Fit:
 
     def whitened(self, lag: float) -> _Fit:
         """The same with positions in units of their noise, larger in depth, as the residual at `lag` has it."""
-        residual = self.residual(lag)
-        noise = residual.T @ residual / len(residual)
-        least = SMALL * float(np.trace(noise)) + np.finfo(float).tiny
-        factor = np.linalg.cholesky(noise + least * np.eye(len(noise)))
-        return replace(self, x=np.linalg.solve(factor, self.x.T).T)
+        return replace(self, x=self.x @ _whitening(self.residual(lag)).T)
 
     def cost(self, lag: float, keep: NDArray[np.bool_] | slice = slice(None)) -> float:
         """Sum of squares of the residual [m²], or in units of the noise."""
         return float(np.sum(self.residual(lag, keep) ** 2))
+
+
+@dataclass(frozen=True)
+class _RigidFit:
+    """The drawn chain with its tolerances, and the positions to be explained."""
+
+    wiggle: Wiggle
+    parameters: ChainParameters
+    t: FloatArray
+    x: FloatArray
+    start: FloatArray  # (p,)
+    white: FloatArray  # (3, 3): of a difference of positions, in units of its noise
+
+    @classmethod
+    def of(cls, smooth: _Fit, lag: float) -> _RigidFit:
+        """The chain where the positions of the smooth function put it.
+
+        Raises:
+            DegenerateDataError: the positions do not tell where that is.
+        """
+        placed = align(
+            smooth.chain, smooth.wiggle.angles(smooth.t - lag), smooth.x, pose_known=False, marker_known=False
+        )
+        parameters = ChainParameters(placed.chain)
+        noise_m = max(placed.rms, np.finfo(float).tiny)
+        return cls(smooth.wiggle, parameters, smooth.t, smooth.x, np.zeros(parameters.size), np.eye(3) / noise_m)
+
+    @property
+    def unknowns(self) -> int:
+        """How many numbers are fitted."""
+        return self.parameters.size
+
+    def fitted(
+        self, lag: float, keep: NDArray[np.bool_] | slice = slice(None), steps: int = 2
+    ) -> tuple[FloatArray, FloatArray]:
+        """The tolerances (p,) that explain the positions best, by Gauss-Newton from `start`, and what they leave.
+
+        The latter has shape (m, 3) [m].
+        """
+        q, x, change = self.wiggle.angles(self.t - lag)[keep], self.x[keep], self.start
+        information = self.parameters.standard_deviations(LOOSE) ** -2.0
+        for _ in range(steps):
+            positions, jacobian = self.parameters.linearised(change, q)
+            J = (self.white @ jacobian).reshape(-1, len(change))
+            r = ((x - positions) @ self.white.T).ravel()
+            slope = J.T @ r - information * change
+            change = change + np.linalg.solve(J.T @ J + np.diag(information), slope)
+        return change, x - self.parameters.positions(change, q)
+
+    def residual(self, lag: float, keep: NDArray[np.bool_] | slice = slice(None)) -> FloatArray:
+        """What the chain with the best tolerances leaves, in units of the noise, shape (m, 3)."""
+        return self.fitted(lag, keep)[1] @ self.white.T
+
+    def whitened(self, lag: float) -> _RigidFit:
+        """The same with residuals in units of their noise, larger in depth, as what is left at `lag` has it."""
+        start, left = self.fitted(lag, steps=SETTLING)
+        return replace(self, start=start, white=_whitening(left))
+
+    def cost(self, lag: float, keep: NDArray[np.bool_] | slice = slice(None)) -> float:
+        """Sum of squares of residual and tolerances, each in units of what is usual."""
+        change, left = self.fitted(lag, keep)
+        return float(
+            np.sum((left @ self.white.T) ** 2) + np.sum((change / self.parameters.standard_deviations(LOOSE)) ** 2)
+        )
+
+
+_AnyFit = _Fit | _RigidFit
+
+
+def _nearest(smooth: _Fit, lag: float) -> tuple[_AnyFit, float, float]:
+    """What explains the positions best, the drawn chain or the smooth function, in units of the noise.
+
+    With about the latency that it finds [s], and the RMS distance that it leaves [m].
+    """
+    left = smooth.residual(lag)
+    unexplained = smooth.whitened(lag), lag, _rms(left)
+    try:
+        rigid = _RigidFit.of(smooth, lag).whitened(lag)
+        grid = lag + np.arange(-REFINED_S, REFINED_S + STEP_S, STEP_S)
+        near_s = float(grid[int(np.argmin([rigid.cost(each) for each in grid]))])
+        rigid = rigid.whitened(near_s)
+    except (DegenerateDataError, np.linalg.LinAlgError):
+        return unexplained
+    explained = rigid.fitted(near_s)[1]
+    if _volume(explained, rigid.unknowns) > _volume(left, smooth.unknowns):
+        return unexplained
+    return rigid, near_s, _rms(explained)
+
+
+def _rms(left: FloatArray) -> float:
+    """RMS length of vectors (m, 3)."""
+    return math.sqrt(float(np.mean(np.sum(left**2, axis=1))))
+
+
+def _volume(left: FloatArray, unknowns: int) -> float:
+    """Determinant [m⁶] of the covariance of what a fit leaves (m, 3), as many numbers as it has taken left out.
+
+    It weighs each direction by its own noise, as the likelihood does: depth does not drown the other two.
+    """
+    return float(np.linalg.det(left.T @ left / max(len(left) - unknowns / 3.0, 1.0)))
+
+
+def _whitening(residual: FloatArray) -> FloatArray:
+    """What brings residuals (m, 3) to a covariance of one, shape (3, 3)."""
+    noise = residual.T @ residual / len(residual)
+    least = SMALL * float(np.trace(noise)) + np.finfo(float).tiny
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(noise + least * np.eye(3))), dtype=np.float64)
 
 
 def _require_motion(wiggle: Wiggle, chain: RigidChain) -> None:
@@ -254,7 +365,7 @@ def _too_few(wiggle: Wiggle, fixes: int) -> str:
     return f"{usable}: keep it in sight of both eyes all the time; `bodyschema watch cameras` shows why it is not found"
 
 
-def _minimum(fit: _Fit, near_s: float, keep: NDArray[np.bool_] | slice = slice(None)) -> float:
+def _minimum(fit: _AnyFit, near_s: float, keep: NDArray[np.bool_] | slice = slice(None)) -> float:
     span = near_s - 2 * STEP_S, near_s + 2 * STEP_S
     found: Any = minimize_scalar(
         lambda lag: fit.cost(lag, keep), bounds=span, method="bounded", options={"xatol": 1e-6}
@@ -262,7 +373,7 @@ def _minimum(fit: _Fit, near_s: float, keep: NDArray[np.bool_] | slice = slice(N
     return float(found.x)
 
 
-def _sigma(fit: _Fit, lag: float) -> float:
+def _sigma(fit: _AnyFit, lag: float) -> float:
     """1-sigma [s]: from how the result changes when a stretch of time is left out, which sees residuals that go along
     with each other; never less than what independent ones would give."""
     blocks = np.arange(len(fit.x)) * BLOCKS // len(fit.x)
@@ -270,7 +381,7 @@ def _sigma(fit: _Fit, lag: float) -> float:
     jackknife = math.sqrt((BLOCKS - 1) * float(np.mean((without - without.mean()) ** 2)))
     residual, step = fit.residual(lag), 1e-3
     slope = (fit.residual(lag + step) - fit.residual(lag - step)) / (2 * step)
-    free = max(residual.size - 3 * fit.terms(lag).shape[1] - 1, 1)
+    free = max(residual.size - fit.unknowns - 1, 1)
     independent = math.sqrt(float(np.sum(residual**2)) / free / float(np.sum(slope**2)))
     return max(jackknife, independent)
 

@@ -101,27 +101,28 @@ _EXAMPLES = "/dev/v4l/by-id/usb-LEFT-video-index0", "/dev/v4l/by-id/usb-RIGHT-vi
 
 def robot_toml(guess: Guess, cameras: Sequence[str] = ()) -> str:
     """The text of a commented robot.toml; with two cameras or more, the first two are its eyes."""
-    joints = "[" + ", ".join(_quoted(joint) for joint in guess.joints) + "]"
+    joints = "[" + ", ".join(quoted(joint) for joint in guess.joints) + "]"
     return _TEMPLATE.format(
-        name=_quoted(guess.name),
-        urdf=_quoted(guess.urdf),
+        name=quoted(guess.name),
+        urdf=quoted(guess.urdf),
         joints=joints,
-        marker_link=_quoted(guess.marker_link),
-        camera_link=_quoted(guess.camera_link),
+        marker_link=quoted(guess.marker_link),
+        camera_link=quoted(guess.camera_link),
         cameras=_camera_tables(cameras),
     )
 
 
 def _camera_tables(cameras: Sequence[str]) -> str:
     """The cameras' tables; as an example, which does nothing, where there are not two."""
-    left, right = map(_quoted, cameras[:2] if len(cameras) >= 2 else _EXAMPLES)
+    left, right = map(quoted, cameras[:2] if len(cameras) >= 2 else _EXAMPLES)
     text = _CAMERAS.format(left=left, right=right)
     if len(cameras) >= 2:
         return text
     return "".join(line if line.startswith("#") else f"# {line}" for line in text.splitlines(keepends=True))
 
 
-def _quoted(text: str) -> str:
+def quoted(text: str) -> str:
+    """Return `text` as a TOML string."""
     escaped = text.replace("\\", "\\\\").replace('"', '\\"')
     return f'"{escaped}"'
 
@@ -140,10 +141,23 @@ def guess_from(urdf: Path, robot: Path) -> Guess:
     tree = UrdfTree.load(urdf)
     root = _root(tree)
     paths = {link: [joint for joint, _ in tree.path(root, link)] for link in tree.links}
-    moving = {link: [joint.name for joint in path if joint.kind in MOVING] for link, path in paths.items()}
-    end = max(tree.links, key=lambda link: (len(moving[link]), len(paths[link])))
-    name = "".join(c if c.isascii() and (c.isalnum() or c in "_.-") else "_" for c in tree.name).lstrip(".-") or "robot"
-    return Guess(name, os.path.relpath(urdf, robot.parent), moving[end], end, root)
+    moving = {link: sum(joint.kind in MOVING for joint in path) for link, path in paths.items()}
+    end = max(tree.links, key=lambda link: (moving[link], len(paths[link])))
+    return guess_of(tree, os.path.relpath(urdf, robot.parent), end)
+
+
+def guess_of(tree: UrdfTree, urdf: str, end: str) -> Guess:
+    """Return the chain of moving joints from the root of `tree` to the link `end`."""
+    from bodyschema.interfaces.urdf import MOVING
+
+    root = _root(tree)
+    joints = [joint.name for joint, _ in tree.path(root, end) if joint.kind in MOVING]
+    return Guess(key_name(tree.name), urdf, joints, end, root)
+
+
+def key_name(text: str) -> str:
+    """Return `text` as a robot's name, which is part of the zenoh keys."""
+    return "".join(c if c.isascii() and (c.isalnum() or c in "_.-") else "_" for c in text).lstrip(".-") or "robot"
 
 
 def _root(tree: UrdfTree) -> str:

@@ -160,7 +160,7 @@ class Installed:
     @classmethod
     def here(cls, systemd: int) -> Installed:
         """The one that runs."""
-        folders = (Path(sys.prefix), Path(sys.base_prefix), Path(__file__).parents[1])
+        folders = (Path(sys.prefix), Path(sys.base_prefix), Path(__file__).parents[2])
         return cls(module_command("bodyschema"), folders, systemd)
 
 

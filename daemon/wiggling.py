@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from bodyschema.interfaces.clock import SystemClock
-from bodyschema.interfaces.errors import RecordingError, SourceEnded
+from bodyschema.interfaces.errors import RecordingError, SourceEnded, SourceLost
 from bodyschema.interfaces.limited import read_at_most
 from bodyschema.interfaces.records import JointReading, MarkerFix, MarkerMiss
 
@@ -58,8 +58,8 @@ def collected(sources: Sources, duration_s: float, tell: Callable[[float], None]
         tell: called with the time [s] since the first fix.
 
     Raises:
-        LatencyError: they say nothing, or the marker is not found.
-        SourceError: they cannot be opened, or are lost.
+        LatencyError: they say nothing, the encoders are lost, or the marker is not found.
+        SourceError: they cannot be opened, or the cameras are lost.
     """
     readings: list[JointReading] = []
     fixes: list[MarkerFix] = []
@@ -104,6 +104,11 @@ def collected(sources: Sources, duration_s: float, tell: Callable[[float], None]
         if sources.cameras is not None:
             health = tuple(sources.cameras.health)
     if failures:
+        if isinstance(failures[0], SourceLost):
+            raise LatencyError(
+                f"the encoders were lost while the arm was moved ({failures[0].brief}). Try again; if it comes again, "
+                "`bodyschema doctor`"
+            ) from failures[0]
         raise failures[0]
     if missed and not fixes:
         raise LatencyError(

@@ -8,7 +8,7 @@ from bodyschema.effects import Effect
 
 from .diagnosis import Diagnosis
 from .nameless import Nameless
-from .rivals import Rival, apart_on, widened
+from .rivals import Rival, apart_on, whole_range, widened
 from .search import describe
 
 # Twice the log-likelihood by which a motion has to tell two causes apart to be worth advising.
@@ -56,7 +56,7 @@ def _motion(diagnosis: Diagnosis, cause: Effect, rival: Rival) -> str:
     apart = [apart_on(fit, rival.instead, widened(fit, [k])) for k in range(len(robot.joints))]
     best = int(np.argmax(apart))
     if apart[best] >= _TELLS:
-        low, high = max(robot.lower[best], -np.pi), min(robot.upper[best], np.pi)
+        low, high = whole_range(fit, best)
         unit, scale = ("mm", 1e3) if robot.chain.prismatic[best] else ("°", 180.0 / np.pi)
         span = f"{low * scale:.0f}{unit} to {high * scale:.0f}{unit}"
         return f"To tell {pair}, move joint {robot.joints[best]} through its whole range ({span}) in another recording."

@@ -106,8 +106,8 @@ class Background:
         """Whether an effect is a periodic error of a drive that is no larger than that of others."""
         if self.scales is None or effect.name not in _PERIODIC:
             return False
-        unit = _DRIVE_M if effect.prismatic else DRIVE_RAD
-        return float(np.linalg.norm(effect.values[effect.amounts])) < _LIKE_OTHERS * self.scales.drives * unit
+        usual = self.scales.lengths * _DRIVE_M if effect.prismatic else self.scales.drives * DRIVE_RAD
+        return float(np.linalg.norm(effect.values[effect.amounts])) < _LIKE_OTHERS * usual
 
     @cached_property
     def precision(self) -> FloatArray:
@@ -175,7 +175,8 @@ def _with(effect: Effect, amounts: FloatArray) -> Effect:
 
 def _groups(effect: Effect) -> np.ndarray:
     if effect.name != "link_geometry":
-        return np.full(len(effect.amounts), 2)
+        # A screw is a length: how true gears run says nothing of it.
+        return np.full(len(effect.amounts), 0 if effect.prismatic else 2)
     return np.array([0, 0, 0, 1, 1, 1])
 
 

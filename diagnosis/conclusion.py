@@ -29,11 +29,9 @@ from .result import (
 from .rivals import Rival, Standing
 from .scan import Candidate
 from .search import NAMED, nats
-from .words import evidence, sentence
+from .words import evidence, is_unsure, sentence
 
 _HALF_WIDTH_95 = 1.959964
-# A cause that is less sure than this leaves the verdict open.
-SURE = 0.9
 # What chance brings about less often than this wants a word why it is no cause.
 _HARDLY_CHANCE = 1e-3
 
@@ -45,9 +43,11 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
     rms = _rms_mm(diagnosis)
     verdict = _verdict(diagnosis, causes)
     gain = Gain(percent, interval)
+    # A tracker or a scanner has no intrinsics in robot.toml.
+    seen_by = "instrument" if diagnosis.aligned.simulation.robot.calibration is None else "camera"
     return DiagnosisFile(
         verdict=verdict,
-        sentence=sentence(verdict, causes, rms, gain, _named_mm(diagnosis), _tolerated_mm(diagnosis)),
+        sentence=sentence(verdict, causes, rms, gain, _named_mm(diagnosis), _tolerated_mm(diagnosis), seen_by),
         pairs=Pairs(len(diagnosis.markers), len(diagnosis.markers), diagnosis.outliers),
         rms_mm=rms,
         mean_mm=_mean_mm(diagnosis),
@@ -60,6 +60,7 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
         limitations=_limitations(diagnosis),
         alike=_alike(diagnosis),
         tolerances=_tolerances(diagnosis),
+        seen_by=seen_by,
     )
 
 
@@ -78,7 +79,7 @@ def _verdict(diagnosis: Diagnosis, causes: tuple[Cause, ...]) -> Verdict:
         return "unexplained"
     if not causes:
         return "nothing_found"
-    return "undecided" if any(c.probability < SURE and c.rivals for c in causes) else "explained"
+    return "undecided" if any(map(is_unsure, causes)) else "explained"
 
 
 def _rms_mm(diagnosis: Diagnosis) -> Errors:

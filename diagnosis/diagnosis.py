@@ -18,7 +18,7 @@ from .alike import Alike, alike
 from .background import Scales
 from .contact import doubtful
 from .drives import with_small_ripples
-from .explanation import changed_by_the_way, explain, needs_no_more_names, without_one
+from .explanation import changed_by_the_way, explain, needs_no_more_names, useful, without_one
 from .fit import Fit, fitted
 from .held_out import Added, Blocks, added, gain_percent, held_out_errors, is_marker
 from .hypotheses import Hypotheses
@@ -244,7 +244,7 @@ def diagnose(
         extended = _searched(start.with_causes(extended.causes).tolerating(scales), search, enough)
     tell("asking whether something without a name is at work")
     blocks = blocks or Blocks.cut(len(recording))
-    explanation = explain(extended, search.path, unknowns, search, tell)
+    explanation = useful(explain(extended, search.path, unknowns, search, tell), blocks, tell)
     tell("asking what else it could be")
     stands = standings(explanation.beside, search, blocks, seed, None if explanation.unknown else unknowns)
     while explanation.unknown and any(standing.probability < _HALF for standing in stands):

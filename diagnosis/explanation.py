@@ -11,7 +11,8 @@ from bodyschema.effects import Effect
 from bodyschema.interfaces.records import FloatArray
 
 from .fit import Fit
-from .search import NAMED, Search, named
+from .held_out import Blocks, held_out_errors, is_marker
+from .search import NAMED, Search, describe, named
 from .together import tolerated
 from .unknown import Apart, Unknowns, Way
 
@@ -112,6 +113,28 @@ def explain(
         tell("something that none of the effects explains")
         best = _pruned(best, unknowns, search, rest=is_rest and best.fit is found)
     return best
+
+
+def useful(explanation: Explanation, blocks: Blocks, tell: Callable[[str], None]) -> Explanation:
+    """Drop causes that do not reduce the error on data not used in the fit."""
+    fit = explanation.fit
+    if explanation.unknown or fit.is_exact:
+        return explanation
+    while fit.causes:
+        markers, error = is_marker(fit), _missed(fit, blocks)
+        fewer = [fit.without(cause) for cause in fit.causes]
+        losses = [float((_missed(one, blocks) - error)[markers].sum()) for one in fewer]
+        least = int(np.argmin(losses))
+        if losses[least] > 0.0:
+            break
+        tell(f"dropped {describe(fit.causes[least])}: no gain on data not used in the fit")
+        fit = fewer[least]
+    return replace(explanation, fit=fit)
+
+
+def _missed(fit: Fit, blocks: Blocks) -> FloatArray:
+    """Squared distances (n,) [m²] on rows not fitted."""
+    return np.square(held_out_errors(fit, blocks)).sum(axis=1)
 
 
 def _rescaled(best: Explanation, apart: Apart, unknowns: Unknowns, search: Search) -> Explanation:

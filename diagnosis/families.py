@@ -63,10 +63,17 @@ class Family:
 
     def columns(self, run: Simulated) -> FloatArray:
         """Derivatives (n, 3, p) of what is measured by its numbers [m], a b where none are tied."""
-        moves, amounts = self.moves(run), self.amounts(run)
-        if self.ties is not None:
-            return (moves * amounts[:, None, :]) @ self.ties
-        return (moves[:, :, :, None] * amounts[:, None, None, :]).reshape(len(moves), 3, -1)
+        moved, functions = self.moved(run), self.functions(run)
+        return (moved[:, :, :, None] * functions[:, None, None, :]).reshape(len(moved), 3, -1)
+
+    def moved(self, run: Simulated) -> FloatArray:
+        """What moves (n, 3, m) [m], each by any function of `functions`; ties are in it."""
+        moves = self.moves(run)
+        return moves if self.ties is None else (moves * self.amounts(run)[:, None, :]) @ self.ties
+
+    def functions(self, run: Simulated) -> FloatArray:
+        """Of what each of `moved` may depend on (n, a); ones where they are tied."""
+        return self.amounts(run) if self.ties is None else np.ones((len(run.motion), 1))
 
     def along(self, functions: FloatArray) -> Family:
         """The part of it whose moves follow some combinations (b, r) of what it may depend on."""

@@ -385,6 +385,19 @@ class Fit:
         background = Background(run, self.observations.whitening, self.background.scales, self.background)
         return _at(self.observations, simulation, self.nuisances, self.noise, background)
 
+    @property
+    def written(self) -> Simulation:
+        """The simulation to be written down: its tolerances as they were found, and all else refitted beside them.
+
+        Tolerances are found to first order. Where a link turns one way and the camera the other, what each of them
+        does to second order is left over.
+        """
+        settled = self.settled()
+        if settled.background.scales is None:
+            return settled.simulation
+        background = Background(settled.run, self.observations.whitening, None)
+        return improved(_at(self.observations, settled.simulation, self.nuisances, self.noise, background)).simulation
+
     def untolerated(self) -> Fit:
         """The same, refitted without any tolerance."""
         if self.background.scales is None:

@@ -104,6 +104,17 @@ class Products:
             self._ports[joint] = self.rows_of(self._fit.weighted(self._fit.run.by_joint[:, :, [joint]]))
         return self._ports[joint]
 
+    def since(self, columns: FloatArray, moments: range) -> System:
+        """Of weighted columns (n, 3, k) from each of some rows on, the last of which is before the end."""
+        parts = [columns, self._basis, self._lefts]
+        step, last = moments.step, moments[-1]
+        between = [part[moments[0] : last].reshape(len(moments) - 1, 3 * step, -1) for part in parts]
+        rest = [part[last:].reshape(1, 3 * (len(columns) - last), -1) for part in parts]
+        turned = [np.swapaxes(rows[0], 1, 2) for rows in (between, rest)]
+        sums = [np.concatenate([turned[0] @ between[k], turned[1] @ rest[k]]) for k in range(3)]
+        inner, onto, toward = (np.cumsum(part[::-1], axis=0)[::-1] for part in sums)
+        return System.of(inner, onto, toward, self._freed)
+
     def rows_of(self, columns: FloatArray) -> Rows:
         """What each row of weighted columns (n, 3, k) adds."""
         turned = np.swapaxes(columns, 1, 2)
@@ -169,13 +180,6 @@ class Rows:
         flat = waves.view(np.float64)
         onto, toward = (
             (flat.T @ part[:, 0]).reshape(count, 2, part.shape[2])[:, ::-1] for part in (self.onto, self.toward)
-        )
-        return System.of(inner, onto, toward, self.freed)
-
-    def since(self, moments: slice) -> System:
-        """Of the rows from each of some moments on."""
-        inner, onto, toward = (
-            np.cumsum(part[::-1], axis=0)[::-1][moments] for part in (self.inner, self.onto, self.toward)
         )
         return System.of(inner, onto, toward, self.freed)
 

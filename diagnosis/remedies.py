@@ -152,9 +152,10 @@ class _Workshop:
         return f"In [camera] of robot.toml: {_toml_pose(self.robot.camera.pose @ self._pose(cause))}."
 
     def bumped(self, cause: Cause, _: Mapping[str, float]) -> str:
-        advice = "Fasten the camera: it was bumped."
+        seen_by = "instrument" if self.robot.calibration is None else "camera"
+        advice = f"Fasten the {seen_by}, and the arm's foot: one of them moved."
         if not self.robot.camera.pose_known:
-            return f"{advice} Calibrate its pose anew with what was measured since."
+            return f"{advice} Calibrate its pose again with what was measured since."
         start = self.robot.camera.pose
         if (known := self.causes.get("camera_pose")) is not None:
             start = start @ self._pose(known)

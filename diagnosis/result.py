@@ -158,7 +158,11 @@ class Stability(msgspec.Struct, frozen=True):
 
 
 class DiagnosisFile(msgspec.Struct, frozen=True):
-    """The contents of `diagnosis.json`."""
+    """The contents of `diagnosis.json`.
+
+    Attributes:
+        seen_by: what measured the positions: a camera, or an instrument such as a laser tracker.
+    """
 
     verdict: Verdict
     sentence: str
@@ -174,4 +178,5 @@ class DiagnosisFile(msgspec.Struct, frozen=True):
     limitations: tuple[str, ...]
     alike: tuple[Alike, ...] = ()
     tolerances: Tolerances | None = None
+    seen_by: Literal["camera", "instrument"] = "camera"
     schema: int = 1

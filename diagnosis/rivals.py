@@ -178,17 +178,26 @@ def widened(fit: Fit, joints: Iterable[int], uneven: float = 0.0) -> Motion:
     Args:
         uneven: by how much the logarithms of the times between rows scatter.
     """
-    robot, motion = fit.simulation.robot, fit.observations.motion
+    motion = fit.observations.motion
     rng = np.random.default_rng(0)
     n = len(motion)
     rows = np.sort(rng.integers(n, size=min(n, _POSES)))
     q = motion.q[rows].copy()
     for k in joints:
-        q[:, k] = rng.uniform(max(robot.lower[k], -np.pi), min(robot.upper[k], np.pi), len(rows))
+        q[:, k] = rng.uniform(*whole_range(fit, k), len(rows))
     clock = motion.clock
     gaps = np.cumsum(np.exp(uneven * rng.normal(size=len(rows))))
     shares = (gaps - gaps[0]) / max(gaps[-1] - gaps[0], 1e-9)
     return Motion(q, clock[0] + shares * (clock[-1] - clock[0]), np.arange(len(rows)) // 2)
+
+
+def whole_range(fit: Fit, joint: int) -> tuple[float, float]:
+    """Return where a joint can be moved [rad, m]: a turn at most; a slide three times as far as in the recording."""
+    robot, q = fit.simulation.robot, fit.observations.motion.q[:, joint]
+    low, high, reach = float(robot.lower[joint]), float(robot.upper[joint]), float(np.ptp(q))
+    if not robot.chain.prismatic[joint]:
+        return max(low, -np.pi), min(high, np.pi)
+    return max(low, float(q.min()) - reach), min(high, float(q.max()) + reach)
 
 
 def apart_on(one: Fit, other: Fit | Nameless, motion: Motion) -> float:

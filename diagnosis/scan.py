@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bodyschema.effects import Effect
+from bodyschema.effects import Effect, Identity
 from bodyschema.effects.moments import settled
 from bodyschema.interfaces.records import FloatArray
 
@@ -29,6 +29,8 @@ _TIME_CONSTANTS = np.geomspace(SHORTEST_DRIFT, 4.0, 24)
 _MEMORIES = np.linspace(0.0, 0.9, 19)
 # As so many independent shapes those of a smooth family count.
 _COARSE = 5
+# So many moments are tried, and all those beside the best of them.
+_MOST_MOMENTS = 1000
 # Rows that have to lie on either side of a moment.
 _BESIDE = 8
 # Twice the fall of the log-likelihood at the ends of a 95 % interval.
@@ -66,6 +68,7 @@ class Scan:
     def __init__(self, fit: Fit, besides: Sequence[Effect] = ()) -> None:
         self._fit, self._products, self._state = fit, Products(fit, besides), 0
         self._besides = tuple(cause.identity for cause in besides)
+        self._before = {0: fit.run.measured}
 
     def without(self, cause: Effect) -> Scan:
         """The scan of the fit without one of `besides`, all others refitted to first order."""
@@ -116,6 +119,27 @@ class Scan:
                 if not dofs[0]:
                     return None
                 return Candidate(_with_amounts(effect, amounts[0]), float(gains[0]), int(dofs[0]))
+
+    def in_full(self, candidate: Candidate) -> Candidate:
+        """Return the candidate with the gain of its amounts themselves, where that is more than to first order.
+
+        A turn of some degrees beside noise of a tenth of a millimetre is more than its tangent.
+        """
+        effects = [effect for effect in self._fit.simulation.effects if effect.identity != self._left_out]
+        simulation, motion = self._fit.simulation, self._fit.observations.motion
+        if self._state not in self._before:
+            self._before[self._state] = simulation.with_effects(effects).run(motion).measured
+        before = self._before[self._state]
+        after = simulation.with_effects([*effects, candidate.effect]).run(motion).measured
+        inner, toward, _ = self._products.of(self._fit.weighted((after - before)[:, :, None])).at(self._state)
+        square = self._products.squares[self._state]
+        explained = np.clip(toward[0, 0] ** 2 / max(float(inner[0, 0, 0]), 1e-300), 0.0, 0.999999 * square)
+        gain = float(-3.0 * self._products.rows * np.log1p(-explained / square))
+        return replace(candidate, gain=gain) if gain > candidate.gain else candidate
+
+    @property
+    def _left_out(self) -> Identity | None:
+        return self._besides[self._state - 1] if self._state else None
 
     def best_pair(self, hypotheses: Iterable[Effect]) -> tuple[Candidate, Candidate] | None:
         """The two effects of one amount each that would explain most together; None where there are not two.
@@ -242,25 +266,32 @@ class Scan:
         return self._products.port(place.joint).waved(waves)
 
     def _moment(self, effect: Effect) -> Candidate | None:
-        """Over all moments between two rows."""
+        """Over moments between two rows: some of them, then all beside the best."""
         n = len(self._fit.left)
         if n < 2 * _BESIDE + 1:
             return None
-        clock = self._fit.observations.motion.clock
         begun = effect.with_values(np.append(effect.values[:-1], -np.inf))
 
-        def since() -> System:
+        def since(rows: range) -> System:
             columns = self._fit.weighted(self._fit.run.columns(begun)[:, :, effect.amounts])
-            return self._products.rows_of(columns).since(slice(_BESIDE, n - _BESIDE))
+            return self._products.since(columns, rows)
 
-        best, gains, amounts, dof = self._best(self._products.kept(effect, since), effect)
+        step = 1 + n // _MOST_MOMENTS
+        some = range(_BESIDE, n - _BESIDE, step)
+        best, gains, amounts, dof = self._best(self._products.kept(effect, lambda: since(some)), effect)
         if not dof:
             return None
-        row = best + _BESIDE
-        moment = 0.5 * (clock[row - 1] + clock[row])
-        values = np.append(amounts, moment)
-        interval = _interval(0.5 * (clock[_BESIDE - 1 : n - _BESIDE - 1] + clock[_BESIDE : n - _BESIDE]), gains)
-        return Candidate(effect.with_values(values), float(gains[best]), dof, len(gains), interval)
+        tried, row = np.asarray(some), some[best]
+        if step > 1:
+            beside = range(max(row - step + 1, _BESIDE), min(row + step, n - _BESIDE))
+            best, closer, amounts, dof = self._best(since(beside), effect)
+            row = beside[best]
+            tried, first = np.unique(np.append(tried, beside), return_index=True)
+            gains = np.append(gains, closer)[first]
+        clock = self._fit.observations.motion.clock
+        values = np.append(amounts, 0.5 * (clock[row - 1] + clock[row]))
+        interval = _interval(0.5 * (clock[tried - 1] + clock[tried]), gains)
+        return Candidate(effect.with_values(values), float(gains.max()), dof, n - 2 * _BESIDE, interval)
 
     def _linear(self, effect: Effect) -> System:
         """The system of an effect that has amounts alone."""

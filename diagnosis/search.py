@@ -20,6 +20,8 @@ from .scatter import instruments, remembers
 NAMED = 3.0
 # Candidates within this share of the best gain are refitted in full, so many at most.
 _NEAR, _MOST = 0.4, 6
+# ... and within this share their gain is worth knowing beyond first order.
+_WORTH_IN_FULL = 0.2
 _MOST_CAUSES = 20
 # After so many causes more it is asked whether these are enough.
 _ASKED_EACH = 3
@@ -282,6 +284,8 @@ class Search:
     def shortlist(self, scan: Scan, hypotheses: Sequence[Effect]) -> list[Candidate]:
         """The candidates that may be the best when all is refitted, the most probable first."""
         scanned = [one for one in scan.candidates(hypotheses, _NEAR) if not scan.tolerates(one.effect)]
+        most = max((one.gain for one in scanned), default=0.0)
+        scanned = [scan.in_full(one) if one.gain >= _WORTH_IN_FULL * most else one for one in scanned]
         ranked = sorted(scanned, key=lambda c: nats(c.gain, c.dof) - self.doubt(c), reverse=True)
         if not ranked:
             return []

@@ -10,7 +10,7 @@ rows do (MacKay 1992, "Bayesian interpolation"; Tipping and Faul 2003, "Fast mar
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -348,6 +348,8 @@ class _Place:
         self.here = self._sets.of(own)
         self.reached = self._sets.climbed(self._sets.starts(own))
         self.name = self.name_of(self.here)
+        # Without what it has worked out, which is large where rows are many.
+        self.fit = replace(fit)
 
     def name_of(self, one: Together) -> frozenset[Key]:
         """Which causes a set has, whatever their numbers."""

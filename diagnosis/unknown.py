@@ -49,52 +49,59 @@ class Way:
 
     Attributes:
         family: which.
-        columns: what its numbers change (3 n, p), whitened and about as long as one.
-        scales: how long they were (p,): those of the moves times those of what they depend on.
-        amounts: on how many functions each move depends.
+        moved: what moves (n, 3, m), whitened and about as long as one.
+        functions: on which functions (n, a), about as large as one, each move depends.
+        scales: how long the columns were (p,): those of the moves times those of what they depend on.
         choice: how many more numbers were spent on choosing the part.
     """
 
     family: Family
-    columns: FloatArray
+    moved: FloatArray
+    functions: FloatArray
     scales: FloatArray
-    amounts: int
     choice: int = 0
 
     @classmethod
     def of(cls, family: Family, start: Fit) -> Way:
         """The whole family."""
-        whitened = start.observations.whitened(family.columns(start.run)).reshape(start.left.size, -1)
-        amounts = 1 if family.ties is not None else family.amounts(start.run).shape[1]
-        lengths = np.linalg.norm(whitened, axis=0).reshape(-1, amounts)
+        functions = family.functions(start.run)
+        moved = start.observations.whitened(family.moved(start.run))
+        # Lengths (m, a) of the columns, which are moves times functions.
+        lengths = np.sqrt(np.square(moved).sum(axis=1).T @ np.square(functions))
         of_moves = np.maximum(np.sqrt(np.square(lengths).mean(axis=1, keepdims=True)), 1e-100)
-        of_amounts = np.maximum(np.sqrt(np.square(lengths / of_moves).mean(axis=0)), 1e-100)
-        scales = (of_moves * of_amounts).ravel()
-        return cls(family, whitened / scales, scales, amounts)
+        of_functions = np.maximum(np.sqrt(np.square(lengths / of_moves).mean(axis=0)), 1e-100)
+        return cls(family, moved / of_moves[:, 0], functions / of_functions, (of_moves * of_functions).ravel())
+
+    @property
+    def columns(self) -> FloatArray:
+        """What its numbers change (3 n, p); made when they are asked for, as those of all ways are many."""
+        columns = self.moved[:, :, :, None] * self.functions[:, None, None, :]
+        return columns.reshape(3 * len(self.moved), -1)
 
     @cached_property
     def inner(self) -> FloatArray:
         """Products (p, p) of the columns with one another."""
-        return self.columns.T @ self.columns
-
-    def weighted_inner(self, weights: FloatArray) -> FloatArray:
-        """The same with rows weighted (n,), by those that do not count in full."""
-        return weighted_products(self.columns, self.inner, weights)
+        columns = self.columns
+        return columns.T @ columns
 
     @property
     def moves(self) -> int:
         """How many there are."""
-        return len(self.scales) // self.amounts
+        return self.moved.shape[2]
+
+    @property
+    def amounts(self) -> int:
+        """On how many functions each move depends."""
+        return self.functions.shape[1]
 
     def along(self, functions: FloatArray) -> Way:
         """The part whose moves follow some functions (b, r), in units of the scales."""
         rank = functions.shape[1]
         scales = self.scales.reshape(self.moves, self.amounts)
         mix = functions / (scales[0] / scales[0].max())[:, None]
-        columns = (self.columns.reshape(-1, self.moves, self.amounts) @ functions).reshape(len(self.columns), -1)
         of_moves = np.repeat(scales[:, scales[0].argmax()], rank)
         choice = numbers_of(self.moves, self.amounts, rank) - len(of_moves)
-        return Way(self.family.along(mix), columns, of_moves, rank, choice)
+        return Way(self.family.along(mix), self.moved, self.functions @ functions, of_moves, choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,9 +178,10 @@ class Unknowns:
         for way in self._ways:
             if way in others:
                 continue
-            products = seen @ way.columns
+            columns = way.columns
+            products = seen @ columns
             onto, toward = products[:-1], products[-1]
-            inner = way.weighted_inner(fit.noise.weights) - onto.T @ onto
+            inner = weighted_products(columns, way.inner, fit.noise.weights) - onto.T @ onto
             values, vectors = np.linalg.eigh(inner)
             told = (values > _TOLD * max(float(values.max()), 1e-12)) & (values > _LEFT)
             explained = float(np.square(vectors[:, told].T @ toward / np.sqrt(values[told])).sum())

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from msgspec.structs import replace
 
 from bodyschema.effects import KINDS
 from bodyschema.effects.unexplained import PLACE
@@ -21,12 +20,21 @@ _BACKWARDS = -1.0
 _BY_TOLERANCES = 0.95
 # A size whose ends are farther apart than this factor is told by its larger end.
 _UNTOLD = 10.0
-# A sentence names so many causes; of more, the smallest are counted.
-_TOLD = 4
+# A headline names so many causes and counts the others: it fits two lines.
+_TOLD = 2
+# A cause that is less sure than this leaves the verdict open.
+SURE = 0.9
 
 
-def finding(name: str, where: str | None, source: str | None, numbers: dict[str, float]) -> str:
-    """One cause as a clause: what is wrong, where, by how much. Of shifts and turns only those in `numbers` count."""
+def finding(
+    name: str, where: str | None, source: str | None, numbers: dict[str, float], seen_by: str = "camera"
+) -> str:
+    """Return one cause as a clause: what is wrong, where, by how much.
+
+    Args:
+        numbers: of shifts and turns only those given count.
+        seen_by: what measures, as in `DiagnosisFile`.
+    """
     at = f"joint {where}"
 
     def size(*names: str) -> float:
@@ -82,9 +90,9 @@ def finding(name: str, where: str | None, source: str | None, numbers: dict[str,
         case "tool_slip":
             return f"the marker slipped by {shift}{when}"
         case "camera_pose":
-            return f"the camera stands {moved} off"
+            return f"the {seen_by} stands {moved} off"
         case "camera_moved":
-            return f"the camera was bumped by {moved}{when}"
+            return f"the {seen_by} {'was bumped' if seen_by == 'camera' else 'moved'} by {moved}{when}"
         case "camera_scale":
             return f"all that is measured is {100 * numbers['scale_error']:+.3g} % too large: the baseline is wrong"
         case "camera_focal":
@@ -109,14 +117,16 @@ def sentence(
     gain: Gain,
     named_mm: float | None = None,
     tolerated_mm: float | None = None,
+    seen_by: str = "camera",
 ) -> str:
-    """The verdict in one sentence.
+    """Return the verdict in one or two short sentences.
 
     Args:
         named_mm: RMS with the causes alone [mm], where there is a smooth model of what has no name beside them.
         tolerated_mm: RMS with small errors everywhere and no cause [mm], where such errors show.
+        seen_by: what measures, as in `DiagnosisFile`.
     """
-    figures = f"{rms.aligned:.3g} mm → {rms.extended:.3g} mm on data not used in the fit"
+    figures = f"{rms.aligned:.3g} → {rms.extended:.3g} mm on held-out data"
     if verdict == "nothing_found" and rms.extended < _BY_TOLERANCES * rms.aligned:
         return f"No cause stands out: small errors everywhere explain {_share(gain)} ({figures})"
     if verdict == "nothing_found":
@@ -124,37 +134,36 @@ def sentence(
     if not causes:
         told = "What is measured differs from the simulation in a way that none of the known effects explains"
         return told if named_mm is None else f"{told}; a smooth model of it explains {_share(gain)} ({figures})"
-    told = [finding(c.effect, c.where, c.source, told_values(c)) for c in causes]
-    ordered = [text for _, text in sorted(zip(causes, told, strict=True), key=lambda p: -p[0].share_of_gain_percent)]
-    if len(ordered) > _TOLD:
-        smaller = len(ordered) - _TOLD + 1
-        ordered = [*ordered[: _TOLD - 1], f"{smaller} smaller causes act beside"]
-    head = ordered[0][0].upper() + ordered[0][1:]
-    if len(ordered) > 1:
-        head += f"; {', '.join(ordered[1:-1])}{', and ' if len(ordered) > 2 else ''}{ordered[-1]}"
-    ends = {
-        "explained": "",
-        "undecided": ". Other causes would explain it nearly as well",
-        "unexplained": ". Something is left that none of the known effects explains",
-    }
-    what = "it explains" if len(ordered) == 1 else "together they explain"
-    if named_mm is not None:
-        alone = replace(gain, held_out_percent=100.0 * (1.0 - named_mm / max(rms.aligned, 1e-12)))
-        figures = f"{rms.aligned:.3g} mm → {named_mm:.3g} mm → {rms.extended:.3g} mm on data not used in the fit"
-        return (
-            f"{head}: {what} {_share(alone)}, and {_share(gain)} with a smooth model of what has no name "
-            f"({figures}){ends[verdict]}"
-        )
-    if tolerated_mm is not None and tolerated_mm < _BY_TOLERANCES * rms.aligned:
-        figures = (
-            f"{rms.aligned:.3g} mm → {tolerated_mm:.3g} mm by small errors everywhere → {rms.extended:.3g} mm on data "
-            "not used in the fit"
-        )
-        beside = replace(gain, held_out_percent=100.0 * (1.0 - rms.extended / max(tolerated_mm, 1e-12)))
-        return f"{head}: {what} {_share(beside)} that tolerances leave ({figures}){ends[verdict]}"
+    largest = sorted(causes, key=lambda cause: -cause.share_of_gain_percent)
+    told = [finding(c.effect, c.where, c.source, told_values(c), seen_by) for c in largest[:_TOLD]]
+    head = told[0][0].upper() + told[0][1:]
+    if more := len(largest) - len(told):
+        head += f"; {', '.join(told[1:])}; {more} smaller cause{'s' * (more > 1)}"
+    elif len(told) > 1:
+        head += f", and {told[1]}"
     if gain.held_out_percent <= 0.0:
-        return f"{head}: this explains the pairs that were fitted and no others ({figures}){ends[verdict]}"
-    return f"{head}: {what} {_share(gain)} ({figures}){ends[verdict]}"
+        return f"{head}: this explains the pairs that were fitted and no others ({figures})"
+    if named_mm is not None:
+        figures += f", {named_mm:.3g} mm without the smooth model of the rest"
+    elif tolerated_mm is not None and tolerated_mm < _BY_TOLERANCES * rms.aligned:
+        figures += f", {tolerated_mm:.3g} mm with tolerances alone"
+    return f"{head}. RMS error {figures}{_open(verdict, causes)}"
+
+
+def _open(verdict: Verdict, causes: Sequence[Cause]) -> str:
+    """What a verdict leaves open, to be added to its sentence."""
+    if verdict == "unexplained":
+        return ". Part of the error remains unexplained"
+    unsure = [cause for cause in causes if is_unsure(cause)]
+    if verdict != "undecided" or not unsure:
+        return ""
+    named = [f"{c.effect}{'' if c.where is None else f' at {c.where}'}" for c in unsure]
+    return f". Not sure: {', '.join(named)}; other causes explain as much"
+
+
+def is_unsure(cause: Cause) -> bool:
+    """Return True for a cause with a rival that is not much less probable."""
+    return cause.probability < SURE and bool(cause.rivals)
 
 
 def _share(gain: Gain) -> str:

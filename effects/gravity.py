@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,7 +16,7 @@ GRAVITY_M_S2 = 9.80665  # down the root link's z axis, as simulators load a URDF
 
 
 @dataclass
-class _Body:
+class Body:
     """The links between one joint that is read and the next: they move as one.
 
     Attributes:
@@ -43,6 +43,16 @@ class GravityLoad:
         self._robot = robot
         self._bodies = _bodies(robot)
         self._outwards = [k for k in self._order() if k is not None]
+
+    @property
+    def bodies(self) -> Mapping[int | None, Body]:
+        """What moves as one, by the place in q of the joint that carries it; None is the base."""
+        return self._bodies
+
+    @property
+    def outwards(self) -> Sequence[int]:
+        """Places in q of the joints, each after the one that carries it."""
+        return self._outwards
 
     @property
     def known(self) -> bool:
@@ -105,22 +115,22 @@ class GravityLoad:
         return order
 
 
-def _bodies(robot: RobotDescription) -> dict[int | None, _Body]:
+def _bodies(robot: RobotDescription) -> dict[int | None, Body]:
     tree, held_at = robot.tree, robot.robot.held_at
-    bodies: dict[int | None, _Body] = {None: _Body(None, None, np.eye(4))}
+    bodies: dict[int | None, Body] = {None: Body(None, None, np.eye(4))}
     for name in robot.joints:
         joint = tree.joints[name]
-        carrier, T = _carried(tree, joint.parent, robot.joints, held_at)
-        bodies[robot.joints.index(name)] = _Body(joint, carrier, frozen_array(T @ joint.T_parent_joint))
+        carrier, T = carried(tree, joint.parent, robot.joints, held_at)
+        bodies[robot.joints.index(name)] = Body(joint, carrier, frozen_array(T @ joint.T_parent_joint))
     for link, mass in tree.masses.items():
-        carrier, T = _carried(tree, link, robot.joints, held_at)
+        carrier, T = carried(tree, link, robot.joints, held_at)
         body = bodies[carrier]
         body.mass_kg += mass.mass_kg
         body.moment = body.moment + mass.mass_kg * (T[:3, :3] @ mass.centre + T[:3, 3])
     return bodies
 
 
-def _carried(
+def carried(
     tree: UrdfTree, link: str, joints: tuple[str, ...], held_at: dict[str, float]
 ) -> tuple[int | None, FloatArray]:
     """The read joint that carries `link`, None for the base, and the link's pose (4, 4) in that joint's child link."""

@@ -94,17 +94,22 @@ class Simulation:
 
     @property
     def since(self) -> Simulation:
-        """The arm as it is since all moments of its recording have passed, standing still and cold.
+        """The arm as it is since all moments have passed, standing still and cold.
 
         What jumped, slipped or was bumped stays where it is; what comes of motion or of warming up is not there.
         """
-        own, later = [], []
-        for effect in self.effects:
-            if effect.name in _STAYS:
-                values = effect.values[:-1]
-                later.append(Effect.at(self.robot, _STAYS[effect.name], effect.where, values=values.tolist()))
-            elif effect.name not in _OF_MOTION:
-                own.append(effect)
+        stayed = self.after_moments
+        return replace(stayed, effects=tuple(effect for effect in stayed.effects if effect.name not in _OF_MOTION))
+
+    @property
+    def after_moments(self) -> Simulation:
+        """The same with what jumped, slipped or was bumped where it stays."""
+        own = [effect for effect in self.effects if effect.name not in _STAYS]
+        later = [
+            Effect.at(self.robot, _STAYS[effect.name], effect.where, values=effect.values[:-1].tolist())
+            for effect in self.effects
+            if effect.name in _STAYS
+        ]
         return replace(self, effects=(*own, *later))
 
     @property

@@ -36,7 +36,9 @@ _NO_MASS = (
 STATE_DIR = "state"
 
 
-def write_calibrated(robot: RobotDescription, geometry: CalibratedGeometry, folder: Path, heading: str) -> Path:
+def write_calibrated(
+    robot: RobotDescription, geometry: CalibratedGeometry, folder: Path, heading: str, *, replace: bool = False
+) -> Path:
     """Write `robot` with another geometry as a URDF and a robot.toml into `folder`, which is made if need be.
 
     Meshes stay where they are; their relative names are made to lead there, names with a scheme are left. Store and
@@ -44,6 +46,7 @@ def write_calibrated(robot: RobotDescription, geometry: CalibratedGeometry, fold
 
     Args:
         heading: one line for the top of both files: where they come from.
+        replace: overwrite files that are there, but for those that the robot was read from.
 
     Returns:
         The path of the robot.toml.
@@ -59,8 +62,10 @@ def write_calibrated(robot: RobotDescription, geometry: CalibratedGeometry, fold
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for file in texts:
-            if file.exists():
-                raise ConfigError("is there already", file=file, remedy="Give another folder")
+            own = file.exists() and any(file.samefile(read) for read in (robot.file, robot.tree.file))
+            if own or (file.exists() and not replace):
+                remedy = "Give another folder" if own else "Give another folder, or --force"
+                raise ConfigError("is there already", file=file, remedy=remedy)
         for file, text in texts.items():
             file.write_bytes(text)
     except OSError as error:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 
+from . import old_names
 from .errors import ConfigError
 from .suggest import did_you_mean
 from .toml_file import line_of
@@ -63,7 +64,10 @@ def installed(group: Group) -> tuple[EntryPoint, ...]:
     """Return what the packages that are installed here offer."""
     from importlib.metadata import entry_points
 
-    return tuple(entry_points(group=group))
+    found = tuple(entry_points(group=group))
+    if found:
+        old_names.allow()
+    return found
 
 
 def _entry(group: Group, name: str) -> EntryPoint:

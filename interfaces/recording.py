@@ -116,17 +116,7 @@ class Recording:
             RecordingError: the file cannot be read; the message names line, column and remedy.
         """
         file, joints = Path(file), tuple(joints)
-        readers = {CSV: read_csv_table, PARQUET: read_parquet_table}
-        reader = readers.get(file.suffix.lower())
-        if reader is None:
-            raise RecordingError(f"recordings end in {CSV} or {PARQUET}", file=file, remedy="Rename or convert it")
-        try:
-            table = reader(file, joints)
-            check_values(table)
-        except Fault as fault:
-            raise _located(fault, file) from None
-        except OSError as error:
-            raise _unreadable(file, error) from error
+        table = read_table(file, joints)
         return cls.from_table(table, joints, file)
 
     @classmethod
@@ -242,6 +232,26 @@ class Recording:
         check_header(table.names, self.joints)
         check_finite(table)
         check_values(table)
+
+
+def read_table(file: Path, joints: tuple[str, ...]) -> Table:
+    """Return the checked columns of a recording of `joints` in `file`, CSV or Parquet by its ending.
+
+    Raises:
+        RecordingError: the file cannot be read; the message names line, column and remedy.
+    """
+    readers = {CSV: read_csv_table, PARQUET: read_parquet_table}
+    reader = readers.get(file.suffix.lower())
+    if reader is None:
+        raise RecordingError(f"recordings end in {CSV} or {PARQUET}", file=file, remedy="Rename or convert it")
+    try:
+        table = reader(file, joints)
+        check_values(table)
+    except Fault as fault:
+        raise _located(fault, file) from None
+    except OSError as error:
+        raise _unreadable(file, error) from error
+    return table
 
 
 def joints_in(file: Path) -> tuple[str, ...]:

@@ -420,6 +420,15 @@ def _parse(file: Path) -> Any:
         raise RobotError("a URDF with a DOCTYPE is not accepted", file=file, line=1, remedy="Delete the DOCTYPE")
     if root.tag != "robot":
         raise RobotError(f"the root element is <{root.tag}>, not <robot>", file=file, line=root.sourceline)
+    macro = next((element for element in root.iter("{*}*") if "xacro" in str(etree.QName(element).namespace)), None)
+    if macro is not None:
+        raise RobotError(
+            "this is a xacro file, of which a URDF is made first",
+            file=file,
+            line=macro.sourceline,
+            remedy=f"With ROS: `xacro {file.name} > made.urdf`, with the arguments that its makers document; then set "
+            'urdf = "made.urdf" in [robot]',
+        )
     if sum(1 for _ in root.iter("link", "joint")) > 2 * MOST_LINKS:
         raise RobotError(f"the URDF has more than {MOST_LINKS:,} links", file=file, remedy="Keep the arm's alone")
     return root

@@ -22,6 +22,8 @@ CLEARLY = 2.0
 # A model whose mean error on the last so many pairs is so many times another one's does not answer: what fitted most of
 # the pairs may fail where the arm has just come to, and the cap below hides by how much. A share of 1.2 is what answers
 # are promised to stay within; fewer than 50 pairs scatter by about as much.
+# Sensitivity, mean error on 90 pairs each of two measured arms (UR5 0.158 mm, UR10 0.409 mm), a solution every ten:
+# 0.3 to 3 times as many pairs change it by up to 1 %, 0.3 to 3 times the margin above 1 by -3 to +12 %.
 LATELY, WORSE = 50, 1.2
 # A difference that no camera sees [m].
 _LEAST_M = 1e-6

@@ -1,4 +1,4 @@
-"""The renderer's process: `python -m bodyschema.sim_backend.renderer MEMORY REQUESTS ANSWERS` with three inherited descriptors.
+"""The renderer's process, `python -m bodyschema.sim_backend.renderer MEMORY REQUESTS ANSWERS`: inherited descriptors.
 
 It ends when its parent closes the pipe, or when the parent is no more: then nobody reads what it paints.
 """

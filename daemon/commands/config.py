@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import cyclopts
 from cyclopts import Parameter
 
-from bodyschema.daemon.commands.options import HERE, RobotFile, flag
+from bodyschema.daemon.commands.options import HERE, RobotFile, flag, several
 
 if TYPE_CHECKING:
     from bodyschema.daemon.config import Config
@@ -34,28 +34,40 @@ def init(
     robot: Annotated[Path, Parameter(help="The file to write.")] = HERE,
     urdf: Annotated[Path | None, Parameter(help="Your robot's URDF: joints and links are taken from it.")] = None,
     sim: Annotated[bool, flag("A whole example: the simulated upper body.")] = False,
+    lerobot: Annotated[
+        str | None, Parameter(help="An arm of LeRobot: so101, so100, moss, koch or koch_leader; with its URDF.")
+    ] = None,
+    calibration: Annotated[Path | None, Parameter(help="LeRobot's calibration of this arm, a JSON file.")] = None,
+    port: Annotated[
+        tuple[str, ...], several("Where the arm's servos are; of several, and without any, it is found")
+    ] = (),
 ) -> None:
     """Write a commented robot.toml. Never replaces a file.
 
-    With --urdf the longest chain of joints is filled in; without it, the names are examples.
+    With --urdf the longest chain of joints is filled in; without it, the names are examples. With --lerobot the servos
+    are filled in as well, with IDs, directions and zeros from LeRobot's calibration: one robot.toml for a leader,
+    another one for a follower. Nothing is written to any servo.
 
-    Needs: your robot's URDF; with --sim nothing at all.
+    Needs: your robot's URDF; with --sim nothing at all; with --lerobot also LeRobot's calibration of the arm.
 
     Next: mend what is marked CHECK, then `bodyschema config check`. With --sim nothing is left to mend:
-    `bodyschema run --sim`.
+    `bodyschema run --sim`. With --lerobot: `bodyschema joints`.
     """
     from bodyschema.interfaces.errors import ConfigError
 
     try:
         if sim:
             _copy_model(robot)
+        elif lerobot is not None:
+            write_new(robot, _of_lerobot(lerobot, urdf, robot, calibration, port))
         else:
             from bodyschema.daemon.robot_template import EXAMPLE, guess_from, robot_toml
 
             write_new(robot, robot_toml(EXAMPLE if urdf is None else guess_from(urdf, robot)))
     except OSError as error:
         raise ConfigError(f"cannot be written: {error.strerror}", file=robot, remedy="Give another --robot") from error
-    say(f"{robot} written. Next: `bodyschema {'run --sim' if sim else 'config check'} --robot {robot}`")
+    following = "run --sim" if sim else "config check" if lerobot is None else "joints"
+    say(f"{robot} written. Next: `bodyschema {following} --robot {robot}`")
 
 
 @config.command(sort_key=2)
@@ -123,6 +135,29 @@ def show(*, robot: RobotFile = HERE) -> None:
     tables["robot"] = msgspec.to_builtins(checked.robot.robot)
     tables["camera"] = msgspec.to_builtins(checked.robot.camera)
     say(msgspec.json.format(msgspec.json.encode(tables)).decode())
+
+
+def _of_lerobot(name: str, urdf: Path | None, robot: Path, calibration: Path | None, ports: Sequence[str]) -> str:
+    """Return a robot.toml for an arm of LeRobot."""
+    from bodyschema.daemon import servo_wiring
+    from bodyschema.daemon.lerobot_robot import lerobot_arm, lerobot_port, lerobot_robot_toml
+    from bodyschema.daemon.wiring import connected_cameras
+    from bodyschema.interfaces.errors import ConfigError
+    from bodyschema.interfaces.lerobot import where_calibrations_are
+
+    arm = lerobot_arm(name)
+    if urdf is None:
+        raise ConfigError(
+            "--lerobot needs the arm's URDF", remedy="Give it with --urdf; SO-ARM100 has one in Simulation/"
+        )
+    if calibration is None:
+        raise ConfigError(
+            "--lerobot needs the arm's calibration", remedy=f"Give --calibration. {where_calibrations_are()}"
+        )
+    if len(ports) != 1:
+        ports = servo_wiring.ports_to_scan(ports, None)
+        ports = [lerobot_port(arm, lambda bauds: servo_wiring.scan(ports, bauds, lambda _: None))]
+    return lerobot_robot_toml(arm, urdf, robot, calibration, ports[0], connected_cameras())
 
 
 def _effect_line(effect: Effect) -> str:

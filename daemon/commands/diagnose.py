@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from bodyschema.daemon.commands.options import SourceRobotFile, flag, robot_file
+from bodyschema.daemon.commands.options import (
+    AS_THEY_ARE,
+    LeRobotFile,
+    SourceOptions,
+    SourceRobotFile,
+    flag,
+    lerobot_lines,
+    robot_file,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -18,7 +26,10 @@ if TYPE_CHECKING:
 
 def diagnose(
     recording: Annotated[
-        Path | None, Parameter(help="A recording (.csv, .parquet) or a pair store (.sqlite); or --live.")
+        Path | None,
+        Parameter(
+            help="A recording (.csv, .parquet), a ROS bag, a LeRobotDataset or a pair store (.sqlite); or --live."
+        ),
     ] = None,
     /,
     *,
@@ -31,6 +42,9 @@ def diagnose(
     effects: Annotated[str | None, Parameter(help="Look for these alone, as in backlash,joint_offset.")] = None,
     exclude: Annotated[str | None, Parameter(help="Do not look for these.")] = None,
     seed: Annotated[int, Parameter(help="Of the resampling behind the intervals.", validator=Number(gte=0))] = 0,
+    taken: SourceOptions = AS_THEY_ARE,
+    lerobot: LeRobotFile = None,
+    write: Annotated[bool, flag("Write the file of --lerobot; the old one is kept beside it.")] = False,
     as_json: Annotated[bool, flag("Print diagnosis.json.", name="--json")] = False,
     force: Annotated[bool, flag("Go on although the pairs do not seem to be of this robot.")] = False,
 ) -> None:
@@ -45,7 +59,8 @@ def diagnose(
 
     Needs: a recording or a store and its robot.toml, no hardware; with --live a running sampler.
 
-    Next: open OUT/report.html; OUT/extended.toml takes the place of robot.toml in any command.
+    Next: open OUT/report.html; OUT/extended.toml takes the place of robot.toml in any command, and
+    `bodyschema export` turns it into models for MuJoCo, controllers and drivers.
     """
     import sys
 
@@ -54,10 +69,13 @@ def diagnose(
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.diagnosis_run import Asked, measured, results_in, run, written
     from bodyschema.daemon.diagnosis_view import view
+    from bodyschema.interfaces.errors import RequestError
 
+    if write and lerobot is None:
+        raise RequestError("--write is for --lerobot FILE. Give LeRobot's calibration file")
     config = Config.load(robot_file(robot, recording))
     asked = Asked.of(effects, exclude, seed)
-    source = measured(config, recording, live=live)
+    source = measured(config, recording, lambda file: taken.opened(config, file, lerobot), live=live)
     told = Console(stderr=True, highlight=False)
     with results_in(out), _progress(told) as tell:
         found = run(config, source, asked, tell, force=force)
@@ -66,11 +84,21 @@ def diagnose(
             written(found, out)
     for warning in found.warnings:
         told.print(f"Warning: {warning}", markup=False, soft_wrap=True)
+    lines: list[str] = []
+    if lerobot is not None:
+        offsets = {
+            cause.where: cause.parameters["offset_rad"].value
+            for cause in found.file.causes
+            if cause.effect == "joint_offset" and cause.where is not None and "offset_rad" in cause.parameters
+        }
+        lines = lerobot_lines(config, lerobot, offsets, write=write)
     if as_json:
         sys.stdout.write(found.json + "\n")
         return
     console = Console(highlight=False)
     console.print(view(found.file, found.remedies, timed=found.timed))
+    for line in ["", *lines] if lines else []:
+        console.print(line, markup=False, soft_wrap=True)
     if out is not None:
         console.print(
             f"\nOpen {out / 'report.html'}. Beside it are diagnosis.json and extended.toml, the simulation with what "

@@ -59,9 +59,9 @@ def latency(
         sys.stdout.write(encode(found).decode() + "\n")
         return
     console.print(
-        f"{found.fixes} fixes at {found.speed_m_s:.2f} m/s, {1e3 * found.residual_m:.1f} mm from a smooth function of "
-        f"the angles: images are taken {1e3 * found.latency_s:.1f} ± {1e3 * found.sigma_s:.1f} ms before their time "
-        "stamps. In [vision.cameras] write",
+        f"{found.fixes} fixes at {found.speed_m_s:.2f} m/s, {1e3 * found.residual_m:.1f} mm from where the angles "
+        f"bring the marker: images are taken {1e3 * found.latency_s:.1f} ± {1e3 * found.sigma_s:.1f} ms before their "
+        "time stamps. In [vision.cameras] write",
         markup=False,
     )
     console.print(f"latency_s = {found.latency_s:.4f}", markup=False)

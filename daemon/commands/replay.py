@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from bodyschema.daemon.commands.options import SourceRobotFile, flag, robot_file
+from bodyschema.daemon.commands.options import (
+    AS_THEY_ARE,
+    DatasetCalibration,
+    SourceOptions,
+    SourceRobotFile,
+    flag,
+    robot_file,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -23,7 +30,7 @@ LINE_EVERY_S = 2.0
 
 
 def replay(
-    recording: Annotated[Path, Parameter(help="A recording (.csv, .parquet).")],
+    recording: Annotated[Path, Parameter(help="A recording (.csv, .parquet), a ROS bag or a LeRobotDataset.")],
     /,
     *,
     robot: SourceRobotFile = None,
@@ -40,6 +47,8 @@ def replay(
     any_step: Annotated[bool, flag("Accept rows whatever their step and speed: single poses far apart.")] = False,
     held_out: Annotated[float, Parameter(help="Share of the rows to leave out and judge by.")] = 0.3,
     as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
+    taken: SourceOptions = AS_THEY_ARE,
+    lerobot: DatasetCalibration = None,
     keep: Annotated[Path | None, Parameter(help="Keep store, checkpoint and logs in this new folder.")] = None,
     force: Annotated[bool, flag("Go on although the rows do not seem to be of this robot.")] = False,
 ) -> None:
@@ -68,11 +77,10 @@ def replay(
     from bodyschema.daemon.replay.run import replay as run_replay
     from bodyschema.daemon.replay.steps import Steps, require_path
     from bodyschema.daemon.wire import encode
-    from bodyschema.interfaces.recording import Recording
 
     config = Config.load(robot_file(robot, recording))
     config.require_learnable()
-    rows = Recording.read(recording, config.robot.joints)
+    rows = taken.opened(config, recording, lerobot)
     require_units(config.robot, rows, recording)
     split = split_blocks(len(rows), held_out)
     any_step |= config.tables.daemon.any_step

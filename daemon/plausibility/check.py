@@ -22,7 +22,7 @@ from bodyschema.interfaces.robot import RobotDescription
 from kbmaps import DegenerateDataError, RigidChain, align
 from kbmaps.chains.placement import place
 
-from .limits import MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD, reach_m, spread_m
+from .limits import KNOWN_TOOL_M, MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD, reach_m, spread_m
 from .reading import QUARTER, Reading
 
 # Rows that are read in other ways, evenly spread. Twice as many cost twice the time and change no verdict of the tests.
@@ -51,6 +51,13 @@ NAMED = 0.12
 FAR_ZERO_RAD = math.radians(20.0)
 # A camera is not turned by so much against a pose that is known.
 TURNED_RAD = math.radians(30.0)
+# Share of its tolerance that a zero is given which is to stay as drawn.
+HELD = 1e-3
+# A zero of the last joint this far off is not fitted where the marker is known: its quarter turns are tried instead.
+LAST_ZERO_RAD = math.radians(3.0)
+# ... and named where the known marker comes out so many times nearer to its place: with 3, 2 of 32 markers that were
+# 50 mm off in each direction (1-sigma) came out so by chance.
+NEARER = 5.0
 # So many other readings that fit as well are told.
 LISTED = 2
 # Distances below this share of the reach are no longer told apart.
@@ -104,12 +111,14 @@ class _Fit:
         error: RMS distance of the nearest pairs, in the recording's own unit.
         nats: minus the log-likelihood, what zeros and marker cost included.
         zeros: added to the joints (d,) beside the quarter turns [rad, m].
+        tool_m: how far from its place the marker is [m].
         rotation: of the nominal measurement frame in the real one (3, 3).
     """
 
     error: float
     nats: float
     zeros: FloatArray
+    tool_m: float
     rotation: FloatArray
 
 
@@ -146,6 +155,9 @@ def plausibility(
     noise = 0.0 if sigma_m is None else NOISES * sigma_m
     if before <= MUCH_BETTER * fit.error and not _nameable(chosen, fit, spread):
         chosen, fit, after = as_it_is, search.fits[as_it_is], before
+    held = search.with_marker_known(chosen) if robot.robot.marker_known else None
+    if held is not None and chosen != as_it_is:
+        chosen, fit = held[0], held[1]
     unexplained = after > max(UNEXPLAINED * spread / chosen.scale, OF_REACH * reach, noise)
     if unexplained or (chosen != as_it_is and not _nameable(chosen, fit, spread) and after > noise):
         looks = "" if chosen == as_it_is else chosen.looks(names, fit.zeros)
@@ -175,6 +187,8 @@ def plausibility(
         found = Plausibility(warnings=tuple(far), undirected=search.undirected(names))
         if robot.camera.pose_known:
             found = _turned(chain, q[rows], x[rows], fit) or found
+        if held is not None and found.refusal is None:
+            found = _turned_last(names, fit, *held)
     if found.refusal is None or len(q) >= FEWEST_ROWS:
         return found
     few = f"{found.refusal}. {found.remedy}. (These are {len(q)} pairs: {FEWEST_ROWS} would tell.)"
@@ -218,6 +232,16 @@ def _turned(chain: RigidChain, q: FloatArray, x: FloatArray, fit: _Fit) -> Plaus
         f"it seems that the measurement frame is turned by {math.degrees(angle):.0f}° against [camera] of robot.toml"
         f"{_frame(fit.rotation, False)}: the pairs then fit to {_mm(free)}, and as they are to {_mm(told)}",
         "Correct the columns x, y, z, the pose of the camera or the zero of the first joint; or set pose_known = false",
+        misread=True,
+    )
+
+
+def _turned_last(names: tuple[str, ...], as_it_is: _Fit, reading: Reading, fit: _Fit) -> Plausibility:
+    """The last joint's zero is a quarter turn off: nothing else brings the marker to where it is known to be."""
+    return Plausibility(
+        f"it seems that {reading.looks(names, fit.zeros)}: the marker then comes out {_mm(fit.tool_m)} from its place "
+        f"in [robot] of robot.toml, and as the columns are {_mm(as_it_is.tool_m)} from it",
+        f"{reading.remedy(names, fit.zeros)}. Or correct marker_xyz, or set marker_known = false",
         misread=True,
     )
 
@@ -288,8 +312,27 @@ class _Search:
 
     def held_error(self) -> float:
         """RMS distance [m] of the nearest pairs as they are, with all zeros as drawn."""
-        held = place(self._chain, self._q[None], self._x[None], zeros_std=1e-3 * self._std, tool_std=TOOL_M)
+        held = place(self._chain, self._q[None], self._x[None], zeros_std=HELD * self._std, tool_std=TOOL_M)
         return float(held.errors(MEASURED)[0])
+
+    def with_marker_known(self, reading: Reading) -> tuple[Reading, _Fit] | None:
+        """The reading with the last joint some quarter turns on, and its fit, where the known marker tells these.
+
+        With a free marker such a turn makes no difference.
+        """
+        if self._chain.prismatic[-1]:
+            return None
+        last = np.arange(self._chain.joints) == self._chain.joints - 1
+        std = np.where(last, LAST_ZERO_RAD, self._std)
+        turned = [reading.turned((turns * last).tolist()) for turns in (0, 1, -1, 2)]
+        fits = self._placed(turned, std=std, tool_m=KNOWN_TOOL_M)
+        as_given = fits.pop(reading, None)
+        best = min(fits, key=lambda each: fits[each].nats + A_CHANGE * each.changes, default=reading)
+        if as_given is None or best not in turned:
+            return None
+        fit = fits[best]
+        clearly = fit.nats + CERTAIN < as_given.nats and NEARER * fit.tool_m < as_given.tool_m
+        return (best, fit) if clearly else None
 
     def undirected(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """Joints whose sign makes no difference."""
@@ -328,31 +371,47 @@ class _Search:
             self._fit(new)
 
     def _fit(self, new: list[Reading], *, held: bool = False, tools: FloatArray | None = None) -> None:
-        """Fit readings; a zero that goes to the next quarter turn makes it another reading.
+        """Fit readings, and keep the best fit of each.
 
         Args:
             held: keep the zeros as drawn.
             tools: moves of the marker (s, 3) [m] to start from.
         """
+        std = self._std * (HELD if held else 1.0)
+        for reading, fit in self._placed(new, std=std, tools=tools).items():
+            if reading not in self.fits or fit.nats < self.fits[reading].nats:
+                self.fits[reading] = fit
+
+    def _placed(
+        self, new: list[Reading], *, std: FloatArray, tool_m: float = TOOL_M, tools: FloatArray | None = None
+    ) -> dict[Reading, _Fit]:
+        """Return the best fit of each reading; a zero that goes to the next quarter turn makes it another reading.
+
+        Args:
+            std: how far each zero may be off (d,) [rad, m]; 1-sigma.
+            tool_m: how far the marker may be from its place [m]; 1-sigma of a coordinate.
+            tools: moves of the marker (s, 3) [m] to start from.
+        """
         slides = self._chain.prismatic
         q = np.stack([reading.angles(self._q, slides) for reading in new])
         x = np.stack([reading.positions(self._x) for reading in new])
-        placed = place(self._chain, q, x, zeros_std=self._std * (1e-3 if held else 1.0), tool_std=TOOL_M, tools=tools)
-        quarters = np.where(slides | held, 0, np.rint(placed.zeros / QUARTER)).astype(np.intp)
+        placed = place(self._chain, q, x, zeros_std=std, tool_std=tool_m, tools=tools)
+        quarters = np.where(slides, 0, np.rint(placed.zeros / QUARTER)).astype(np.intp)
         zeros = placed.zeros - QUARTER * quarters
         errors = np.maximum(placed.errors(MEASURED), self._exact_m) * [reading.scale for reading in new]
-        cost = 0.5 * np.square(zeros / self._std).sum(axis=1) + 0.5 * np.square(placed.tools / TOOL_M).sum(axis=1)
+        moved = np.linalg.norm(placed.tools, axis=1)
+        cost = 0.5 * np.square(zeros / std).sum(axis=1) + 0.5 * np.square(moved / tool_m)
         if self._pose_known:
             turns = Rotation.from_matrix(placed.rotations).magnitude()
             cost += [0.0 if r.mirrored else 0.5 * (turn / TURNED_RAD) ** 2 for r, turn in zip(new, turns, strict=True)]
         nats = 3.0 * MEASURED * len(self._x) * np.log(errors) + cost
+        fits: dict[Reading, _Fit] = {}
         for k, reading in enumerate(new):
-            found, fit = (
-                reading.turned(quarters[k].tolist()),
-                _Fit(float(errors[k]), float(nats[k]), zeros[k], placed.rotations[k]),
-            )
-            if found not in self.fits or fit.nats < self.fits[found].nats:
-                self.fits[found] = fit
+            found = reading.turned(quarters[k].tolist())
+            fit = _Fit(float(errors[k]), float(nats[k]), zeros[k], float(moved[k]), placed.rotations[k])
+            if found not in fits or fit.nats < fits[found].nats:
+                fits[found] = fit
+        return fits
 
 
 def _mm(distance_m: float) -> str:

@@ -29,6 +29,8 @@ UNITS_PER_METRE = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 39.37,
 MEASURED = 0.7
 # How far zeros and marker may be off (1-sigma). Of arms with zeros off by 10° and a marker by 0.3 m all are placed.
 ZEROS_RAD, SLIDES_M, TOOL_M = 0.15, 0.05, 0.3
+# ... and a marker whose place is known, by ruler.
+KNOWN_TOOL_M = 0.01
 # Rows by which a unit of length is told, and the share of the drawn positions' spread that a fit in it leaves at most.
 FITTED_ROWS, FITTING = 80, 0.1
 # Where none fits, units are told by the size of the positions: the next one too where it is off by less than a factor.

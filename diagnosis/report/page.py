@@ -131,7 +131,7 @@ def _causes(residuals: Residuals, file: DiagnosisFile, remedies: Sequence[str]) 
     fitted = zip_longest(file.causes, residuals.diagnosis.causes)
     ordered = sorted(fitted, key=lambda pair: -pair[0].share_of_gain_percent)
     articles = [
-        _cause(residuals, cause, effect, remedy, opened=k < _OPEN)
+        _cause(residuals, cause, effect, remedy, file.seen_by, opened=k < _OPEN)
         for k, ((cause, effect), remedy) in enumerate(zip(ordered, remedies, strict=True))
     ]
     return (
@@ -141,8 +141,10 @@ def _causes(residuals: Residuals, file: DiagnosisFile, remedies: Sequence[str]) 
     )
 
 
-def _cause(residuals: Residuals, cause: Cause, effect: Effect | None, remedy: str, *, opened: bool) -> str:
-    said = finding(cause.effect, cause.where, cause.source, told_values(cause))
+def _cause(
+    residuals: Residuals, cause: Cause, effect: Effect | None, remedy: str, seen_by: str, *, opened: bool
+) -> str:
+    said = finding(cause.effect, cause.where, cause.source, told_values(cause), seen_by)
     plots = [outlier_panel(residuals)] if effect is None else evidence_panels(residuals, effect)
     state = " open" if opened else ""
     return (

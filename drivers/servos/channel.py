@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
@@ -11,7 +12,8 @@ from statistics import median
 from .bus import Answer
 from .handshake import FittedServo
 
-SURPRISE_TICKS = 4
+# A position this far off its course is asked for again: rounding alone, of three positions, makes two ticks.
+SURPRISE_RAD, SURPRISE_TICKS = math.radians(0.35), 2.0
 LATELY = 51  # readings that tell what is usual
 HELD_UP_S = 0.3e-3
 SHORTEST_S = 1e-3  # between two samples that make a trend
@@ -42,6 +44,11 @@ class Sample:
     moving: bool
     alert: bool
 
+    @property
+    def middle(self) -> float:
+        """The middle of the time in which it was so [s]."""
+        return (self.earliest + self.latest) / 2
+
 
 class Channel(ABC):
     """The answers of one servo since the bus was opened.
@@ -60,6 +67,8 @@ class Channel(ABC):
         self.doubts = 0
         self.surprising = True
         self._trend: tuple[float, float, float] | None = None
+        self._speed = 0.0
+        self._off_course = max(SURPRISE_RAD / servo.model.rad_per_tick, SURPRISE_TICKS)
         self._supply: tuple[int, int] | None = None
 
     def take(self, answer: Answer) -> Sample | None:
@@ -80,20 +89,26 @@ class Channel(ABC):
     def _sample(self, answer: Answer) -> Sample | None:
         """What the answer says, if that is possible."""
 
-    def agrees(self, first: Sample, second: Sample, speed: float) -> bool:
-        """Whether a joint of at most `speed` [rad/s] can have told both."""
-        ticks = speed * abs(second.latest - first.earliest) / self.servo.model.rad_per_tick
-        return abs(self._step(second.ticks - first.ticks)) <= ticks + SURPRISE_TICKS
+    def agrees(self, first: Sample, second: Sample) -> bool:
+        """Whether a joint goes from one sample to the next as fast as it moved before both.
+
+        A joint that is only then set going has gone on by too few ticks to tell; a wrong answer is off by more, as
+        it surprised.
+        """
+        moved = self._speed * (second.middle - first.middle)
+        return abs(self._step(second.ticks - first.ticks) - moved) <= self._off_course
 
     def _compare(self, sample: Sample) -> None:
         """Whether it goes on from where the last ones led: time, ticks and ticks per second of them."""
-        t = (sample.earliest + sample.latest) / 2
+        t = sample.middle
         if self._trend is None:
             self._trend = (t, sample.ticks, 0.0)
             return
         before_t, before, speed = self._trend
+        if not self.surprising:
+            self._speed = speed
         moved = self._step(sample.ticks - before)
-        self.surprising = abs(moved - speed * (t - before_t)) > SURPRISE_TICKS
+        self.surprising = abs(moved - speed * (t - before_t)) > self._off_course
         self._trend = (t, sample.ticks, moved / max(t - before_t, SHORTEST_S))
 
     def _step(self, ticks: float) -> float:

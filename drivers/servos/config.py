@@ -50,7 +50,8 @@ class ServoConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         model: as its maker writes it; it tells the protocol.
         bus: needed where there are several.
         direction: −1 where the joint counts against the servo.
-        zero_ticks: the servo's position where the joint is at 0; by default the middle of its range.
+        zero_ticks: the servo's position where the joint is at 0, also between two ticks; by default the middle of its
+            range.
     """
 
     joint: str
@@ -58,7 +59,7 @@ class ServoConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     model: str
     bus: str | None = None
     direction: Literal[1, -1] = 1
-    zero_ticks: int | None = None
+    zero_ticks: int | float | None = None
 
 
 class ServosConfig(msgspec.Struct, Generic[BusT], frozen=True, forbid_unknown_fields=True):

@@ -44,7 +44,7 @@ class FittedServo:
     id: int
     model: Model
     direction: int
-    zero_ticks: int
+    zero_ticks: int | float
     firmware: int
     drive_mode: int
     operating_mode: int

@@ -359,7 +359,7 @@ class ServoJoints:
         model = channel.servo.model
         exchange = bus.ask(bus.read_request(model, channel.servo.id, model.layout.block))
         again = channel.take(exchange.answers[0]) if exchange.trouble is None else None
-        return again is not None and channel.agrees(sample, again, math.radians(self._config.max_speed_deg_s))
+        return again is not None and channel.agrees(sample, again)
 
     def _judge(self, samples: list[Sample]) -> JointReading | None:
         t, unsure = middle(samples)

@@ -140,7 +140,7 @@ class Workbench:
 
     def homing_offset(self, bus: Bus, servo: FittedServo) -> int:
         """The homing offset with which the servo's position here and now would be its `zero_ticks`, or a turn off."""
-        moved = servo.zero_ticks - self.position(bus, servo)
+        moved = round(servo.zero_ticks - self.position(bus, servo))
         turn = servo.ticks_per_turn
         wanted = servo.homing_offset + self.make.homing_sign * moved
         return wanted if turn is None else (wanted + turn // 2) % turn - turn // 2

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 HERE = Path(__file__).parent
-OURS = {"kbmaps", "interfaces", "drivers", "vision", "sim_backend", "effects", "diagnosis", "daemon", "benchmarks"}
+OURS = {"kbmaps", "bodyschema", "benchmarks"}
 INSTRUMENT = {
     "rendered.py": {"bodyschema.interfaces.camera", "bodyschema.interfaces.records", "bodyschema.vision.tracker"}
 }  # it looks at images

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib.util import find_spec
 from itertools import count
 from pathlib import Path
@@ -391,13 +392,19 @@ TRACKED = [pytest.param(make, marks=SIMULATED) for make in (tracked_camera, trac
 MARKERS = [replayed_marker, scripted_marker, *TRACKED]
 STANDING_STILL = [ENDING_JOINTS[2], *MARKERS[2:], *CAMERAS]
 Make = Callable[[], AbstractContextManager[Rig]]
+Shared = Callable[[Make], Rig]
 
 
-@pytest.fixture(scope="module", params=[*JOINTS, *MARKERS, *CAMERAS, *ENDING_EYES, *WAITING_EYES])
-def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
-    """A closed source of each kind, shared by the laws after which it can still be used."""
-    with request.param() as rig:
-        yield rig
+@pytest.fixture(scope="module")
+def shared() -> Iterator[Shared]:
+    """A function that gives a closed source of each kind, one for all laws after which it can still be used."""
+    with ExitStack() as stack:
+        yield cache(lambda make: stack.enter_context(make()))
+
+
+@pytest.fixture(params=[*JOINTS, *MARKERS, *CAMERAS, *ENDING_EYES, *WAITING_EYES])
+def rig(request: pytest.FixtureRequest, shared: Shared) -> Rig:
+    return shared(request.param)
 
 
 # --- lifetime
@@ -443,24 +450,15 @@ def test_an_error_in_the_block_passes_through_the_closing(rig: Rig) -> None:
         raise ZeroDivisionError
 
 
-@pytest.mark.parametrize("make", [*ENDING_JOINTS, *MARKERS, *CAMERAS, *ENDING_EYES])
-def test_the_end_is_said_each_time_one_reads(make: Make) -> None:
-    with make() as rig, rig.opened():
-        rig.read(1)
-        with pytest.raises(SourceEnded):
-            rig.read_to_the_end()
-        with pytest.raises(SourceEnded):
-            rig.source.read(0.05)
-
-
 # --- waiting
 
 
 @pytest.mark.parametrize(
     "make", [replayed_joints, replayed_marker, ENDING_JOINTS[2], *SILENT, *MARKERS[2:], *CAMERAS, *WAITING_EYES]
 )
-def test_where_nothing_comes_in_time_none_is_returned(make: Make) -> None:
-    with make() as rig, rig.opened():
+def test_where_nothing_comes_in_time_none_is_returned(make: Make, shared: Shared) -> None:
+    rig = shared(make)
+    with rig.opened():
         while rig.source.read(0.01) is not None:  # time stands still until the other side is read too
             continue
         assert rig.source.read(0.0) is None
@@ -469,27 +467,31 @@ def test_where_nothing_comes_in_time_none_is_returned(make: Make) -> None:
 # --- what is read
 
 
-@pytest.fixture(scope="module", params=JOINTS)
-def joints(request: pytest.FixtureRequest) -> Iterator[tuple[JointSource, list[Any]]]:
-    with request.param() as rig, rig.opened():
+@pytest.fixture(params=JOINTS)
+def joints(request: pytest.FixtureRequest, shared: Shared) -> Iterator[tuple[JointSource, list[Any]]]:
+    rig = shared(request.param)
+    with rig.opened():
         yield rig.source, rig.read()
 
 
-@pytest.fixture(scope="module", params=MARKERS)
-def seen(request: pytest.FixtureRequest) -> Iterator[tuple[MarkerSource, list[Any]]]:
-    with request.param() as rig, rig.opened():
+@pytest.fixture(params=MARKERS)
+def seen(request: pytest.FixtureRequest, shared: Shared) -> Iterator[tuple[MarkerSource, list[Any]]]:
+    rig = shared(request.param)
+    with rig.opened():
         yield rig.source, rig.read()
 
 
-@pytest.fixture(scope="module", params=[*ENDING_EYES[:-1], *WAITING_EYES])
-def looks(request: pytest.FixtureRequest) -> Iterator[tuple[StereoEyes, list[Any]]]:
-    with request.param() as rig, rig.opened():
+@pytest.fixture(params=[*ENDING_EYES[:-1], *WAITING_EYES])
+def looks(request: pytest.FixtureRequest, shared: Shared) -> Iterator[tuple[StereoEyes, list[Any]]]:
+    rig = shared(request.param)
+    with rig.opened():
         yield rig.source, rig.read()
 
 
-@pytest.fixture(scope="module", params=[*CAMERAS, ideal_camera])
-def frames(request: pytest.FixtureRequest) -> Iterator[tuple[StereoCamera, list[Any]]]:
-    with request.param() as rig, rig.opened():
+@pytest.fixture(params=[*CAMERAS, ideal_camera])
+def frames(request: pytest.FixtureRequest, shared: Shared) -> Iterator[tuple[StereoCamera, list[Any]]]:
+    rig = shared(request.param)
+    with rig.opened():
         yield rig.source, rig.read()
 
 
@@ -567,3 +569,17 @@ def test_joints_through_a_bench_are_those_of_the_source_at_its_times(make: Make)
     assert [reading.t for reading in told] == TIMES.tolist()
     expected = [[0.01 * k, 0.1, -0.01 * k, 0.2] for k in range(ROWS)]
     assert np.abs(np.array([reading.q for reading in told]) - expected).max() <= np.pi / 4096 + 1e-9
+
+
+# --- the end; nothing is read of a shared source after it
+
+
+@pytest.mark.parametrize("make", [*ENDING_JOINTS, *MARKERS, *CAMERAS, *ENDING_EYES])
+def test_the_end_is_said_each_time_one_reads(make: Make, shared: Shared) -> None:
+    rig = shared(make)
+    with rig.opened():
+        rig.read(1)
+        with pytest.raises(SourceEnded):
+            rig.read_to_the_end()
+        with pytest.raises(SourceEnded):
+            rig.source.read(0.05)

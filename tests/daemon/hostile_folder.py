@@ -5,7 +5,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-FIRST_PARTY = {"kbmaps", "interfaces", "drivers", "vision", "effects", "sim_backend", "diagnosis", "daemon"}
+PARTS = {"interfaces", "drivers", "vision", "effects", "sim_backend", "diagnosis", "daemon"}
+FIRST_PARTY = {"bodyschema", "kbmaps"} | PARTS
 THIRD_PARTY = {"cv2", "cyclopts", "lxml", "msgspec", "numpy", "pybullet", "rich", "scipy", "serial", "uvicorn", "zenoh"}
 
 

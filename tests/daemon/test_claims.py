@@ -99,7 +99,7 @@ def test_residuals_at_learnt_pairs_raise_the_claim_at_the_data(walk: FloatArray)
 @pytest.mark.parametrize("known", [(True, False), (False, True), (False, False)])
 def test_away_from_the_first_pairs_the_claim_says_how_wrong_the_drawing_may_be(known: tuple[bool, bool]) -> None:
     parameters, within, beyond = ChainParameters(NOMINAL.chain), [], []
-    for seed in range(6):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         drawn = parameters.standard_deviations(TOLERANCES) * rng.normal(size=parameters.size)
         chain = parameters.chain(drawn).with_tool(0.1 * rng.normal(size=3) * (not known[1]))
@@ -168,7 +168,7 @@ def test_claims_are_the_same_after_a_restart(walk: FloatArray) -> None:
         )
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 3))])
 def test_the_claim_holds_between_poses_of_a_sweep_in_large_steps(seed: int) -> None:
     # The gears ripple nine times a turn: what is missed at a pose says nothing of the next one, 25 degrees away.
     rng = np.random.default_rng(seed)

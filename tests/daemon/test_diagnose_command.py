@@ -31,7 +31,19 @@ from bodyschema.interfaces.records import Pair
 from bodyschema.interfaces.robot import RobotDescription
 
 FEW = ("--effects", "joint_scale,backlash")
-KEYS = {"schema", "verdict", "pairs", "mean_mm", "rms_mm", "gain", "causes", "rejected", "unexplained", "advice"}
+KEYS = {
+    "schema",
+    "verdict",
+    "pairs",
+    "mean_mm",
+    "rms_mm",
+    "gain",
+    "causes",
+    "rejected",
+    "unexplained",
+    "advice",
+    "hand_eye",
+}
 RMS_KEYS = {"nominal", "aligned", "geometry", "extended", "noise_floor"}
 CAUSE_KEYS = {
     "effect", "where", "source", "parameters", "probability", "share_of_gain_percent", "indistinguishable_from",

@@ -25,6 +25,7 @@ from bodyschema.daemon.keys import Keys
 from bodyschema.daemon.servo_wiring import Check
 from bodyschema.daemon.status import SamplerStatus
 from bodyschema.daemon.store import PairStore, Session
+from bodyschema.daemon.units import FOLDER
 from bodyschema.daemon.wire import encode
 from bodyschema.drivers import checks
 from bodyschema.drivers.checks import Holder
@@ -154,6 +155,29 @@ def test_a_disk_that_is_nearly_full_is_told(tmp_path, monkeypatch, free_mib, sta
     monkeypatch.setattr(doctor.shutil, "disk_usage", lambda _: usage)
     (check,) = doctor.disk_checks(tmp_path / "not" / "yet" / "there")
     assert check.state == state
+
+
+@pytest.mark.parametrize(
+    ("name", "mend"),
+    [
+        ("bodyschema-sampler@.service", "install service"),
+        ("bodyschema-learner@lab.service.d/robot.conf", "install service"),
+        ("bodyschema-router.service", "install router"),
+    ],
+)
+def test_a_unit_that_starts_an_older_version_is_to_be_installed_again(tmp_path, name, mend) -> None:
+    file = tmp_path / FOLDER / name
+    file.parent.mkdir(parents=True)
+    file.write_text("[Service]\nExecStart=\nExecStart=/opt/arm/bin/python -P -m daemon sampler --robot robot.toml\n")
+    (told,) = doctor.unit_checks(tmp_path)
+    assert (told.state, str(file) in told.said, mend in told.mend) == ("wrong", True, True)
+
+
+def test_a_unit_of_this_version_is_not_told_of(tmp_path) -> None:
+    file = tmp_path / FOLDER / "bodyschema-sampler@.service"
+    file.parent.mkdir(parents=True)
+    file.write_text("[Service]\nExecStart=/opt/arm/bin/python -P -m bodyschema sampler --robot robot.toml\n")
+    assert list(doctor.unit_checks(tmp_path)) == []
 
 
 def test_a_free_endpoint_is_ok(endpoint) -> None:

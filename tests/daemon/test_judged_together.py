@@ -58,12 +58,12 @@ def test_the_instant_learner_knows_a_pair_before_it_is_judged() -> None:
 
 
 def test_together_the_same_pairs_are_doubted_as_one_by_one() -> None:
-    pairs = with_outliers(Scene.draw(1, 200).pairs, [90, 131, 150, 190])
+    pairs = with_outliers(Scene.draw(1, 150).pairs, [90, 110, 131, 145])
     assert taught(pairs, TOGETHER_S).state().header.counters.doubted == taught(pairs, 0.0).counters.doubted == 4
 
 
 def test_together_they_teach_as_much_as_one_by_one() -> None:
-    scene = Scene.draw(2, 200)
+    scene = Scene.draw(2, 120)
     together, each = (scene.error_m(taught(scene.pairs, seconds)) for seconds in (TOGETHER_S, 0.0))
     assert together < 1.1 * each
 
@@ -104,8 +104,8 @@ def test_a_change_is_followed_as_soon_as_the_pairs_with_it_are_judged(moved_m: f
 
 
 def test_pairs_judged_after_a_change_are_learnt_in_the_new_era() -> None:
-    rng, before = np.random.default_rng(6), 150
-    chain, q = built_chain(rng), path(rng, 200)
+    rng, before = np.random.default_rng(6), 100
+    chain, q = built_chain(rng), path(rng, 150)
     moved = chain.with_tool([0.3, 0.0, 0.0])
     pairs = measured(chain, q[:before], rng) + measured(moved, q[before:], rng, first=before + 1)
     learning = taught(pairs, TOGETHER_S)

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.interpolate import PchipInterpolator
 from scipy.optimize import minimize_scalar
 
-from bodyschema.daemon.latency import EARLIEST_S, LATEST_S, STEP_S, LatencyError, Wiggle, latency_of
+from bodyschema.daemon.latency import EARLIEST_S, LATEST_S, STEP_S, Latency, LatencyError, Wiggle, latency_of
 from bodyschema.daemon.wiggling import read_wiggle, wiggle_of, write_wiggle
 from bodyschema.interfaces.errors import RecordingError
 from bodyschema.interfaces.robot import RobotDescription
-from kbmaps import RigidChain
+from kbmaps import ChainParameters, ChainTolerances, RigidChain
 
 ARM = RobotDescription.load(Path(__file__).parents[2] / "examples" / "desk_arm" / "robot.toml")
 TICK_RAD = 2 * np.pi / 4096
@@ -69,6 +71,39 @@ def test_the_claimed_uncertainty_covers() -> None:
     off = np.array([(each.latency_s - latency) / each.sigma_s for each, latency in zip(found, hidden, strict=True)])
     assert (np.abs(off) < 3).all()
     assert np.sqrt(np.mean(off**2)) > 0.2  # and claims no more than there is
+
+
+def guided(seed: int) -> Wiggle:
+    """12 s as a hand guides the arm: from pose to pose at one pace, its zeros 2.5°, axes 0.6° and links 5 mm off."""
+    rng = np.random.default_rng(seed)
+    parameters = ChainParameters(ARM.chain)
+    made = ChainTolerances(axes=0.01, points=0.005, zeros=0.045, tool=0.01)
+    change = parameters.standard_deviations(made) * rng.normal(size=parameters.size)
+    poses = POSE + rng.uniform(-0.8, 0.8, (12, 4))
+    times = np.cumsum(np.r_[0.0, np.linalg.norm(np.diff(poses, axis=0), axis=1) / 0.87])
+    path = PchipInterpolator(times, poses)
+    t_joints, t_marker = np.arange(0.0, 12.0, 0.01), np.arange(0.0, 12.0, 1 / 30)
+    x = parameters.positions(change, path(np.minimum(t_marker, times[-1])))
+    q = np.round(path(np.minimum(t_joints, times[-1])) / TICK_RAD) * TICK_RAD
+    return Wiggle(t_joints, q, t_marker, x + 2e-4 * rng.normal(size=x.shape) * [0.7, 0.7, 2.0])
+
+
+def test_a_slowly_guided_arm_tells_its_latency_to_a_fraction_of_a_millisecond() -> None:
+    assert all(abs(latency_of(guided(seed), ARM.chain).latency_s) < 0.7e-3 for seed in range(2))
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(900)
+def test_the_95_percent_intervals_of_slowly_guided_arms_cover_95_percent() -> None:
+    found = list[Latency]()
+    for seed in range(60):
+        with suppress(LatencyError):  # too slow a motion
+            found.append(latency_of(guided(seed), ARM.chain))
+    assert len(found) > 50
+    off = np.array([each.latency_s / each.sigma_s for each in found])
+    print(f"rms {1e3 * np.sqrt(np.mean([each.latency_s**2 for each in found])):.2f} ms, off / sigma {np.sort(off)}")
+    assert np.mean(np.abs(off) < 1.96) > 0.9
+    assert np.sqrt(np.mean(off**2)) > 0.4  # and claims no more than there is
 
 
 def in_step(seed: int, latency_s: float) -> Wiggle:

@@ -30,8 +30,8 @@ from bodyschema.interfaces.records import Pair
 from kbmaps import NLMS
 from kbmaps.contest import LISTED
 
-SEEDS = [0, 1, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(2, 8))]
-MANY_SEEDS = range(6)
+SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 8))]
+MANY_SEEDS = range(4)
 HALF = 150
 
 
@@ -238,11 +238,11 @@ def test_a_learner_restored_amid_a_tool_change_fits_the_tool_all_the_same() -> N
 
 @pytest.mark.parametrize("end", ["restart", "lost solver"])
 def test_what_was_learnt_from_pairs_that_are_no_longer_kept_is_not_forgotten(end: str) -> None:
-    scene = Scene.draw(0, 400)
-    settings = LearnerConfig(replay_capacity=100)
+    scene = Scene.draw(0, 240)
+    settings = LearnerConfig(replay_capacity=60)
     learning = new_learning(settings=settings)
     teach(learning, scene.pairs, every=NOW_AND_THEN)
-    early = Scene(scene.chain, scene.q[:200], [])
+    early = Scene(scene.chain, scene.q[:120], [])
     before, sigma = early.error_m(learning), learning.snapshot.predict(early.q).sigma.mean()
     if end == "restart":
         state, learning = learning.state(), new_learning(settings=settings)
@@ -252,7 +252,7 @@ def test_what_was_learnt_from_pairs_that_are_no_longer_kept_is_not_forgotten(end
     learning.solve_soon()
     teach(
         learning,
-        measured(scene.chain, scene.q[-1] + path(np.random.default_rng(1), 60), np.random.default_rng(1), first=401),
+        measured(scene.chain, scene.q[-1] + path(np.random.default_rng(1), 60), np.random.default_rng(1), first=241),
         every=NOW_AND_THEN,
     )
     assert early.error_m(learning) < 1.5 * before
@@ -347,7 +347,7 @@ def test_the_same_pairs_and_seed_give_the_same_model() -> None:
     assert one.snapshot.digest == two.snapshot.digest
 
 
-@settings(max_examples=12)
+@settings(max_examples=6)
 @given(
     seed=st.integers(0, 2**32 - 1),
     wild=st.dictionaries(st.integers(0, 23), st.floats(-900.0, 900.0), max_size=12),

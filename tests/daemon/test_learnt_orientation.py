@@ -180,7 +180,7 @@ def test_where_the_hand_bends_the_maps_of_the_axes_answer() -> None:
         if pair.R is not None
     ]
     learning = new_learning()
-    teach(learning, pairs, every=50)
+    teach(learning, pairs, every=125)
     status = learning.orientation_status()
     assert status is not None
     assert status.answering == "exact"

@@ -48,7 +48,7 @@ def test_while_pairs_are_few_the_misfit_with_the_last_tool_counts() -> None:
     np.testing.assert_allclose([few, many], [np.sqrt(0.8) * before, NONE])
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 5))])
 def test_what_the_solutions_own_numbers_took_from_the_errors_is_given_back(seed: int) -> None:
     rng = np.random.default_rng(seed)
     rows, numbers = 100, 50

@@ -34,9 +34,11 @@ class Pairs:
     q: np.ndarray
     x: np.ndarray
     pose_known: bool = False
+    marker_known: bool = False
 
     def seen(self, rows: int | None = None) -> Plausibility:
-        return plausibility(robot(pose_known=self.pose_known), self.q[:rows], self.x[:rows])
+        known = robot(pose_known=self.pose_known, marker_known=self.marker_known)
+        return plausibility(known, self.q[:rows], self.x[:rows])
 
     def read(self, reading: Reading) -> Pairs:
         """As `reading` would have to be undone: applied to this recording's columns."""
@@ -53,10 +55,17 @@ def arm() -> RigidChain:
     return RigidChain(fixed, axes, np.zeros(6, dtype=bool))
 
 
-def robot(*, pose_known: bool = False) -> SimpleNamespace:
+def robot(*, pose_known: bool = False, marker_known: bool = False) -> SimpleNamespace:
     limits, tree = np.full(6, 3.0), SimpleNamespace(joint=lambda _: SimpleNamespace(kind="revolute"))
-    camera = SimpleNamespace(pose_known=pose_known)
-    return SimpleNamespace(chain=arm(), joints=JOINTS, lower=-limits, upper=limits, camera=camera, tree=tree)
+    return SimpleNamespace(
+        chain=arm(),
+        joints=JOINTS,
+        lower=-limits,
+        upper=limits,
+        camera=SimpleNamespace(pose_known=pose_known),
+        robot=SimpleNamespace(marker_known=marker_known),
+        tree=tree,
+    )
 
 
 def pairs(
@@ -92,7 +101,17 @@ MISREAD = {
 }
 
 
-@pytest.mark.parametrize("said", MISREAD)
+# Of two columns misread alike, and of more than two, `make soak` knows more.
+RARELY = (
+    "q2 and q5 count the other way",
+    "the columns q1, q2 and q3 are in the order q2, q3, q1",
+    "the columns q2 and q3 are exchanged and q5 counts the other way",
+)
+
+
+@pytest.mark.parametrize(
+    "said", [pytest.param(said, marks=[pytest.mark.soak] if said in RARELY else []) for said in MISREAD]
+)
 def test_a_wrong_reading_is_refused_and_named(said) -> None:
     found = pairs().read(MISREAD[said]).seen()
     assert found.misread
@@ -187,6 +206,30 @@ def test_exchanged_positions_are_named_where_the_pose_is_known() -> None:
     assert "the columns x, y, z hold y, x, z" in (found.refusal or "")
 
 
+LAST = PLAIN.turned((0, 0, 0, 0, 0, 1))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_zero_of_the_last_joint_is_named_where_the_marker_is_known(seed) -> None:
+    right = replace(pairs(seed, tool=0.003), marker_known=True)
+    assert right.seen().sentences == ()
+    found = right.read(LAST).seen()
+    assert "the zero of q6 is about 90° off" in (found.refusal or "")
+    assert found.remedy.startswith("Add -90° to the readings of q6")
+    assert "marker_known = false" in found.remedy
+
+
+def test_a_zero_of_the_last_joint_is_named_beside_another_fault() -> None:
+    right = replace(pairs(tool=0.003), marker_known=True)
+    found = right.read(replace(LAST, signs=(1, 1, -1, 1, 1, 1))).seen()
+    assert "q3 counts the other way and the zero of q6 is about 90° off" in (found.refusal or "")
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_marker_elsewhere_is_no_zero_of_the_last_joint(seed) -> None:
+    assert replace(pairs(seed, tool=0.05), marker_known=True).seen().sentences == ()
+
+
 def test_what_no_simple_reading_explains_gets_no_name() -> None:
     many = replace(PLAIN, order=(2, 0, 1, 4, 3, 5), signs=(1, -1, 1, 1, -1, 1), quarters=(0, 1, -1, 0, 1, 0))
     found = pairs().read(many).seen()
@@ -226,9 +269,9 @@ CASES = {
 }
 
 
-def misread_ur5(case: str) -> tuple[Config, Recording]:
+def misread_ur5(case: str | None) -> tuple[Config, Recording]:
     config = Config.load(UR5 / "robot.toml", {})
-    order, signs, zero, axes = CASES[case]
+    order, signs, zero, axes = CASES[case] if case else (range(6), [1] * 6, 0.0, [0, 1, 2])
     recording = Recording.read(UR5 / "measured.csv", config.robot.joints)
     q = recording.q[:, list(order)] * signs + [0.0, zero, 0.0, 0.0, 0.0, 0.0]
     return config, dataclasses.replace(recording, q=q, x=recording.x[:, axes])
@@ -243,7 +286,11 @@ def test_a_misread_recording_of_a_real_arm_is_named(case) -> None:
 
 @real
 @pytest.mark.parametrize(
-    "name", ["ur5_laser", "wam_laser", "ur10_laser_a", "ur10_laser_b", "panda_eyeinhand", "tiago_eyehand"]
+    "name",
+    [
+        *("ur5_laser", "wam_laser", "ur10_laser_a", "ur10_laser_b", "panda_eyeinhand"),
+        pytest.param("tiago_eyehand", marks=pytest.mark.soak),
+    ],
 )
 def test_real_recordings_are_not_doubted(name) -> None:
     robot = Config.load(REAL_DATA / name / "robot.toml", {}).robot
@@ -252,11 +299,9 @@ def test_real_recordings_are_not_doubted(name) -> None:
 
 
 @real
-@pytest.mark.parametrize("case", [*CASES, None])
+@pytest.mark.parametrize("case", ["q3 counts the other way", None])
 def test_the_live_learner_names_a_wrong_reading(case) -> None:
-    config, recording = misread_ur5(case or "q3 counts the other way")
-    if case is None:
-        recording = Recording.read(UR5 / "measured.csv", config.robot.joints)
+    config, recording = misread_ur5(case)
     learning = Learning(NominalModel.extended_by(config.simulation), config.tables.learner, DirectSolver())
     findings = Findings(learning, config.robot, SystemClock())
     for k in range(45):

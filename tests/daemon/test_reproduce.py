@@ -36,8 +36,8 @@ PAGE = Path(__file__).parents[2] / "docs" / "reproduced.md"
 SMALL = {
     "fig4": lambda run: fig4(run, samples=1_000, tests=200),
     "fig5": lambda run: fig5(run, train=300, test=30),
-    "fig6": lambda run: fig6(run, online=36, cycles=72),
-    "fig7": lambda run: fig7(run, online=48, cycles=96),
+    "fig6": lambda run: fig6(run, online=30, cycles=60),
+    "fig7": lambda run: fig7(run, online=32, cycles=64),
     "exactness": lambda run: exactness(run, joints=(5,)),
 }
 
@@ -160,7 +160,7 @@ def test_every_figure_has_the_new_models_beside_the_papers_method(name: str) -> 
 
 
 def test_on_figure_7s_noisy_pairs_the_rigid_chain_is_ahead_of_the_papers_rule() -> None:
-    where = ("σ = 20 mm", "near", "at 48")
+    where = ("σ = 20 mm", "near", "at 32")
     assert error(small("fig7"), "rigid chain", *where) < 0.6 * error(small("fig7"), "paper's rule", *where)
 
 
@@ -239,14 +239,14 @@ def test_figure_5_simulates_in_the_very_postures_that_were_measured(monkeypatch)
 
 def test_figure_7_tests_on_measured_points_and_on_the_truth(monkeypatch) -> None:
     monkeypatch.setattr("bodyschema.daemon.reproduce.fig7.guided_walk", planted)
-    found = fig7(a_run(real=True), online=36, cycles=72, held_out=20, onward=20)
-    of_truth = error(found, "rigid chain", "measured", "held out, true", "at 36")
-    assert of_truth < error(found, "rigid chain", "measured", "held out, as measured", "at 36")
+    found = fig7(a_run(real=True), online=32, cycles=64, held_out=20, onward=20)
+    of_truth = error(found, "rigid chain", "measured", "held out, true", "at 32")
+    assert of_truth < error(found, "rigid chain", "measured", "held out, as measured", "at 32")
 
 
 def test_a_guided_walk_is_measured_in_the_samplers_steps_as_well_as_the_tracker_can() -> None:
     pytest.importorskip("pybullet")
-    found = guided_walk(6, 20, 0, lambda _said: None)
+    found = guided_walk(6, 12, 0, lambda _said: None)
     steps = np.degrees(np.linalg.norm(np.diff(found.q, axis=0), axis=1))
     assert (steps.min() >= 1.0, steps.max() <= 3.0, found.noise_m < 0.003) == (True, True, True)
 

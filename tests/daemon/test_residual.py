@@ -48,7 +48,7 @@ def arm() -> SaggingArm:
 @pytest.fixture(scope="module")
 def taught(arm: SaggingArm) -> Learning:
     learning = new_learning()
-    teach(learning, arm.pairs(slice(0, PAIRS)))
+    teach(learning, arm.pairs(slice(0, PAIRS)), every=10)
     return learning
 
 
@@ -96,7 +96,7 @@ def test_what_the_arm_yields_stays_known_with_another_tool(arm: SaggingArm, taug
     learning.restore(taught.state())
     learning.tool_changed()
     marker = arm.chain.with_tool(TOOL)
-    teach(learning, arm.pairs(slice(PAIRS, PAIRS + 60), marker))
+    teach(learning, arm.pairs(slice(PAIRS, PAIRS + 60), marker), every=10)
     assert learning.snapshot.answering == RESIDUAL
     snapshot = learning.snapshot
     assert arm.error_m(snapshot.require_model(), marker) < 0.6 * arm.error_m(snapshot.require_map(), marker)
@@ -113,7 +113,7 @@ def test_the_solver_s_process_gives_the_solution_that_a_direct_one_gives(arm: Sa
     nominal = nominal_model()
     tolerances = ChainTolerances(axes=0.05, points=0.015, tool=0.03)
     task = Task(1, nominal.prior(), nominal.belief(nominal.chain, tolerances))
-    q = arm.q[:100]
+    q = arm.q[:60]
     found: list[str] = []
     with SolverProcess() as process:
         direct = DirectSolver()

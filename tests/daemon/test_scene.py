@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.demo.scene import prepare
 from bodyschema.daemon.demo.tags import CUBE_M
+from bodyschema.daemon.wiring import open_sources
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.vision.tag_body import TagBody
 
@@ -62,3 +64,15 @@ def test_the_tool_meets_the_demos_single_tag_from_behind(tmp_path) -> None:
 @pytest.mark.parametrize(("marker", "looked_for"), [("ball", "ball"), ("tag", "cluster"), ("cluster", "cluster")])
 def test_the_demo_looks_for_what_is_in_the_hand(tmp_path, marker, looked_for) -> None:
     assert Config.load(prepare(tmp_path / "demo", seed=0, marker=marker).robot_file).tables.vision.marker == looked_for
+
+
+def test_the_demo_over_servos_reads_the_simulated_arm_through_them(tmp_path, caplog) -> None:
+    pytest.importorskip("pybullet")
+    caplog.set_level(logging.INFO)
+    config = Config.load(prepare(tmp_path / "demo", seed=0, bus="dynamixel").robot_file)
+    with open_sources(config, sim=True) as sources, sources.joints as joints, sources.marker as marker:
+        while (reading := joints.read(0.05)) is None:
+            marker.read(0.05)
+    assert "7 servos, torque verified off" in caplog.text
+    assert ((config.robot.lower <= reading.q) & (reading.q <= config.robot.upper)).all()
+    assert np.abs(reading.q).max() > 0.1

@@ -32,8 +32,7 @@ RARELY_NEEDED = (
     "bodyschema.daemon.view",
     "bodyschema.daemon.fleet",
     "bodyschema.daemon.reproduce",
-    "daemon.rerun",
-    "bodyschema.daemon.__main__",
+    "bodyschema.daemon.rerun",
 )
 PR_SET_PDEATHSIG = 1
 LONGEST_REQUEST = 1 << 17
@@ -126,9 +125,9 @@ def _server() -> socket.socket:
 
 
 def _import_all() -> None:
-    import bodyschema.daemon
+    from bodyschema import daemon
 
-    for module in pkgutil.walk_packages(daemon.__path__, "daemon."):
+    for module in pkgutil.walk_packages(daemon.__path__, "bodyschema.daemon."):
         if not module.name.startswith(RARELY_NEEDED):
             with suppress(ImportError):  # of an extra that is not installed
                 importlib.import_module(module.name)

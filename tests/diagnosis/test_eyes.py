@@ -18,6 +18,7 @@ from bodyschema.interfaces.records import FloatArray
 
 TURNS = st.lists(st.floats(-0.01, 0.01), min_size=3, max_size=3).map(np.array)
 ROBOT = surveyed_arm()
+ROWS = 200
 assert ROBOT.calibration is not None
 CALIBRATION = ROBOT.calibration
 
@@ -56,11 +57,11 @@ def test_derivatives_by_turns_are_those_of_small_turns() -> None:
 
 def found(x: FloatArray, seed: int) -> DiagnosisFile:
     noise = SIGMA_M * np.random.default_rng([seed, 1]).normal(size=x.shape)
-    return conclusion(diagnose(measured(ROBOT, walk(ROBOT, seed), x + noise), Simulation(ROBOT)))
+    return conclusion(diagnose(measured(ROBOT, walk(ROBOT, seed, ROWS), x + noise), Simulation(ROBOT)))
 
 
 def with_turned_eyes(vergence: float, seed: int) -> DiagnosisFile:
-    right = Simulation(ROBOT).positions(walk(ROBOT, seed))
+    right = Simulation(ROBOT).positions(walk(ROBOT, seed, ROWS))
     return found(reported(right, CALIBRATION, np.array([0.0, vergence, 0.0])), seed)
 
 
@@ -79,5 +80,5 @@ def test_a_turn_that_the_data_hardly_tell_from_a_scale_is_no_scale_for_sure() ->
 
 def test_a_wrong_scale_is_named_and_not_taken_for_turned_eyes() -> None:
     scale = Effect.at(ROBOT, "camera_scale", values=[0.004])
-    file = found(Simulation(ROBOT, (scale,)).positions(walk(ROBOT, 1)), 1)
+    file = found(Simulation(ROBOT, (scale,)).positions(walk(ROBOT, 1, ROWS)), 1)
     assert (file.verdict, [cause.effect for cause in file.causes]) == ("explained", ["camera_scale"])

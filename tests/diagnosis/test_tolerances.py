@@ -6,10 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planted_cases import ELBOW, SHOULDER, measured, motion_of, surveyed_arm
+from planted_cases import ELBOW, SHOULDER, desk_arm, measured, motion_of, scattered, surveyed_arm
 
+from bodyschema.diagnosis.alignment import aligned
+from bodyschema.diagnosis.background import Scales
 from bodyschema.diagnosis.conclusion import conclusion
 from bodyschema.diagnosis.diagnosis import diagnose
+from bodyschema.diagnosis.observations import Observations
 from bodyschema.diagnosis.result import DiagnosisFile
 from bodyschema.effects import Effect, Simulation, load_simulation, write_extended
 from bodyschema.interfaces.errors import ConfigError
@@ -95,3 +98,20 @@ def test_a_background_with_an_unknown_joint_is_refused_with_its_line(robot: Robo
     with pytest.raises(ConfigError, match="background 5") as refused:
         load_simulation(file)
     assert refused.value.line is not None
+
+
+def test_a_written_simulation_is_refitted_to_second_order() -> None:
+    robot, left, first_order = desk_arm(), 0.0, 0.0
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        values = np.concatenate([1e-3 * rng.normal(size=(4, 3)), 0.06 * rng.normal(size=(4, 3))], axis=1)
+        links = (
+            Effect.at(robot, "link_geometry", *link) for link in zip(robot.joints, [None] * 4, values, strict=True)
+        )
+        truth, motion = Simulation(robot, tuple(links)), scattered(robot, seed, ROWS)
+        recording = measured(robot, motion, truth.positions(motion) + NOISE_M * rng.normal(size=(ROWS, 3)))
+        start = aligned(Observations.of(recording, Simulation(robot)), Simulation(robot))
+        fit = start.tolerating(Scales(10.0, 10.0, 1.0))
+        left += float(np.square(fit.written.positions(motion) - recording.x).sum())
+        first_order += float(np.square(fit.settled().predicted - recording.x).sum())
+    assert left < 0.7 * first_order

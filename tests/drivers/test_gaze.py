@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+import sys
+import threading
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
 from gazing_robot import HEAD, GazingRobot
 
 from bodyschema.daemon.wire import JointsRequest, PredictReply, decode, encode
+from bodyschema.drivers.dynamixel.bench.driven_shaft import DrivenShaft
 from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.robot import RobotDescription
@@ -215,3 +219,22 @@ def test_nothing_is_written_to_an_eeprom() -> None:
         robot.switch_on()
         robot.run(1.0)
     assert min(address for address, _ in robot.port.writes()) >= TORQUE
+
+
+@pytest.fixture
+def often_switched() -> Iterator[None]:
+    """Threads that take turns a thousand times as often as usual."""
+    usual = sys.getswitchinterval()
+    sys.setswitchinterval(1e-3 * usual)
+    yield
+    sys.setswitchinterval(usual)
+
+
+def test_cameras_see_where_a_head_was_while_its_servo_turns_it(often_switched) -> None:
+    shaft = DrivenShaft(0.5)
+    turning = threading.Thread(target=lambda: [shaft(t) for t in range(20_000)])
+    turning.start()
+    seen = set()
+    while turning.is_alive():
+        seen.add(shaft(-1.0))
+    assert seen == {0.5}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import replace
 from itertools import pairwise
 from random import Random
@@ -137,6 +138,34 @@ def test_a_late_answer_does_not_hold_the_next_question_up(model) -> None:
     begin = clock.now()
     assert bus.ask(ask).trouble is None
     assert clock.now() - begin < 4e-3
+
+
+class RepeatsItself:
+    """The wire of a chain on which some answers carry what the servo told several answers of their length before."""
+
+    def __init__(self, before: int, share: float) -> None:
+        self._told: dict[tuple[int, int], deque[bytes]] = {}
+        self._before, self._share, self._rng = before, share, Random(1)
+
+    def __call__(self, reply: Reply) -> Reply:
+        told = self._told.setdefault((reply.id, len(reply.data)), deque(maxlen=self._before))
+        repeated = told[0] if len(told) == self._before and self._rng.random() < self._share else None
+        told.append(reply.data)
+        return reply if repeated is None else replace(reply, data=repeated)
+
+
+@pytest.mark.parametrize(
+    "make", [MAKES["feetech"], MAKES["SCS"], MAKES["protocol 1"]], ids=["STS", "SCS", "protocol 1"]
+)
+def test_an_earlier_answer_in_place_of_the_own_one_is_seldom_believed(make) -> None:
+    arm = make()
+    wrong = 0
+    with arm.joints:
+        arm.chain.faults = RepeatsItself(8, 0.01)
+        for _ in range(500):
+            reading = arm.joints.read(0.1)
+            wrong += reading is not None and arm.error(reading) > 0.01
+    assert wrong <= 1
 
 
 @pytest.mark.parametrize("loss", [0.02, 0.05])

@@ -46,7 +46,7 @@ def test_a_command_executes_nothing_of_the_current_folder(tmp_path: Path, comman
 
 
 def test_a_users_own_vision_folder_is_not_ours(tmp_path: Path) -> None:
-    for package in FIRST_PARTY - {"daemon"}:
+    for package in FIRST_PARTY - {"bodyschema"}:
         (tmp_path / package).mkdir()
         (tmp_path / package / "__init__.py").write_text("raise ImportError(__file__)")
     command = [sys.executable, "-m", "bodyschema", "predict", "--robot", "no.toml", "0"]

@@ -68,7 +68,6 @@ def attempt(file: Path) -> tuple[Recording | None, str]:
         return None, str(error)
 
 
-@settings(max_examples=150, deadline=None)
 @given(recordings(), st.sampled_from([".csv", ".parquet"]))
 def test_every_bit_survives_a_round_trip(recording: Recording, ending: str) -> None:
     if ending == ".parquet":
@@ -79,7 +78,6 @@ def test_every_bit_survives_a_round_trip(recording: Recording, ending: str) -> N
         assert_same(recording, Recording.read(file, JOINTS))
 
 
-@settings(max_examples=300, deadline=None)
 @given(recordings(), st.data())
 def test_a_mutated_csv_is_refused_or_still_a_recording(recording: Recording, data: st.DataObject) -> None:
     with tempfile.TemporaryDirectory() as folder:

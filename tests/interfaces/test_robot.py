@@ -139,6 +139,11 @@ def test_a_folder_in_the_place_of_the_urdf_is_told(tmp_path) -> None:
     [
         ("</robot>", "", ", line 11: not XML: Premature end of data in tag robot line 1"),
         ('<robot name="arm">', '<!DOCTYPE robot [<!ENTITY e "x">]><robot name="arm">', ", line 1: a URDF with a DOC"),
+        (
+            '<robot name="arm">',
+            '<robot name="arm" xmlns:xacro="http://wiki.ros.org/xacro"><xacro:arg name="a" default="1"/>',
+            "line 1: this is a xacro file, of which a URDF is made first. With ROS: `xacro arm.urdf > made.urdf`",
+        ),
         ('<child link="upper"/>', '<child link="uper"/>', "joint 'waist' names the link 'uper', which is not there"),
         ('<child link="tip"/>', '<child link="upper"/>', "link 'upper' hangs on more than one joint"),
         ('<link name="tip"/>', '<link name="tip"/><link name="spare"/>', "do not form one tree (roots: base, spare)"),

@@ -85,7 +85,7 @@ def test_too_few_pairs_for_blocks_trust_the_prior() -> None:
     assert blockwise_precision(prior, q, np.zeros((100, 3))) == pytest.approx(1e-3 * scale)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 3))])
 def test_the_chosen_precision_is_the_one_that_refits_without_each_block_choose(seed: int) -> None:
     rng = np.random.default_rng(seed)
     chain = random_chain(rng, "RR")

@@ -84,7 +84,7 @@ class Arm:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 3))])
 def test_a_change_ten_times_the_noise_is_noticed_within_ten_pairs_and_dated(seed: int, kind: str) -> None:
     arm = Arm(seed)
     arm.change(kind, 10.0 * SIGMA)
@@ -95,7 +95,7 @@ def test_a_change_ten_times_the_noise_is_noticed_within_ten_pairs_and_dated(seed
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 3))])
 def test_a_change_is_named_rightly_by_the_pairs_since(seed: int, kind: str) -> None:
     arm = Arm(seed)
     arm.change(kind, 10.0 * SIGMA)
@@ -105,7 +105,7 @@ def test_a_change_is_named_rightly_by_the_pairs_since(seed: int, kind: str) -> N
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 3))])
 def test_the_noise_of_many_pairs_is_not_taken_for_a_change_of_everything(seed: int, kind: str) -> None:
     arm = Arm(seed, BEFORE + 400)
     arm.change(kind, 5.0 * SIGMA)
@@ -129,7 +129,7 @@ def test_probabilities_of_all_kinds_add_up_to_one() -> None:
     assert sum(each.probability for each in found) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 3))])
 def test_without_a_change_there_is_no_alarm(seed: int) -> None:
     arm = Arm(seed, 400)
     detector = arm.detector()
@@ -181,7 +181,7 @@ def alarms(arm: Arm, every: int) -> Iterator[tuple[int, bool]]:
             yield k + every, detector.suspicion_if_it_bends().alarm
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 3))])
 def test_an_arm_that_bends_raises_no_alarm_that_stands(seed: int) -> None:
     arm = Arm(seed, 200)
     arm.bend(3.0 * SIGMA)
@@ -198,7 +198,7 @@ def test_encoders_beside_their_axes_raise_no_alarm_that_stands() -> None:
     assert not any(stands for _, stands in raised)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 3))])
 def test_that_an_arm_did_not_bend_before_makes_a_change_more_probable(seed: int) -> None:
     arm, earlier = Arm(seed), Arm(seed, 400)
     arm.change("tool", 2.0 * SIGMA)
@@ -210,7 +210,7 @@ def test_that_an_arm_did_not_bend_before_makes_a_change_more_probable(seed: int)
     assert aware.suspicion_if_it_bends().log_odds > unaware.suspicion_if_it_bends().log_odds
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 3))])
 def test_a_change_of_an_arm_that_bends_is_noticed_and_dated(seed: int) -> None:
     arm = Arm(seed, speed=0.4)
     arm.bend(2.0 * SIGMA)

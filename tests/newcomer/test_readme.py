@@ -16,11 +16,15 @@ ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("code", re.findall(r"```python\n(.*?)```", README, re.DOTALL))
-def test_the_readme_s_python_runs(code: str) -> None:
+def test_the_library_page_s_python_runs() -> None:
+    [code] = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "library.md").read_text(encoding="utf-8"), re.DOTALL)
     scope: dict[str, object] = {}
     exec(code, scope)
     assert "learnt" in scope
+
+
+def test_the_readme_has_at_most_600_words() -> None:
+    assert len(README.split()) <= 600
 
 
 @pytest.mark.parametrize("target", sorted(set(re.findall(r"\]\(([^)#:]+)\)", README))))
@@ -33,8 +37,9 @@ def test_the_readme_s_make_targets_exist(target: str) -> None:
     assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
 
 
-def test_the_readme_lists_every_command_with_its_own_words() -> None:
-    assert re.findall(r"^\| `bodyschema (\w+)` \| (.*) \|$", README, re.MULTILINE) == list(COMMANDS.items())
+def test_the_page_of_commands_has_them_all() -> None:
+    page = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
+    assert re.findall(r"^\| `bodyschema (\w+)` \| (.*) \|$", page, re.MULTILINE) == list(COMMANDS.items())
 
 
 @pytest.mark.parametrize("command", re.findall(r"^\.venv/bin/(bodyschema .*)$", README, re.MULTILINE))

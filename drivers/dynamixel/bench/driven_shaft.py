@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections import deque
 from typing import TYPE_CHECKING
 
@@ -27,9 +28,20 @@ class DrivenShaft:
         self.jammed = False
         self._fastest = fastest_rad_s
         self._moves = deque([(-math.inf, angle)], maxlen=KEPT)
+        self._lock = threading.RLock()  # its servo moves it in one thread, cameras see it in others
 
     def __call__(self, t: float) -> float:
         """Where it is at `t` [s], or was, as far back as it remembers [rad]."""
+        with self._lock:
+            return self._at(t)
+
+    def turn_by_hand(self, angle: float) -> None:
+        """Somebody turns it by `angle` [rad]."""
+        with self._lock:
+            moved_s, before = self._moves[-1]
+            self._moves.append((moved_s, before + angle))
+
+    def _at(self, t: float) -> float:
         moved_s, angle = self._moves[-1]
         if t <= moved_s:
             return self._before(t)
@@ -40,11 +52,6 @@ class DrivenShaft:
             angle += min(max(goal - angle, -most), most)
             self._moves[-1] = (t, angle)
         return angle
-
-    def turn_by_hand(self, angle: float) -> None:
-        """Somebody turns it by `angle` [rad]."""
-        moved_s, before = self._moves[-1]
-        self._moves.append((moved_s, before + angle))
 
     def _before(self, t: float) -> float:
         after: tuple[float, float] | None = None

@@ -1,0 +1,99 @@
+"""Exported models on measured data that they were not diagnosed from: does MuJoCo gain what `diagnose` promised?
+
+    python -m benchmarks.export_real --data $DATA
+
+Of each recording three tenths are held out, in blocks. The rest is diagnosed, and exported as MJCF and correction.json.
+MuJoCo and examples/correction/correction.py then predict the held-out rows from their readings. *Before* is the robot
+as described, placed by the rows that were diagnosed. A gain is to lie in the interval that diagnosis.json states.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyschema.diagnosis.alignment import aligned
+from bodyschema.diagnosis.conclusion import conclusion
+from bodyschema.diagnosis.diagnosis import diagnose
+from bodyschema.diagnosis.observations import Observations
+from bodyschema.effects import Motion, load_simulation
+from bodyschema.effects.exports import replayed, write_correction, write_mjcf
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.records import FloatArray
+
+READERS = Path(__file__).resolve().parents[1] / "examples" / "correction"
+ROBOTS = ("ur5_laser", "wam_laser")
+TENTHS, HELD_OUT = 10, (1, 4, 7)
+DRAWS = 2000
+
+
+def corrected(file: Path, q: FloatArray) -> FloatArray:
+    """Positions (n, 3) [m] by the Python reader of correction.json."""
+    sys.path.insert(0, str(READERS))
+    reader = importlib.import_module("correction").Correction(file.read_text(encoding="utf-8"))
+    return np.array([reader.read(row)[1][3::4] for row in q.tolist()])
+
+
+def rms_mm(distances: FloatArray) -> float:
+    """Of distances (n,) [m]."""
+    return float(1e3 * np.sqrt(np.square(distances).mean()))
+
+
+def gain(before: FloatArray, after: FloatArray, blocks: NDArray[np.int64]) -> str:
+    """By how much the RMS falls [%], with the 95 % interval over resampled blocks of rows."""
+    numbers, rng = np.unique(blocks), np.random.default_rng(0)
+    sums = np.array([[np.square(d[blocks == b]).sum() for d in (before, after)] for b in numbers])
+    drawn = sums[rng.integers(len(numbers), size=(DRAWS, len(numbers)))].sum(axis=1)
+    low, high = np.quantile(100.0 * (1.0 - np.sqrt(drawn[:, 1] / drawn[:, 0])), [0.025, 0.975])
+    return f"{100.0 * (1.0 - rms_mm(after) / rms_mm(before)):.1f} [{low:.1f}, {high:.1f}]"
+
+
+def row(folder: Path) -> str:
+    """One row of the table."""
+    simulation = load_simulation(folder / "robot.toml")
+    recording = Recording.read(folder / "measured.csv", simulation.robot.joints)
+    tenth = np.arange(len(recording)) * TENTHS // len(recording)
+    held = np.isin(tenth, HELD_OUT)
+    known, asked = recording.rows(~held), recording.rows(held)
+    diagnosis = diagnose(known, simulation)
+    promised = conclusion(diagnosis).gain
+    start = aligned(Observations.of(known, simulation), simulation).simulation
+    written = diagnosis.extended.written
+    with tempfile.TemporaryDirectory() as name:
+        mjcf, correction = Path(name) / "model.xml", Path(name) / "correction.json"
+        write_mjcf(written, mjcf, "a benchmark")
+        write_correction(written, correction, "a benchmark")
+        predicted = {
+            "before": start.positions(Motion.of(asked)),
+            "mjcf": replayed(mjcf, simulation.robot.joints, Motion.of(asked)),
+            "correction": corrected(correction, asked.q),
+        }
+    left = {name: np.linalg.norm(x - asked.x, axis=1) for name, x in predicted.items()}
+    # Rows that lie next to each other are not independent: thirty blocks of them.
+    blocks = np.arange(len(asked)) * 30 // len(asked)
+    cells = [f"`{folder.name}`", f"{len(known)} / {len(asked)}", f"{rms_mm(left['before']):.3f}"]
+    cells += [f"{promised.held_out_percent:.1f} [{promised.ci95[0]:.1f}, {promised.ci95[1]:.1f}]"]
+    for name in ("mjcf", "correction"):
+        cells += [f"{rms_mm(left[name]):.3f}", gain(left["before"], left[name], blocks)]
+    return f"| {' | '.join(cells)} |"
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True, help="The folder of the recordings.")
+    folder = parser.parse_args().data
+    print("| recording | rows | before [mm] | promised [%] | MJCF [mm] | gain [%] | correction [mm] | gain [%] |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    for robot in ROBOTS:
+        print(row(folder / robot), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,8 @@
+"""The simulation in the formats of other programs, with a list of what each of them cannot hold."""
+
+from .correction import write_correction
+from .mjcf import write_mjcf
+from .replay import replayed
+from .urdf import write_urdf
+
+__all__ = ["replayed", "write_correction", "write_mjcf", "write_urdf"]

@@ -1,0 +1,145 @@
+"""correction.json: what a controller needs to turn readings into true joint angles and the marker's pose.
+
+docs/exporting.md has the format, examples/correction its readers. Every joint's frame is turned so that its axis is z.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bodyschema.effects.effect import Effect
+from bodyschema.effects.gravity import GRAVITY_M_S2, carried
+from bodyschema.effects.simulation import RIGID, Simulation
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.urdf import inverse
+
+from .geometry import geometry_without_zeros
+from .joint_errors import LeftOut, moment_notes, residual_note, sentences, why_not
+
+FORMAT, VERSION = "bodyschema correction", 1
+# Values as in extended.toml; a ripple's cycles become radians for each unit of the reading.
+_OF_READINGS = (
+    "joint_offset",
+    "joint_scale",
+    "joint_eccentricity",
+    "joint_ripple",
+    "joint_coupling",
+    "backlash",
+    "settling",
+)
+_HELD = {*_OF_READINGS, *RIGID, "joint_compliance"}
+
+
+def held_by_correction(simulation: Simulation) -> Simulation:
+    """Return the simulation with those of its effects alone that correction.json holds."""
+    stayed = simulation.after_moments
+    own, background = (
+        tuple(effect for effect in effects if effect.name in _HELD) for effects in (stayed.effects, stayed.background)
+    )
+    return Simulation(simulation.robot, own, None, background)
+
+
+def write_correction(simulation: Simulation, file: Path, heading: str) -> list[str]:
+    """Write the simulation's correction of readings to `file`.
+
+    Args:
+        heading: one line: where it comes from.
+
+    Returns:
+        Sentences on what the file does not hold, or holds in another way.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    kept, left_out = held_by_correction(simulation), []
+    for effect in simulation.after_moments.all_effects:
+        if effect.name == "joint_compliance" and not simulation.bears_weight:
+            left_out.append(LeftOut(effect, 'with hold = "torque_free" the guiding hand bore the weight'))
+        elif effect.name not in _HELD:
+            left_out.append(LeftOut(effect, why_not(effect)))
+    told = [*sentences(left_out), *residual_note(simulation), *moment_notes(simulation)]
+    springs = np.zeros(len(simulation.robot.joints))
+    for effect in kept.all_effects:
+        if effect.name == "joint_compliance" and simulation.bears_weight:
+            springs[kept.place(effect).joint] += effect.values[0]
+    contents = {
+        "format": FORMAT,
+        "version": VERSION,
+        "robot": simulation.robot.name,
+        "from": heading,
+        "notes": told,
+        "effects": [_entry(kept, effect) for effect in kept.all_effects if effect.name in _OF_READINGS],
+        "gravity_m_s2": GRAVITY_M_S2,
+    } | _chain(kept, springs)
+    file.write_text(json.dumps(contents, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    return told
+
+
+def _entry(simulation: Simulation, effect: Effect) -> dict[str, Any]:
+    place, values = simulation.place(effect), effect.values.tolist()
+    if effect.name == "joint_ripple" and effect.prismatic:
+        values[2] *= 2.0 * np.pi
+    # Settling and backlash remember; nothing is known before the first reading.
+    entry = {"effect": effect.name, "joint": place.joint, "values": values, "state": []}
+    return entry if place.source is None else entry | {"source": place.source}
+
+
+def _chain(simulation: Simulation, springs: FloatArray) -> dict[str, Any]:
+    """The joints, in the order of the readings, and the frames of camera and marker."""
+    robot, gravity, geometry = simulation.robot, simulation.gravity, geometry_without_zeros(simulation)
+    aligned: dict[int | None, FloatArray] = {None: np.eye(4)}
+    for k, name in enumerate(robot.joints):
+        aligned[k] = _onto_z(robot.tree.joint(name).axis)
+    joints = []
+    for k, name in enumerate(robot.joints):
+        joint, body = robot.tree.joint(name), gravity.bodies[k]
+        origin = geometry.T_parent_joint.get(name, joint.T_parent_joint)
+        pose = body.T_carrier_joint @ inverse(joint.T_parent_joint) @ origin
+        joints.append(
+            {
+                "name": name,
+                "slides": bool(robot.chain.prismatic[k]),
+                "parent": _numbered(body.carrier),
+                "pose": _numbers(inverse(aligned[body.carrier]) @ pose @ aligned[k]),
+                "compliance": float(springs[k]),
+                "mass_kg": float(body.mass_kg),
+                "moment_kg_m": (aligned[k][:3, :3].T @ body.moment).tolist(),
+            }
+        )
+    T_link_marker = np.eye(4)
+    T_link_marker[:3, 3] = geometry.marker_xyz
+    ends = {
+        "camera": (robot.camera.parent_link, geometry.T_parent_camera),
+        "marker": (robot.robot.marker_link, T_link_marker),
+    }
+    found: dict[str, Any] = {"joints": joints, "outwards": list(gravity.outwards)}
+    for name, (link, T) in ends.items():
+        carrier, T_carrier_link = carried(robot.tree, link, robot.joints, robot.robot.held_at)
+        found[name] = {
+            "parent": _numbered(carrier),
+            "pose": _numbers(inverse(aligned[carrier]) @ T_carrier_link @ T),
+        }
+    return found
+
+
+def _onto_z(axis: FloatArray) -> FloatArray:
+    """A pose (4, 4) whose z is `axis`."""
+    across = np.eye(3)[int(np.argmin(np.abs(axis)))]
+    x = np.cross(across, axis)
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([x, np.cross(axis, x), axis], axis=1)
+    return T
+
+
+def _numbered(carrier: int | None) -> int:
+    return -1 if carrier is None else carrier
+
+
+def _numbers(T: FloatArray) -> list[float]:
+    """The upper three rows of a pose, row by row."""
+    return T[:3].ravel().tolist()

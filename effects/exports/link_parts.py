@@ -1,0 +1,190 @@
+"""The visual shapes of a URDF as MuJoCo has them. Meshes stay where they are."""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bodyschema.interfaces.errors import RobotError
+from bodyschema.interfaces.limited import read_at_most
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.rpy import rotation_of
+from kbmaps.rotations import quaternions
+
+# What MuJoCo reads, and the most triangles of an STL file for it.
+_MESHES = (".stl", ".obj", ".msh")
+_MOST_TRIANGLES = 200_000
+_STL_HEADER, _STL_TRIANGLE = 84, 50
+# The shape of a link that has none: a rod from its joint to the next one [m].
+_ROD_RADIUS, _SHORTEST_ROD = 0.02, 0.01
+# A moment of inertia below this [kg·m²] is next to none; MuJoCo needs one.
+_LEAST_INERTIA = 1e-9
+_GREY = "0.7 0.7 0.72 1"
+
+
+@dataclass(frozen=True)
+class LinkParts:
+    """What only a simulator needs of a URDF.
+
+    Attributes:
+        meshes: attributes of the assets.
+        geoms: attributes of the geoms, by link.
+        inertias: (3, 3) [kg·m²] about the centres of mass, along the links' axes, by link.
+        mimics: by joint that moves with another: that one, the factor, and the offset [rad, m].
+        unreadable: mesh files that are missing, or that MuJoCo does not read.
+    """
+
+    meshes: list[dict[str, str]]
+    geoms: dict[str, list[dict[str, str]]]
+    inertias: dict[str, FloatArray]
+    mimics: dict[str, tuple[str, float, float]]
+    unreadable: list[str]
+
+    @classmethod
+    def of(cls, urdf: Path, folder: Path) -> LinkParts:
+        """Of a URDF that has been checked, for a file in `folder`."""
+        from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
+
+        parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False)
+        root = etree.fromstring(read_at_most(urdf), parser)
+        colours = {m.get("name"): m.find("color").get("rgba") for m in root.iter("material") if _coloured(m)}
+        parts = cls([], {}, {}, {}, [])
+        for link in root.iterfind("link"):
+            geoms = [parts._geom(visual, colours, urdf, folder) for visual in link.iterfind("visual")]
+            parts.geoms[link.get("name")] = [geom for geom in geoms if geom is not None]
+            if link.find("inertial/inertia") is not None:
+                with _blamed_on(link, urdf):
+                    parts.inertias[link.get("name")] = _inertia(link.find("inertial"))
+        for joint in root.iterfind("joint[mimic]"):
+            mimic = joint.find("mimic")
+            with _blamed_on(joint, urdf):
+                numbers = float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))
+            parts.mimics[joint.get("name")] = (mimic.get("joint", ""), *numbers)
+        return parts
+
+    def _geom(self, visual: Any, colours: dict[str, str], urdf: Path, folder: Path) -> dict[str, str] | None:
+        shape = visual.find("geometry/*")
+        material = visual.find("material")
+        try:
+            kind = None if shape is None else self._kind(shape, urdf, folder)
+            T = _origin(visual)
+        except (AttributeError, ValueError):  # a shape is not checked where the URDF is read: none is needed
+            return None
+        if kind is None:
+            return None
+        colour = None if material is None else colours.get(material.get("name"))
+        return kind | placed(T) | {"rgba": colour or _GREY}
+
+    def _kind(self, shape: Any, urdf: Path, folder: Path) -> dict[str, str] | None:
+        match shape.tag:
+            case "box":
+                return {"type": "box", "size": texts(0.5 * _floats(shape.get("size")))}
+            case "sphere":
+                return {"type": "sphere", "size": texts(_floats(shape.get("radius")))}
+            case "cylinder" | "capsule":
+                sizes = np.append(_floats(shape.get("radius")), 0.5 * _floats(shape.get("length")))
+                return {"type": shape.tag, "size": texts(sizes)}
+            case "mesh":
+                return self._mesh(shape, urdf, folder)
+        return None
+
+    def _mesh(self, shape: Any, urdf: Path, folder: Path) -> dict[str, str] | None:
+        given = shape.get("filename", "")
+        file = _found(given, urdf)
+        if file is None or not _readable(file):
+            self.unreadable.append(given)
+            return None
+        name = f"mesh_{len(self.meshes)}"
+        path = Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
+        # MuJoCo refuses to weigh a mesh that is not closed; as a shell it can be.
+        mesh = {"name": name, "file": path, "inertia": "shell"}
+        if shape.get("scale"):
+            mesh["scale"] = shape.get("scale")
+        self.meshes.append(mesh)
+        return {"type": "mesh", "mesh": name}
+
+
+def rod(end: FloatArray) -> dict[str, str] | None:
+    """A rod from a link's origin to `end` (3,) [m] in its frame; None where that is next to nothing."""
+    if np.linalg.norm(end) < _SHORTEST_ROD:
+        return None
+    return {"type": "capsule", "fromto": f"0 0 0 {texts(end)}", "size": texts(np.array([_ROD_RADIUS])), "rgba": _GREY}
+
+
+def placed(T: FloatArray) -> dict[str, str]:
+    """The attributes of a pose (4, 4)."""
+    x, y, z, w = quaternions(T[None, :3, :3])[0]
+    return {"pos": texts(T[:3, 3]), "quat": texts(np.array([w, x, y, z]))}
+
+
+def texts(values: FloatArray) -> str:
+    """Numbers as an attribute, exactly."""
+    return " ".join(map(repr, (np.atleast_1d(values) + 0.0).tolist()))  # no minus before a zero
+
+
+@contextmanager
+def _blamed_on(element: Any, urdf: Path) -> Iterator[None]:
+    """RobotError where an attribute in `element` is no number."""
+    try:
+        yield
+    except ValueError as error:
+        what = f"{element.tag} {element.get('name')!r}: {error}"
+        raise RobotError(what, file=urdf, line=element.sourceline, remedy="Give numbers") from None
+
+
+def _coloured(material: Any) -> bool:
+    colour = material.find("color")
+    return colour is not None and colour.get("rgba") is not None
+
+
+def _origin(element: Any) -> FloatArray:
+    """The pose (4, 4) of an element's <origin>."""
+    origin, T = element.find("origin"), np.eye(4)
+    if origin is not None:
+        T[:3, :3] = rotation_of(_floats(origin.get("rpy", "0 0 0")))
+        T[:3, 3] = _floats(origin.get("xyz", "0 0 0"))
+    return T
+
+
+def _inertia(inertial: Any) -> FloatArray:
+    """The tensor (3, 3) along the link's axes, made one that a body can have."""
+    element = inertial.find("inertia")
+    xx, yy, zz, xy, xz, yz = (float(element.get(key, "0")) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
+    moments, axes = np.linalg.eigh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    R = _origin(inertial)[:3, :3] @ axes
+    return R @ np.diag(np.maximum(moments, _LEAST_INERTIA)) @ R.T
+
+
+def _floats(text: str) -> FloatArray:
+    return np.array([float(word) for word in text.split()])
+
+
+def _found(name: str, urdf: Path) -> Path | None:
+    """The file of a mesh: relative to the URDF, or in a package whose folder is above the URDF or beside it."""
+    scheme, _, rest = name.rpartition("://")
+    places = [urdf.parent / name.removeprefix("file://")]
+    if scheme == "package":
+        package, _, inside = rest.partition("/")
+        for folder in urdf.resolve().parents:
+            places += [folder / package / inside, *([folder / inside] if folder.name == package else [])]
+    return next((place for place in places if place.is_file()), None)
+
+
+def _readable(file: Path) -> bool:
+    if file.suffix.lower() not in _MESHES:
+        return False
+    if file.suffix.lower() != ".stl":
+        return True
+    with file.open("rb") as stream:
+        head = stream.read(_STL_HEADER)
+    if len(head) < _STL_HEADER:
+        return False
+    (triangles,) = struct.unpack("<I", head[-4:])
+    return 0 < triangles <= _MOST_TRIANGLES and file.stat().st_size == _STL_HEADER + _STL_TRIANGLE * triangles

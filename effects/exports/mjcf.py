@@ -1,0 +1,344 @@
+"""The simulation as MJCF: the value of a joint is what its encoder reads, and further joints have its errors.
+
+| error | in MJCF |
+| --- | --- |
+| zero | `ref` of the joint |
+| scale, coupling, periodic errors | a second joint about the same axis, tied to the readings that cause them |
+| backlash | a second joint with a range, and friction between the link and its parent |
+| compliance | a second joint with a stiffness |
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bodyschema.effects.gravity import GRAVITY_M_S2
+from bodyschema.effects.simulation import Simulation
+from bodyschema.interfaces.errors import RobotError
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.urdf import MOVING, UrdfJoint, standing
+
+from .geometry import geometry_without_zeros
+from .joint_errors import ArmErrors, JointErrors, Wave, numbers
+from .link_parts import LinkParts, placed, rod, texts
+
+MARKER, MEASUREMENT = "marker", "measurement_frame"
+_STEP_S = 0.001
+# Added to the inertia of each joint [kg·m²], for joints about one axis in a row; of what turns nothing less.
+_ARMATURE, _IDLE_ARMATURE = 0.05, 1e-6
+# Rates [rad/s] of the actuators and of springs without a load: well below 1/_STEP_S, so that the integrator follows.
+_SERVO_RATE, _SPRING_RATE = 100.0, 60.0
+# Backlash shows only if the weight does not close it: friction, as a multiple of gravity's largest torque.
+_FRICTION_MARGIN, _LEAST_FRICTION = 2.0, 0.1
+_POSTURES = 256
+# A point so far [m] from a circle of this radius [m] is at a distance that is a sine of the angle, to 1 in 2,000.
+_WAVE_ANCHOR, _WAVE_RADIUS = 1.0, 0.001
+# Constraints that give less than 1e-4 of what pulls at them.
+_STIFF = {"solref": f"{4 * _STEP_S:g} 1", "solimp": "0.9999 0.9999 0.001 0.5 2"}
+_HIDDEN, _WORLD = "5", "world"
+
+
+def write_mjcf(simulation: Simulation, file: Path, heading: str) -> list[str]:
+    """Write the simulation as MJCF to `file`.
+
+    Args:
+        heading: one line for the top: where it comes from.
+
+    Returns:
+        Sentences on what the file does not hold, or holds in another way.
+
+    Raises:
+        RobotError: two joints would have one name.
+        OSError: it cannot be written.
+    """
+    document = _Document(simulation, file.parent)
+    told = document.told
+    file.write_bytes(document.written([heading, *told]))
+    return told
+
+
+@dataclass
+class _Document:
+    """One MJCF file in the making.
+
+    Attributes:
+        simulation: what it says.
+        folder: where it will be.
+        joints: names of the joints in it.
+    """
+
+    simulation: Simulation
+    folder: Path
+    joints: set[str] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
+
+        self._etree = etree
+        robot = self.simulation.robot
+        self._robot, self._tree = robot, robot.tree
+        self._errors = ArmErrors.of(self.simulation)
+        self._parts = LinkParts.of(robot.tree.file, self.folder)
+        self._geometry = geometry_without_zeros(self._errors.simulation)  # zeros go into `ref`
+        self._root = etree.Element("mujoco", model=robot.name)
+        self._settings()
+        self._asset = self._add(self._root, "asset")
+        self._world = self._add(self._root, "worldbody")
+        self._tendon, self._equality, self._actuator, self._custom = (
+            self._add(self._root, tag) for tag in ("tendon", "equality", "actuator", "custom")
+        )
+        sky = {"builtin": "gradient", "rgb1": "0.9 0.92 0.95", "rgb2": "0.6 0.65 0.7", "width": "64", "height": "384"}
+        self._add(self._asset, "texture", type="skybox", **sky)
+        for mesh in self._parts.meshes:
+            self._add(self._asset, "mesh", **mesh)
+        self._add(self._world, "light", pos="0 0 3", dir="0 0 -1", directional="true")
+        children = {joint.child for joint in self._tree.joints.values()}
+        base = next(link for link in self._tree.links if link not in children)
+        self._link(self._world, base, np.eye(4), None)
+        self._keep_left_out()
+
+    @property
+    def told(self) -> list[str]:
+        """Sentences on what is not in the file, or in another way."""
+        told = self._errors.told()
+        if self._parts.unreadable:
+            some = ", ".join(self._parts.unreadable[:3]) + (", ..." if len(self._parts.unreadable) > 3 else "")
+            told.append(f"not in the file: {len(self._parts.unreadable)} meshes ({some}): missing, or not STL or OBJ")
+        if not self.simulation.gravity.known:
+            told.append("the URDF states no masses: those of the file are placeholders, so its dynamics mean nothing")
+        return told
+
+    def written(self, told: list[str]) -> bytes:
+        """The file, with sentences at its top."""
+        etree = self._etree
+        lines = [
+            *told,
+            "The value of each joint is what its encoder reads. Positions of the measurement are those of the site "
+            f"{MARKER} in the frame of the site {MEASUREMENT}.",
+            "At rest the arm stands as found. Armature, damping, gains and friction were chosen, not measured.",
+        ]
+        text = "\n".join(lines)
+        self._root.insert(0, etree.Comment(re.sub("-(?=-)", "- ", f"\n{text}\n")))  # no comment may have two in a row
+        for group in (self._tendon, self._equality, self._actuator, self._custom):
+            if not len(group):
+                self._root.remove(group)
+        etree.indent(self._root, space="  ")
+        return etree.tostring(self._root, encoding="utf-8", xml_declaration=True, pretty_print=True)
+
+    def _add(self, parent: Any, tag: str, /, **attributes: str) -> Any:
+        return self._etree.SubElement(parent, tag, attributes)
+
+    def _settings(self) -> None:
+        self._add(
+            self._root,
+            "compiler",
+            angle="radian",
+            inertiafromgeom="false",
+            balanceinertia="true",
+            boundmass="1e-6",
+            boundinertia="1e-9",
+        )
+        gravity = texts(np.array([0.0, 0.0, -GRAVITY_M_S2]))
+        self._add(self._root, "option", timestep=f"{_STEP_S:g}", integrator="implicitfast", gravity=gravity)
+        default = self._add(self._root, "default")
+        self._add(default, "geom", contype="0", conaffinity="0", group="2")
+        self._add(default, "joint", armature=f"{_ARMATURE:g}")
+        self._add(default, "equality", **_STIFF)
+        self._add(default, "tendon", group=_HIDDEN)
+
+    def _link(self, parent: Any, link: str, T: FloatArray, above: UrdfJoint | None) -> None:
+        """Add a link at the pose T (4, 4) in `parent`, and all that hangs on it."""
+        # MuJoCo keeps the name of the world for itself.
+        is_world = link == _WORLD and parent is self._world
+        body = parent if is_world else self._add(parent, "body", name=link, **placed(T))
+        mass = self._tree.masses.get(link)
+        if mass is not None and mass.mass_kg > 0.0 and not is_world:
+            inertia = self._parts.inertias.get(link, np.zeros((3, 3)))
+            full = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+            self._add(body, "inertial", pos=texts(mass.centre), mass=repr(mass.mass_kg), fullinertia=texts(full))
+        if above is not None:
+            self._joints(body, above)
+        below = [joint for joint in self._tree.joints.values() if joint.parent == link]
+        poses = [self._geometry.T_parent_joint.get(joint.name, joint.T_parent_joint) for joint in below]
+        for geom in self._parts.geoms.get(link) or filter(None, (rod(T_child[:3, 3]) for T_child in poses)):
+            self._add(body, "geom", **geom)
+        self._frames(body, link)
+        for joint, T_child in zip(below, poses, strict=True):
+            if self._moves(joint):
+                self._link(body, joint.child, T_child, joint)
+            else:
+                held = self._robot.robot.held_at.get(joint.name, 0.0)
+                self._link(body, joint.child, standing(joint, False, held), None)
+
+    def _moves(self, joint: UrdfJoint) -> bool:
+        """Whether a joint is one in the file: those that robot.toml holds somewhere stand there."""
+        name, robot = joint.name, self._robot
+        return joint.kind in MOVING and (name in robot.joints or name not in robot.robot.held_at)
+
+    def _frames(self, body: Any, link: str) -> None:
+        if link == self._robot.robot.marker_link:
+            self._add(body, "site", name=MARKER, pos=texts(self._geometry.marker_xyz), size="0.01", rgba="1 0.4 0 1")
+        if link != self._robot.camera.parent_link:
+            return
+        T = self._geometry.T_parent_camera
+        self._add(body, "site", name=MEASUREMENT, size="0.01", rgba="0 0.4 1 1", **placed(T))
+        camera = self._robot.camera
+        if camera.focal_px is None or camera.image_size_px is None or camera.principal_point_px is None:
+            return
+        size = np.array(camera.image_size_px, dtype=np.float64)
+        # MuJoCo's cameras look along -z; their principal point counts from the middle, to the right and up.
+        centre = (np.array(camera.principal_point_px) - 0.5 * size) * [1.0, -1.0]
+        self._add(
+            body,
+            "camera",
+            name="camera",
+            **placed(T @ np.diag([1.0, -1.0, -1.0, 1.0])),
+            resolution=f"{camera.image_size_px[0]} {camera.image_size_px[1]}",
+            sensorsize=texts(size * 1e-5),
+            focalpixel=texts(np.full(2, camera.focal_px)),
+            principalpixel=texts(centre),
+        )
+
+    def _joints(self, body: Any, joint: UrdfJoint) -> None:
+        """Add the joint that is read, then those that have its errors."""
+        errors = self._errors.joints.get(joint.name, JointErrors())
+        kind = {"type": "slide" if joint.kind == "prismatic" else "hinge", "axis": texts(joint.axis)}
+        limits = {} if joint.kind == "continuous" else {"range": texts(np.array([joint.lower, joint.upper]))}
+        zero = {"ref": repr(-errors.offset)} if errors.offset else {}
+        inertia = self._inertia(joint) + _ARMATURE
+        # MuJoCo's friction and limits are as soft as the joints in the row are light: a play needs them hard.
+        heavy = {"armature": f"{inertia:.4g}"} if errors.play else {}
+        self._joint(body, joint.name, **kind, **limits, **zero, **heavy)
+        gain = f"{_SERVO_RATE**2 * inertia:.4g}"
+        if (mimic := self._parts.mimics.get(joint.name)) and self._moves(self._tree.joint(mimic[0])):
+            self._tie(joint.name, *mimic)
+        else:
+            self._add(
+                self._actuator,
+                "position",
+                name=joint.name,
+                joint=joint.name,
+                kp=gain,
+                dampratio="1",
+                **({"ctrlrange": limits["range"]} if limits else {}),
+            )
+        if errors.ratios or errors.waves:
+            name = f"{joint.name}_error"
+            self._joint(body, name, **kind, **heavy)
+            self._tie_error(name, joint, errors)
+        if errors.play:
+            self._play(body, joint, kind | heavy, errors.play)
+        if errors.compliance:
+            stiffness = 1.0 / errors.compliance
+            armature = stiffness / _SPRING_RATE**2
+            damping = 2.0 * np.sqrt(stiffness * (armature + inertia))
+            spring = {"stiffness": repr(stiffness), "damping": f"{damping:.4g}", "armature": f"{armature:.4g}"}
+            self._joint(body, f"{joint.name}_spring", **kind, **spring)
+
+    def _joint(self, body: Any, name: str, **attributes: str) -> None:
+        if name in self.joints:
+            raise RobotError(f"two joints would be called {name!r}", file=self._tree.file, remedy="Rename it there")
+        self.joints.add(name)
+        self._add(body, "joint", name=name, **attributes)
+
+    def _tie(self, name: str, source: str, factor: float, offset: float = 0.0) -> None:
+        """A joint whose value is offset + factor · (reading of another)."""
+        errors = self._errors.joints.get(source, JointErrors())
+        # MuJoCo counts the reading from where its joint stands in the file, which is -offset.
+        at_rest = offset - factor * errors.offset
+        polynomial = texts(np.array([at_rest, factor, 0.0, 0.0, 0.0]))
+        self._add(self._equality, "joint", joint1=name, joint2=source, polycoef=polynomial)
+
+    def _tie_error(self, name: str, joint: UrdfJoint, errors: JointErrors) -> None:
+        """Tie the joint `name` to the readings: its value less a share of each is the sum of the periodic errors."""
+        rest = self._add(self._tendon, "fixed", name=name)
+        self._add(rest, "joint", joint=name, coef="1")
+        constant, factor, ends = 0.0, 0.0, {"tendon1": name}
+        for source, ratio in errors.ratios.items():
+            self._add(rest, "joint", joint=source, coef=repr(-ratio))
+            # MuJoCo counts the reading from where its joint stands in the file, which is minus its offset.
+            constant -= ratio * self._errors.joints[source].offset
+        if errors.waves:
+            # The largest error has the largest hand.
+            scale = _WAVE_RADIUS / max(wave.amplitude for wave in errors.waves)
+            factor, ends["tendon2"] = -1.0 / scale, f"{name}_waves"
+            constant += factor * self._wave_dials(f"{name}_waves", joint, errors.waves, scale)
+        polynomial = texts(np.array([constant, factor, 0.0, 0.0, 0.0]))
+        self._add(self._equality, "tendon", polycoef=polynomial, **ends)
+
+    def _wave_dials(self, name: str, joint: UrdfJoint, waves: list[Wave], scale: float) -> float:
+        """A tendon from a fixed point to one hand for each periodic error, which turns as the reading goes on.
+
+        The way from (a, 0) to r · (cos, sin) of an angle is a - r · cos to first order in r/a.
+
+        Returns:
+            By how much it is longer [m] than the ways to the hands' axes where the joint stands in the file.
+        """
+        still, length, longer = self._wave_base(), self._add(self._tendon, "spatial", name=name), 0.0
+        for count, wave in enumerate(waves):
+            dial, radius = f"{name}_{count}", scale * wave.amplitude
+            turning = self._add(still, "body", name=dial)
+            self._joint(turning, dial, type="hinge", axis="0 0 1", armature=f"{_IDLE_ARMATURE:g}")
+            hand = radius * np.array([np.cos(wave.phase), -np.sin(wave.phase), 0.0])
+            self._add(turning, "site", name=dial, pos=texts(hand), group=_HIDDEN)
+            self._tie(dial, joint.name, wave.frequency)
+            if count:
+                self._add(length, "pulley", divisor="1")
+            for site in ("wave_anchor", dial):
+                self._add(length, "site", site=site)
+            longer += float(np.hypot(_WAVE_ANCHOR - hand[0], hand[1])) - _WAVE_ANCHOR
+        return longer
+
+    def _wave_base(self) -> Any:
+        """The body of the points that turn with readings."""
+        still = self._world.find("body[@name='periodic_errors']")
+        if still is None:
+            still = self._add(self._world, "body", name="periodic_errors")
+            self._add(still, "site", name="wave_anchor", pos=texts(np.array([_WAVE_ANCHOR, 0, 0])), group=_HIDDEN)
+        return still
+
+    def _play(self, body: Any, joint: UrdfJoint, kind: dict[str, str], width: float) -> None:
+        """A joint that is loose over the width of the play, and friction that keeps the link where it was left."""
+        name = f"{joint.name}_backlash"
+        stiff = {f"{key}limit": value for key, value in _STIFF.items()}
+        reach = texts(np.array([-0.5 * width, 0.5 * width]))
+        self._joint(body, name, **kind, range=reach, **stiff)
+        torque = self._largest_torques[self._robot.joints.index(joint.name)]
+        friction = max(_FRICTION_MARGIN * float(torque), _LEAST_FRICTION)
+        held = {f"{key}friction": value for key, value in _STIFF.items()}
+        output = self._add(self._tendon, "fixed", name=name, frictionloss=f"{friction:.4g}", **held)
+        for part in (joint.name, name):
+            self._add(output, "joint", joint=part, coef="1")
+
+    @cached_property
+    def _largest_torques(self) -> FloatArray:
+        """Gravity's largest torque or force (d,) about each joint that is read, over its range."""
+        lower, upper = np.maximum(self._robot.lower, -np.pi), np.minimum(self._robot.upper, np.pi)
+        q = np.random.default_rng(0).uniform(lower, upper, (_POSTURES, len(lower)))
+        return np.abs(self.simulation.gravity.torques(q)).max(axis=0)
+
+    def _inertia(self, joint: UrdfJoint) -> float:
+        """Inertia about a joint, of point masses where they are at zero [kg·m²]; of a slide the mass [kg]."""
+        total, ends = 0.0, [(joint.child, np.eye(4))]
+        for link, T in ends:  # grows on the way
+            mass = self._tree.masses.get(link)
+            if mass is not None:
+                arm = np.cross(joint.axis, T[:3, :3] @ mass.centre + T[:3, 3])
+                total += mass.mass_kg * (1.0 if joint.kind == "prismatic" else float(arm @ arm))
+            below = (other for other in self._tree.joints.values() if other.parent == link)
+            ends += [(other.child, T @ other.T_parent_joint) for other in below]
+        return total
+
+    def _keep_left_out(self) -> None:
+        """The numbers of what the file cannot hold, for programs that know what to do with them."""
+        for count, left_out in enumerate(self._errors.left_out):
+            effect = left_out.effect
+            name = f"{'_'.join(filter(None, effect.key))}_{count}"
+            self._add(self._custom, "numeric", name=name, data=texts(effect.values))
+            self._add(self._custom, "text", name=name, data=numbers(effect))

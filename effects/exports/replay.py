@@ -1,0 +1,121 @@
+"""An exported file, replayed by MuJoCo: where its marker comes to rest at the readings of a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bodyschema.effects.motion import Motion
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.records import FloatArray
+
+from .mjcf import MARKER, MEASUREMENT
+
+# A spring's deflection changes its own load: each round brings the next order.
+_SPRING_ROUNDS = 5
+
+
+def mujoco_version() -> str | None:
+    """The installed MuJoCo; None without it."""
+    try:
+        import mujoco
+    except ImportError:
+        return None
+    return str(mujoco.__version__)
+
+
+def replayed(file: Path, joints: Sequence[str], motion: Motion) -> FloatArray:
+    """Positions (n, 3) [m] of the marker in the measurement frame, of an MJCF file alone.
+
+    At each row the arm stands still: constraints are met, springs bear what gravity pulls at them, and what has
+    backlash is dragged along by the rest of its joint.
+
+    Raises:
+        ConfigError: MuJoCo is not installed, or does not load the file.
+    """
+    import mujoco
+
+    try:
+        statics = _Statics(mujoco, file, joints)
+    except ValueError as error:
+        raise ConfigError(f"MuJoCo does not load it: {error}", file=file) from error
+    return statics.positions(motion.q)
+
+
+class _Statics:
+    """MuJoCo's model at rest."""
+
+    def __init__(self, mujoco: Any, file: Path, joints: Sequence[str]) -> None:
+        self._mujoco = mujoco
+        self._model = mujoco.MjModel.from_xml_path(str(file))
+        self._data = mujoco.MjData(self._model)
+        model, types = self._model, mujoco.mjtEq
+        self._read = np.array([model.joint(name).qposadr[0] for name in joints])
+        tied = [(k, model.eq_obj1id[k], model.eq_obj2id[k]) for k in range(model.neq)]
+        self._ties = [
+            (model.jnt_qposadr[a], model.jnt_qposadr[b], model.eq_data[k, :5])
+            for k, a, b in tied
+            if model.eq_type[k] == types.mjEQ_JOINT
+        ]
+        # The first joint of a tied tendon is the one that has the errors.
+        self._errors = [
+            (model.jnt_qposadr[model.wrap_objid[model.tendon_adr[a]]], a, b, model.eq_data[k, :5])
+            for k, a, b in tied
+            if model.eq_type[k] == types.mjEQ_TENDON
+        ]
+        # The joints of a tendon with friction: the one that is read, and the loose one.
+        self._plays = [
+            tuple(model.wrap_objid[model.tendon_adr[k] + i] for i in range(2))
+            for k in range(model.ntendon)
+            if model.tendon_frictionloss[k] > 0.0
+        ]
+        self._springs = np.flatnonzero(model.jnt_stiffness > 0.0)
+
+    def positions(self, readings: FloatArray) -> FloatArray:
+        """At readings (n, d), in their order."""
+        mujoco, model, data = self._mujoco, self._model, self._data
+        qpos, springs = data.qpos, model.jnt_qposadr[self._springs]
+        loads, stiffness = model.jnt_dofadr[self._springs], model.jnt_stiffness[self._springs]
+        outputs = [self._first_output(read, loose, readings) for read, loose in self._plays]
+        found = np.empty((len(readings), 3))
+        for row, reading in enumerate(readings):
+            qpos[self._read] = reading
+            for y, x, polynomial in self._ties:
+                qpos[y] = model.qpos0[y] + _polynomial(polynomial, qpos[x] - model.qpos0[x])
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_tendon(model, data)
+            for y, tied, by, polynomial in self._errors:
+                longer = data.ten_length[by] - model.tendon_length0[by] if by >= 0 else 0.0
+                qpos[y] += model.tendon_length0[tied] + _polynomial(polynomial, longer) - data.ten_length[tied]
+            for k, (read, loose) in enumerate(self._plays):
+                input_ = qpos[model.jnt_qposadr[read]]
+                outputs[k] = input_ + np.clip(outputs[k] - input_, *model.jnt_range[loose])
+                qpos[model.jnt_qposadr[loose]] = outputs[k] - input_
+            for _ in range(_SPRING_ROUNDS if len(springs) else 0):
+                mujoco.mj_forward(model, data)
+                qpos[springs] = -data.qfrc_bias[loads] / stiffness
+            mujoco.mj_kinematics(model, data)
+            seen = data.site(MEASUREMENT)
+            found[row] = (data.site(MARKER).xpos - seen.xpos) @ seen.xmat.reshape(3, 3)
+        return found
+
+    def _first_output(self, read: int, loose: int, readings: FloatArray) -> float:
+        """Where a play begins: on the side to which the first move leads."""
+        model = self._model
+        column = readings[:, int(np.flatnonzero(self._read == model.jnt_qposadr[read])[0])]
+        moves = np.diff(column)
+        leading = moves[np.flatnonzero(moves)[:1]]
+        lower, upper = model.jnt_range[loose]
+        return float(column[0]) + (0.0 if not len(leading) else float(lower if leading[0] > 0.0 else upper))
+
+
+def _polynomial(coefficients: FloatArray, x: float) -> float:
+    """A polynomial with the constant first, as MuJoCo's equalities have it."""
+    value = 0.0
+    for coefficient in coefficients[::-1]:
+        value = value * x + coefficient
+    return float(value)

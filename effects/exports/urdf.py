@@ -1,0 +1,33 @@
+"""The simulation as a URDF, as far as a URDF can say it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bodyschema.effects.simulation import RIGID, Simulation
+from bodyschema.interfaces.calibrated_files import calibrated_urdf
+
+from .geometry import geometry_of
+from .joint_errors import LeftOut, moment_notes, residual_note, sentences
+
+_WHY_NOT = "a URDF has zeros, links and fixed frames alone"
+
+
+def write_urdf(simulation: Simulation, file: Path, heading: str) -> list[str]:
+    """Write the URDF of the simulation's robot, corrected where a URDF can be, to `file`.
+
+    Args:
+        heading: one line for the top: where it comes from.
+
+    Returns:
+        Sentences on what the file does not hold.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    robot, stayed = simulation.robot, simulation.after_moments
+    geometry = geometry_of(stayed)
+    left_out = [LeftOut(effect, _WHY_NOT) for effect in stayed.all_effects if effect.name not in RIGID]
+    told = [*sentences(left_out), *residual_note(simulation), *moment_notes(simulation)]
+    file.write_bytes(calibrated_urdf(robot, geometry, file.parent, "\n".join([heading, *told])))
+    return told

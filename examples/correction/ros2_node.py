@@ -1,0 +1,83 @@
+"""Publishes corrected joint states beside the raw ones of a ROS 2 robot whose nodes use rmw_zenoh.
+
+python ros2_node.py correction.json [--router tcp/127.0.0.1:7447] [--domain 0] [--topic /joint_states]
+
+It publishes sensor_msgs/JointState on /joint_states_corrected, which `ros2 topic echo` shows, and for programs without
+ROS {"t_ns": …, "q": […], "pose": […]} as JSON on bodyschema/<robot>/corrected. A message that does not have all joints
+is passed over. Velocities and efforts stay as they are. What depends on moves between rows of a recording (settling) is
+left out: messages come at another pace.
+"""
+
+import argparse
+import hashlib
+import json
+import time
+
+import zenoh
+from correction import Correction
+
+from bodyschema.drivers.ros2 import rmw
+from bodyschema.drivers.ros2.cdr import Malformed
+from bodyschema.drivers.ros2.link import open_session
+from bodyschema.drivers.ros2.messages import JOINT_STATE, JointState, decode_joint_state, encode_joint_state
+
+NODE = "bodyschema_correction"
+
+
+class CorrectedJoints:
+    """A node that listens to joint states and publishes corrected ones."""
+
+    def __init__(self, session, file, domain, topic):
+        contents = json.loads(file)
+        contents["effects"] = [effect for effect in contents["effects"] if effect["effect"] != "settling"]
+        self.arm, self.names = Correction(json.dumps(contents)), [joint["name"] for joint in contents["joints"]]
+        self.session, self.sequence = session, 0
+        corrected, name = f"{topic}_corrected", str(session.info.zid())
+        tokens = rmw.node_token(domain, name, NODE), rmw.publisher_token(domain, name, NODE, corrected, JOINT_STATE)
+        self.tokens = [session.liveliness().declare_token(token) for token in tokens]
+        self.gid = hashlib.blake2b(tokens[1].encode(), digest_size=rmw.GID_BYTES).digest()
+        self.to_ros = session.declare_publisher(rmw.topic_key(domain, corrected, JOINT_STATE))
+        self.to_zenoh = session.declare_publisher(f"bodyschema/{contents['robot']}/corrected")
+        # Messages of whatever ROS 2 version: the type is given, its hash is not.
+        key = rmw.topic_key(domain, topic, JOINT_STATE, rmw.ANY)
+        self.raw = session.declare_subscriber(key, self.take)
+
+    def take(self, sample):
+        """Publish what a message becomes."""
+        try:
+            message = decode_joint_state(sample.payload.to_bytes())
+            places = [message.names.index(name) for name in self.names]
+            angles, pose = self.arm.read([message.positions[place] for place in places])
+        except (Malformed, ValueError, IndexError):
+            return
+        positions = list(message.positions)
+        for place, angle in zip(places, angles, strict=True):
+            positions[place] = angle
+        corrected = JointState(message.header, message.names, tuple(positions), message.velocities, message.efforts)
+        self.sequence += 1
+        attached = rmw.attachment(self.sequence, time.time_ns(), self.gid)
+        self.to_ros.put(encode_joint_state(corrected), attachment=attached)
+        self.to_zenoh.put(json.dumps({"t_ns": message.header.stamp_ns, "q": angles, "pose": pose}))
+
+
+def main():
+    """Correct until Ctrl-C."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("file")
+    parser.add_argument("--router", default="tcp/127.0.0.1:7447")
+    parser.add_argument("--domain", type=int, default=0)
+    parser.add_argument("--topic", default="/joint_states")
+    asked = parser.parse_args()
+    with open(asked.file, encoding="utf-8") as stream, open_session(asked.router) as session:
+        node = CorrectedJoints(session, stream.read(), asked.domain, asked.topic)
+        print(f"{asked.topic} -> {asked.topic}_corrected for {', '.join(node.names)}; Ctrl-C ends")
+        try:
+            while True:
+                time.sleep(1.0)
+        except KeyboardInterrupt:
+            pass
+
+
+if __name__ == "__main__":
+    zenoh.init_log_from_env_or("error")
+    main()

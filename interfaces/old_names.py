@@ -1,0 +1,63 @@
+"""The import names that plug-ins had before they began with `bodyschema`, for one more release."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder
+from pathlib import Path
+from types import ModuleType
+
+HOME = Path(__file__).resolve().parents[1]
+# What docs/extending.md told plug-ins to import from.
+PARTS = ("drivers", "effects", "interfaces", "vision")
+
+
+class OldNames(MetaPathFinder):
+    """Finds `interfaces.camera` as `bodyschema.interfaces.camera`, unless another package has that name."""
+
+    def find_spec(
+        self,
+        fullname: str,
+        path: Sequence[str] | None = None,  # noqa: ARG002
+        target: ModuleType | None = None,  # noqa: ARG002
+    ) -> ModuleSpec | None:
+        """Return the spec of a module of ours that is asked for by its old name."""
+        part = fullname.partition(".")[0]
+        if part not in PARTS or _is_anothers(part):
+            return None
+        warnings.warn(
+            f"a plug-in imports {fullname}, which is bodyschema.{fullname} now: the next release has no other name",
+            FutureWarning,
+            stacklevel=2,
+        )
+        return ModuleSpec(fullname, _Alias(f"bodyschema.{fullname}"))
+
+
+class _Alias(Loader):
+    """Gives the module that is already there under its full name, so that it is loaded once."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:  # noqa: ARG002
+        module = import_module(self._name)
+        self._spec = module.__spec__
+        return module
+
+    def exec_module(self, module: ModuleType) -> None:
+        module.__spec__ = self._spec
+
+
+def allow() -> None:
+    """Let plug-ins that are loaded from now on import by the old names, each with a FutureWarning."""
+    if not any(isinstance(finder, OldNames) for finder in sys.meta_path):
+        sys.meta_path.insert(0, OldNames())
+
+
+def _is_anothers(part: str) -> bool:
+    found = PathFinder.find_spec(part)
+    return found is not None and (found.origin is None or Path(found.origin).resolve().parent != HOME / part)

@@ -1,0 +1,165 @@
+"""What `bodyschema calibrate` holds, expects on new poses, and tells ROS, against planted robots."""
+
+from __future__ import annotations
+
+import functools
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from bodyschema.daemon.calibration import Calibration
+from bodyschema.daemon.calibration_report import CalibrationReport
+from bodyschema.daemon.calibration_view import sentences
+from bodyschema.daemon.chain_figures import HALF_WIDTH_95
+from bodyschema.daemon.cli import command_line
+from bodyschema.daemon.hand_eye import HandEye, write_launch_file
+from bodyschema.daemon.plausibility.check import Plausibility
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.robot import RobotDescription
+from kbmaps import ChainParameters, ChainTolerances
+
+DESK_ARM = Path(__file__).parents[2] / "examples" / "desk_arm"
+SIGMA_M = 5e-4
+OFFSETS_DEG = np.array([0.0, 2.0, -1.5, 0.0])
+ANYWHERE = ChainTolerances(tool=0.03, base_rotation=0.2, base_translation=0.2)
+MADE = ChainTolerances(0.003, 0.001, tool=0.03, base_rotation=0.2, base_translation=0.2)
+
+
+class Arm:
+    """A desk arm whose camera and tool are elsewhere, and whose links and zeros may be."""
+
+    def __init__(self, made: ChainTolerances, offsets_deg: np.ndarray, seed: int) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.robot = RobotDescription.load(DESK_ARM / "robot.toml")
+        parameters = ChainParameters(self.robot.chain)
+        self.change = parameters.standard_deviations(made) * self.rng.normal(size=parameters.size)
+        self.change[parameters.zeros] = np.radians(offsets_deg)
+        self.parameters = parameters
+        self.recording = self.measured(120)
+
+    def measured(self, poses: int) -> Recording:
+        q = self.rng.uniform(self.robot.lower, self.robot.upper, (poses, 4))
+        x = self.parameters.positions(self.change, q) + SIGMA_M * self.rng.normal(size=(poses, 3))
+        return Recording(joints=self.robot.joints, q=q, x=x)
+
+    def calibrated(self, trusted: str = "nothing") -> Calibration:
+        return Calibration.of(self.robot, self.recording, sigma_m=None, zeros_rad=0.05, trusted=trusted)
+
+
+@functools.cache
+def arm(kind: str, seed: int = 0) -> Arm:
+    made, offsets = {
+        "as drawn": (ANYWHERE, np.zeros(4)),
+        "with offsets": (ANYWHERE, OFFSETS_DEG),
+        "made by hand": (MADE, OFFSETS_DEG),
+    }[kind]
+    return Arm(made, offsets, seed)
+
+
+def report_on(calibration: Calibration, free: Calibration | None = None) -> CalibrationReport:
+    return CalibrationReport.of(calibration, Plausibility(), "pairs.csv", frame="camera", free=free)
+
+
+def test_a_trusted_urdf_tightens_the_hand_eye() -> None:
+    free, trusted = (report_on(arm("as drawn").calibrated(held)) for held in ("nothing", "urdf"))
+    widths = [[figure.half_width for figure in report.camera_xyz_mm] for report in (free, trusted)]
+    assert max(widths[1]) < 0.5 < max(widths[0])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_hand_eye_of_a_trusted_urdf_is_within_its_intervals(seed) -> None:
+    planted = arm("as drawn", seed)
+    report = report_on(planted.calibrated("urdf"))
+    true = np.linalg.inv(
+        planted.parameters.chain(planted.change).fixed[0] @ np.linalg.inv(planted.robot.chain.fixed[0])
+    )
+    place = (planted.robot.camera.pose @ true)[:3, 3]
+    off = np.abs([figure.learnt for figure in report.camera_xyz_mm] - 1e3 * place)
+    assert (off < 2 * np.array([figure.half_width for figure in report.camera_xyz_mm])).all()
+
+
+def test_a_trusted_urdf_has_no_offsets() -> None:
+    assert [zero.zero for zero in report_on(arm("with offsets").calibrated("urdf")).zeros] == [0.0] * 4
+
+
+def test_offsets_alone_are_found() -> None:
+    zeros = report_on(arm("with offsets").calibrated("links")).zeros
+    assert [zero.zero for zero in zeros] == pytest.approx(OFFSETS_DEG, abs=0.1)
+
+
+def test_a_urdf_that_is_wrong_is_told() -> None:
+    planted = arm("with offsets")
+    told = sentences(report_on(planted.calibrated("urdf"), planted.calibrated()))
+    assert any("with nothing held, expect" in sentence for sentence in told)
+
+
+def test_a_urdf_that_is_right_is_not_doubted() -> None:
+    planted = arm("as drawn")
+    told = sentences(report_on(planted.calibrated("urdf"), planted.calibrated()))
+    assert not any("with nothing held" in sentence for sentence in told)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_expected_errors_are_those_of_new_poses(seed) -> None:
+    planted = arm("made by hand", seed)
+    calibration = planted.calibrated()
+    fresh = planted.measured(1000)
+    distances = np.linalg.norm(calibration.learner.predict(fresh.q) - fresh.x, axis=1)
+    expected = calibration.expected
+    assert expected is not None
+    assert [expected.mean_m, expected.p95_m] == pytest.approx(
+        [distances.mean(), np.quantile(distances, 0.95)], rel=0.25
+    )
+
+
+def test_hand_eye_is_the_same_in_every_form() -> None:
+    report = report_on(arm("made by hand").calibrated())
+    pose = report.hand_eye
+    matrix = np.array(pose.matrix)
+    rpy = Rotation.from_euler("xyz", [figure.learnt for figure in report.camera_rpy_deg], degrees=True)
+    assert Rotation.from_quat(pose.quaternion_xyzw).as_matrix() == pytest.approx(matrix[:3, :3])
+    assert rpy.as_matrix() == pytest.approx(matrix[:3, :3], abs=1e-9)
+    assert 1e3 * matrix[:3, 3] == pytest.approx([figure.learnt for figure in report.camera_xyz_mm])
+
+
+def test_hand_eye_covariance_has_the_intervals_in_it() -> None:
+    report = report_on(arm("made by hand").calibrated())
+    cov = np.array(report.hand_eye.covariance).reshape(6, 6)
+    widths = [figure.half_width for figure in report.camera_xyz_mm]
+    assert 1e3 * HALF_WIDTH_95 * np.sqrt(np.diag(cov)[:3]) == pytest.approx(widths)
+    assert np.linalg.eigvalsh(cov)[0] > 0
+
+
+def test_static_transform_line_publishes_the_pose() -> None:
+    T = np.eye(4)
+    T[:3] = np.column_stack([Rotation.from_euler("xyz", [0.3, -0.2, 2.9]).as_matrix(), [0.1, -0.25, 0.75]])
+    line = HandEye.of("base_link", "camera", T).static_transform_publisher
+    told = {name: float(value) for name, value in re.findall(r"--(q?[xyzw]) (\S+)", line)}
+    assert [told[name] for name in "xyz"] == pytest.approx(T[:3, 3])
+    turned = Rotation.from_quat([told[name] for name in ("qx", "qy", "qz", "qw")]).as_matrix()
+    assert turned == pytest.approx(T[:3, :3], abs=1e-8)
+
+
+def test_launch_file_has_the_same_arguments(tmp_path) -> None:
+    pose = report_on(arm("made by hand").calibrated()).hand_eye
+    text = write_launch_file(pose, tmp_path).read_text()
+    compile(text, "hand_eye.launch.py", "exec")
+    assert (
+        re.findall(r"'(\S+?)'", text.split("arguments = ")[1].split("]")[0])
+        == pose.static_transform_publisher.split()[4:]
+    )
+
+
+def test_force_replaces_what_was_written_before(tmp_path) -> None:
+    for name in ("robot.toml", "desk_arm.urdf"):
+        shutil.copy(DESK_ARM / name, tmp_path)
+    arm("made by hand").recording.write_csv(tmp_path / "pairs.csv")
+    out = tmp_path / "out"
+    words = ["calibrate", str(tmp_path / "pairs.csv"), "--out", str(out), "--force"]
+    for _ in range(2):
+        command_line("calibrate")(words, exit_on_error=False, result_action="return_value")
+    assert (out / "robot.toml").exists()

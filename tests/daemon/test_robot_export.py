@@ -1,0 +1,78 @@
+"""`bodyschema export` of a robot with its effects."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_arm import write_small_arm
+
+from bodyschema.daemon.cli import app
+from bodyschema.daemon.synthesis import simulated
+from bodyschema.effects import Effect, Simulation, load_simulation, write_extended
+from bodyschema.interfaces.errors import ConfigError, RequestError
+from bodyschema.interfaces.recording import Recording
+from bodyschema.interfaces.robot import RobotDescription
+
+
+@pytest.fixture
+def extended(tmp_path: Path) -> Path:
+    robot = RobotDescription.load(write_small_arm(tmp_path))
+    joint = robot.joints[0]
+    effects = [("joint_offset", [0.05]), ("backlash", [0.02]), ("settling", [0.1, 0.0])]
+    simulation = Simulation(robot, tuple(Effect.at(robot, name, joint, values=values) for name, values in effects))
+    return write_extended(simulation, tmp_path / "found", "made by a test")
+
+
+@pytest.fixture
+def measured(extended: Path) -> Path:
+    simulation = load_simulation(extended)
+    robot = simulation.robot
+    q = np.random.default_rng(0).uniform(robot.lower, robot.upper, (30, len(robot.joints)))
+    recording = simulated(simulation, Recording(robot.joints, q, np.zeros((30, 3))))
+    recording.write_csv(extended.parent / "measured.csv")
+    return extended.parent / "measured.csv"
+
+
+def export(*arguments: object) -> None:
+    app(["export", *map(str, arguments)], result_action="return_value")
+
+
+@pytest.mark.parametrize("ending", ["xml", "urdf"])
+def test_gain_of_the_file_itself_is_printed(extended, measured, tmp_path, capsys, ending) -> None:
+    pytest.importorskip("mujoco")
+    export(extended, tmp_path / f"model.{ending}", "--measured", measured)
+    told = capsys.readouterr().out
+    rows = {line.split("│")[1].strip(): line.split("│") for line in told.splitlines() if line.count("│") > 3}
+    [own] = [cells for name, cells in rows.items() if name.startswith("model.")]
+    assert float(rows["bodyschema simulate"][2]) == 0.0
+    assert 0.0 < float(own[2]) < float(rows["nominal"][2])
+    assert 0.0 < float(own[4]) < 100.0
+    assert "not in the file: settling" in told
+
+
+def test_without_mujoco_the_file_is_written_and_not_replayed(extended, measured, tmp_path, capsys, monkeypatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "mujoco", None)
+    export(extended, tmp_path / "model.xml", "--measured", measured)
+    assert (tmp_path / "model.xml").exists()
+    assert "pip install mujoco" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("target", "what"), [("model.csv", "end in"), ("none/model.xml", "no folder")])
+def test_wrong_targets_are_refused(extended, tmp_path, target, what) -> None:
+    with pytest.raises(ConfigError, match=what):
+        export(extended, tmp_path / target)
+
+
+def test_existing_files_need_force(extended, tmp_path) -> None:
+    out = tmp_path / "model.xml"
+    export(extended, out)
+    with pytest.raises(ConfigError, match="--force"):
+        export(extended, out)
+    export(extended, out, "--force")
+
+
+def test_measured_goes_with_a_robot(measured, tmp_path) -> None:
+    with pytest.raises(RequestError, match="extended"):
+        export(measured, tmp_path / "pairs.csv", "--measured", measured)

@@ -1,0 +1,136 @@
+"""The readers of correction.json agree with the simulation, and with each other."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from effect_arms import arm, everywhere, sized, walk
+
+from bodyschema.effects import KINDS, Effect, LiveEncoders, Motion, Simulation
+from bodyschema.effects.exports import write_correction
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.robot import RobotDescription
+
+READERS = Path(__file__).resolve().parents[2] / "examples" / "correction"
+NOT_OF_THE_ARM = {"camera_scale", "camera_focal", "lens_distortion", "camera_latency", "thermal_drift"}
+NAMES = tuple(name for name in KINDS if name not in NOT_OF_THE_ARM)
+
+
+@pytest.fixture(scope="module")
+def commands(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
+    """How to run each reader that this machine can run."""
+    found = {"python": [sys.executable, str(READERS / "correction.py")]}
+    if node := shutil.which("node"):
+        found["javascript"] = [node, str(READERS / "correction.js")]
+    if compiler := shutil.which("g++"):
+        built = str(tmp_path_factory.mktemp("built") / "correct")
+        warnings = ["-Wall", "-Wextra", "-Werror"]
+        subprocess.run(
+            [compiler, "-std=c++17", "-O2", *warnings, str(READERS / "correct.cpp"), "-o", built], check=True
+        )
+        found["c++"] = [built]
+    return found
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
+    return arm(tmp_path_factory.mktemp("arm"))
+
+
+def steady(rows: int = 40) -> Motion:
+    """A walk in one run, whose rows come at the usual time."""
+    return Motion(walk(rows=rows).q, 0.1 * np.arange(rows), np.zeros(rows, dtype=np.int64))
+
+
+def corrected(command: list[str], file: Path, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """True joint angles (n, d) and positions (n, 3) by a reader."""
+    lines = "\n".join(" ".join(map(repr, row)) for row in q.tolist())
+    run = subprocess.run([*command, str(file)], input=lines, capture_output=True, text=True, check=True)
+    found = np.array([line.split() for line in run.stdout.splitlines()], dtype=np.float64)
+    return found[:, : q.shape[1]], found[:, q.shape[1] :].reshape(-1, 3, 4)[:, :, 3]
+
+
+def began(effect: Effect) -> Effect:
+    """The effect with its moment before the first row."""
+    return effect.with_values(np.append(effect.values[:-1], -1.0)) if effect.kind.begins else effect
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_python_agrees_effect_by_effect(name, robot, tmp_path) -> None:
+    sys.path.insert(0, str(READERS))
+    try:
+        from correction import Correction
+    finally:
+        sys.path.remove(str(READERS))
+    motion = steady()
+    for place in [where for where in everywhere(robot) if where[0] == name]:
+        simulation = Simulation(robot, (began(sized(robot, place, 1.0)),))
+        assert not [told for told in write_correction(simulation, tmp_path / "c.json", "") if told.startswith("not")]
+        reader = Correction((tmp_path / "c.json").read_text())
+        found = [reader.read(row.tolist()) for row in motion.q]
+        run = simulation.run(motion)
+        # On which side a play begins is known when the joint has moved.
+        np.testing.assert_allclose([angles for angles, _ in found][1:], run.q[1:], rtol=0, atol=1e-12)
+        np.testing.assert_allclose([pose[3::4] for _, pose in found][1:], run.measured[1:], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("language", ["python", "c++", "javascript"])
+def test_all_effects_together_agree(language, commands, robot, tmp_path) -> None:
+    if language not in commands:
+        pytest.skip(f"no compiler or interpreter of {language}; to run it: apt install g++ nodejs")
+    effects = [began(sized(robot, where, 0.3, k)) for k, where in enumerate(everywhere(robot)) if where[0] in NAMES]
+    # A spring is loaded by the moved links here, and by those of the URDF in the simulation.
+    simulation = Simulation(robot, tuple(effect for effect in effects if effect.name != "link_geometry"))
+    write_correction(simulation, tmp_path / "c.json", "")
+    motion, file = steady(), tmp_path / "c.json"
+    angles, x = corrected(commands[language], file, motion.q)
+    run = simulation.run(motion)
+    np.testing.assert_allclose(angles[1:], run.q[1:], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(x[1:], run.measured[1:], rtol=0, atol=1e-9)
+
+
+def test_the_three_readers_agree_exactly_with_geometry(commands, robot, tmp_path) -> None:
+    effects = [began(sized(robot, where, 0.3, k)) for k, where in enumerate(everywhere(robot)) if where[0] in NAMES]
+    write_correction(Simulation(robot, tuple(effects)), tmp_path / "c.json", "")
+    found = {language: corrected(command, tmp_path / "c.json", steady().q) for language, command in commands.items()}
+    for angles, x in found.values():
+        np.testing.assert_allclose(angles, found["python"][0], rtol=0, atol=1e-13)
+        np.testing.assert_allclose(x, found["python"][1], rtol=0, atol=1e-13)
+
+
+def test_a_play_begins_as_in_the_simulated_world(commands, robot, tmp_path) -> None:
+    simulation = Simulation(robot, tuple(Effect.at(robot, "backlash", joint, values=[0.02]) for joint in robot.joints))
+    write_correction(simulation, tmp_path / "c.json", "")
+    q, live = np.repeat(steady(10).q, 3, axis=0), LiveEncoders(simulation)
+    wanted = [live.true_angles(row, 0.0, np.zeros_like(row)) for row in q]
+    for command in commands.values():
+        np.testing.assert_allclose(corrected(command, tmp_path / "c.json", q)[0], wanted, rtol=0, atol=1e-14)
+
+
+def test_memory_goes_on_from_a_state_in_the_file(commands, robot, tmp_path) -> None:
+    pairs = [("backlash", "elbow", [0.02]), ("settling", "wrist", [0.1, 0.5])]
+    simulation = Simulation(robot, tuple(Effect.at(robot, name, at, values=values) for name, at, values in pairs))
+    file, q = tmp_path / "c.json", steady().q
+    write_correction(simulation, file, "")
+    contents = json.loads(file.read_text())
+    whole = corrected(commands["python"], file, q)[0]
+    lag = whole[19] - q[19]
+    contents["effects"][0]["state"] = [whole[19, 4], True]
+    contents["effects"][1]["state"] = [q[19, 6], -lag[6]]
+    file.write_text(json.dumps(contents))
+    for command in commands.values():
+        np.testing.assert_allclose(corrected(command, file, q[20:])[0], whole[20:], rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", sorted(NOT_OF_THE_ARM))
+def test_what_is_no_error_of_the_arm_is_listed(name, robot, tmp_path) -> None:
+    simulation = Simulation(robot, (sized(robot, (name, None, None), 1.0),))
+    [told] = write_correction(simulation, tmp_path / "c.json", "")
+    assert told.startswith(f"not in the file: {name}")
+    assert json.loads((tmp_path / "c.json").read_text())["notes"] == [told]

@@ -1,0 +1,123 @@
+"""Wheel and sdist hold the same files, no links, and live beside a package that brings its own `daemon`."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tarfile
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+LIMIT_S = 600.0
+PURE = {**os.environ, "BODYSCHEMA_PURE": "1"}
+# Named like python-daemon's package; pip removes a folder that it has emptied.
+OTHER = {"daemon/__init__.py": "OTHER = True\n", "daemon/daemon.py": "", "daemon/runner.py": ""}
+
+
+def build(source: Path, target: str, folder: Path) -> Path:
+    command = [sys.executable, "-m", "hatchling", "build", "-t", target, "-d", str(folder)]
+    subprocess.run(command, cwd=source, env=PURE, capture_output=True, check=True, timeout=LIMIT_S)
+    return next(folder.glob("*.whl" if target == "wheel" else "*.tar.gz"))
+
+
+def files_of(wheel: Path) -> set[str]:
+    with zipfile.ZipFile(wheel) as archive:
+        return {name for name in archive.namelist() if ".dist-info/" not in name}
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build(ROOT, "wheel", tmp_path_factory.mktemp("wheel"))
+
+
+@pytest.fixture(scope="module")
+def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build(ROOT, "sdist", tmp_path_factory.mktemp("sdist"))
+
+
+def tracked() -> set[str]:
+    """The files of the parts, as they are to be named in a wheel."""
+    links = [link for link in (ROOT / "bodyschema").iterdir() if link.is_symlink()]
+    files = [(file, f"bodyschema/{file.relative_to(ROOT)}") for link in links for file in (ROOT / link.name).rglob("*")]
+    return {name for file, name in files if file.is_file() and "__pycache__" not in name}
+
+
+def test_the_wheel_has_every_file_of_every_part_and_two_packages(wheel: Path) -> None:
+    files = files_of(wheel)
+    assert {name.partition("/")[0] for name in files} == {"bodyschema", "kbmaps"}
+    assert tracked() <= files
+
+
+def test_the_sdist_has_no_link_and_makes_the_same_wheel(sdist: Path, wheel: Path, tmp_path: Path) -> None:
+    with tarfile.open(sdist) as archive:
+        assert [member.name for member in archive if member.issym() or member.islnk()] == []
+        archive.extractall(tmp_path, filter="data")
+    (source,) = tmp_path.iterdir()
+    assert files_of(build(source, "wheel", tmp_path / "built")) == files_of(wheel)
+
+
+def test_links_that_came_as_text_are_mended(tmp_path: Path) -> None:
+    """As a zip archive of the repository is unpacked by pip."""
+    source = tmp_path / "source"
+    for name in ("interfaces", "bodyschema", "kbmaps"):
+        shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "hatch_build.py", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    for link in [link for link in (source / "bodyschema").iterdir() if link.is_symlink()]:
+        target = str(link.readlink())
+        link.unlink()
+        if link.name == "interfaces":
+            link.write_text(target)
+    assert "bodyschema/interfaces/errors.py" in files_of(build(source, "wheel", tmp_path / "built"))
+
+
+def wheel_of_another(folder: Path) -> Path:
+    """A wheel with a top-level package `daemon`, as python-daemon's."""
+    file, info = folder / "other_daemon-1.0-py3-none-any.whl", "other_daemon-1.0.dist-info"
+    named = {
+        **OTHER,
+        f"{info}/METADATA": "Metadata-Version: 2.1\nName: other-daemon\nVersion: 1.0\n",
+        f"{info}/WHEEL": "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
+    }
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, text in {**named, f"{info}/RECORD": "".join(f"{name},,\n" for name in named)}.items():
+            archive.writestr(name, text)
+    return file
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("first", ["bodyschema", "other"])
+@pytest.mark.parametrize("source", ["wheel", "sdist"])
+def test_it_lives_beside_another_daemon_and_outlives_it(
+    request: pytest.FixtureRequest, tmp_path: Path, source: str, first: str
+) -> None:
+    venv.create(tmp_path / "venv", with_pip=True, system_site_packages=True)
+    python = tmp_path / "venv" / "bin" / "python"
+    # The dependencies are those of the interpreter that tests; its own bodyschema is not.
+    packages = next((tmp_path / "venv" / "lib").glob("*/site-packages"))
+    needed = next(Path(entry) for entry in sys.path if Path(entry, "numpy").is_dir())
+    (packages / "needed.pth").write_text(f"{needed}\n")
+
+    def pip(*words: object) -> None:
+        command = [python, "-m", "pip", "--disable-pip-version-check", "--quiet", *words]
+        environment = {name: value for name, value in PURE.items() if name != "PYTHONPATH"}
+        subprocess.run(list(map(str, command)), check=True, timeout=LIMIT_S, cwd=tmp_path, env=environment)
+
+    def says() -> str:
+        code = "import bodyschema.daemon.cli as c, kbmaps; print(c.__file__); c.main()"
+        command = [python, "-P", "-c", code, "--version"]
+        return subprocess.run(command, check=True, capture_output=True, text=True, timeout=LIMIT_S).stdout
+
+    install = ("install", "--no-deps", "--no-build-isolation", "--no-index", "--force-reinstall")
+    own, other = request.getfixturevalue(source), wheel_of_another(tmp_path)
+    for package in (own, other) if first == "bodyschema" else (other, own):
+        pip(*install, package)
+    assert says().startswith(str(packages / "bodyschema" / "daemon" / "cli.py"))
+    pip("uninstall", "--yes", "other-daemon")
+    assert says().startswith(str(packages / "bodyschema" / "daemon" / "cli.py"))

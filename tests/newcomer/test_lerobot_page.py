@@ -1,0 +1,79 @@
+"""The way of docs/lerobot.md, typed as it stands there, on an SO-101 emulated at the bytes."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from so101_on_a_port import So101
+from typed_pages import DOCS, TypedPage, commands_of, expected_mm
+
+from bodyschema.daemon.cli import command_line
+from bodyschema.daemon.config import Config
+from bodyschema.interfaces.lerobot import read_calibration
+
+PAGE = (DOCS / "lerobot.md").read_text(encoding="utf-8")
+SO101 = DOCS.parent / "examples" / "so101"
+ROWS = 300
+TRUST, AGAIN = (f"bodyschema calibrate {name}.csv --trust-urdf" for name in ("so101", "again"))
+INIT, EXPORT, DIFFERENCE, WRITE = (
+    next(command for command in commands_of(PAGE) if re.search(word, command))
+    for word in ("config init", "export", r"\.json$", "--write")
+)
+
+
+@pytest.fixture
+def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> TypedPage:
+    """The page, with the example's files in the present folder and a robot.toml."""
+    shutil.copytree(SO101, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    return TypedPage(PAGE, capsys)
+
+
+@pytest.mark.parametrize("command", commands_of(PAGE))
+def test_commands_are_understood(command: str) -> None:
+    words = shlex.split(command)[1:]
+    command_line(words[0]).parse_args(words, exit_on_error=False, print_error=False)
+
+
+def test_offsets_go_into_the_servos_and_errors_fall(page: TypedPage) -> None:
+    assert page.type(INIT) == page.shown(INIT)
+    config = Config.load(Path("robot.toml"), {})
+    arm = So101(config.robot, read_calibration(Path("follower.json")), (0.0, 2.5, -3.0, 1.5, 0.0), seed=1)
+    arm.record(config, ROWS).write_csv(Path("so101.csv"))
+
+    before = expected_mm(page.type(TRUST))
+    assert before == pytest.approx(expected_mm(page.shown(TRUST)), rel=0.2)
+    assert offsets(page.type(DIFFERENCE)) == pytest.approx(offsets(page.shown(DIFFERENCE)), abs=3)
+    page.type(WRITE)
+
+    arm.give(read_calibration(Path("follower.json"))).record(config, ROWS).write_csv(Path("again.csv"))
+    after = expected_mm(page.type(AGAIN))
+    assert after == pytest.approx(expected_mm(page.shown(AGAIN)), rel=0.2)
+    assert after[0] < before[0] / 2
+
+
+def offsets(text: str) -> list[int]:
+    """Return the new homing offsets of a difference, modulo a turn."""
+    return [int(number) % 4096 for number in re.findall(r"homing_offset -?\d+ → (-?\d+)", text)]
+
+
+def test_a_dataset_gives_the_same_joints(page: TypedPage) -> None:
+    pytest.importorskip("pyarrow")
+    from lerobot_datasets import write_dataset
+
+    page.type(INIT)
+    motors = read_calibration(Path("follower.json"))
+    t = np.arange(0, 4, 1 / 30)
+    q = np.sin(np.outer(t, [0.5, 0.7, 0.9, 1.1, 1.3, 0.2]))
+    write_dataset(Path("my_dataset"), "v3.0", "degrees", motors, [(t, q)])
+    chain = Config.load(Path("robot.toml"), {}).robot.chain
+    rows = np.column_stack([t, chain.positions(q[:, :5])])[5:-5]
+    np.savetxt("tag.csv", rows, fmt="%.9f", delimiter=",", header="t,x,y,z", comments="")
+    assert page.type(EXPORT) == "110 pairs written to so101.csv\n"
+    read = np.loadtxt("so101.csv", delimiter=",", skiprows=1, usecols=range(2, 7))
+    assert read == pytest.approx(q[5:-5, :5], abs=1e-6)

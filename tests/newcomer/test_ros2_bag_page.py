@@ -1,0 +1,63 @@
+"""The way of docs/ros2_bag.md, typed as it stands there, with bags that rosbags wrote."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bodyschema.daemon.cli import command_line
+from bodyschema.interfaces.errors import RecordingError
+from bodyschema.interfaces.robot import RobotDescription
+
+pytest.importorskip("rosbags")
+from arm_in_a_bag import ArmInABag
+from typed_pages import DOCS, TypedPage, commands_of, expected_mm
+
+PAGE = (DOCS / "ros2_bag.md").read_text(encoding="utf-8")
+DESK_ARM = DOCS.parent / "examples" / "desk_arm"
+COMMANDS = commands_of(PAGE)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_commands_are_understood(command: str) -> None:
+    words = shlex.split(command)[1:]
+    command_line(words[0]).parse_args(words, exit_on_error=False, print_error=False)
+
+
+def test_a_new_bag_is_predicted_to_the_noise(tmp_path, monkeypatch, capsys) -> None:
+    page = TypedPage(PAGE, capsys)
+    arm = ArmInABag(RobotDescription.load(DESK_ARM / "robot.toml"), seed=1)
+    arm.write(tmp_path / "my_bag", seconds=60.0, mcap=True)
+    arm.write(tmp_path / "new_bag", seconds=30.0, mcap=False)
+    shutil.copy(DESK_ARM / "desk_arm.urdf", tmp_path)
+    monkeypatch.chdir(tmp_path)
+
+    init, asked, calibrate, export, simulate, compare = COMMANDS
+    assert page.type(init) == page.shown(init)
+    with pytest.raises(RecordingError) as unclear:
+        page.type(asked)
+    assert f"bodyschema: {unclear.value}\n" == page.shown(asked)
+
+    calibrated = page.type(calibrate)
+    assert expected_mm(calibrated) == pytest.approx(expected_mm(page.shown(calibrate)), rel=0.1)
+    assert transform(calibrated) == pytest.approx(transform(page.shown(calibrate)), abs=1e-4)
+    assert Path("calibrated/hand_eye.launch.py").exists()
+
+    for command in (export, simulate):
+        assert page.type(command).strip() in PAGE
+    assert rms(page.type(compare)) == pytest.approx(rms(PAGE), abs=0.02)
+
+
+def transform(text: str) -> list[float]:
+    return [float(value) for value in re.findall(r"--q?[xyzw] (\S+)", text)]
+
+
+def rms(text: str) -> np.ndarray:
+    line = re.search(r"^RMS \[mm\] +([\d.]+) +([\d.]+) +([\d.]+)", text, re.MULTILINE)
+    assert line is not None, text
+    return np.array(list(map(float, line.groups())))
