@@ -94,7 +94,7 @@ def _no_simulation(config: Config) -> str:
     if find_spec("pybullet") is None:
         return "for a guided path: pip install 'bodyschema[sim]'"
     if config.robot.calibration is None:
-        return "for a guided path describe the stereo pair in [camera]"
+        return "for a guided path describe the cameras in [camera]"
     return ""
 
 

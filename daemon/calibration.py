@@ -22,6 +22,8 @@ from kbmaps import (
     RigidChain,
     RigidLearner,
     align,
+    rotation_matrices,
+    unexplained_variance,
 )
 
 from .chain_figures import ChainFigures, is_told
@@ -33,6 +35,8 @@ Trusted = Literal["nothing", "links", "urdf"]
 # How many pairs are asked. No arm is quite rigid, and thousands of pairs would take its sag for bad workmanship.
 JUDGED_PAIRS = 300
 SLIDE_ZEROS_M = 0.02
+# No measured coordinate is surer.
+ROUNDING_M = 1e-9
 # A number is shown when it is left so much less uncertain than it was.
 MUCH_SURER = 1.0 / 3.0
 # Of what is said to be known, and of what is not, once it has been fitted: then far more than the fit can be off.
@@ -106,7 +110,9 @@ class Calibration:
             )
         known = {"pose_known": robot.camera.pose_known, "marker_known": robot.robot.marker_known}
         try:
-            placed = align(robot.chain, recording.q, recording.x, **known)
+            turned = recording.orientation
+            turns = None if turned is None else rotation_matrices("orientation", turned)
+            placed = align(robot.chain, recording.q, recording.x, turns=turns, **known)
             learners, shares = _learners(placed.chain, _tolerances(robot, zeros_rad, trusted), recording, sigma_m)
             learners[0].report()  # fits it, so that what cannot be fitted shows here
         except KBMapsError as error:
@@ -141,13 +147,15 @@ class Calibration:
         fold = np.arange(rows) * 2 * FOLDS // rows % FOLDS
         if rows < FOLDS * 2 * len(self.robot.joints):
             return None
-        sigma = _sigma(self.recording, self.learner.report().noise if self.noise_told else None)
+        sigma_m = self.learner.report().noise if self.noise_told else None
+        told = _told(self.recording, self.learner, np.arange(rows))
         predicted = np.empty_like(self.recording.x)
         for held_out in range(FOLDS):
             kept = np.flatnonzero(fold != held_out)
             kept = kept[np.unique(np.linspace(0, len(kept) - 1, FOLD_ROWS).astype(np.intp))]
             fresh = RigidLearner(self.placed.chain, self.learner.tolerances)
-            fresh.learn(self.recording.q[kept], self.recording.x[kept], None if sigma is None else sigma[kept])
+            q, x = self.recording.q[kept], self.recording.x[kept]
+            fresh.learn(q, x, sigma_m) if told is None else fresh.learn(q, x, cov=told[kept])
             try:
                 predicted[fold == held_out] = fresh.predict(self.recording.q[fold == held_out])
             except KBMapsError:
@@ -180,25 +188,38 @@ def _learners(
     nominal: RigidChain, choices: list[ChainTolerances], recording: Recording, sigma_m: float | None
 ) -> tuple[tuple[RigidLearner, ...], FloatArray]:
     """Learners of all pairs whose tolerances make some of the pairs probable, and their shares."""
-    sigma = _sigma(recording, sigma_m)
+    told = None if recording.cov is None else recording.cov + ROUNDING_M**2 * np.eye(3)
     some = np.unique(np.linspace(0, len(recording) - 1, JUDGED_PAIRS).astype(np.intp))
 
     def learner(tolerances: ChainTolerances, rows: IntArray) -> RigidLearner:
         fresh = RigidLearner(nominal, tolerances)
-        fresh.learn(recording.q[rows], recording.x[rows], None if sigma is None else sigma[rows])
+        if told is None:
+            fresh.learn(recording.q[rows], recording.x[rows], sigma_m)
+        else:
+            fresh.learn(recording.q[rows], recording.x[rows], cov=told[rows])
         return fresh
 
+    told = _told(recording, learner(choices[-1], some), some)
     evidence = np.array([learner(tolerances, some).log_evidence for tolerances in choices])
     kept, shares = probable(evidence)
     everything = np.arange(len(recording))
     return tuple(learner(choices[k], everything) for k in kept), shares
 
 
-def _sigma(recording: Recording, sigma_m: float | None) -> FloatArray | None:
-    """Return 1-sigma of each row (n,) [m]: its own, else `sigma_m`; None where neither is told."""
-    if recording.cov is not None:
-        return np.sqrt(np.trace(recording.cov, axis1=1, axis2=2) / 3.0)
-    return None if sigma_m is None else np.full(len(recording), sigma_m)
+def _told(recording: Recording, learner: RigidLearner, rows: IntArray) -> FloatArray | None:
+    """Return covariances (n, 3, 3) [m²]: stated, plus what the arm adds in some rows; None where none are stated."""
+    if recording.cov is None:
+        return None
+    return recording.cov + (ROUNDING_M**2 + _of_the_arm(learner, recording, rows)) * np.eye(3)
+
+
+def _of_the_arm(learner: RigidLearner, recording: Recording, rows: IntArray) -> float:
+    """Variance [m²] of a coordinate in these rows that the instrument, which tells its own, has not: encoders, play."""
+    assert recording.cov is not None
+    good = rows[learner.inliers]
+    residuals = recording.x[good] - learner.predict(recording.q[good])
+    freedom = max(learner.scatter.freedom, 1.0)
+    return unexplained_variance(residuals, recording.cov[good] + ROUNDING_M**2 * np.eye(3), freedom)
 
 
 def _tolerances(robot: RobotDescription, zeros_rad: float, trusted: Trusted) -> list[ChainTolerances]:

@@ -19,10 +19,12 @@ from bodyschema.vision.calibration.calibrate import Asked, Calibrated, ModelChoi
 from bodyschema.vision.calibration.check import Check, check
 from bodyschema.vision.calibration.gather import Gathered, gathered, require_both
 from bodyschema.vision.calibration.images import ImagePair, PairFiles, pair_files, read_pairs, write_pair
+from bodyschema.vision.calibration.live import LiveViews
 from bodyschema.vision.calibration.report import page as report_page
+from bodyschema.vision.calibration.view import EYES, ONE_EYE
 from bodyschema.vision.printing.sheet import rulers_mm
 from bodyschema.vision.rectified import Rectification
-from bodyschema.vision.rig import CalibrationError, StereoRig
+from bodyschema.vision.rig import CalibrationError, OneEyeRig, StereoRig
 from bodyschema.vision.rig_file import read_rig, write_rig
 from bodyschema.vision.spread import covariance_of
 from bodyschema.vision.triangulated import triangulated
@@ -46,18 +48,22 @@ class Images:
         folder: the folder.
         left, right: patterns of the eyes' files.
         side_by_side: whether each image shows both eyes.
+        one: whether all images are of one camera alone.
     """
 
     folder: Path
     left: str | None = None
     right: str | None = None
     side_by_side: bool = False
+    one: bool = False
 
     def files(self) -> list[PairFiles]:
         """Which files belong together; CalibrationError when there are none."""
-        if (self.left is None) != (self.right is None):
+        if self.one and (self.right is not None or self.side_by_side):
+            raise ConfigError("--one is of one camera alone", remedy="Leave --right and --side-by-side away")
+        if (self.left is None) != (self.right is None) and not self.one:
             raise ConfigError("--left and --right belong together", remedy="Give both patterns, or none")
-        return pair_files(self.folder, self.left, self.right, side_by_side=self.side_by_side)
+        return pair_files(self.folder, self.left, self.right, side_by_side=self.side_by_side, one=self.one)
 
 
 class Parameter(msgspec.Struct):
@@ -94,15 +100,18 @@ class UnusableImage(msgspec.Struct):
 
 
 class CamerasFile(msgspec.Struct):
-    """What `bodyschema calibrate cameras --json` prints. Half widths are those of 95 % intervals."""
+    """What `bodyschema calibrate cameras --json` prints. Half widths are those of 95 % intervals.
+
+    One camera alone has no baseline.
+    """
 
     model: str
     image_size_px: tuple[int, int]
-    serials: tuple[str, str]
+    serials: tuple[str, ...]
     board: str
-    baseline_mm: float
-    baseline_half_width_mm: float
-    position_half_widths_mm: tuple[float, float, float]
+    baseline_mm: float | None
+    baseline_half_width_mm: float | None
+    position_half_widths_mm: tuple[float, float, float] | None
     reprojection_px: float
     held_out_px: float
     held_out_by_model_px: dict[str, float]
@@ -190,7 +199,7 @@ def from_images(images: Images, board: Board, tell: Tell) -> Gathered:
         CalibrationError: there are no pairs, sizes differ, or an eye never sees a usable board.
     """
     files = images.files()
-    tell(f"looking for the board in {len(files)} pairs of images")
+    tell(f"looking for the board in {len(files)} {'images' if images.one else 'pairs of images'}")
     found = gathered(read_pairs(files, side_by_side=images.side_by_side), board, tell)
     require_both(found)
     return found
@@ -200,7 +209,7 @@ def from_images(images: Images, board: Board, tell: Tell) -> Gathered:
 class Wanted:
     """Of a calibration, besides views and board; as `bodyschema.vision.calibration.calibrate.Asked` has it."""
 
-    serials: tuple[str, str] = ("", "")
+    serials: tuple[str, ...] = ("", "")
     model: ModelChoice = "auto"
     scale_sigma: float = 0.001
     baseline_mm: float | None = None
@@ -210,7 +219,7 @@ def calibrated(found: Gathered, wanted: Wanted, tell: Tell) -> Calibrated:
     """The calibration of views; CalibrationError with the reasons when it is not good enough."""
     asked = Asked(
         image_size_px=found.image_size_px,
-        serials=wanted.serials,
+        serials=wanted.serials[: len(found.eyes)],
         date=SystemClock().utc(),
         model=wanted.model,
         scale_sigma=wanted.scale_sigma,
@@ -219,14 +228,19 @@ def calibrated(found: Gathered, wanted: Wanted, tell: Tell) -> Calibrated:
     return calibrate(found.views, found.board, asked, tell)
 
 
-def of_cameras(wanted: Wanted) -> Callable[[Gathered, tuple[str, str], Tell], Calibrated]:
+def of_cameras(wanted: Wanted) -> Callable[[Gathered, tuple[str, ...], Tell], Calibrated]:
     """As `calibrated`, of cameras whose serials are known; those that are wanted come first."""
 
-    def of(found: Gathered, serials: tuple[str, str], tell: Tell) -> Calibrated:
-        left, right = (own or told for own, told in zip(wanted.serials, serials, strict=True))
-        return calibrated(found, replace(wanted, serials=(left, right)), tell)
+    def of(found: Gathered, serials: tuple[str, ...], tell: Tell) -> Calibrated:
+        known = tuple(own or told for own, told in zip(wanted.serials, serials, strict=False))
+        return calibrated(found, replace(wanted, serials=known), tell)
 
     return of
+
+
+def live_views(board: Board, eyes: int) -> LiveViews:
+    """Views of the board by so many eyes, of which none was taken yet."""
+    return LiveViews(board, eyes=EYES if eyes > 1 else ONE_EYE)
 
 
 def kept_in(folder: Path | None) -> Callable[[ImagePair, int], None]:
@@ -249,6 +263,7 @@ def figures(result: Calibrated, found: Gathered, *, size_was_measured: bool) -> 
         size_was_measured: whether a ruler told the board's size, or the distance of the lenses.
     """
     rig, fitted = result.rig, result.fitted
+    pair = rig if isinstance(rig, StereoRig) else None
     errors = zip(fitted.views, fitted.bundle.view_rms_px().tolist(), fitted.held_out.view_rms_px.tolist(), strict=True)
     widths = NORMAL_95 * rig.sigma
     return CamerasFile(
@@ -256,9 +271,9 @@ def figures(result: Calibrated, found: Gathered, *, size_was_measured: bool) -> 
         image_size_px=rig.image_size_px,
         serials=rig.serials,
         board=rig.made.board,
-        baseline_mm=1e3 * rig.baseline_m,
-        baseline_half_width_mm=1e3 * NORMAL_95 * rig.baseline_sigma_m,
-        position_half_widths_mm=_position_half_widths_mm(rig),
+        baseline_mm=None if pair is None else 1e3 * pair.baseline_m,
+        baseline_half_width_mm=None if pair is None else 1e3 * NORMAL_95 * pair.baseline_sigma_m,
+        position_half_widths_mm=None if pair is None else _position_half_widths_mm(pair),
         reprojection_px=rig.made.reprojection_px,
         held_out_px=rig.made.held_out_px,
         held_out_by_model_px={str(model): px for model, px in result.rivals_px.items()},
@@ -279,7 +294,7 @@ def checked(file: Path, images: Images, board: Board) -> tuple[CheckFile, str]:
         ConfigError: the file is damaged.
         CalibrationError: no pair shows the board to both eyes, or the images are of another size.
     """
-    rig = read_rig(file)
+    rig = pair_in(file)
     files = images.files()
     for pair in reversed(files):
         found = gathered(read_pairs([pair], side_by_side=images.side_by_side), board)
@@ -288,6 +303,17 @@ def checked(file: Path, images: Images, board: Board) -> tuple[CheckFile, str]:
             return check_figures(check(rig, found.views[0], board)), f"view {pair.name}"
     require_both(gathered(read_pairs(files, side_by_side=images.side_by_side), board))
     raise CalibrationError("no pair of images shows the board to both eyes. Hold it into the middle of both images")
+
+
+def pair_in(file: Path) -> StereoRig:
+    """The calibration of two cameras in a file; CalibrationError where it is of one, which no single look checks."""
+    rig = read_rig(file)
+    if isinstance(rig, OneEyeRig):
+        raise CalibrationError(
+            f"{file} is of one camera: one look at the board checks two against each other. Calibrate it again to see "
+            "whether it changed: `bodyschema calibrate cameras`"
+        )
+    return rig
 
 
 def check_figures(found: Check) -> CheckFile:

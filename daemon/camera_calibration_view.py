@@ -15,14 +15,16 @@ _WISHES = 3
 
 
 def cameras_view(found: CamerasFile) -> Group:
-    """Both eyes' parameters, then what they are good for in sentences."""
+    """The eyes' parameters, then what they are good for in sentences."""
     width, height = found.image_size_px
-    table = _table(f"{found.model} lenses, {width}x{height}", "left", "95 %", "right", "95 %")
+    eyes = ("left", "right") if found.baseline_mm is not None else ("left",)
+    titles = ("left", "95 %", "right", "95 %") if len(eyes) > 1 else ("value", "95 %")
+    table = _table(f"{found.model} {'lenses' if len(eyes) > 1 else 'lens'}, {width}x{height}", *titles)
     values = {each.name: each for each in found.parameters}
     own = [name.removeprefix("left.") for name in values if name.startswith("left.")]
     for name in own:
-        left, right = values[f"left.{name}"], values[f"right.{name}"]
-        pairs = (to_its_interval(each.value, each.half_width) for each in (left, right))
+        own_of = (values[f"{eye}.{name}"] for eye in eyes)
+        pairs = (to_its_interval(each.value, each.half_width) for each in own_of)
         table.add_row(Text(_with_unit(name)), *(text for pair in pairs for text in pair))
     return Group(table, *(Padding(Text(text), (1, 0, 0, 0), expand=False) for text in _sentences(found)))
 
@@ -48,20 +50,25 @@ def check_view(found: CheckFile, name: str) -> Group:
 
 
 def _sentences(found: CamerasFile) -> list[str]:
-    across, down, ahead = found.position_half_widths_mm
-    said = [
-        f"Baseline {found.baseline_mm:.2f} ± {found.baseline_half_width_mm:.2f} mm (95 %). A position {AHEAD_M:g} m "
-        f"ahead is known to ± {across:.2f} mm across, {down:.2f} down, {ahead:.2f} in depth, as far as the calibration "
-        "goes.",
+    said: list[str] = []
+    if found.position_half_widths_mm is not None:
+        across, down, ahead = found.position_half_widths_mm
+        said.append(
+            f"Baseline {found.baseline_mm:.2f} ± {found.baseline_half_width_mm:.2f} mm (95 %). A position "
+            f"{AHEAD_M:g} m ahead is known to ± {across:.2f} mm across, {down:.2f} down, {ahead:.2f} in depth, as far "
+            "as the calibration goes."
+        )
+    said.append(
         f"Views that were not fitted are foretold to {found.held_out_px:.3f} px (RMS per coordinate; fitted "
-        f"{found.reprojection_px:.3f}); {len(found.views)} views of {found.board}. {_rivals(found)}",
-    ]
+        f"{found.reprojection_px:.3f}); {len(found.views)} views of {found.board}. {_rivals(found)}"
+    )
     if found.left_out:
         names = "; ".join(f"{each.name} ({each.rms_px:.2f} px, others {each.usual_px:.2f})" for each in found.left_out)
         said.append(f"Left out, since they do not fit the others: {names}.")
     if found.unusable:
         said.append(f"{len(found.unusable)} images could not be used; the report names them.")
-    if not found.size_was_measured:
+    # The size of the board moves it nearer or farther, and changes nothing of a lens.
+    if not found.size_was_measured and found.baseline_mm is not None:
         said.append(
             "No image tells whether the board is as large as it says: measure the line below it and give --ruler-mm, "
             "or the distance of the lenses and give --baseline-mm."

@@ -23,7 +23,7 @@ from bodyschema.vision.cameras.opened import eyes_of
 from bodyschema.vision.cameras.serials import connected
 from bodyschema.vision.cameras.watched import PlainEyes, WatchedCamera
 from bodyschema.vision.rectified import RectifiedCamera
-from bodyschema.vision.rig import StereoRig
+from bodyschema.vision.rig import OneEyeRig, Rig
 from bodyschema.vision.rig_file import read_rig
 
 from .config import Config
@@ -89,11 +89,13 @@ def camera_of(config: Config, eyes: LiveEyes | Film) -> StereoCamera:
     return IdealCamera(eyes, config.robot.calibration)
 
 
-def _of_files(rig: StereoRig, cameras: CamerasConfig) -> StereoRig:
+def _of_files(rig: Rig, cameras: CamerasConfig) -> Rig:
     """The rig without serials, as files do not tell which cameras took them, unless it names these very files."""
     layout = cameras.layout
     names = {layout.left, layout.right} if isinstance(layout, ImagesConfig | VideosConfig) else set[str | None]()
-    return rig if names & set(rig.serials) else replace(rig, serials=("", ""))
+    if names & set(rig.serials):
+        return rig
+    return replace(rig, serials=("",)) if isinstance(rig, OneEyeRig) else replace(rig, serials=("", ""))
 
 
 def require_usable(config: Config) -> None:
@@ -183,7 +185,7 @@ def _open_checks(eyes: LiveEyes | Film, cameras: CamerasConfig) -> Iterator[Chec
             if isinstance(eyes, Film):
                 break
         width, height = eyes.image_size_px
-        said = f"{serials[0]} and {serials[1]}: {width}x{height} pixels, time known to {1e3 * sigma_s:.0f} ms"
+        said = f"{' and '.join(serials)}: {width}x{height} pixels, time known to {1e3 * sigma_s:.0f} ms"
         yield Check("cameras", "ok" if frames else "warning", said if frames else f"{said}; no pair of images came")
         if isinstance(eyes, LiveEyes):
             yield from _live_checks(eyes, cameras)
@@ -222,7 +224,7 @@ def camera_lines(config: Config) -> Iterator[str]:
             width, height = layout.image_size_px
             yield f"images of {width}x{height} pixels for each eye, {layout.fps:g} a second, as {layout.fourcc}"
         case ImagesConfig(left=left, right=right) as images:
-            yield f"images {left} and {right}, {_speed(images.speed)}"
+            yield f"images {left if right is None else f'{left} and {right}'}, {_speed(images.speed)}"
         case VideosConfig() as films:
             names = " and ".join(name for name in (films.left, films.right, films.side_by_side) if name)
             yield f"films {names}, {_speed(films.speed)}"
@@ -236,6 +238,8 @@ def _calibrated_by(name: str, file: Path) -> str:
     if not file.exists():
         return f"calibrated by {name}, which is not there yet: `bodyschema calibrate cameras`"
     rig = read_rig(file)
+    if isinstance(rig, OneEyeRig):
+        return f"calibrated by {name}: one {rig.model} lens"
     return f"calibrated by {name}: {rig.model} lenses, baseline {1e3 * rig.baseline_m:.1f} mm"
 
 

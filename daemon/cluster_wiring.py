@@ -71,6 +71,8 @@ def measured(images: Images, calibration: Path, wanted: Wanted, tell: Callable[[
         CalibrationError: images or tags are not what is needed; or the squares are not of that side.
     """
     rig, files = read_rig(calibration), images.files()
+    if len(rig.serials) < 2:
+        raise CalibrationError(f"{calibration} is of one camera, and a cluster is measured by two. Calibrate both")
     rectification = Rectification(rig)
     maps = rectification.maps(0), rectification.maps(1)
     config = TagConfig(dictionary=wanted.dictionary, side_m=wanted.side_m)
@@ -80,7 +82,7 @@ def measured(images: Images, calibration: Path, wanted: Wanted, tell: Callable[[
     twice: dict[int, list[str]] = {}
     for pair in read_pairs(files, side_by_side=images.side_by_side):
         rig.require(pair.size_px, rig.serials)
-        seen = [_seen(finder, image, maps[eye]) for eye, image in enumerate((pair.left, pair.right))]
+        seen = [_seen(finder, image, maps[eye]) for eye, image in enumerate(pair.images)]
         for id in sorted({id for tags in seen for id, tag in tags.items() if tag is Reason.AMBIGUOUS}):
             twice.setdefault(id, []).append(pair.name)
         left, right = ({id: tag for id, tag in tags.items() if isinstance(tag, TagImage)} for tags in seen)

@@ -170,6 +170,7 @@ class Config:
                 line=line_of(text, ("vision", "radius_m")),
                 remedy="Give metres",
             )
+        _require_size(robot, tables, overridden.get("vision", {}), file, text)
         return cls(file, robot, tables, simulation)
 
     def require_learnable(self) -> None:
@@ -253,6 +254,32 @@ def _check_router(tables: Tables, file: Path, text: str) -> None:
             file=file,
             line=line_of(text, ("drivers", "ros2")),
             remedy='Write in [zenoh]: sampler = "tcp/127.0.0.1:7457" and learner = "tcp/127.0.0.1:7458"',
+        )
+
+
+def _require_size(robot: RobotDescription, tables: Tables, vision: Mapping[str, Any], file: Path, text: str) -> None:
+    """ConfigError where one camera alone is to tell the depth of a marker whose size nobody said."""
+    cameras = tables.vision.cameras
+    if robot.camera.eyes == 2 and (cameras is None or cameras.eyes == 2):
+        return
+    match tables.vision.marker:
+        case "ball" | "bright_ball":
+            place, what = ("vision", "radius_m"), "the ball's radius [m]"
+            said = "radius_m" in vision
+        case "tag":
+            place, what = ("vision", "tag", "side_m"), "the side of the tag's black square [m]"
+            said = "side_m" in vision.get("tag", {})
+        case "cluster":
+            place, what = ("vision", "tag", "side_m"), "the side of the tags' black squares [m]"
+            said = "side_m" in vision.get("tag", {}) or all(tag.side_m for tag in tables.vision.cluster.tags)
+        case "plugin":
+            return
+    if not said:
+        raise ConfigError(
+            f"{'.'.join(place)} is missing: one camera alone tells the depth from the marker's size",
+            file=file,
+            line=line_of(text, place[:-1]),
+            remedy=f"Measure it with a caliper, and give {what}",
         )
 
 

@@ -89,12 +89,12 @@ def _description(config: Config) -> Iterator[Check]:
     if cameras is not None and cameras.calibration is not None:
         return
     if config.robot.calibration is None:
-        said = "[camera] describes no stereo pair: images cannot be used, recordings can"
-        yield Check(
-            "camera", "warning", said, "add focal_px, principal_point_px, baseline_m, image_size_px to [camera]"
-        )
+        said = "[camera] does not describe how the cameras see: images cannot be used, recordings can"
+        keys = "focal_px, principal_point_px, image_size_px, and baseline_m or eyes = 1"
+        yield Check("camera", "warning", said, f"add {keys} to [camera]")
     else:
-        yield Check("camera", "ok", "[camera] describes a stereo pair")
+        what = "a stereo pair" if config.robot.calibration.is_stereo else "one camera"
+        yield Check("camera", "ok", f"[camera] describes {what}")
 
 
 def _cameras(config: Config) -> Iterator[Check]:

@@ -19,9 +19,8 @@ from bodyschema.vision.calibration.guidance import Coverage
 from bodyschema.vision.calibration.images import ImagePair
 from bodyschema.vision.calibration.live import LiveViews, Look, Outcome
 from bodyschema.vision.rig import CalibrationError
-from bodyschema.vision.rig_file import read_rig
 
-from .camera_calibration import Tell
+from .camera_calibration import Tell, pair_in
 from .reopen import Reopening
 
 READ_S = 0.2
@@ -67,7 +66,7 @@ class HealthyEyes(StereoEyes, Protocol):
     def health(self) -> tuple[str, ...]: ...
 
 
-Require = Callable[[tuple[int, int], tuple[str, str]], None]
+Require = Callable[[tuple[int, int], tuple[str, ...]], None]
 
 
 class RequiredEyes:
@@ -104,9 +103,9 @@ class SameAsFirst:
     """What is required of cameras whose views belong together: that they stay those that they were."""
 
     def __init__(self) -> None:
-        self._first: tuple[tuple[int, int], tuple[str, str]] | None = None
+        self._first: tuple[tuple[int, int], tuple[str, ...]] | None = None
 
-    def __call__(self, image_size_px: tuple[int, int], serials: tuple[str, str]) -> None:
+    def __call__(self, image_size_px: tuple[int, int], serials: tuple[str, ...]) -> None:
         """SourceError where these are others than at the first call."""
         self._first = self._first or (image_size_px, serials)
         if (image_size_px, serials) != self._first:
@@ -114,7 +113,7 @@ class SameAsFirst:
             raise SourceError(f"these are {these}, the views are of {first}. Plug those in")
 
 
-def _named(image_size_px: tuple[int, int], serials: tuple[str, str]) -> str:
+def _named(image_size_px: tuple[int, int], serials: tuple[str, ...]) -> str:
     return f"{' and '.join(serials)} with {'x'.join(map(str, image_size_px))} pixels"
 
 
@@ -125,7 +124,7 @@ class LiveCalibration:
         self,
         eyes: HealthyEyes,
         views: LiveViews,
-        calibrated: Callable[[Gathered, tuple[str, str], Tell], Calibrated],
+        calibrated: Callable[[Gathered, tuple[str, ...], Tell], Calibrated],
         show: Show,
         clock: Clock,
         keep: Callable[[ImagePair, int], None] = lambda _pair, _number: None,
@@ -209,7 +208,7 @@ def checked_live(
         CalibrationError: they do not see it in time.
         SourceError: they cannot be opened, or are not the calibrated ones.
     """
-    rig, last = read_rig(calibration), ""
+    rig, last = pair_in(calibration), ""
     until = clock.now() + longest_s
     with Reopening(RequiredEyes(eyes, rig.require), "the cameras", clock) as source, suppress(SourceEnded):
         while clock.now() < until:

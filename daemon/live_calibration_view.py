@@ -13,7 +13,7 @@ from rich.text import Text
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.vision.calibration.guidance import TILTED_EACH_WAY, WANTED_VIEWS, Coverage, cell_counts
 from bodyschema.vision.calibration.live import Look, Outcome
-from bodyschema.vision.calibration.view import EYES, Eye, all_px
+from bodyschema.vision.calibration.view import Eye, all_px, image_of
 
 from .live_calibration import Show, Shown
 
@@ -37,19 +37,20 @@ def now_text(shown: Shown) -> str:
         case Outcome.KNOWN:
             return "there is a view like this one: move or tilt the board"
         case Outcome.UNSEEN:
-            return "; ".join(f"{each.eye} eye: {each.fault.text}" for each in look.unusable)
+            named = len(shown.coverage.eyes) > 1
+            return "; ".join(f"{f'{each.eye} eye: ' if named else ''}{each.fault.text}" for each in look.unusable)
 
 
 def screen(shown: Shown, heading: str) -> Group:
     """All of it, for 80 columns and 24 lines."""
     coverage = shown.coverage
-    count = f"{coverage.stereo_views} of {max(WANTED_VIEWS, coverage.stereo_views)} views, {coverage.progress:.0%}"
+    count = f"{coverage.whole_views} of {max(WANTED_VIEWS, coverage.whole_views)} views, {coverage.progress:.0%}"
     parts = Table.grid(padding=(0, 4))
-    for _ in range(4):
+    for _ in range(len(coverage.eyes) + 2):
         parts.add_column(no_wrap=True)
-    titles = (*(f"{eye} image" for eye in EYES), "tilted, edge away", "distance")
+    titles = (*(image_of(eye, coverage.eyes) for eye in coverage.eyes), "tilted, edge away", "distance")
     parts.add_row(*(Text(title, style="bold") for title in titles))
-    parts.add_row(*(_cells(coverage, shown.look, eye) for eye in EYES), _tilts(coverage), _distances(coverage))
+    parts.add_row(*(_cells(coverage, shown.look, eye) for eye in coverage.eyes), _tilts(coverage), _distances(coverage))
     texts = [
         Text(f"{heading}: {count}", style="bold"),
         Text(""),
@@ -118,7 +119,7 @@ class Lines:
             self._once(text)
         if _is_taken(shown.look) or (shown.wish != self._wish and not shown.doing):
             self._wish = shown.wish
-            said = f"{shown.coverage.stereo_views} views, {shown.coverage.progress:.0%}. Next: {shown.wish}"
+            said = f"{shown.coverage.whole_views} views, {shown.coverage.progress:.0%}. Next: {shown.wish}"
             self._say(f"{now_text(shown)}. {said}" if _is_taken(shown.look) else said)
             self._said.clear()
         elif shown.doing or (shown.look is not None and self._clock.now() >= self._next_s):

@@ -50,7 +50,7 @@ xyz = [0.0, 0.0, 0.0]
 rpy = [-1.5707963267948966, 0.0, -1.5707963267948966]
 # true once the pose was measured; false fits it first.
 pose_known = false
-# The rectified stereo pair, from its calibration; all or none.
+# The rectified stereo pair, from its calibration; all or none. One camera alone: eyes = 1, and no baseline_m.
 # focal_px = 600.0
 # principal_point_px = [319.5, 239.5]
 # baseline_m = 0.09
@@ -85,6 +85,7 @@ _CAMERAS = """\
 [vision.cameras]
 # calibration = "cameras.toml"   # as `bodyschema calibrate cameras` wrote it; without it images are rectified already
 # latency_s = 0.0                # as `bodyschema calibrate latency` says, with its latency_sigma_s
+# One camera alone is the table [vision.cameras.one] with device in the place of left and right: docs/one_camera.md.
 [vision.cameras.two]
 left = {left}
 right = {right}

@@ -44,7 +44,7 @@ def with_noise(simulation: Simulation, exact: Recording, like: Recording, rng: n
     if like.cov is not None:
         roots = np.linalg.cholesky(like.cov)
         x = exact.x + np.einsum("nij,nj->ni", roots, rng.standard_normal(exact.x.shape))
-    elif calibration is not None:
+    elif calibration is not None and calibration.is_stereo:
         x = _seen_again(calibration, exact.x, rng)
     else:
         raise ConfigError(

@@ -280,7 +280,7 @@ def _require_found(config: Config, calibration: StereoCalibration, camera: Camer
 
     tracker, reasons = tracker_of(calibration, config.tables.vision), []
     for t, images in enumerate(portraits(calibration, camera)):
-        seen = tracker.track(StereoFrame(_APART_S * t, *images))
+        seen = tracker.track(StereoFrame(_APART_S * t, images[0], images[1] if len(images) > 1 else None))
         if isinstance(seen, MarkerFix):
             return
         reasons.append(seen.reason)

@@ -117,7 +117,7 @@ def families(run: Simulated) -> list[Family]:
         found.append(Family(what, "place", None, (), False, _in_depth, _places_in_image(degree)))
         what = "an error that depends on where the marker is in the image"
         found.append(Family(what, "place", None, (), False, _anywhere, _places_in_image(degree)))
-    if robot.calibration is not None:
+    if robot.calibration is not None and robot.calibration.is_stereo:
         found.append(_turned("the eyes are turned towards each other", robot.calibration, _TOWARDS))
         found.append(_turned("the eyes are turned against each other", robot.calibration, _ANY_WAY))
     return found

@@ -53,7 +53,7 @@ class Observations:
         calibration = simulation.robot.calibration
         if recording.cov is not None:
             stated = _bounded(recording.cov)
-        elif calibration is not None:
+        elif calibration is not None and calibration.is_stereo:
             stated = _bounded(stereo_covariances(recording.x, calibration))
         else:
             stated = np.broadcast_to(_UNIT_M**2 * np.eye(3), (len(recording), 3, 3))

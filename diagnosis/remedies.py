@@ -189,6 +189,11 @@ class _Workshop:
             return (
                 f"Divide what is measured by {factor:.5f}: the instrument's scale is off, or all links of the URDF are."
             )
+        if not self.robot.calibration.is_stereo:
+            return (
+                f"Measure the marker again: its side_m (or radius_m) in robot.toml seems to be {factor:.5f} times what "
+                "it is."
+            )
         return (
             f"Calibrate the stereo pair again; or set baseline_m = {self.robot.calibration.baseline_m / factor:.6g} in "
             "robot.toml."

@@ -134,7 +134,7 @@ def default_covariances(
         sigma_m: 1-sigma per axis [m], or None.
         calibration: the stereo camera whose pixel noise decides when `sigma_m` is None.
     """
-    if sigma_m is None and calibration is not None and (recording.x[:, 2] > 0).all():
+    if sigma_m is None and calibration is not None and calibration.is_stereo and (recording.x[:, 2] > 0).all():
         return stereo_covariances(recording.x, calibration)
     sigma_m = DEFAULT_SIGMA_M if sigma_m is None else sigma_m
     return np.broadcast_to(np.eye(3) * sigma_m**2, (len(recording), 3, 3))

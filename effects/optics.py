@@ -32,11 +32,17 @@ class Optics:
         return (self.focal_error, self.k1, self.k2) != (0.0, 0.0, 0.0)
 
     def reported(self, x: FloatArray, calibration: StereoCalibration | None) -> FloatArray:
-        """What the nominal calibration triangulates (n, 3) [m] of points (n, 3) [m] in the true left optical frame."""
+        """What the nominal calibration makes (n, 3) [m] of points (n, 3) [m] in the true left optical frame.
+
+        Two eyes triangulate; one takes the depth from the marker's size, which `scale_error` is an error of then.
+        """
         if not self.inside:
             return x * (1.0 + self.scale_error)
         assert calibration is not None
         left, right = self.rays(x, calibration)
+        if not calibration.is_stereo:
+            depth = x[:, 2] * (1.0 + self.scale_error) / self._magnified(x)
+            return np.column_stack([left * depth[:, None], depth])
         depth = calibration.baseline_m / (left[:, 0] - right[:, 0])
         return np.stack([left[:, 0] * depth, 0.5 * (left[:, 1] + right[:, 1]) * depth, depth], axis=1)
 
@@ -49,6 +55,16 @@ class Optics:
         left = self._seen(x[:, 0] / x[:, 2], x[:, 1] / x[:, 2])
         right = self._seen((x[:, 0] - true_baseline) / x[:, 2], x[:, 1] / x[:, 2])
         return left, right
+
+    def _magnified(self, x: FloatArray) -> FloatArray:
+        """By how much larger small things at x (n, 3) [m] seem to one camera, which tells their depth (n,).
+
+        Distortion makes them larger by one factor along the radius and by another across it: the geometric mean.
+        """
+        r2 = np.square(x[:, :2] / x[:, 2:]).sum(axis=1)
+        across = 1.0 + r2 * (self.k1 + self.k2 * r2)
+        along = 1.0 + r2 * (3.0 * self.k1 + 5.0 * self.k2 * r2)
+        return (1.0 + self.focal_error) * np.sqrt(across * along)
 
     def _seen(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Nominal rays (n, 2) of what the true camera sees along the rays (x, y, 1)."""

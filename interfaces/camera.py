@@ -1,4 +1,4 @@
-"""A rectified stereo pair: two ideal pinholes side by side."""
+"""Ideal pinholes: a rectified stereo pair side by side, or one camera alone."""
 
 from __future__ import annotations
 
@@ -16,13 +16,15 @@ LARGEST_SIDE_PX = 16384
 class StereoCalibration:
     """A rectified stereo pair; the measurement frame is the left optical frame (x right, y down, z forward).
 
+    One camera alone is the left eye of a pair without a right one: its baseline is 0.
+
     The right eye stands at (+baseline_m, 0, 0) in the left optical frame and looks the same way, so that
     u_left = cx + f·x/z, u_right = cx + f·(x − baseline)/z and v = cy + f·y/z in both.
 
     Attributes:
         focal_px: focal length f of both eyes [px].
         principal_point_px: (cx, cy) of both eyes; integer coordinates are pixel centres.
-        baseline_m: distance of the eyes [m].
+        baseline_m: distance of the eyes [m]; 0 where there is one alone.
         image_size_px: (width, height).
         pixel_sigma: 1-sigma of a marker centre's image coordinates, per coordinate [px].
     """
@@ -32,6 +34,16 @@ class StereoCalibration:
     baseline_m: float
     image_size_px: tuple[int, int]
     pixel_sigma: float = 0.2
+
+    @property
+    def is_stereo(self) -> bool:
+        """Whether there are two eyes."""
+        return self.baseline_m > 0.0
+
+    @property
+    def eyes_m(self) -> FloatArray:
+        """Where the eyes stand in the left optical frame (eyes, 3) [m]."""
+        return np.array([[0.0, 0.0, 0.0], [self.baseline_m, 0.0, 0.0]])[: 2 if self.is_stereo else 1]
 
     def project(self, x: FloatArray) -> FloatArray:
         """Image coordinates (..., 4) as (ul, vl, ur, vr) [px] of points (..., 3) [m] in the left optical frame."""

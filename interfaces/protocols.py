@@ -56,7 +56,7 @@ class JointSource(Source, Protocol):
 
 @runtime_checkable
 class StereoEyes(Source, Protocol):
-    """Two cameras side by side, or one that has two eyes, as the images come: neither calibrated nor rectified."""
+    """Two cameras, one with two eyes, or one alone, as the images come: neither calibrated nor rectified."""
 
     @property
     def image_size_px(self) -> tuple[int, int]:
@@ -64,8 +64,8 @@ class StereoEyes(Source, Protocol):
         ...
 
     @property
-    def serials(self) -> tuple[str, str]:
-        """What tells the left and the right device from all others: serial number, path or file name."""
+    def serials(self) -> tuple[str, ...]:
+        """What tells each eye's device, the left one's first, from all others: serial number, path or file name."""
         ...
 
     def read(self, timeout_s: float) -> StereoFrame | None:
@@ -80,7 +80,7 @@ class StereoEyes(Source, Protocol):
 
 @runtime_checkable
 class StereoCamera(Source, Protocol):
-    """Two calibrated eyes on one clock with the encoders; their images are rectified."""
+    """Two calibrated eyes, or one, on one clock with the encoders; their images are rectified."""
 
     @property
     def calibration(self) -> StereoCalibration:

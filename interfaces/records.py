@@ -65,19 +65,25 @@ class JointReading:
 
 @dataclass(frozen=True, slots=True)
 class StereoFrame:
-    """Both eyes' images of one instant.
+    """Both eyes' images of one instant, or those of the only camera.
 
     Attributes:
         t: middle of the exposure on the same clock as the joint readings [s].
         left, right: images, shape (height, width, 3), uint8, BGR as OpenCV has it. Pixel (i, j) (column, row)
-            covers the square around (i, j): its centre has the image coordinates u = i, v = j.
+            covers the square around (i, j): its centre has the image coordinates u = i, v = j. `right` is None
+            where there is one camera alone, whose image is the left one.
         t_sigma: 1-sigma of `t`, and of the time that lies between the two eyes' exposures [s].
     """
 
     t: float
     left: ImageArray
-    right: ImageArray
+    right: ImageArray | None
     t_sigma: float = 0.0
+
+    @property
+    def images(self) -> tuple[ImageArray, ...]:
+        """One image for each eye, the left one first."""
+        return (self.left,) if self.right is None else (self.left, self.right)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +95,7 @@ class MarkerFix:
         x: position in the measurement frame [m], shape (3,).
         cov: its covariance [m²], shape (3, 3).
         centres_px: (ul, vl, ur, vr), where the centre is seen by the left and the right eye, or None
-            when the source measures positions directly (a laser tracker, a recording).
+            when the source measures positions directly (a laser tracker, a recording), or has one eye alone.
         t_sigma: 1-sigma of `t` [s].
         R: how the marker is turned in the measurement frame: a unit quaternion (x, y, z, w), shape (4,), or None
             where the marker looks the same from all sides.

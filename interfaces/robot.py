@@ -66,7 +66,9 @@ class CameraSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         parent_link: the link the cameras stand on or ride on.
         xyz, rpy: pose of the left optical frame in it [m], [rad], URDF convention.
         pose_known: False when the instrument stands anywhere: fitted first, and not a finding.
-        focal_px, principal_point_px, baseline_m, image_size_px: the rectified stereo pair; all or none.
+        eyes: 2 of a stereo pair, 1 of one camera alone.
+        focal_px, principal_point_px, baseline_m, image_size_px: the rectified stereo pair; all or none. One camera
+            alone has no baseline_m.
         pixel_sigma: 1-sigma of a marker centre's image coordinates [px].
     """
 
@@ -74,6 +76,7 @@ class CameraSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     xyz: Vector3 = (0.0, 0.0, 0.0)
     rpy: Vector3 = (0.0, 0.0, 0.0)
     pose_known: bool = True
+    eyes: Literal[1, 2] = 2
     focal_px: Positive | None = None
     principal_point_px: tuple[float, float] | None = None
     baseline_m: Positive | None = None
@@ -98,7 +101,7 @@ class RobotDescription:
         tree: the URDF.
         chain: measurement frame to marker over `joints`.
         lower, upper: joint limits [rad or m], shape (d,).
-        calibration: the stereo pair, or None when [camera] does not describe one.
+        calibration: the stereo pair or the one camera, or None when [camera] describes neither.
     """
 
     file: Path
@@ -233,17 +236,22 @@ def _calibration(camera: CameraSection) -> StereoCalibration | None:
     parts = {
         "focal_px": camera.focal_px,
         "principal_point_px": camera.principal_point_px,
-        "baseline_m": camera.baseline_m,
         "image_size_px": camera.image_size_px,
     }
+    if camera.eyes == 2:
+        parts["baseline_m"] = camera.baseline_m
+    elif camera.baseline_m is not None:
+        raise RobotError("one eye alone has no baseline_m", remedy="Take out baseline_m, or eyes = 1")
     missing = [name for name, value in parts.items() if value is None]
     if len(missing) == len(parts):
         return None
     if missing:
+        what = "stereo camera" if camera.eyes == 2 else "camera"
+        alone = "; a camera without a second one is eyes = 1" if missing == ["baseline_m"] else ""
         raise RobotError(
-            f"the stereo camera is described in part: {', '.join(missing)} missing", remedy="Give all or none"
+            f"the {what} is described in part: {', '.join(missing)} missing", remedy=f"Give all or none{alone}"
         )
-    return StereoCalibration(**parts, pixel_sigma=camera.pixel_sigma)  # pyright: ignore[reportArgumentType]
+    return StereoCalibration(**{"baseline_m": 0.0} | parts, pixel_sigma=camera.pixel_sigma)  # pyright: ignore[reportArgumentType]
 
 
 def _moving(tree: UrdfTree, name: str) -> UrdfJoint:

@@ -61,6 +61,7 @@ if TYPE_CHECKING:
     from kbmaps.planning.posterior import ChainPosterior, Posterior
     from kbmaps.residual.learner import ResidualLearner
     from kbmaps.residual.model import ResidualModel
+    from kbmaps.robust import unexplained_variance
     from kbmaps.rotations import nearest_rotation, quaternions, rotation_matrices, rotation_vectors
     from kbmaps.trains.core_prior import CoreFamily, CorePrior
     from kbmaps.trains.learner import TensorLearner
@@ -155,6 +156,7 @@ __all__ = [
     "rotation_vectors",
     "shared_by",
     "systematic_error",
+    "unexplained_variance",
     "with_refitted_tool",
 ]
 
@@ -213,6 +215,7 @@ _MODULES = {
     "planning.posterior": ["ChainPosterior", "Posterior"],
     "residual.learner": ["ResidualLearner"],
     "residual.model": ["ResidualModel"],
+    "robust": ["unexplained_variance"],
     "rotations": ["nearest_rotation", "quaternions", "rotation_matrices", "rotation_vectors"],
     "trains.core_prior": ["CoreFamily", "CorePrior"],
     "trains.learner": ["TensorLearner"],

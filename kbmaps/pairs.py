@@ -20,34 +20,43 @@ class Pairs:
     """Pairs q (n, d) [rad, m] and x (n, 3) [m].
 
     Attributes:
-        unit: 1-sigma (n,) of each coordinate [m] up to a common factor.
+        unit: 1-sigma (n,) of each coordinate [m] up to a common factor; the geometric mean of all directions.
         known: whether that factor is 1; otherwise it has to be estimated.
+        shape: (n, 3, 3) of determinant 1: what makes an error as large in all directions; None where it is.
     """
 
     q: FloatArray
     x: FloatArray
     unit: FloatArray
     known: bool
+    shape: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.q)
 
     def chosen(self, mask: BoolArray) -> Pairs:
         """Those of the mask (n,), in the same units."""
-        return Pairs(self.q[mask], self.x[mask], self.unit[mask], self.known)
+        shape = None if self.shape is None else self.shape[mask]
+        return Pairs(self.q[mask], self.x[mask], self.unit[mask], self.known, shape)
+
+    def whitened(self, errors: FloatArray) -> FloatArray:
+        """Errors (n, 3) or (n, 3, k) [m], as large in all directions."""
+        if self.shape is None:
+            return errors
+        return (self.shape @ errors[..., None])[..., 0] if errors.ndim == 2 else self.shape @ errors
 
 
-def with_units(q: FloatArray, x: FloatArray, sigma: FloatArray) -> Pairs:
-    """Pairs from their sigma (n,) [m], NaN where it was not told.
+def with_units(q: FloatArray, x: FloatArray, sigma: FloatArray, shape: FloatArray | None = None) -> Pairs:
+    """Pairs from their sigma (n,) [m], NaN where it was not told, and the shape of their errors, as `Pairs` has it.
 
     As soon as one was not told, the others count relative to their median, which stands for the missing ones too.
     """
     told = ~np.isnan(sigma)
     if told.all():
-        return Pairs(q, x, sigma, len(q) > 0)
+        return Pairs(q, x, sigma, len(q) > 0, shape)
     if not told.any():
-        return Pairs(q, x, np.ones(len(q)), False)
-    return Pairs(q, x, np.where(told, sigma / np.median(sigma[told]), 1.0), False)
+        return Pairs(q, x, np.ones(len(q)), False, shape)
+    return Pairs(q, x, np.where(told, sigma / np.median(sigma[told]), 1.0), False, shape)
 
 
 def stored_pairs(arrays: Mapping[str, FloatArray], joints: int) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -89,6 +98,25 @@ def checked_pairs(
     if sigmas.size and sigmas.min() <= 0.0:
         raise SettingError("every sigma must be greater than 0 m; pass None where the noise is not known")
     return angles, positions, np.broadcast_to(sigmas, (len(angles),))
+
+
+def of_covariances(covariances: ArrayLike, pairs: int) -> tuple[FloatArray, FloatArray]:
+    """Sigma (n,) [m] and shape (n, 3, 3), as `Pairs` has them, of errors with covariances (n, 3, 3), or (3, 3), [m²].
+
+    Raises:
+        ShapeError, NonFiniteError, SettingError: one is not positive definite.
+    """
+    told = numbers("cov", covariances)
+    if told.shape not in ((3, 3), (pairs, 3, 3)):
+        raise ShapeError("cov", f"(3, 3) or ({pairs}, 3, 3)", told.shape)
+    if not np.isfinite(told).all():
+        raise NonFiniteError("cov")
+    try:
+        roots = np.linalg.cholesky(np.broadcast_to(told, (pairs, 3, 3)))
+    except np.linalg.LinAlgError as error:
+        raise SettingError("every covariance must be symmetric and positive definite") from error
+    sigma = np.cbrt(np.diagonal(roots, axis1=1, axis2=2).prod(axis=1))
+    return sigma, sigma[:, None, None] * np.linalg.inv(roots)
 
 
 def runs(told: BoolArray) -> list[slice]:

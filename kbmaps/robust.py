@@ -16,6 +16,7 @@ ROUNDING_M = 1e-9
 # (chi, three dimensions).
 OUTLIER_SIGMAS = 4.8
 _ONE_SIGMA = 0.841344746
+_HALVINGS = 40
 
 
 def student(freedom: float) -> float:
@@ -36,3 +37,29 @@ def claimed_sigma(variance: FloatArray, pairs: Pairs, noise: float, freedom: flo
     if pairs.known:
         return np.sqrt(variance + (noise**2 - 1.0) * float(np.square(pairs.unit).mean()))
     return np.sqrt(variance) * student(freedom)
+
+
+def unexplained_variance(residuals: FloatArray, covariances: FloatArray, freedom: float) -> float:
+    """The most probable variance [m²], alike in all directions, that residuals have beyond what was told of them.
+
+    An instrument knows its own noise, not that of the arm's encoders and play.
+
+    Args:
+        residuals: (n, 3) [m], without outliers.
+        covariances: of the instrument's errors (n, 3, 3) [m²].
+        freedom: residual coordinates minus those that a fit has used up, above 0.
+    """
+    told, axes = np.linalg.eigh(covariances)
+    squares = np.square((axes.swapaxes(1, 2) @ residuals[..., None])[..., 0]) * (residuals.size / freedom)
+
+    def slope(variance: float) -> float:
+        """Twice the derivative of the log likelihood."""
+        return float(((squares - told - variance) / np.square(told + variance)).sum())
+
+    low, high = 0.0, float(squares.max())  # where each term is negative
+    if slope(low) <= 0.0:
+        return 0.0
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if slope(middle) > 0.0 else (low, middle)
+    return low

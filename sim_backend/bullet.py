@@ -94,6 +94,16 @@ class Body:
         states = self.bullet.getJointStates(self.id, self.joints, physicsClientId=self.client)
         return np.array([state[0] for state in states])
 
+    def stands(self, link: str) -> bool:
+        """Whether no joint moves a link."""
+        index = self.links[link]
+        while index >= 0:
+            info = self.bullet.getJointInfo(self.id, index, physicsClientId=self.client)
+            if info[2] != self.bullet.JOINT_FIXED:
+                return False
+            index = info[16]
+        return True
+
     def link_pose(self, link: str) -> FloatArray:
         """Pose (4, 4) of a link's URDF frame in the world."""
         state = self.bullet.getLinkState(

@@ -1,4 +1,4 @@
-"""One stereo frame: the robot by TinyRenderer, the marker by ray casting, the room behind, the sensor's noise."""
+"""One frame of each eye: the robot by TinyRenderer, the marker by ray casting, the room behind, the sensor's noise."""
 
 from __future__ import annotations
 
@@ -61,13 +61,13 @@ class StereoEyes:
         T_world_camera: FloatArray,
         x_eyes: FloatArray,
         R_camera_marker: FloatArray,
-        images: tuple[ImageArray, ImageArray],
+        images: tuple[ImageArray, ...],
     ) -> None:
-        """Paint frame `number` into the left and the right image (height, width, 3), BGR.
+        """Paint frame `number` into each eye's image (height, width, 3), BGR, the left one's first.
 
         Args:
             T_world_camera: pose of the left eye (4, 4).
-            x_eyes: where the marker's centre looks to be in each eye's optical frame (2, 3) [m].
+            x_eyes: where the marker's centre looks to be in each eye's optical frame (eyes, 3) [m].
             R_camera_marker: how it is turned there (3, 3).
         """
         far = background(self._room, self._directions, T_world_camera[:3, :3])
@@ -154,8 +154,8 @@ class StereoEyes:
         cv2.add(image, self._noise[field, dy : dy + height, dx : dx + width], dst=image, dtype=cv2.CV_8U)
 
 
-def portraits(calibration: StereoCalibration, config: CameraConfig) -> Iterator[tuple[ImageArray, ImageArray]]:
-    """Yield the marker alone before a plain wall in left and right images (height, width, 3), BGR, without noise.
+def portraits(calibration: StereoCalibration, config: CameraConfig) -> Iterator[tuple[ImageArray, ...]]:
+    """Yield the marker alone before a plain wall in each eye's image (height, width, 3), BGR, without noise.
 
     It is in the middle between the images, near enough to be measured well, and a tag is turned a little away.
     """
@@ -169,7 +169,7 @@ def portraits(calibration: StereoCalibration, config: CameraConfig) -> Iterator[
         x, y = middle_px * z / calibration.focal_px
         left = np.array([x + calibration.baseline_m / 2, y, z])
         turn = Rotation.from_euler("x", 180.0 - turn_deg, degrees=True) * faced
-        images = np.zeros((height, width, 3), np.uint8), np.zeros((height, width, 3), np.uint8)
-        x_eyes = np.stack([left, left - [calibration.baseline_m, 0.0, 0.0]])
+        x_eyes = left - calibration.eyes_m
+        images = tuple(np.zeros((height, width, 3), np.uint8) for _ in x_eyes)
         eyes.paint(0, np.eye(4), x_eyes, turn.as_matrix(), images)
         yield images

@@ -55,7 +55,7 @@ class RenderProcess:
         self._exit = ExitStack()
 
     def __enter__(self) -> Self:
-        size = SLOTS * frame_bytes(self._setup.image_size_px)
+        size = SLOTS * frame_bytes(self._setup)
         with ExitStack() as stack:
             memory = os.memfd_create("bodyschema_frames")
             stack.callback(os.close, memory)
@@ -97,7 +97,7 @@ class RenderProcess:
             )
         )
 
-    def fetch(self, number: int, timeout_s: float) -> tuple[ImageArray, ImageArray] | None:
+    def fetch(self, number: int, timeout_s: float) -> tuple[ImageArray, ...] | None:
         """Frame `number`, the earliest not yet fetched, as images of the caller's own; None after `timeout_s`.
 
         Raises:
@@ -107,8 +107,7 @@ class RenderProcess:
             return None
         if not os.read(self._answers, 1):
             raise self._lost()
-        left, right = slot_images(self._shared, number, self._setup.image_size_px)
-        return np.array(left), np.array(right)
+        return tuple(np.array(image) for image in slot_images(self._shared, number, self._setup))
 
     def _send(self, message: Setup | Tool | Frame) -> None:
         try:

@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import ImageArray
 
 from .config import CameraConfig
@@ -32,6 +33,16 @@ class Setup(msgspec.Struct, frozen=True, tag=True):
     camera: CameraConfig
     seed: int
 
+    @property
+    def calibration(self) -> StereoCalibration:
+        """The eyes."""
+        return StereoCalibration(self.focal_px, self.principal_point_px, self.baseline_m, self.image_size_px)
+
+    @property
+    def eyes(self) -> int:
+        """How many there are."""
+        return len(self.calibration.eyes_m)
+
 
 class Tool(msgspec.Struct, frozen=True, tag=True):
     """A stick from the marker link's origin to `tip` [m], in the marker link."""
@@ -45,7 +56,7 @@ class Frame(msgspec.Struct, frozen=True, tag=True):
     Attributes:
         angles: true joint angles [rad or m].
         T_world_camera: pose of the left eye, row by row, 16 numbers.
-        x_eyes: where the marker's centre looks to be in the left, then in the right eye's frame [m], 6 numbers.
+        x_eyes: where the marker's centre looks to be in the left, then in the right eye's frame [m], 3 numbers each.
         R_camera_marker: how it is turned there, row by row, 9 numbers.
     """
 
@@ -78,19 +89,18 @@ def receive(pipe: int) -> Message | None:
     return None if body is None else _decoder.decode(body)
 
 
-def frame_bytes(image_size_px: tuple[int, int]) -> int:
-    """Bytes of one stereo frame."""
-    width, height = image_size_px
-    return 2 * width * height * 3
+def frame_bytes(setup: Setup) -> int:
+    """Bytes of one frame, all its eyes' images."""
+    width, height = setup.image_size_px
+    return setup.eyes * width * height * 3
 
 
-def slot_images(shared: Any, number: int, image_size_px: tuple[int, int]) -> tuple[ImageArray, ImageArray]:
-    """The left and right image (height, width, 3) of frame `number` in the shared memory."""
-    width, height = image_size_px
-    size = frame_bytes(image_size_px)
+def slot_images(shared: Any, number: int, setup: Setup) -> tuple[ImageArray, ...]:
+    """The image (height, width, 3) of each eye, the left one first, of frame `number` in the shared memory."""
+    width, height = setup.image_size_px
+    size = frame_bytes(setup)
     pixels = np.frombuffer(shared, dtype=np.uint8, count=size, offset=(number % SLOTS) * size)
-    left, right = pixels.reshape(2, height, width, 3)
-    return left, right
+    return tuple(pixels.reshape(setup.eyes, height, width, 3))
 
 
 def _read(pipe: int, count: int) -> bytes | None:

@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, ImageArray
 
 from .bullet import Body
@@ -43,7 +42,8 @@ class Stick:
             bullet.removeBody(self._id, physicsClientId=client)
             self._id = -1
         length = float(np.linalg.norm(tip))
-        if length < _SHORTEST_STICK_M:
+        # What stands in the world, before a camera that the arm carries, is on no stick.
+        if length < _SHORTEST_STICK_M or self._body.stands(self._link):
             return
         shape = bullet.createVisualShape(
             bullet.GEOM_CYLINDER,
@@ -76,8 +76,8 @@ def serve(memory: int, requests: int, answers: int) -> None:
     setup = _next(requests)
     if not isinstance(setup, Setup):
         return
-    calibration = StereoCalibration(setup.focal_px, setup.principal_point_px, setup.baseline_m, setup.image_size_px)
-    with Body(setup.urdf, setup.joints) as body, mmap.mmap(memory, SLOTS * frame_bytes(setup.image_size_px)) as shared:
+    calibration = setup.calibration
+    with Body(setup.urdf, setup.joints) as body, mmap.mmap(memory, SLOTS * frame_bytes(setup)) as shared:
         raster = Raster(body.bullet, body.client, calibration, TO_LIGHT)
         eyes = StereoEyes(raster, calibration, setup.camera, setup.seed)
         stick = Stick(body, setup.marker_link)
@@ -85,14 +85,14 @@ def serve(memory: int, requests: int, answers: int) -> None:
             if isinstance(message, Tool):
                 stick.change(np.array(message.tip))
             elif isinstance(message, Frame):
-                _paint(message, body, stick, eyes, slot_images(shared, message.number, setup.image_size_px))
+                _paint(message, body, stick, eyes, slot_images(shared, message.number, setup))
                 os.write(answers, b"\0")
 
 
-def _paint(frame: Frame, body: Body, stick: Stick, eyes: StereoEyes, images: tuple[ImageArray, ImageArray]) -> None:
+def _paint(frame: Frame, body: Body, stick: Stick, eyes: StereoEyes, images: tuple[ImageArray, ...]) -> None:
     body.set_angles(np.array(frame.angles))
     stick.follow()
-    T_world_camera, x_eyes = np.array(frame.T_world_camera).reshape(4, 4), np.array(frame.x_eyes).reshape(2, 3)
+    T_world_camera, x_eyes = np.array(frame.T_world_camera).reshape(4, 4), np.array(frame.x_eyes).reshape(-1, 3)
     eyes.paint(frame.number, T_world_camera, x_eyes, np.array(frame.R_camera_marker).reshape(3, 3), images)
 
 

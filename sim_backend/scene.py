@@ -23,7 +23,7 @@ class Scene:
         T_world_camera: pose of the left eye, shape (4, 4).
         x_world: centre of the ball [m], shape (3,).
         tip: the same in the marker link, where the tool ends [m], shape (3,).
-        x_eyes: where it looks to be in the left and the right eye's optical frame [m], shape (2, 3): where it is,
+        x_eyes: where it looks to be in each eye's optical frame [m], shape (eyes, 3): where it is,
             unless the lenses differ from the calibration.
         R_camera_marker: how the marker is turned in the left eye's optical frame, shape (3, 3).
         x_seen: what an ideal tracker with the described calibration makes of it [m], shape (3,).
@@ -61,16 +61,16 @@ def scene_of(
 def _through_lenses(
     simulation: Simulation, calibration: StereoCalibration, x_camera: FloatArray, added: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Where a point (3,) [m] looks to be in each eye (2, 3), and what is triangulated of it (3,).
+    """Where a point (3,) [m] looks to be in each eye (eyes, 3), and what is triangulated of it (3,).
 
     What is `added` (3,) [m] to the triangulated position moves the images accordingly. The longer the focal length, the
     larger the image, so the nearer the point looks.
     """
     optics = simulation.optics
-    rays = np.concatenate(optics.rays(x_camera[None], calibration))
+    eyes = calibration.eyes_m
+    rays = np.concatenate(optics.rays(x_camera[None], calibration))[: len(eyes)]
     reported = optics.reported(x_camera[None], calibration)[0]
-    eyes = np.array([[0.0, 0.0, 0.0], [calibration.baseline_m, 0.0, 0.0]])
     before, after = reported - eyes, reported + added - eyes
     rays += after[:, :2] / after[:, 2:] - before[:, :2] / before[:, 2:]
-    x_eyes = np.column_stack([rays, np.ones(2)]) * (x_camera[2] / (1.0 + optics.focal_error))
+    x_eyes = np.column_stack([rays, np.ones(len(eyes))]) * (x_camera[2] / (1.0 + optics.focal_error))
     return x_eyes, reported + added

@@ -99,8 +99,7 @@ class Sight:
         T_world_camera = self._body.link_pose(self._truth.robot.camera.parent_link) @ self._truth.T_parent_camera
         x = self._chain.positions(q)
         starts, ends = [], []
-        for shift in (0.0, self._calibration.baseline_m):
-            eye = np.array([shift, 0.0, 0.0])
+        for eye in self._calibration.eyes_m:
             away = (x - eye) / np.linalg.norm(x - eye)
             across = np.cross(away, [0.0, 1.0, 0.0])
             for rim in (np.zeros(3), across, -across, np.cross(away, across), -np.cross(away, across)):

@@ -268,18 +268,18 @@ def true_chain(
 
 
 def stereo_calibration(robot: RobotDescription) -> StereoCalibration:
-    """What [camera] says of the stereo pair. ConfigError: nothing."""
+    """What [camera] says of the stereo pair, or of the one camera. ConfigError: nothing."""
     if robot.calibration is None:
         raise ConfigError(
-            "the simulation renders stereo images, but [camera] describes no stereo pair",
+            "the simulation renders images, but [camera] does not describe how the cameras see",
             file=robot.file,
-            remedy="Add focal_px, principal_point_px, baseline_m and image_size_px to [camera]",
+            remedy="Add focal_px, principal_point_px, image_size_px, and baseline_m or eyes = 1 to [camera]",
         )
     return robot.calibration
 
 
-def stereo_frame(t: float, images: tuple[ImageArray, ImageArray]) -> StereoFrame:
-    """A frame of two images (height, width, 3), BGR, which become read-only."""
+def stereo_frame(t: float, images: tuple[ImageArray, ...]) -> StereoFrame:
+    """A frame of each eye's image (height, width, 3), BGR, the left one first; they become read-only."""
     for image in images:
         image.setflags(write=False)
-    return StereoFrame(t, *images)
+    return StereoFrame(t, images[0], images[1] if len(images) > 1 else None)

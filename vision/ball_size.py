@@ -18,7 +18,7 @@ from bodyschema.interfaces.records import FloatArray, Reason
 from .triangulate import Location, triangulate
 
 # How well somebody measures a ball (1-sigma, relative), and what calibration leaves of a size at one place and another.
-_PRIOR_SIGMA, _TOLERANCE = 0.03, 0.004
+RADIUS_SIGMA, _TOLERANCE = 0.03, 0.004
 # So many fixes are remembered.
 _MEMORY = 31
 # A size that is off by no more sigmas than this says nothing.
@@ -69,14 +69,14 @@ class BallSize:
     def _known(self) -> tuple[float, float]:
         """The share and its 1-sigma."""
         if not self._shares:
-            return 1.0, _PRIOR_SIGMA
+            return 1.0, RADIUS_SIGMA
         shares, sigmas = np.array(self._shares).T
         # The median, as some of the fixes may have been pulled themselves.
         order = np.argsort(shares)
         weights = sigmas[order] ** -2
         median = shares[order][np.searchsorted(np.cumsum(weights), 0.5 * weights.sum())]
-        sum_of_weights = _PRIOR_SIGMA**-2 + weights.sum()
-        return float(_PRIOR_SIGMA**-2 + weights.sum() * median) / sum_of_weights, sum_of_weights**-0.5
+        sum_of_weights = RADIUS_SIGMA**-2 + weights.sum()
+        return float(RADIUS_SIGMA**-2 + weights.sum() * median) / sum_of_weights, sum_of_weights**-0.5
 
 
 def _variances(found: Location) -> FloatArray:

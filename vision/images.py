@@ -14,10 +14,16 @@ from bodyschema.interfaces.records import ImageArray, StereoFrame
 def check_images(frame: StereoFrame, calibration: StereoCalibration) -> None:
     """SourceError: the images are not uint8 BGR of the calibration's size."""
     width, height = calibration.image_size_px
-    for eye, image in (("left", frame.left), ("right", frame.right)):
+    if len(frame.images) != len(calibration.eyes_m):
+        raise SourceError(
+            f"frames with {len(frame.images)} images for each instant, but the calibration is of "
+            f"{len(calibration.eyes_m)}. Mend [camera] eyes, or [vision.cameras]"
+        )
+    names = ("left image", "right image") if calibration.is_stereo else ("image",)
+    for name, image in zip(names, frame.images, strict=True):
         if image.shape != (height, width, 3) or image.dtype != np.uint8:
             raise SourceError(
-                f"the {eye} image is {_described(image)}; the calibration is for {width}x{height} pixels of three "
+                f"the {name} is {_described(image)}; the calibration is for {width}x{height} pixels of three "
                 "colours (uint8, BGR). Set the camera to that size, or mend [camera] image_size_px"
             )
 
@@ -29,11 +35,12 @@ def _described(image: ImageArray) -> str:
 
 
 def check_calibration(calibration: StereoCalibration) -> None:
-    """ConfigError: the calibration describes no stereo pair."""
+    """ConfigError: the calibration describes no stereo pair, nor one camera."""
     width, height = calibration.image_size_px
-    for name, value in (("focal_px", calibration.focal_px), ("baseline_m", calibration.baseline_m)):
-        if not (math.isfinite(value) and value > 0):
-            raise ConfigError(f"[camera] {name} is {value}", remedy="It has to be a number above 0")
+    if not (math.isfinite(calibration.focal_px) and calibration.focal_px > 0):
+        raise ConfigError(f"[camera] focal_px is {calibration.focal_px}", remedy="It has to be a number above 0")
+    if not (math.isfinite(calibration.baseline_m) and calibration.baseline_m >= 0):
+        raise ConfigError(f"[camera] baseline_m is {calibration.baseline_m}", remedy="It has to be 0 or more")
     if not (math.isfinite(calibration.pixel_sigma) and calibration.pixel_sigma >= 0):
         raise ConfigError(f"[camera] pixel_sigma is {calibration.pixel_sigma}", remedy="It has to be 0 or more")
     if not all(math.isfinite(value) for value in calibration.principal_point_px):

@@ -1,4 +1,4 @@
-"""The most likely pose of a rigid body whose points two eyes see."""
+"""The most likely pose of a rigid body whose points one eye or two see."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two cameras as the two ideal pinholes side by side that everything else works with."""
+"""Two cameras as the two ideal pinholes side by side that everything else works with, or one as one."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bodyschema.interfaces.protocols import StereoEyes
 from bodyschema.interfaces.records import FloatArray, ImageArray, StereoFrame
 
 from .lens import Lens
-from .rig import CalibrationError, StereoRig
+from .rig import CalibrationError, OneEyeRig, Rig
 
 _BORDER_POINTS = 64
 # Of directions that a rectified image may show, the largest x/z and y/z: beyond, a fisheye's image is stretched out.
@@ -30,17 +30,19 @@ class Rectification:
 
     The rectified left frame has the left eye's optical centre as its origin; it is the left camera's own frame turned
     by `R_rectified_left`: its x axis points to the right eye, and its z axis is as near as that allows to the mean of
-    where both cameras look. Nothing is moved and no length changes.
+    where both cameras look. Nothing is moved and no length changes. The frame of one camera alone is its own.
 
     Attributes:
         rig: the calibration.
     """
 
-    rig: StereoRig
+    rig: Rig
 
     @cached_property
     def R_rectified_left(self) -> FloatArray:
         """Turns directions of the left camera's own frame into the rectified one's, shape (3, 3)."""
+        if isinstance(self.rig, OneEyeRig):
+            return np.eye(3)
         R, t = self.rig.R_right_left, self.rig.translation_m
         x = -R.T @ t / np.linalg.norm(t)
         ahead = np.array([0.0, 0.0, 1.0]) + R.T @ np.array([0.0, 0.0, 1.0])
@@ -49,18 +51,16 @@ class Rectification:
         return np.stack([x, y, np.cross(x, y)])
 
     @property
-    def R_rectified_right(self) -> FloatArray:
-        """The same for the right camera's own frame."""
-        return self.R_rectified_left @ self.rig.R_right_left.T
-
-    @property
-    def eyes(self) -> tuple[tuple[Lens, FloatArray], tuple[Lens, FloatArray]]:
-        """Lens and rotation of the left and of the right eye."""
-        return (self.rig.left, self.R_rectified_left), (self.rig.right, self.R_rectified_right)
+    def eyes(self) -> tuple[tuple[Lens, FloatArray], ...]:
+        """Lens and rotation of each eye, the left one first."""
+        left = self.rig.left, self.R_rectified_left
+        if isinstance(self.rig, OneEyeRig):
+            return (left,)
+        return left, (self.rig.right, self.R_rectified_left @ self.rig.R_right_left.T)
 
     @cached_property
     def calibration(self) -> StereoCalibration:
-        """The two pinholes: the largest view of which both eyes fill every pixel.
+        """The pinholes: the largest view of which all eyes fill every pixel.
 
         Its `pixel_sigma` is the error of views that were not calibrated with, at the rectified focal length.
 
@@ -73,11 +73,11 @@ class Rectification:
             raise CalibrationError("the cameras do not look the same way: both see almost nothing. Turn them parallel")
         focal = float(max((width - 1) / (high[0] - low[0]), (height - 1) / (high[1] - low[1])))
         centre = 0.5 * np.array([width - 1, height - 1]) - 0.5 * focal * (low + high)
-        own = float(np.mean([*self.rig.left.focal_px, *self.rig.right.focal_px]))
+        own = float(np.mean([lens.focal_px for lens, _ in self.eyes]))
         return StereoCalibration(
             focal_px=focal,
             principal_point_px=(float(centre[0]), float(centre[1])),
-            baseline_m=self.rig.baseline_m,
+            baseline_m=0.0 if isinstance(self.rig, OneEyeRig) else self.rig.baseline_m,
             image_size_px=self.rig.image_size_px,
             pixel_sigma=self.rig.made.held_out_px * focal / own,
         )
@@ -105,7 +105,7 @@ class Rectification:
         return cv2.convertMaps(x, y, cv2.CV_16SC2)  # pyright: ignore
 
     def _common_view(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper limits (x/z, y/z) of the largest upright rectangle that both eyes' images fill."""
+        """Lower and upper limits (x/z, y/z) of the largest upright rectangle that all eyes' images fill."""
         views = [_filled(lens, R, self.rig.image_size_px) for lens, R in self.eyes]
         low = np.max([view[0] for view in views], axis=0)
         return low, np.min([view[1] for view in views], axis=0)
@@ -131,9 +131,9 @@ def _turned(directions: FloatArray, R: FloatArray) -> FloatArray:
 
 
 class RectifiedCamera:
-    """The rectified images of two calibrated cameras: a `StereoCamera`."""
+    """The rectified images of calibrated cameras: a `StereoCamera`."""
 
-    def __init__(self, eyes: StereoEyes, rig: StereoRig) -> None:
+    def __init__(self, eyes: StereoEyes, rig: Rig) -> None:
         """Compute the maps. Whether these are the cameras that were calibrated is seen when they are opened.
 
         Raises:
@@ -142,12 +142,12 @@ class RectifiedCamera:
         self._eyes, self._rig = eyes, rig
         rectification = Rectification(rig)
         self._calibration = rectification.calibration
-        self._maps = rectification.maps(0), rectification.maps(1)
+        self._maps = [rectification.maps(eye) for eye in range(len(rectification.eyes))]
         self._open = False
 
     @property
     def calibration(self) -> StereoCalibration:
-        """The two pinholes that the images are those of."""
+        """The pinholes that the images are those of."""
         return self._calibration
 
     def __enter__(self) -> Self:
@@ -176,8 +176,8 @@ class RectifiedCamera:
         frame = self._eyes.read(timeout_s)
         if frame is None:
             return None
-        left, right = (self._rectified(image, eye) for eye, image in enumerate((frame.left, frame.right)))
-        return StereoFrame(frame.t, left, right, frame.t_sigma)
+        images = [self._rectified(image, eye) for eye, image in enumerate(frame.images)]
+        return StereoFrame(frame.t, images[0], images[1] if len(images) > 1 else None, frame.t_sigma)
 
     def _rectified(self, image: ImageArray, eye: int) -> ImageArray:
         if image.shape[1::-1] != self._rig.image_size_px:

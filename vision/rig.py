@@ -1,4 +1,4 @@
-"""What a calibration tells of two cameras."""
+"""What a calibration tells of two cameras, or of one alone."""
 
 from __future__ import annotations
 
@@ -119,13 +119,13 @@ class StereoRig:
             left, right, rotation, translation, self.image_size_px, self.serials, self.covariance, self.made
         )
 
-    def require(self, image_size_px: tuple[int, int], serials: tuple[str, str]) -> None:
+    def require(self, image_size_px: tuple[int, int], serials: tuple[str, ...]) -> None:
         """OtherCameras when these cameras are not the calibrated ones. A serial that is not known fits all."""
-        if image_size_px != self.image_size_px:
-            is_, was = ("x".join(map(str, size)) for size in (image_size_px, self.image_size_px))
+        _require_size(image_size_px, self.image_size_px)
+        if len(serials) != len(self.serials):
             raise OtherCameras(
-                f"the cameras give images of {is_}, they were calibrated with {was}. Set that size, or calibrate "
-                "again: `bodyschema calibrate cameras`"
+                "this is the calibration of two cameras, but one looks alone. Name both in [vision.cameras], or "
+                "calibrate the one: `bodyschema calibrate cameras`"
             )
         if all(self.serials) and serials == self.serials[::-1] and serials != self.serials:
             raise OtherCameras(
@@ -140,10 +140,88 @@ class StereoRig:
                 )
 
 
+@dataclass(frozen=True, eq=False)
+class OneEyeRig:
+    """One camera alone: its lens, and how sure that is.
+
+    Attributes:
+        left: the lens, as that of a pair's left eye.
+        image_size_px: width and height of its images.
+        serials: what tells the device from all others; "" where it was not known.
+        covariance: of `vector`, shape (p, p).
+        made: how it was made.
+    """
+
+    left: Lens
+    image_size_px: tuple[int, int]
+    serials: tuple[str]
+    covariance: FloatArray
+    made: Made
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "covariance", frozen_array(self.covariance))
+
+    @property
+    def model(self) -> Model:
+        """The lens's model."""
+        return self.left.model
+
+    @property
+    def vector(self) -> FloatArray:
+        """All parameters: those of the lens."""
+        return self.left.vector
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters in `vector`."""
+        return tuple(f"left.{name}" for name in _lens_names(self.model))
+
+    @property
+    def sigma(self) -> FloatArray:
+        """1-sigma of `vector`."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def require(self, image_size_px: tuple[int, int], serials: tuple[str, ...]) -> None:
+        """OtherCameras when this camera is not the calibrated one. A serial that is not known fits all."""
+        _require_size(image_size_px, self.image_size_px)
+        if len(serials) != 1:
+            raise OtherCameras(
+                "this is the calibration of one camera, but two look. Name one in [vision.cameras.one], or calibrate "
+                "both: `bodyschema calibrate cameras`"
+            )
+        if self.serials[0] and serials[0] and serials != self.serials:
+            raise OtherCameras(
+                f"the camera is {serials[0]}, calibrated was {self.serials[0]}. Name its own file, or calibrate: "
+                "`bodyschema calibrate cameras`"
+            )
+
+
+Rig = StereoRig | OneEyeRig
+
+
+def _require_size(image_size_px: tuple[int, int], calibrated_px: tuple[int, int]) -> None:
+    """OtherCameras when the images are of another size than those that were calibrated with."""
+    if image_size_px != calibrated_px:
+        is_, was = ("x".join(map(str, size)) for size in (image_size_px, calibrated_px))
+        raise OtherCameras(
+            f"the cameras give images of {is_}, they were calibrated with {was}. Set that size, or calibrate "
+            "again: `bodyschema calibrate cameras`"
+        )
+
+
+def _lens_names(model: Model) -> tuple[str, ...]:
+    return ("fx_px", "fy_px", "cx_px", "cy_px", *DISTORTION_NAMES[model])
+
+
 def parameter_names(model: Model) -> tuple[str, ...]:
-    """Names of the parameters of a rig whose lenses are of this model."""
-    lens = ("fx_px", "fy_px", "cx_px", "cy_px", *DISTORTION_NAMES[model])
+    """Names of the parameters of a rig of two eyes whose lenses are of this model."""
+    lens = _lens_names(model)
     return (*(f"left.{name}" for name in lens), *(f"right.{name}" for name in lens), *_POSE_NAMES)
+
+
+def lens_of_one(model: Model, vector: FloatArray) -> Lens | None:
+    """The lens, where a vector is of all parameters of one camera alone."""
+    return Lens.from_vector(model, vector) if len(vector) == len(_lens_names(model)) else None
 
 
 def split(model: Model, vector: FloatArray) -> tuple[Lens, Lens, FloatArray, FloatArray]:

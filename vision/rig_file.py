@@ -17,9 +17,9 @@ from bodyschema.interfaces.toml_file import convert, line_of, read_toml
 from bodyschema.interfaces.toml_text import toml_text
 
 from .lens import DISTORTION_NAMES, Lens, Model
-from .rig import Made, StereoRig, parameter_names
+from .rig import Made, OneEyeRig, Rig, StereoRig, parameter_names
 
-FORMAT = "bodyschema stereo rig 1"
+FORMAT, FORMAT_OF_ONE = "bodyschema stereo rig 1", "bodyschema camera 1"
 _AGAIN = "Take the file from a copy, or calibrate again: `bodyschema calibrate cameras`"
 _SYMMETRY = 1e-6
 
@@ -69,25 +69,34 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     uncertainty: _Uncertainty
 
 
-def read_rig(file: Path) -> StereoRig:
-    """The calibration in `file`.
+class _FileOfOne(msgspec.Struct, forbid_unknown_fields=True):
+    format: str
+    model: Model
+    image_size_px: tuple[Pixels, Pixels]
+    camera: _Eye
+    made: _Made
+    uncertainty: _Uncertainty
+
+
+def read_rig(file: Path) -> Rig:
+    """The calibration in `file`, of two cameras or of one.
 
     Raises:
         ConfigError: it cannot be read, is damaged or is another kind of file; names the line.
     """
     tables, text = read_toml(file, written_by="`bodyschema calibrate cameras` writes one", damaged=_AGAIN)
     form = tables.get("format")
-    if form != FORMAT:
+    if form not in (FORMAT, FORMAT_OF_ONE):
         what = f"of another format: {form!r}" if form is not None else "no camera calibration"
         raise ConfigError(f"{what}, not {FORMAT!r}", file=file, line=line_of(text, ("format",)), remedy=_AGAIN)
     try:
-        found = convert(tables, _File, file=file, text=text)
+        found = convert(tables, _File if form == FORMAT else _FileOfOne, file=file, text=text)
     except ConfigError as error:
         raise ConfigError(error.what, file=file, line=error.line, remedy=error.remedy or _AGAIN) from error
     return _checked(found, file, text)
 
 
-def write_rig(rig: StereoRig, file: Path) -> None:
+def write_rig(rig: Rig, file: Path) -> None:
     """Write the calibration; what stood there is replaced at once, or not at all.
 
     Raises:
@@ -108,19 +117,24 @@ def write_rig(rig: StereoRig, file: Path) -> None:
         raise ConfigError(f"cannot be written: {error.strerror}", file=file, remedy="Mend folder or disk") from error
 
 
-def _text(rig: StereoRig) -> str:
+def _text(rig: Rig) -> str:
     sigma = rig.sigma
     correlation = rig.covariance / np.outer(sigma, sigma)
+    eyes: dict[str, object] = {"camera": _eye_table(rig.left, rig.serials[0])}
+    if isinstance(rig, StereoRig):
+        eyes = {
+            "left": _eye_table(rig.left, rig.serials[0]),
+            "right": _eye_table(rig.right, rig.serials[1]),
+            "right_from_left": {
+                "rotation_rad": rig.rotation_rad.tolist(),
+                "translation_m": rig.translation_m.tolist(),
+            },
+        }
     tables = {
-        "format": FORMAT,
+        "format": FORMAT if isinstance(rig, StereoRig) else FORMAT_OF_ONE,
         "model": rig.model,
         "image_size_px": rig.image_size_px,
-        "left": _eye_table(rig.left, rig.serials[0]),
-        "right": _eye_table(rig.right, rig.serials[1]),
-        "right_from_left": {
-            "rotation_rad": rig.rotation_rad.tolist(),
-            "translation_m": rig.translation_m.tolist(),
-        },
+        **eyes,
         "made": {name: getattr(rig.made, name) for name in Made.__dataclass_fields__},
         "uncertainty": {
             "names": rig.names,
@@ -140,21 +154,24 @@ def _eye_table(lens: Lens, serial: str) -> dict[str, object]:
     }
 
 
-def _checked(found: _File, file: Path, text: str) -> StereoRig:
+def _checked(found: _File | _FileOfOne, file: Path, text: str) -> Rig:
     def wrong(what: str, *keys: str) -> ConfigError:
         return ConfigError(f"{'.'.join(keys)}: {what}", file=file, line=line_of(text, keys), remedy=_AGAIN)
 
-    for name, eye in (("left", found.left), ("right", found.right)):
+    eyes = {"camera": found.camera} if isinstance(found, _FileOfOne) else {"left": found.left, "right": found.right}
+    for name, eye in eyes.items():
         wanted = len(DISTORTION_NAMES[found.model])
         if len(eye.distortion) != wanted:
             raise wrong(f"{len(eye.distortion)} coefficients, {found.model} has {wanted}", name, "distortion")
         for at, size in zip(eye.principal_point_px, found.image_size_px, strict=True):
             if not 0 <= at <= size:
                 raise wrong(f"{at:g} is outside an image of {found.image_size_px}", name, "principal_point_px")
-    if not float(np.linalg.norm(found.right_from_left.translation_m)) >= 1e-3:
+    if isinstance(found, _File) and not float(np.linalg.norm(found.right_from_left.translation_m)) >= 1e-3:
         raise wrong("the eyes are in one place", "right_from_left", "translation_m")
     uncertainty = found.uncertainty
     names = parameter_names(found.model)
+    if isinstance(found, _FileOfOne):
+        names = tuple(name for name in names if name.startswith("left."))
     if uncertainty.names != names:
         raise wrong(f"not the parameters of a {found.model} rig", "uncertainty", "names")
     if len(uncertainty.sigma) != len(names):
@@ -163,7 +180,11 @@ def _checked(found: _File, file: Path, text: str) -> StereoRig:
         covariance = _covariance(uncertainty)
     except ValueError as error:
         raise wrong(str(error), "uncertainty", "correlation") from error
-    left, right = (Lens(found.model, e.focal_px, e.principal_point_px, e.distortion) for e in (found.left, found.right))
+    lenses = [Lens(found.model, e.focal_px, e.principal_point_px, e.distortion) for e in eyes.values()]
+    made = Made(**msgspec.structs.asdict(found.made))
+    if isinstance(found, _FileOfOne):
+        return OneEyeRig(lenses[0], found.image_size_px, (found.camera.serial,), covariance, made)
+    left, right = lenses
     return StereoRig(
         left,
         right,
@@ -172,7 +193,7 @@ def _checked(found: _File, file: Path, text: str) -> StereoRig:
         found.image_size_px,
         (found.left.serial, found.right.serial),
         covariance,
-        Made(**msgspec.structs.asdict(found.made)),
+        made,
     )
 
 

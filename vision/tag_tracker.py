@@ -1,4 +1,4 @@
-"""Follows a tag, or a rigid cluster of tags, through rectified stereo images: position and orientation."""
+"""Follows a tag, or a rigid cluster of tags, through rectified images of one eye or two: position and orientation."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from bodyschema.interfaces.records import (
 )
 
 from .images import check_calibration, check_images
+from .one_eye import first_pose
 from .pose import Pose, PoseEstimator, Sighting, fitted_motion, mirrored
 from .tag_body import TagBody
 from .tag_config import TagConfig
@@ -38,22 +39,28 @@ _REGION_SHARE, _REGION_PX = 0.6, 30
 _LONGEST_PAUSE_S = 0.5
 # Two poses this much apart [rad] are two; the worse one has to be so much less likely (difference of squares).
 _TWO_POSES_RAD, _CLEARLY_WORSE = 0.05, 12.0
+# Of two poses that the image does not tell apart, the one that the marker is known to have been in: no farther from
+# the last frame's than this part of the way between the two.
+_STAYED = 1.0 / 3.0
 # The most telling reason, where all tags were refused.
 _TELLING = (Reason.AMBIGUOUS, Reason.EPIPOLAR, Reason.OCCLUDED, Reason.AT_BORDER, Reason.NO_MARKER)
 
 
 class TagTracker:
-    """Finds one marker made of tags in rectified stereo images.
+    """Finds one marker made of tags in rectified images of one eye or two.
 
     Near where the last frame had it, else in the whole images. Whatever the images show, `track` answers with a fix or
     a reason.
+
+    A small plane looks nearly the same tilted one way and the other. Two eyes hardly ever leave that open, one does:
+    where the image does not tell, the pose of the frame before does, if that was told; else the frame is ambiguous.
     """
 
     def __init__(self, calibration: StereoCalibration, body: TagBody, config: TagConfig | None = None) -> None:
         """Prepare for images of `calibration`.
 
         Raises:
-            ConfigError: that describes no stereo pair, or a tag's number is not in the dictionary.
+            ConfigError: that describes no cameras, or a tag's number is not in the dictionary.
         """
         check_calibration(calibration)
         self.calibration, self.body, self.config = calibration, body, config or TagConfig()
@@ -61,7 +68,7 @@ class TagTracker:
             require_tag(self.config.dictionary, id)
         self._finder = TagFinder(self.config, body.corners)
         self._whole = (0, 0, *calibration.image_size_px)
-        self._last: tuple[float, list[FloatArray]] | None = None
+        self._last: tuple[float, list[FloatArray], FloatArray] | None = None
 
     def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
         """The marker in `frame`, in the left optical frame, or why there is none.
@@ -70,13 +77,13 @@ class TagTracker:
             SourceError: the images are not uint8 BGR of the calibration's size.
         """
         check_images(frame, self.calibration)
-        greys = [np.asarray(cv2.cvtColor(eye, cv2.COLOR_BGR2GRAY), np.uint8) for eye in (frame.left, frame.right)]
+        greys = [np.asarray(cv2.cvtColor(eye, cv2.COLOR_BGR2GRAY), np.uint8) for eye in frame.images]
         found: Pose | Reason = Reason.NO_MARKER
         regions = self._predicted(frame.t)
         if regions is not None:
             found = self._look(frame.t, greys, regions)
         if not isinstance(found, Pose):
-            found = self._look(frame.t, greys, [self._whole, self._whole])
+            found = self._look(frame.t, greys, [self._whole] * len(greys))
         if isinstance(found, Reason):
             if self._last is not None:
                 _log.debug("marker lost at %.3f s: %s", frame.t, found)
@@ -90,28 +97,37 @@ class TagTracker:
 
     def _fix(self, t: float, pose: Pose) -> MarkerFix:
         ul, vl, ur, vr = self.calibration.project(pose.x).tolist()
+        centres = (ul, vl, ur, vr) if self.calibration.is_stereo else None
         turn = Rotation.from_matrix(pose.rotation).as_quat(canonical=True)
         cov, cov_R = frozen_array(pose.cov[3:, 3:]), frozen_array(pose.cov[:3, :3])
-        return MarkerFix(t, frozen_array(pose.x), cov, (ul, vl, ur, vr), R=frozen_array(turn), cov_R=cov_R)
+        return MarkerFix(t, frozen_array(pose.x), cov, centres, R=frozen_array(turn), cov_R=cov_R)
 
     def _look(
         self, t: float, greys: Sequence[ImageArray], regions: Sequence[tuple[int, int, int, int]]
     ) -> Pose | Reason:
-        left, right = (self._finder.find(grey, region) for grey, region in zip(greys, regions, strict=True))
-        seen = [{id: tag for id, tag in eye.items() if isinstance(tag, TagImage)} for eye in (left, right)]
-        if not seen[0] or not seen[1]:
-            return _why(eye for eye, tags in zip((left, right), seen, strict=True) if not tags)
-        both = sorted(seen[0].keys() & seen[1].keys())
+        found = [self._finder.find(grey, region) for grey, region in zip(greys, regions, strict=True)]
+        seen = [{id: tag for id, tag in eye.items() if isinstance(tag, TagImage)} for eye in found]
+        if not all(seen):
+            return _why(eye for eye, tags in zip(found, seen, strict=True) if not tags)
+        if len(seen) > 1:
+            seen = self._agreeing(*seen)
+            if isinstance(seen, Reason):
+                return seen
+        pose = self._pose(t, seen)
+        if isinstance(pose, Pose):
+            corners = [np.concatenate([tag.corners_px for tag in eye.values()]) for eye in seen]
+            self._last = t, corners, pose.rotation
+        return pose
+
+    def _agreeing(self, left: dict[int, TagImage], right: dict[int, TagImage]) -> list[dict[int, TagImage]] | Reason:
+        """What both eyes see without the tags whose rows differ."""
+        both = sorted(left.keys() & right.keys())
         if not both:
             return Reason.OCCLUDED
-        apart = {id for id in both if not self._rows_agree(seen[0][id], seen[1][id])}
+        apart = {id for id in both if not self._rows_agree(left[id], right[id])}
         if apart.issuperset(both):
             return Reason.EPIPOLAR
-        seen = [{id: tag for id, tag in eye.items() if id not in apart} for eye in seen]
-        found = self._pose(seen)
-        if isinstance(found, Pose):
-            self._last = t, [np.concatenate([tag.corners_px for tag in eye.values()]) for eye in seen]
-        return found
+        return [{id: tag for id, tag in eye.items() if id not in apart} for eye in (left, right)]
 
     def _rows_agree(self, left: TagImage, right: TagImage) -> bool:
         """Whether the rows of a tag's corners differ by no more than noise, and its disparity is positive."""
@@ -122,20 +138,20 @@ class TagTracker:
         allowed = self.config.epipolar_px + self.config.epipolar_sigmas * sigma
         return abs(float(apart[:, 1].mean())) <= allowed and bool((apart[:, 0] > 0.0).all())
 
-    def _pose(self, seen: list[dict[int, TagImage]]) -> Pose | Reason:
+    def _pose(self, t: float, seen: list[dict[int, TagImage]]) -> Pose | Reason:
         """The one likely pose; a tag that contradicts the others is left out once."""
-        found = self._likely(seen)
-        if isinstance(found, Pose) or found is not Reason.REPROJECTION or len(seen[0].keys() | seen[1].keys()) < 3:
+        found = self._likely(t, seen)
+        if isinstance(found, Pose) or found is not Reason.REPROJECTION or len(_ids(seen)) < 3:
             return found
         outcomes = []
-        for id in sorted(seen[0].keys() | seen[1].keys()):
+        for id in sorted(_ids(seen)):
             others = [{key: tag for key, tag in eye.items() if key != id} for eye in seen]
-            if others[0].keys() & others[1].keys():
-                outcomes.append(self._likely(others))
+            if others[0].keys() & others[-1].keys():
+                outcomes.append(self._likely(t, others))
         poses = [outcome for outcome in outcomes if isinstance(outcome, Pose)]
         return min(poses, key=lambda pose: pose.squares) if poses else found
 
-    def _likely(self, seen: list[dict[int, TagImage]]) -> Pose | Reason:
+    def _likely(self, t: float, seen: list[dict[int, TagImage]]) -> Pose | Reason:
         sightings = [
             Sighting(self.body.corners[id], tag.corners_px, tag.cov_px, right=bool(eye))
             for eye, tags in enumerate(seen)
@@ -144,17 +160,21 @@ class TagTracker:
         estimator = PoseEstimator(self.calibration, sightings)
         poses = self._minima(estimator, seen)
         if not poses:
-            return Reason.EPIPOLAR
+            return Reason.EPIPOLAR if self.calibration.is_stereo else Reason.REPROJECTION
         best = poses[0]
-        grown, sigma = estimator.scale(best)
-        if abs(grown) > self.config.size_tolerance + 4.0 * sigma:
-            return Reason.SIZE_MISMATCH
+        if self.calibration.is_stereo:
+            grown, sigma = estimator.scale(best)
+            if abs(grown) > self.config.size_tolerance + 4.0 * sigma:
+                return Reason.SIZE_MISMATCH
         freedom = 8 * len(sightings) - 6
         misfit = best.squares / freedom
         if misfit > self.config.max_reprojection**2:
             return Reason.REPROJECTION
         if len(poses) > 1 and (poses[1].squares - best.squares) / max(misfit, 1.0) < _CLEARLY_WORSE:
-            return Reason.AMBIGUOUS
+            stayed = self._stayed(t, poses[:2])
+            if stayed is None:
+                return Reason.AMBIGUOUS
+            best = stayed
         # What the claimed noise does not explain, nor chance (1-sigma), is taken for more noise.
         unexplained = max(misfit - math.sqrt(2.0 / freedom), 1.0)
         return Pose(best.rotation, best.x, best.cov * unexplained, best.squares, best.by_sighting)
@@ -169,8 +189,20 @@ class TagTracker:
                     poses.append(pose)
         return sorted(poses, key=lambda pose: pose.squares)
 
+    def _stayed(self, t: float, poses: Sequence[Pose]) -> Pose | None:
+        """Of two poses the one that the marker is in if it has not turned over since the last frame."""
+        if self._last is None or not 0 < t - self._last[0] <= _LONGEST_PAUSE_S:
+            return None
+        turned = [float(Rotation.from_matrix(self._last[2].T @ pose.rotation).magnitude()) for pose in poses]
+        nearest = int(np.argmin(turned))
+        return poses[nearest] if turned[nearest] < _STAYED * _apart(poses[0], poses[1]) else None
+
     def _starts(self, seen: list[dict[int, TagImage]]) -> list[tuple[FloatArray, FloatArray]]:
-        """A first pose from all corners that both eyes see."""
+        """A first pose from all corners that all eyes see."""
+        if not self.calibration.is_stereo:
+            ids = list(seen[0])
+            corners = np.concatenate([self.body.corners[id] for id in ids])
+            return first_pose(self.calibration, corners, np.concatenate([seen[0][id].corners_px for id in ids]))
         body, points = [], []
         for id in sorted(seen[0].keys() & seen[1].keys()):
             pixels = np.hstack([seen[0][id].corners_px, seen[1][id].corners_px])
@@ -182,15 +214,11 @@ class TagTracker:
         return [fitted_motion(np.array(body), np.array(points))] if len(points) >= 3 else []
 
     def _mirrored(self, rotation: FloatArray, x: FloatArray, seen: list[dict[int, TagImage]]) -> FloatArray:
-        """The rotation that looks nearly the same, where one plane is seen; of a body with depth there is none."""
-        ids = seen[0].keys() | seen[1].keys()
-        if len(ids) > 1:
-            return rotation
-        corners = self.body.corners[next(iter(ids))]
-        edges = np.column_stack([corners[1] - corners[0], corners[0] - corners[3], np.zeros(3)])
-        edges[:, :2] /= np.linalg.norm(edges[:, :2], axis=0)
-        edges[:, 2] = np.cross(edges[:, 0], edges[:, 1])
-        return mirrored(rotation @ edges, x + rotation @ corners.mean(axis=0)) @ edges.T
+        """The rotation under which the plane that the corners lie in, or nearest to, looks nearly the same."""
+        corners = np.concatenate([self.body.corners[id] for id in sorted(_ids(seen))])
+        axes = np.linalg.svd(corners - corners.mean(axis=0))[2].T
+        axes[:, 2] *= np.sign(np.linalg.det(axes))
+        return mirrored(rotation @ axes, x + rotation @ corners.mean(axis=0)) @ axes.T
 
     def _predicted(self, t: float) -> list[tuple[int, int, int, int]] | None:
         if self._last is None or not 0 < t - self._last[0] <= _LONGEST_PAUSE_S:
@@ -203,6 +231,11 @@ class TagTracker:
             low, high = np.floor(low - room).astype(int), np.ceil(high + room).astype(int)
             regions.append((max(low[0], 0), max(low[1], 0), min(high[0], width), min(high[1], height)))
         return regions
+
+
+def _ids(seen: Iterable[dict[int, TagImage]]) -> set[int]:
+    """The numbers that any eye sees."""
+    return set[int]().union(*seen)
 
 
 def _why(eyes: Iterable[Seen]) -> Reason:

@@ -164,10 +164,11 @@ class StereoTracker:
 
     def _look(self, frame: StereoFrame, in_left: _Expected | None, in_right: _Expected | None) -> Location | Reason:
         """The marker where it is expected, else anywhere in view."""
-        left, left_rough = self._discs(frame.left, in_left)
+        left_image, right_image = frame.images
+        left, left_rough = self._discs(left_image, in_left)
         if left is Reason.NO_MARKER:
             return left
-        right, right_rough = self._discs(frame.right, in_right)
+        right, right_rough = self._discs(right_image, in_right)
         lefts, rights = (
             rough if isinstance(discs, Reason) else discs + rough
             for discs, rough in ((left, left_rough), (right, right_rough))
@@ -190,7 +191,8 @@ class StereoTracker:
         reason = self._matcher.doubt(found, left, right)
         if reason is not None:
             return reason
-        eyes = ((left, right, frame.right, found.centres_px[:2]), (right, left, frame.left, found.centres_px[2:]))
+        left_image, right_image = frame.images
+        eyes = ((left, right, right_image, found.centres_px[:2]), (right, left, left_image, found.centres_px[2:]))
         for discs, others, image, centre_px in eyes:
             rest = [disc for disc in discs if np.linalg.norm(disc.centre_px - centre_px) > disc.radius_px]
             if not rest:

@@ -7,6 +7,7 @@ from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.plugins import load
 
 from .config import VisionConfig
+from .one_eye_ball import OneEyeBallTracker
 from .tag_body import TagBody
 from .tag_tracker import TagTracker
 from .tracked_camera import MarkerTracker
@@ -14,14 +15,14 @@ from .tracker import StereoTracker
 
 
 def tracker_of(calibration: StereoCalibration, config: VisionConfig) -> MarkerTracker:
-    """A tracker for rectified images of `calibration`.
+    """A tracker for rectified images of `calibration`, of two eyes or one.
 
     Raises:
-        ConfigError: that describes no stereo pair, or the marker cannot be.
+        ConfigError: that describes no cameras, or the marker cannot be.
     """
     match config.marker:
         case "ball" | "bright_ball":
-            return StereoTracker(calibration, config)
+            return (StereoTracker if calibration.is_stereo else OneEyeBallTracker)(calibration, config)
         case "tag":
             return TagTracker(calibration, TagBody.single(config.tag), config.tag)
         case "cluster":

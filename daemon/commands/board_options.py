@@ -76,12 +76,13 @@ class EyeFiles:
     left: Annotated[str | None, Parameter(help="Pattern of the left eye's files in it, as in cam0_*.png.")] = None
     right: Annotated[str | None, Parameter(help="Pattern of the right eye's.")] = None
     side_by_side: Annotated[bool, flag("Each image shows both eyes, the left one in its left half.")] = False
+    one: Annotated[bool, flag("All images are of one camera alone; --left may tell which of the folder's.")] = False
 
     def of(self, folder: Path) -> Images:
         """The images in `folder`."""
         from bodyschema.daemon.camera_calibration import Images
 
-        return Images(folder, self.left, self.right, self.side_by_side)
+        return Images(folder, self.left, self.right, self.side_by_side, self.one)
 
 
 AS_DRAWN, AS_PRINTED, BY_NAME = DrawnBoard(), PrintedBoard(), EyeFiles()

@@ -49,13 +49,14 @@ def cameras(
     ] = None,
     as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
 ) -> None:
-    """Lenses and places of two cameras, from views of the board: writes cameras.toml and a report.
+    """Lenses and places of two cameras, or the lens of one, from views of a board: writes cameras.toml and a report.
 
-    About 20 pairs, the board held still in each: all over both images, tilted by 20° to 40° each way, near and far.
-    Without IMAGES the robot's own cameras look: it is said what to show next, and a view is taken by itself as soon as
-    the board is still and the view is new; it ends when the calibration is good enough, or with Ctrl-C. Views that do
-    not fit the others are left out and named. It is refused, with the reasons, when it is not good enough; what is
-    wrong with the board's size no image can tell, so measure the ruler on the print.
+    About 20 pairs of images, or 20 images of one camera alone (--one), the board held still in each: all over the
+    images, tilted by 20° to 40° each way, near and far. Without IMAGES the robot's own cameras look: it is said what to
+    show next, and a view is taken by itself as soon as the board is still and the view is new; it ends when the
+    calibration is good enough, or with Ctrl-C. Views that do not fit the others are left out and named. It is refused,
+    with the reasons, when it is not good enough; what is wrong with the board's size no image can tell, so measure the
+    ruler on the print. One camera alone does not need to know it.
 
     Needs: the board that `bodyschema board` wrote (or a plain chessboard), and images of it, no hardware; or
     robot.toml with cameras, and no sampler that runs.
@@ -158,17 +159,18 @@ def _of_images(images: Path, files: EyeFiles, board: Board, wanted: Wanted) -> t
 def _live(config: Config, board: Board, wanted: Wanted, save: Path | None) -> tuple[Gathered, Calibrated]:
     from rich.console import Console
 
-    from bodyschema.daemon.camera_calibration import kept_in, of_cameras
-    from bodyschema.daemon.camera_wiring import open_eyes
-    from bodyschema.daemon.live_calibration import LiveCalibration, LiveViews
+    from bodyschema.daemon.camera_calibration import kept_in, live_views, of_cameras
+    from bodyschema.daemon.camera_wiring import open_eyes, require_cameras
+    from bodyschema.daemon.live_calibration import LiveCalibration
     from bodyschema.daemon.live_calibration_view import guidance_on
     from bodyschema.daemon.signals import on_termination
     from bodyschema.interfaces.clock import SystemClock
 
-    clock = SystemClock()
+    clock, eyes = SystemClock(), require_cameras(config).eyes
+    views = live_views(board, eyes)
     with guidance_on(Console(stderr=True, highlight=False), board.name, clock) as show:
         calibration = LiveCalibration(
-            open_eyes(config, clock), LiveViews(board), of_cameras(wanted), show, clock, keep=kept_in(save)
+            open_eyes(config, clock), views, of_cameras(wanted), show, clock, keep=kept_in(save)
         )
         with on_termination(calibration.stop):
             return calibration.run()

@@ -105,8 +105,9 @@ def check(*, robot: RobotFile = HERE) -> None:
     for line in camera_lines:
         say(f"  {line}")
     if cameras is None or cameras.calibration is None:
-        stereo = "described" if description.calibration else "not described: no images can be used, recordings can"
-        say(f"  stereo calibration {stereo}")
+        seen = description.calibration
+        stereo = "described" if seen else "not described: no images can be used, recordings can"
+        say(f"  {'stereo' if seen is None or seen.is_stereo else 'one camera, its'} calibration {stereo}")
     for effect in checked.simulation.effects:
         say(f"  effect {_effect_line(effect)}")
     for sentence in without_consequence(checked.simulation):

@@ -28,11 +28,16 @@ def demo(
         Parameter(help="The joints stand on a bench and are read by this driver.", show_default=False),
     ] = None,
     marker: Annotated[
-        Literal["ball", "tag", "cluster"],
+        Literal["ball", "tag", "cluster"] | None,
         Parameter(
-            help="In the hand: a red ball, one AprilTag, or a cube of six, which the cameras see from all sides."
+            help="In the hand: a red ball, one AprilTag (which --camera mono has unless told), or a cube of six, which "
+            "the cameras see from all sides.",
+            show_default=False,
         ),
-    ] = "ball",
+    ] = None,
+    camera: Annotated[
+        Literal["stereo", "mono"], Parameter(help="Two cameras side by side, or one alone, as a webcam is.")
+    ] = "stereo",
 ) -> None:
     """Watch the whole thing learn, in simulation, in about a minute.
 
@@ -41,6 +46,8 @@ def demo(
 
     With --marker cluster the ball is a cube of AprilTags, and how it is turned is learnt too. With --marker
     tag it is one tag alone, seen only while it faces the cameras: the hand turns it to them.
+
+    With --camera mono one eye is closed: the size of the tag tells how far away it is.
 
     With --bus the joints are read as on a real arm, by the driver: from Dynamixel or Feetech servos or a board of
     encoders (serial) on a serial port, or from a ROS 2 robot behind a zenoh router. All of these are a bench at the
@@ -62,7 +69,8 @@ def demo(
 
     require_simulation()
     console = Console(highlight=False)
-    scene = prepare(out, seed, bus=bus, marker=marker)
+    marker = marker or ("tag" if camera == "mono" else "ball")
+    scene = prepare(out, seed, bus=bus, marker=marker, camera=camera)
     if bus is not None:
         console.print(f"The joints are {WHAT[bus]} on a bench; {scene.log_file} tells of them.", soft_wrap=True)
     with shown_on(console) as show:

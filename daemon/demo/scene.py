@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import socket
 from collections.abc import Mapping
@@ -22,6 +23,9 @@ STATE = "state"
 MARK = ".bodyschema-demo"
 Bus = Literal["dynamixel", "feetech", "serial", "ros2"]
 Marker = Literal["ball", "tag", "cluster"]
+Camera = Literal["stereo", "mono"]
+# Of the simulation's ball.
+BALL_RADIUS_M = 0.02
 # Light ones in the neck, strong ones in the shoulder.
 DYNAMIXEL = {
     "neck_yaw": "XL330-M288",
@@ -77,12 +81,15 @@ class Scene:
         return self.folder / "learning_curve.svg"
 
 
-def prepare(folder: Path, seed: int, *, bus: Bus | None = None, marker: Marker = "ball") -> Scene:
+def prepare(
+    folder: Path, seed: int, *, bus: Bus | None = None, marker: Marker = "ball", camera: Camera = "stereo"
+) -> Scene:
     """Lay out the demo's folder; what an earlier demo left there is replaced.
 
     Args:
         bus: what the joints are read through, from a bench.
         marker: what is in the hand.
+        camera: the stereo pair, or its left eye alone.
 
     Raises:
         ConfigError: the folder is neither empty nor a demo's, or cannot be written.
@@ -101,13 +108,19 @@ def prepare(folder: Path, seed: int, *, bus: Bus | None = None, marker: Marker =
                 shutil.copyfile(path, folder / path.name)
         scene = Scene(folder.resolve())
         scene.robot_file.write_text(
-            model.read_text(encoding="utf-8") + _own_tables(seed, bus) + _marker(marker, model), encoding="utf-8"
+            _described(model, camera) + _own_tables(seed, bus) + _marker(marker, model), encoding="utf-8"
         )
     except OSError as error:
         raise ConfigError(
             f"cannot be written: {error.strerror}", file=folder, remedy="Give another --out or free some space"
         ) from error
     return scene
+
+
+def _described(model: Path, camera: Camera) -> str:
+    """The robot as it ships; its right eye closed where there is one camera alone."""
+    text = model.read_text(encoding="utf-8")
+    return text if camera == "stereo" else re.sub(r"(?m)^baseline_m = .*$", "eyes = 1", text)
 
 
 def _own_tables(seed: int, bus: Bus | None) -> str:
@@ -131,7 +144,7 @@ def _marker(marker: Marker, model: Path) -> str:
     towards_hand = -np.array(RobotDescription.load(model).robot.marker_xyz)
     match marker:
         case "ball":
-            return ""
+            return f"\n[vision]\nradius_m = {BALL_RADIUS_M}\n"
         case "tag":
             return tag_tables(towards_hand)
         case "cluster":

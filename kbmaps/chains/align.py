@@ -9,11 +9,11 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import BoolArray, FloatArray, frozen, rows
+from kbmaps.arrays import BoolArray, FloatArray, frozen, numbers, rows
 from kbmaps.chains.chain import RigidChain
 from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
 from kbmaps.robust import MEDIAN_NORM, ROUNDING_M
-from kbmaps.rotations import cross_matrix, exponentials
+from kbmaps.rotations import cross_matrix, exponentials, nearest_rotation
 
 # Pairs beyond this many σ are outliers. Far out, since the errors of an uncalibrated arm have long tails themselves
 # and must not be rejected.
@@ -110,6 +110,7 @@ def align(
     pose_known: bool,
     marker_known: bool,
     sigma: float | None = None,
+    turns: ArrayLike | None = None,
 ) -> Alignment:
     """Fits what is not known of the instrument's pose and the marker's place to measured pairs.
 
@@ -124,6 +125,8 @@ def align(
         pose_known: the instrument stands where the chain says.
         marker_known: the marker sits where the chain says.
         sigma: noise of one coordinate [m], if known: nothing within 15 sigma is ever called an outlier.
+        turns: how the marker was measured to be turned, rotations (n, 3, 3), if it was. They tell where to begin where
+            neither pose nor marker is known, and nothing else.
 
     Raises:
         ShapeError, NonFiniteError
@@ -155,7 +158,7 @@ def align(
             _check_spread(fit.nominal_positions, "the nominal marker positions at q")
     inliers = np.ones(len(angles), dtype=np.bool_)
     if fit.fit_pose and fit.fit_marker:
-        fit.shift = _start_shift(fit, sigma or 0.0)
+        fit.shift = _start_shift(fit, sigma or 0.0, None if turns is None else numbers("turns", turns))
     if fit.fit_pose or fit.fit_marker:
         inliers = _fit_robustly(fit, sigma or 0.0)
     return _alignment(chain, fit, inliers)
@@ -175,7 +178,7 @@ def rigid_motion(points: FloatArray, targets: FloatArray, weights: FloatArray) -
     return rotation, centre_targets - rotation @ centre_points
 
 
-def _start_shift(fit: _Fit, sigma: float) -> FloatArray:
+def _start_shift(fit: _Fit, sigma: float, turns: FloatArray | None) -> FloatArray:
     """Marker shift (3,) whose fit explains a sample of the pairs best, of several starting points.
 
     Pose and marker together have local minima, mostly with few joints or small ranges.
@@ -183,7 +186,10 @@ def _start_shift(fit: _Fit, sigma: float) -> FloatArray:
     chosen = np.unique(np.linspace(0, len(fit.x) - 1, _START_PAIRS).astype(np.intp))
     reach = float(np.linalg.norm(fit.x - np.median(fit.x, axis=0), axis=1).mean())
     best, best_spread = np.zeros(3), math.inf
-    for start in reach * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]):
+    starts = reach * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    if turns is not None:
+        starts = np.concatenate([_shift_by_turns(fit, turns)[None], starts])
+    for start in starts:
         trial = _Fit(fit.nominal_rotations[chosen], fit.nominal_positions[chosen], fit.x[chosen], True, True)
         trial.shift = start
         _fit_robustly(trial, sigma)
@@ -192,6 +198,28 @@ def _start_shift(fit: _Fit, sigma: float) -> FloatArray:
         if spread < 0.9 * best_spread - ROUNDING_M:
             best, best_spread = trial.shift, spread
     return best
+
+
+def _shift_by_turns(fit: _Fit, turns: FloatArray) -> FloatArray:
+    """Marker shift (3,) that follows from how the marker was turned (n, 3, 3) beside where it was.
+
+    With the instrument turned by A and the marker on the last frame N by B, Aᵀ M = N B is linear in A and B; then so is
+    x = A (p + N δ) + t in the shift δ and the place t. As robot-world and hand-eye are solved (Shah 2013).
+    """
+    if turns.shape != fit.nominal_rotations.shape:
+        raise ShapeError("turns", f"{fit.nominal_rotations.shape} to go with q", turns.shape)
+    # Rows: entry (i, k) of Aᵀ M − N B; columns: A's entries (j, i), then B's (j, k).
+    design = np.zeros((len(turns), 3, 3, 18))
+    for i in range(3):
+        for k in range(3):
+            design[:, i, k, i:9:3] = turns[:, :, k]
+            design[:, i, k, 9 + k :: 3] = -fit.nominal_rotations[:, i, :]
+    both = np.linalg.svd(design.reshape(-1, 18), full_matrices=False)[2][-1]
+    found = both[:9].reshape(3, 3)
+    rotation = nearest_rotation(found * np.sign(np.linalg.det(found)))
+    columns = np.concatenate([rotation @ fit.nominal_rotations, np.broadcast_to(np.eye(3), turns.shape)], axis=2)
+    target = fit.x - fit.nominal_positions @ rotation.T
+    return cast(FloatArray, np.linalg.lstsq(columns.reshape(-1, 6), target.ravel(), rcond=_RANK_TOLERANCE)[0])[:3]
 
 
 def _fit_robustly(fit: _Fit, sigma: float) -> BoolArray:

@@ -68,7 +68,7 @@ class RigidFit:
 
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """Residuals (n, 3), their norms in units (n,), and Jacobian (n, 3, f) at one change (size,).
+    """Residuals (n, 3) and Jacobian (n, 3, f), as sure in all directions, and norms in units (n,) at a change (size,).
 
     The f free parameters are counted from the prior's mean in columns of its root; `offset` (f,) is where they are.
     """
@@ -152,9 +152,10 @@ class _Fitter:
         change = self.prior.mean.copy()
         change[self.free] += self.root @ offset
         x, jacobian = self.prior.parameters.linearised(change, self.pairs.q)
-        residuals = self.pairs.x - x
+        residuals = self.pairs.whitened(self.pairs.x - x)
         norms = np.linalg.norm(residuals, axis=1) / self.pairs.unit
-        return _Point(change, residuals, norms, jacobian[:, :, self.free] @ self.root, offset)
+        by_free = self.pairs.whitened(jacobian[:, :, self.free] @ self.root)
+        return _Point(change, residuals, norms, by_free, offset)
 
 
 def fit_chain(

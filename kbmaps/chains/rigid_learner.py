@@ -17,10 +17,10 @@ from kbmaps.chains.placed_start import PlacedStart
 from kbmaps.chains.report import ChainReport, Scatter, chain_report
 from kbmaps.chains.rigid_fit import RigidFit, fit_chain
 from kbmaps.chains.valley import deviations
-from kbmaps.errors import DegenerateDataError
+from kbmaps.errors import DegenerateDataError, ModelFormatError, SettingError
 from kbmaps.model import Estimate, near_data, widest
 from kbmaps.packed import complete, named, pack, restoring, unpack
-from kbmaps.pairs import Pairs, checked_pairs, stored_pairs, with_units
+from kbmaps.pairs import Pairs, checked_pairs, of_covariances, stored_pairs, with_units
 from kbmaps.robust import claimed_sigma, student
 
 _KIND = "rigid chain, batch, 2"
@@ -68,7 +68,7 @@ class RigidLearner:
             self._prior = ChainBelief(self._parameters, prior.mean, prior.root)
         self._place = PlacedStart(self._parameters, tolerances)
         self._q, self._x = np.empty((0, nominal.joints)), np.empty((0, 3))
-        self._sigma = np.empty(0)
+        self._sigma, self._shape = np.empty(0), np.empty((0, 3, 3))
         self._fit: RigidFit | None = None
         self._widest = 0.0
         self._twin: RigidLearner | None = None
@@ -153,20 +153,30 @@ class RigidLearner:
         fit = self._fitted()
         return 0.0 if fit is None else fit.log_evidence
 
-    def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
+    def learn(
+        self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None, *, cov: ArrayLike | None = None
+    ) -> None:
         """Pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
 
         Args:
             sigma: 1-sigma of the positions [m], () or (n,); None where it is to be estimated. Once one pair came
                 without, the noise is estimated for all, and those told count relative to their median.
+            cov: in its place their covariances [m²], (3, 3) or (n, 3, 3), where some directions are surer than others:
+                one camera tells depth far worse than what is across.
 
         Raises:
-            ShapeError, NonFiniteError, SettingError (a sigma that is not positive): nothing has changed.
+            ShapeError, NonFiniteError, SettingError (a sigma that is not positive, a covariance that is not positive
+                definite, or both): nothing has changed.
         """
+        if sigma is not None and cov is not None:
+            raise SettingError("give sigma or cov, not both")
         angles, positions, sigmas = checked_pairs(q, x, sigma, self.joints)
+        shape = np.broadcast_to(np.eye(3), (len(angles), 3, 3))
+        if cov is not None:
+            sigmas, shape = of_covariances(cov, len(angles))
         self._q = np.concatenate([self._q, angles])
         self._x = np.concatenate([self._x, positions])
-        self._sigma = np.concatenate([self._sigma, sigmas])
+        self._sigma, self._shape = np.concatenate([self._sigma, sigmas]), np.concatenate([self._shape, shape])
         self._fit = None
 
     def predict(self, q: ArrayLike) -> FloatArray:
@@ -243,6 +253,8 @@ class RigidLearner:
             "x": self._x,
             "sigma": self._sigma,
         }
+        if self._shaped:
+            arrays["shape"] = self._shape
         if self._told_prior:
             arrays |= {"prior_mean": self._prior.mean, "prior_root": self._prior.root}
         return pack(_KIND, {"tolerances": describe_tolerances(self._tolerances)}, arrays)
@@ -253,17 +265,26 @@ class RigidLearner:
         fields, arrays = unpack(data, _KIND)
         with restoring("a rigid learner"):
             tolerances = parse_tolerances(named(fields, "the fields", ("tolerances",))["tolerances"])
-            complete(arrays, (*CHAIN, "q", "x", "sigma"), ("prior_mean", "prior_root"))
+            complete(arrays, (*CHAIN, "q", "x", "sigma"), ("prior_mean", "prior_root"), ("shape",))
             chain = chain_from_arrays(arrays)
             prior = None
             if "prior_mean" in arrays:
                 prior = ChainBelief(ChainParameters(chain), arrays["prior_mean"], arrays["prior_root"])
             learner = cls(chain, tolerances, prior)
             learner._q, learner._x, learner._sigma = stored_pairs(arrays, learner.joints)
+            shape = arrays.get("shape", np.broadcast_to(np.eye(3), (learner.pairs, 3, 3)))
+            if shape.shape != (learner.pairs, 3, 3) or not np.isfinite(shape).all():
+                raise ModelFormatError(f"no shapes of {learner.pairs} pairs' errors: {shape.shape}")
+            learner._shape = shape
         return learner
 
     def _units(self) -> Pairs:
-        return with_units(self._q, self._x, self._sigma)
+        return with_units(self._q, self._x, self._sigma, self._shape if self._shaped else None)
+
+    @property
+    def _shaped(self) -> bool:
+        """Whether some errors are not as large in all directions."""
+        return bool((self._shape != np.eye(3)).any())
 
     def _fitted(self) -> RigidFit | None:
         twin = self._twin
@@ -280,11 +301,11 @@ class RigidLearner:
         good = np.flatnonzero(fit.inliers)
         some = good[:: max(len(good) // _FOLLOWED, 1)]
         sigma = fit.noise * pairs.unit[some] * math.sqrt(len(some) / max(len(good), 1))
-        return deviations(fit.belief, pairs.q[some], sigma)
+        return deviations(fit.belief, pairs.chosen(np.isin(np.arange(len(pairs)), some)), sigma)
 
     def _same_pairs(self, other: RigidLearner) -> bool:
-        pairs = zip((self._q, self._x, self._sigma), (other._q, other._x, other._sigma), strict=True)
-        return all(np.array_equal(own, others, equal_nan=True) for own, others in pairs)
+        own, others = ((each._q, each._x, each._sigma, each._shape) for each in (self, other))
+        return all(np.array_equal(mine, theirs, equal_nan=True) for mine, theirs in zip(own, others, strict=True))
 
     def _start(self) -> FloatArray:
         return self._prior.mean if self._told_prior else self._place.change(self._q, self._x)

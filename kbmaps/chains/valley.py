@@ -6,6 +6,7 @@ import numpy as np
 
 from kbmaps.arrays import FloatArray
 from kbmaps.chains.belief import ChainBelief, squared
+from kbmaps.pairs import Pairs
 
 # Of a direction that is open the pairs have left at least this share of the prior's variance.
 _OPEN = 0.5
@@ -13,7 +14,7 @@ _OPEN = 0.5
 _LONGEST_STEP = 0.1
 
 
-def deviations(belief: ChainBelief, q: FloatArray, sigma: FloatArray) -> FloatArray:
+def deviations(belief: ChainBelief, pairs: Pairs, sigma: FloatArray) -> FloatArray:
     """Root mean square deviation (size,) [rad, m] of each parameter's true value from the mean, to second order.
 
     What the pairs do not tell apart lies along a curved valley, not along its tangent: another zero of the last joint,
@@ -26,23 +27,24 @@ def deviations(belief: ChainBelief, q: FloatArray, sigma: FloatArray) -> FloatAr
 
     Args:
         belief: after the pairs.
-        q: the configurations (n, d) of the pairs, or of some that stand for them.
+        pairs: the n pairs, or some that stand for them.
         sigma: 1-sigma (n,) of a coordinate there [m].
     """
-    opened, closed, follow = _sides(belief, q, sigma)
+    q = pairs.q
+    opened, closed, follow = _sides(belief, pairs, sigma)
     bend = np.empty((len(belief.mean), opened.shape[1], opened.shape[1]))
     for k, direction in enumerate(opened.T):
         step = _LONGEST_STEP / max(float(np.abs(direction).max()), _LONGEST_STEP)
         _, ahead = belief.parameters.linearised(belief.mean + step * direction, q)
         _, behind = belief.parameters.linearised(belief.mean - step * direction, q)
-        second = ((ahead - behind) @ opened) / (2.0 * step * sigma[:, None, None])
+        second = pairs.whitened((ahead - behind) @ opened) / (2.0 * step * sigma[:, None, None])
         bend[:, k] = -closed @ (follow @ second.reshape(-1, opened.shape[1]))
     mean = 0.5 * np.einsum("ikk->i", bend)
     variance = np.square(belief.root).sum(axis=1) + 0.5 * np.square(bend).sum(axis=(1, 2))
     return np.sqrt(variance + np.square(mean))
 
 
-def _sides(belief: ChainBelief, q: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _sides(belief: ChainBelief, pairs: Pairs, sigma: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """A root of the belief in two parts, open (size, k) and closed (size, c), and (J W_c)⁺ (c, 3 n) of the latter.
 
     In units of the posterior the square of J W is what the pairs have taken of the prior's variance.
@@ -50,8 +52,8 @@ def _sides(belief: ChainBelief, q: FloatArray, sigma: FloatArray) -> tuple[Float
     free, triangle = squared(belief.root)
     root = np.zeros((len(belief.mean), len(free)))
     root[free] = triangle
-    _, jacobian = belief.parameters.linearised(belief.mean, q)
-    rows = (jacobian[:, :, free] @ triangle / sigma[:, None, None]).reshape(-1, len(free))
+    _, jacobian = belief.parameters.linearised(belief.mean, pairs.q)
+    rows = (pairs.whitened(jacobian[:, :, free] @ triangle) / sigma[:, None, None]).reshape(-1, len(free))
     taken, vectors = np.linalg.eigh(rows.T @ rows)
     opened, closed = vectors[:, taken <= 1.0 - _OPEN], vectors[:, taken > 1.0 - _OPEN]
     follow = (rows @ closed / taken[taken > 1.0 - _OPEN]).T

@@ -6,7 +6,7 @@ import pytest
 from small_arm import ROBOT, write_small_arm
 
 from bodyschema.daemon.config import Config, ZenohConfig
-from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.errors import ConfigError, RobotError
 
 
 def load(folder: Path, tables: str = "", environment: dict[str, str] | None = None) -> Config:
@@ -131,3 +131,34 @@ def test_a_camera_that_stands_as_far_as_a_laser_tracker_is_none_in_millimetres(t
     file = write_small_arm(tmp_path)
     file.write_text(file.read_text().replace("[camera]\n", "[camera]\nxyz = [8.0, -6.0, 1.5]\n"))
     assert Config.load(file, {}).robot.camera.xyz == (8.0, -6.0, 1.5)
+
+
+ONE_EYE = "eyes = 1\nfocal_px = 600.0\nprincipal_point_px = [319.5, 239.5]\nimage_size_px = [640, 480]\n"
+
+
+def test_one_camera_alone_has_a_calibration_without_a_baseline(tmp_path) -> None:
+    calibration = load(tmp_path, f"{ONE_EYE}[vision]\nradius_m = 0.02\n").robot.calibration
+    assert calibration is not None
+    assert not calibration.is_stereo
+
+
+@pytest.mark.parametrize(
+    ("tables", "said"),
+    [
+        (ONE_EYE, r"vision\.radius_m is missing: one camera alone tells the depth from the marker's size"),
+        (f'{ONE_EYE}[vision]\nmarker = "tag"\n', r"vision\.tag\.side_m is missing.*black square"),
+        (
+            f'{ONE_EYE}[vision]\nmarker = "cluster"\n[[vision.cluster.tags]]\nid = 1\n',
+            r"vision\.tag\.side_m is missing",
+        ),
+        (f"{ONE_EYE}baseline_m = 0.1\n", r"one eye alone has no baseline_m"),
+        (ONE_EYE.replace("eyes = 1\n", ""), r"baseline_m missing.*eyes = 1"),
+        (
+            '[vision.cameras.one]\ndevice = "/dev/v4l/by-id/usb-A-video-index0"\nimage_size_px = [640, 480]\n',
+            r"vision\.radius_m is missing",
+        ),
+    ],
+)
+def test_what_one_camera_alone_cannot_do_without_is_named(tmp_path, tables, said) -> None:
+    with pytest.raises((ConfigError, RobotError), match=said):
+        load(tmp_path, tables)

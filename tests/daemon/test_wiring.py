@@ -61,7 +61,7 @@ def test_a_recording_that_is_not_there_is_named(tmp_path) -> None:
 
 
 def test_the_simulation_asks_for_a_stereo_camera(tmp_path) -> None:
-    with pytest.raises(ConfigError, match=r"describes no stereo pair.*Add focal_px"):
+    with pytest.raises(ConfigError, match=r"does not describe how the cameras see.*Add focal_px"):
         enter(load(tmp_path), sim=True)
 
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 from datetime import datetime
 
 import numpy as np
@@ -198,3 +199,14 @@ def test_a_camera_that_is_opened_again_after_its_renderer_died_gives_frames(worl
 def test_the_ball_is_red_in_both_images(world):
     frame = frames(world, 1)[0]
     assert min(red_pixels(frame.left), red_pixels(frame.right)) > 200
+
+
+def test_a_robot_with_one_eye_is_rendered_with_one_image_that_shows_the_marker():
+    robot = shipped()
+    assert robot.calibration is not None
+    alone = replace(robot, calibration=replace(robot.calibration, baseline_m=0.0))
+    with SimWorld(alone, SimConfig(seed=3)) as world, world.joints, world.camera:
+        frame = world.next_frame(WAIT_S)
+    assert frame is not None
+    assert frame.right is None
+    assert red_pixels(frame.left) > 50

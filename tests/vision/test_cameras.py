@@ -61,7 +61,7 @@ def two(left: str = BY_ID, right: str = "/dev/v4l/by-path/b") -> dict[str, objec
         ({"side_by_side": {"device": "1", "image_size_px": [640, 480]}}, "side_by_side.device: '1' may be another"),
         ({"images": {"left": "a", "right": "b"}}, "times have to come from one thing"),
         ({"images": {"left": "a", "right": "b", "fps": 1.0, "times": "t"}}, "times have to come from one thing"),
-        ({"videos": {"left": "a"}}, "which films"),
+        ({"videos": {"right": "a"}}, "which films"),
         ({"videos": {"left": "a", "right": "b", "side_by_side": "c"}}, "which films"),
         ({"videos": {"side_by_side": "c", "fps": 1.0, "times": "t"}}, "times have to come from one thing"),
     ],

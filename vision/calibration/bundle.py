@@ -11,7 +11,7 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.vision.lens import Lens, Model
-from bodyschema.vision.rig import CalibrationError, split
+from bodyschema.vision.rig import CalibrationError, lens_of_one, split
 
 from .view import EYES, Eye, View
 
@@ -140,6 +140,9 @@ def eye_of(
     Args:
         pose: the board's in the left eye's frame, shape (6,).
     """
+    alone = lens_of_one(model, vector)
+    if alone is not None:
+        return alone, pose[:3], pose[3:], (np.zeros((6, 0)), np.eye(6))
     left, right, rotation, translation = split(model, vector)
     if eye == "left":
         return left, pose[:3], pose[3:], (np.zeros((6, 6)), np.eye(6))
@@ -159,7 +162,7 @@ def seen_with_slopes(
     The slopes have two rows a corner, u and v: shapes (2 corners, p) and (2 corners, 6).
     """
     p = len(vector)
-    n = (p - _POSE) // 2
+    n = p if lens_of_one(model, vector) is not None else (p - _POSE) // 2
     residuals, by_rig_and_lens, by_board = [], [], []
     for eye in EYES:
         corners = view.eye(eye)

@@ -1,4 +1,4 @@
-"""Two cameras' calibration from views of a board."""
+"""The calibration of two cameras, or of one, from views of a board."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.vision.board import Board
 from bodyschema.vision.lens import Model
-from bodyschema.vision.rig import CalibrationError, Made, StereoRig, split
+from bodyschema.vision.rig import CalibrationError, Made, OneEyeRig, Rig, StereoRig, lens_of_one, split
 
 from .bundle import Bundle, solve
 from .guidance import Coverage
@@ -20,7 +20,7 @@ from .held_out import HeldOut, held_out
 from .influence import covariance
 from .requirements import contradicts, lacking, misplaced, together, unsure
 from .start import start
-from .view import View
+from .view import EYES, ONE_EYE, Eye, View
 from .weights import corner_weights
 
 ModelChoice = Literal["auto", "pinhole", "fisheye"]
@@ -44,11 +44,16 @@ class Asked:
     """
 
     image_size_px: tuple[int, int]
-    serials: tuple[str, str]
+    serials: tuple[str, ...]
     date: str
     model: ModelChoice = "auto"
     scale_sigma: float = 0.001
     baseline_m: float | None = None
+
+    @property
+    def eyes(self) -> tuple[Eye, ...]:
+        """Which eyes look."""
+        return EYES if len(self.serials) > 1 else ONE_EYE
 
 
 @dataclass(frozen=True)
@@ -81,7 +86,7 @@ class Calibrated:
         coverage: what the views cover.
     """
 
-    rig: StereoRig
+    rig: Rig
     board: Board
     fitted: Fitted
     rivals_px: dict[Model, float]
@@ -91,20 +96,24 @@ class Calibrated:
 def calibrate(
     views: Sequence[View], board: Board, asked: Asked, tell: Callable[[str], None] = lambda _: None
 ) -> Calibrated:
-    """Lenses and places of two cameras.
+    """Lenses and places of two cameras, or the lens of one.
 
     Raises:
         CalibrationError: it is not good enough, and why.
     """
-    coverage = Coverage.of(views, board, asked.image_size_px)
+    coverage = Coverage.of(views, board, asked.image_size_px, asked.eyes)
     if reasons := lacking(coverage):
         raise CalibrationError(together(reasons))
     models: tuple[Model, ...] = ("pinhole", "fisheye") if asked.model == "auto" else (asked.model,)
-    fits = _fits(views, board, asked.image_size_px, models, tell)
+    fits = _fits(views, board, asked, models, tell)
     model = _chosen(fits)
     rig = _rig(fits[model], board, asked)
     reasons = unsure(rig)
-    if asked.baseline_m is not None and (reason := contradicts(rig, asked.baseline_m)) is not None:
+    if (
+        asked.baseline_m is not None
+        and isinstance(rig, StereoRig)
+        and (reason := contradicts(rig, asked.baseline_m)) is not None
+    ):
         reasons.append(reason)
     if reasons:
         raise CalibrationError(together(reasons))
@@ -115,7 +124,7 @@ def calibrate(
 def _fits(
     views: Sequence[View],
     board: Board,
-    image_size_px: tuple[int, int],
+    asked: Asked,
     models: Sequence[Model],
     tell: Callable[[str], None],
 ) -> dict[Model, Fitted]:
@@ -125,7 +134,7 @@ def _fits(
     for model in models:
         tell(f"fitting {model} lenses to {len(views)} views")
         try:
-            fits[model] = fit(views, board.corners_m, image_size_px, model)
+            fits[model] = fit(views, board.corners_m, asked.image_size_px, model, asked.eyes)
         except CalibrationError as error:
             refusals.append(error)
     if not fits:
@@ -133,7 +142,13 @@ def _fits(
     return fits
 
 
-def fit(views: Sequence[View], corners_m: FloatArray, image_size_px: tuple[int, int], model: Model) -> Fitted:
+def fit(
+    views: Sequence[View],
+    corners_m: FloatArray,
+    image_size_px: tuple[int, int],
+    model: Model,
+    eyes: tuple[Eye, ...] = EYES,
+) -> Fitted:
     """One model's fit; views that do not fit the others are left out, the worst first.
 
     Raises:
@@ -141,7 +156,7 @@ def fit(views: Sequence[View], corners_m: FloatArray, image_size_px: tuple[int, 
     """
     kept = list(views)
     left_out: list[LeftOut] = []
-    vector, poses = start(kept, corners_m, image_size_px, model)
+    vector, poses = start(kept, corners_m, image_size_px, model, eyes)
     while True:
         bundle = _weighed(kept, corners_m, solve(kept, corners_m, model, vector, poses))
         worst = _outlier(bundle.view_rms_px())
@@ -192,18 +207,17 @@ def _outlier(rms_px: FloatArray) -> int | None:
 
 
 def _require_places(model: Model, vector: FloatArray) -> None:
+    if lens_of_one(model, vector) is not None:
+        return
     _, _, rotation, translation = split(model, vector)
     reason = misplaced(np.asarray(cv2.Rodrigues(rotation)[0], dtype=np.float64), translation)
     if reason is not None:
         raise CalibrationError(reason)
 
 
-def _rig(fitted: Fitted, board: Board, asked: Asked) -> StereoRig:
+def _rig(fitted: Fitted, board: Board, asked: Asked) -> Rig:
     bundle = fitted.bundle
-    left, right, rotation, translation = split(bundle.model, bundle.vector)
-    # A board of another size makes all lengths as much longer, and nothing else.
     unsure_by = covariance(fitted.views, board.corners_m, bundle)
-    unsure_by[-3:, -3:] += asked.scale_sigma**2 * np.outer(translation, translation)
     made = Made(
         date=asked.date,
         board=board.name,
@@ -213,4 +227,11 @@ def _rig(fitted: Fitted, board: Board, asked: Asked) -> StereoRig:
         held_out_px=fitted.held_out.rms_px,
         scale_sigma=asked.scale_sigma,
     )
-    return StereoRig(left, right, rotation, translation, asked.image_size_px, asked.serials, unsure_by, made)
+    alone = lens_of_one(bundle.model, bundle.vector)
+    if alone is not None:
+        return OneEyeRig(alone, asked.image_size_px, (asked.serials[0],), unsure_by, made)
+    left, right, rotation, translation = split(bundle.model, bundle.vector)
+    # A board of another size makes all lengths as much longer, and nothing else.
+    unsure_by[-3:, -3:] += asked.scale_sigma**2 * np.outer(translation, translation)
+    serials = asked.serials[0], asked.serials[1]
+    return StereoRig(left, right, rotation, translation, asked.image_size_px, serials, unsure_by, made)

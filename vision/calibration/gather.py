@@ -14,7 +14,7 @@ from bodyschema.vision.rig import CalibrationError
 
 from .guidance import Coverage
 from .images import ImagePair, require_equal_sizes
-from .view import EYES, Eye, View
+from .view import EYES, ONE_EYE, Eye, View, image_of
 
 _MOST_NAMES = 4
 # So many pairs that show another board, and none the one looked for, say enough; progress is told after so many.
@@ -43,6 +43,7 @@ class Gathered:
 
     Attributes:
         image_size_px: of each eye; (0, 0) before the first image.
+        eyes: which eyes look.
     """
 
     board: Board
@@ -50,10 +51,11 @@ class Gathered:
     views: list[View] = field(default_factory=list)
     images: dict[str, ImagePair] = field(default_factory=dict)
     unusable: list[Unusable] = field(default_factory=list)
+    eyes: tuple[Eye, ...] = EYES
 
     def coverage(self) -> Coverage:
         """What the views cover."""
-        return Coverage.of(self.views, self.board, self.image_size_px)
+        return Coverage.of(self.views, self.board, self.image_size_px, self.eyes)
 
     def add(self, view: View, images: ImagePair) -> None:
         """Take a view."""
@@ -74,7 +76,7 @@ def gathered(pairs: Iterable[ImagePair], board: Board, tell: Callable[[str], Non
     found = Gathered(board)
     for number, pair in enumerate(pairs, start=1):
         view, unusable = looked_at(pair, detector)
-        found.image_size_px = pair.size_px
+        found.image_size_px, found.eyes = pair.size_px, eyes_of(pair)
         found.unusable += unusable
         if view.left is not None or view.right is not None:
             found.add(view, pair)
@@ -82,18 +84,18 @@ def gathered(pairs: Iterable[ImagePair], board: Board, tell: Callable[[str], Non
             break
         if number % _TOLD_PAIRS == 0:
             tell(f"{number} pairs looked at; the board is in {len(found.views)}")
-    for line in summarised(found.unusable):
+    for line in summarised(found.unusable, found.eyes):
         tell(line)
     return found
 
 
-def summarised(unusable: Sequence[Unusable]) -> list[str]:
+def summarised(unusable: Sequence[Unusable], eyes: Sequence[Eye] = EYES) -> list[str]:
     """Which images cannot be used, and why: one line for each eye and reason, numbers in it apart."""
     alike: dict[tuple[Eye, str], list[Unusable]] = {}
     for each in unusable:
         alike.setdefault((each.eye, _kind(each)), []).append(each)
     return [
-        f"{_named(group)}, {eye} image: {_usual([each.fault.text for each in group])}"
+        f"{_named(group)}{f', {eye} image' if len(eyes) > 1 else ''}: {_usual([each.fault.text for each in group])}"
         for (eye, _), group in alike.items()
     ]
 
@@ -113,32 +115,38 @@ def _usual(texts: Sequence[str]) -> str:
     return Counter(texts).most_common(1)[0][0]
 
 
+def eyes_of(pair: ImagePair) -> tuple[Eye, ...]:
+    """Which eyes' images a pair has."""
+    return ONE_EYE if pair.right is None else EYES
+
+
 def looked_at(pair: ImagePair, detector: Detector) -> tuple[View, tuple[Unusable, ...]]:
     """The board's corners in a pair of images, and why an eye has none.
 
     Raises:
         CalibrationError: the two eyes' images are of different sizes.
     """
-    require_equal_sizes(pair.name, pair.left, pair.right)
+    if pair.right is not None:
+        require_equal_sizes(pair.name, pair.left, pair.right)
     seen: list[Corners | None] = []
     unusable: list[Unusable] = []
-    for eye, image in zip(EYES, (pair.left, pair.right), strict=True):
+    for eye, image in zip(eyes_of(pair), pair.images, strict=True):
         corners = detector.find(image)
         if isinstance(corners, NotFound):
             unusable.append(Unusable(pair.name, eye, corners))
         seen.append(None if isinstance(corners, NotFound) else corners)
-    return View(pair.name, *seen), tuple(unusable)
+    return View(pair.name, seen[0], seen[1] if len(seen) > 1 else None), tuple(unusable)
 
 
 def require_both(found: Gathered) -> None:
     """CalibrationError where an eye sees no usable board in any image, with the reason that most of its images have."""
     if not found.views and not found.unusable:
         raise CalibrationError("there are no images")
-    blind = [eye for eye in EYES if all(view.eye(eye) is None for view in found.views)]
+    blind: list[Eye] = [eye for eye in found.eyes if all(view.eye(eye) is None for view in found.views)]
     if not blind:
         return
     faults = [each for each in found.unusable if each.eye in blind]
     kind = _usual([_kind(each) for each in faults])
     alike = [each.fault.text for each in faults if _kind(each) == kind]
-    who = "no image" if len(blind) == len(EYES) else f"no {blind[0]} image"
+    who = "no image" if len(blind) == len(found.eyes) else f"no {image_of(blind[0], found.eyes)}"
     raise CalibrationError(f"{who} shows a board that can be used; {len(alike)} of {len(faults)}: {_usual(alike)}")

@@ -14,7 +14,7 @@ from bodyschema.vision.board import Board, Corners
 from bodyschema.vision.lens import Lens
 
 from .start import pose_of
-from .view import EYES, Eye, View, all_px, seen_by
+from .view import EYES, Eye, View, all_px, image_of, seen_by
 
 GRID = (3, 3)
 _ROWS, _COLUMNS = ("upper", "middle", "lower"), ("left", "middle", "right")
@@ -32,35 +32,39 @@ class Coverage:
     """What the views have covered.
 
     Attributes:
-        stereo_views: views that both eyes saw.
-        cells: corners in each cell of a 3×3 grid, for each eye, shape (2, 3, 3).
-        tilts_deg: of the board in each stereo view about the image's upright and level axes, shape (n, 2), roughly:
+        whole_views: views that all eyes saw.
+        cells: corners in each cell of a 3×3 grid, for each eye, shape (eyes, 3, 3).
+        tilts_deg: of the board in each whole view about the image's upright and level axes, shape (n, 2), roughly:
             right edge away and lower edge away are positive.
-        extents: of the board in each stereo view, as a share of the image.
+        extents: of the board in each whole view, as a share of the image.
+        eyes: which eyes look.
     """
 
-    stereo_views: int
+    whole_views: int
     cells: NDArray[np.int64]
     tilts_deg: FloatArray
     extents: FloatArray
+    eyes: tuple[Eye, ...] = EYES
 
     @classmethod
-    def of(cls, views: Sequence[View], board: Board, image_size_px: tuple[int, int]) -> Coverage:
+    def of(
+        cls, views: Sequence[View], board: Board, image_size_px: tuple[int, int], eyes: tuple[Eye, ...] = EYES
+    ) -> Coverage:
         """What these views cover."""
-        stereo = [view for view in views if view.is_stereo]
-        left = seen_by(stereo, "left")
+        whole = [view for view in views if view.is_seen_by(eyes)]
+        left = seen_by(whole, "left")
         tilts = [rough_tilt_deg(corners, board, image_size_px) for corners in left]
         extents = [extent(corners, image_size_px) for corners in left]
-        cells = np.array([cell_counts(all_px(views, eye), image_size_px) for eye in EYES])
-        return cls(len(stereo), cells, np.reshape(tilts, (-1, 2)), np.array(extents))
+        cells = np.array([cell_counts(all_px(views, eye), image_size_px) for eye in eyes])
+        return cls(len(whole), cells, np.reshape(tilts, (-1, 2)), np.array(extents), eyes)
 
     def covered(self, eye: Eye) -> NDArray[np.bool_]:
         """Which cells of an eye's image have enough corners, shape (3, 3)."""
-        return self.cells[EYES.index(eye)] >= CORNERS_A_CELL
+        return self.cells[self.eyes.index(eye)] >= CORNERS_A_CELL
 
     @property
     def largest_tilts_deg(self) -> FloatArray:
-        """Of each stereo view, shape (n,)."""
+        """Of each whole view, shape (n,)."""
         return np.hypot(self.tilts_deg[:, 0], self.tilts_deg[:, 1])
 
     def missing(self) -> list[str]:
@@ -70,9 +74,9 @@ class Coverage:
     @property
     def progress(self) -> float:
         """How much of what is wanted is there, 0 to 1."""
-        wanted = len(self.tilted()) + 2 * GRID[0] * GRID[1] + 2 + WANTED_VIEWS
+        wanted = len(self.tilted()) + len(self.eyes) * GRID[0] * GRID[1] + 2 + WANTED_VIEWS
         lacking = len(self._tilts_missing()) + len(self._cells_missing()) + len(self._distances_missing())
-        return 1.0 - (lacking + max(WANTED_VIEWS - self.stereo_views, 0)) / wanted
+        return 1.0 - (lacking + max(WANTED_VIEWS - self.whole_views, 0)) / wanted
 
     def tilted(self) -> dict[str, int]:
         """How many views have each edge of the board farther away than the opposite one."""
@@ -97,15 +101,15 @@ class Coverage:
 
     def _tilts_missing(self) -> list[str]:
         return [
-            f"tilt the board's {edge} edge away from the cameras, by 30°"
+            f"tilt the board's {edge} edge away from the camera{'s' * (len(self.eyes) > 1)}, by 30°"
             for edge, count in self.tilted().items()
             if count < TILTED_EACH_WAY
         ]
 
     def _cells_missing(self) -> list[str]:
         return [
-            f"bring the board to the {cell_name(r, c)} of the {eye} image"
-            for eye in EYES
+            f"bring the board to the {cell_name(r, c)} of the {image_of(eye, self.eyes)}"
+            for eye in self.eyes
             for r, c in np.argwhere(~self.covered(eye)).tolist()
         ]
 
@@ -118,7 +122,7 @@ class Coverage:
         return texts
 
     def _views_missing(self) -> list[str]:
-        lacking = WANTED_VIEWS - self.stereo_views
+        lacking = WANTED_VIEWS - self.whole_views
         return [f"{lacking} more view{'s' if lacking > 1 else ''}, tilted and anywhere"] if lacking > 0 else []
 
 

@@ -1,4 +1,4 @@
-"""Pairs of images in files: which belong together, and reading them."""
+"""Pairs of images in files, or those of one camera: which belong together, and reading them."""
 
 from __future__ import annotations
 
@@ -21,20 +21,25 @@ _WILDCARD = re.compile(r"(\*|\?|\[[^\]]*\])")
 
 @dataclass(frozen=True)
 class PairFiles:
-    """The files of one view: the same one twice where it shows both eyes side by side."""
+    """The files of one view: the same one twice where it shows both eyes side by side, one of one camera alone."""
 
     name: str
     left: Path
-    right: Path
+    right: Path | None
 
 
 @dataclass(frozen=True, eq=False)
 class ImagePair:
-    """Both eyes' images of one instant, shape (height, width, 3) BGR each."""
+    """Both eyes' images of one instant, or that of one camera alone, shape (height, width, 3) BGR each."""
 
     name: str
     left: ImageArray
-    right: ImageArray
+    right: ImageArray | None
+
+    @property
+    def images(self) -> tuple[ImageArray, ...]:
+        """One for each eye, the left one's first."""
+        return (self.left,) if self.right is None else (self.left, self.right)
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -42,7 +47,9 @@ class ImagePair:
         return self.left.shape[1], self.left.shape[0]
 
 
-def pair_files(folder: Path, left: str | None, right: str | None, *, side_by_side: bool) -> list[PairFiles]:
+def pair_files(
+    folder: Path, left: str | None, right: str | None, *, side_by_side: bool, one: bool = False
+) -> list[PairFiles]:
     """Which files of a folder belong together, in the order of their names.
 
     Without patterns, left and right are told apart by `left`, `right`, `l` or `r` in the names of files or of their
@@ -51,23 +58,26 @@ def pair_files(folder: Path, left: str | None, right: str | None, *, side_by_sid
     Args:
         left, right: patterns of the eyes' files, as in left*.png; equal texts for the star
             belong together.
+        one: whether all images are of one camera alone.
 
     Raises:
         CalibrationError: there is no such folder, or it has no pairs.
     """
     if not folder.is_dir():
         raise CalibrationError(f"{folder}: there is no such folder")
-    if side_by_side:
-        files = sorted(_images(folder, "*"), key=_in_order)
-        pairs = [PairFiles(file.stem, file, file) for file in files]
+    if side_by_side or one:
+        files = sorted(_images(folder, left or "*"), key=_in_order)
+        pairs = [PairFiles(file.stem, file, None if one else file) for file in files]
     elif left is not None and right is not None:
         pairs = _matched(*({_varied(file, each): file for file in _images(folder, each)} for each in (left, right)))
     else:
         pairs = _matched(*_by_eye(folder))
+    if not pairs and one:
+        raise CalibrationError(f"{folder}: no images")
     if not pairs:
         raise CalibrationError(
             f"{folder}: no pairs of images. Name them left01.png and right01.png, or put them into folders left and "
-            "right; else give --left and --right, or --side-by-side"
+            "right; else give --left and --right, --side-by-side, or --one of one camera alone"
         )
     return pairs
 
@@ -81,7 +91,7 @@ def read_pairs(pairs: list[PairFiles], *, side_by_side: bool) -> Iterator[ImageP
     first: tuple[str, tuple[int, int]] | None = None
     for files in pairs:
         left = _read(files.left)
-        right = left if side_by_side else _read(files.right)
+        right = left if side_by_side or files.right is None else _read(files.right)
         if side_by_side:
             half = left.shape[1] // 2
             left, right = left[:, :half], left[:, half : 2 * half]
@@ -92,7 +102,7 @@ def read_pairs(pairs: list[PairFiles], *, side_by_side: bool) -> Iterator[ImageP
             raise CalibrationError(
                 f"{files.name} has {_size(size)}, {first[0]} has {_size(first[1])}: all images have to be of one size"
             )
-        yield ImagePair(files.name, left, right)
+        yield ImagePair(files.name, left, None if files.right is None else right)
 
 
 def require_equal_sizes(name: str, left: ImageArray, right: ImageArray) -> None:
@@ -154,9 +164,14 @@ def _read(file: Path) -> ImageArray:
 
 
 def write_pair(pair: ImagePair, folder: Path, number: int) -> None:
-    """Write a pair as left01.png and right01.png, as `pair_files` reads them; CalibrationError where it cannot be."""
-    for eye, image in (("left", pair.left), ("right", pair.right)):
-        file = folder / f"{eye}{number:02d}.png"
+    """Write a pair as left01.png and right01.png, as `pair_files` reads them, or the image of one camera alone.
+
+    Raises:
+        CalibrationError: it cannot be written.
+    """
+    names = ("left", "right") if len(pair.images) > 1 else ("image",)
+    for name, image in zip(names, pair.images, strict=True):
+        file = folder / f"{name}{number:02d}.png"
         try:
             folder.mkdir(parents=True, exist_ok=True)
             file.write_bytes(cv2.imencode(file.suffix, image)[1].tobytes())

@@ -12,7 +12,7 @@ import numpy as np
 from bodyschema.interfaces.records import StereoFrame
 from bodyschema.vision.board import Board, BoardDetector
 
-from .gather import Detector, Gathered, Unusable, looked_at
+from .gather import Detector, Gathered, Unusable, eyes_of, looked_at
 from .guidance import CORNERS_A_CELL, cell_counts, rough_tilt_deg
 from .images import ImagePair
 from .view import EYES, Eye, View, all_px
@@ -60,9 +60,9 @@ class LiveViews:
         coverage: what they cover.
     """
 
-    def __init__(self, board: Board, detector: Detector | None = None) -> None:
+    def __init__(self, board: Board, detector: Detector | None = None, eyes: tuple[Eye, ...] = EYES) -> None:
         """Nothing was seen yet."""
-        self.found = Gathered(board)
+        self.found = Gathered(board, eyes=eyes)
         self.coverage = self.found.coverage()
         self._detector = BoardDetector(board) if detector is None else detector
         self._tilts: list[tuple[float, float]] = []
@@ -76,7 +76,7 @@ class LiveViews:
         """
         pair = ImagePair(f"view {len(self.found.views) + 1}", frame.left, frame.right)
         view, unusable = looked_at(pair, self._detector)
-        self.found.image_size_px = pair.size_px
+        self.found.image_size_px, self.found.eyes = pair.size_px, eyes_of(pair)
         outcome = self._outcome(view)
         if outcome is Outcome.TAKEN:
             self.found.add(view, pair)
@@ -90,8 +90,8 @@ class LiveViews:
         self._before = None
 
     def _outcome(self, view: View) -> Outcome:
-        seeing: list[Eye] = [eye for eye in EYES if view.eye(eye) is not None]
-        if not view.is_stereo and not any(self._fills(view, eye) for eye in seeing):
+        seeing: list[Eye] = [eye for eye in self.found.eyes if view.eye(eye) is not None]
+        if not view.is_seen_by(self.found.eyes) and not any(self._fills(view, eye) for eye in seeing):
             return Outcome.UNSEEN
         if not self._is_new(view, seeing):
             return Outcome.KNOWN

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.vision.rig import StereoRig
+from bodyschema.vision.rig import Rig, StereoRig
 
 from .guidance import Coverage, cell_name
-from .view import EYES
+from .view import image_of
 
 LEAST_VIEWS = 8
 _LEAST_CELLS = 6
@@ -27,22 +27,22 @@ _MOST_HAND_ERROR_M = 0.0015
 def lacking(coverage: Coverage) -> list[str]:
     """What is wrong with the views, before anything is made of them."""
     reasons = []
-    if coverage.stereo_views < LEAST_VIEWS:
+    who = "both eyes saw" if len(coverage.eyes) > 1 else "the camera saw"
+    if coverage.whole_views < LEAST_VIEWS:
         reasons.append(
-            f"too few views: both eyes saw the board in {coverage.stereo_views}, at least {LEAST_VIEWS} are needed, "
-            "20 are good"
+            f"too few views: {who} the board in {coverage.whole_views}, at least {LEAST_VIEWS} are needed, 20 are good"
         )
     tilted = np.count_nonzero(coverage.largest_tilts_deg > _TILTED_DEG)
-    if coverage.stereo_views and tilted < _LEAST_TILTED:
+    if coverage.whole_views and tilted < _LEAST_TILTED:
         reasons.append(
             f"the board faces the cameras in all views{f' but {tilted}' if tilted else ''}: focal length and distance "
             "cannot be told apart. Tilt it by 20° to 40°, each way"
         )
-    for eye in EYES:
+    for eye in coverage.eyes:
         covered = coverage.covered(eye)
         if np.count_nonzero(covered) < _LEAST_CELLS:
             empty = ", ".join(cell_name(r, c) for r, c in np.argwhere(~covered).tolist())
-            reasons.append(f"the board was hardly ever in these parts of the {eye} image: {empty}")
+            reasons.append(f"the board was hardly ever in these parts of the {image_of(eye, coverage.eyes)}: {empty}")
     return reasons
 
 
@@ -72,7 +72,7 @@ def misplaced(R_right_left: FloatArray, translation_m: FloatArray) -> str | None
     return None
 
 
-def unsure(rig: StereoRig) -> list[str]:
+def unsure(rig: Rig) -> list[str]:
     """What of a calibration is not determined well enough."""
     reasons = []
     width = rig.image_size_px[0]
@@ -83,17 +83,20 @@ def unsure(rig: StereoRig) -> list[str]:
         )
     sigma = dict(zip(rig.names, rig.sigma.tolist(), strict=True))
     value = dict(zip(rig.names, rig.vector.tolist(), strict=True))
-    for eye in EYES:
+    for eye in ("left", "right")[: len(rig.serials)]:
+        whose = f"{eye} " if len(rig.serials) > 1 else ""
         focal = max(sigma[f"{eye}.f{axis}_px"] / value[f"{eye}.f{axis}_px"] for axis in "xy")
         if focal > _MOST_FOCAL_SIGMA:
             reasons.append(
-                f"the {eye} focal length is known to {focal:.1%} only. Take views with the board tilted more"
+                f"the {whose}focal length is known to {focal:.1%} only. Take views with the board tilted more"
             )
         centre = max(sigma[f"{eye}.c{axis}_px"] for axis in "xy")
         if centre > _MOST_CENTRE_SIGMA * width:
             reasons.append(
-                f"the {eye} principal point is known to {centre:.1f} px only. Take tilted views near corners"
+                f"the {whose}principal point is known to {centre:.1f} px only. Take tilted views near corners"
             )
+    if not isinstance(rig, StereoRig):
+        return reasons
     share = rig.baseline_sigma_m / rig.baseline_m
     if share > _MOST_BASELINE_SIGMA:
         reasons.append(

@@ -21,18 +21,25 @@ _LEAST_CORNERS = 6
 
 
 def start(
-    views: Sequence[View], corners_m: FloatArray, image_size_px: tuple[int, int], model: Model
+    views: Sequence[View],
+    corners_m: FloatArray,
+    image_size_px: tuple[int, int],
+    model: Model,
+    eyes: Sequence[Eye] = EYES,
 ) -> tuple[FloatArray, FloatArray]:
     """The rig's parameters and the board's pose in the left eye's frame in each view, shape (views, 6).
 
     Raises:
         CalibrationError: no two views were seen by both eyes, or OpenCV finds no lens.
     """
-    lenses = {eye: _lens(seen_by(views, eye), corners_m, image_size_px, model, eye) for eye in EYES}
+    lenses = {eye: _lens(seen_by(views, eye), corners_m, image_size_px, model, eye) for eye in eyes}
     poses = {
         eye: [None if (seen := view.eye(eye)) is None else pose_of(seen, corners_m, lenses[eye]) for view in views]
-        for eye in EYES
+        for eye in eyes
     }
+    if len(eyes) == 1:
+        alone = [pose for pose in poses["left"] if pose is not None]
+        return lenses["left"].vector, np.array(alone)
     rotation, translation = _between(poses["left"], poses["right"])
     in_left = [
         left if left is not None else _through(right, rotation, translation)
@@ -58,7 +65,7 @@ def pose_of(seen: Corners, corners_m: FloatArray, lens: Lens) -> FloatArray:
 def _lens(seen: Sequence[Corners], corners_m: FloatArray, size_px: tuple[int, int], model: Model, eye: Eye) -> Lens:
     usable = [corners for corners in seen if len(corners) >= _LEAST_CORNERS]
     if len(usable) < 3:
-        raise CalibrationError(f"the {eye} eye saw the board in {len(usable)} views. Take at least 3, better 20")
+        raise CalibrationError(f"the board is in {len(usable)} {eye} images. Take at least 3, better 20")
     if model == "fisheye":
         return min(
             (_fisheye(usable, corners_m, size_px, share) for share in _FISHEYE_FOCALS), key=lambda each: each[1]

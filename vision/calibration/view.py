@@ -13,6 +13,13 @@ from bodyschema.vision.board import Corners
 
 Eye = Literal["left", "right"]
 EYES: tuple[Eye, Eye] = ("left", "right")
+# Of one camera alone.
+ONE_EYE: tuple[Eye, ...] = ("left",)
+
+
+def image_of(eye: Eye, eyes: Sequence[Eye]) -> str:
+    """What an eye's image is called: that of the only eye needs no name."""
+    return f"{eye} image" if len(eyes) > 1 else "image"
 
 
 @dataclass(frozen=True)
@@ -34,7 +41,11 @@ class View:
     @property
     def is_stereo(self) -> bool:
         """Whether both eyes saw the board."""
-        return self.left is not None and self.right is not None
+        return self.is_seen_by(EYES)
+
+    def is_seen_by(self, eyes: Sequence[Eye]) -> bool:
+        """Whether all these eyes saw the board."""
+        return all(self.eye(eye) is not None for eye in eyes)
 
     @property
     def corner_count(self) -> int:

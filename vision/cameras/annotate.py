@@ -63,17 +63,17 @@ class Annotator:
         return found
 
     def drawn(self, frame: StereoFrame, seen: MarkerFix | MarkerMiss) -> ImageArray:
-        """Both images side by side (height, 2 width, 3), with what was seen in them."""
-        eyes = [np.ascontiguousarray(image).copy() for image in (frame.left, frame.right)]
-        sights = [self.sights(image) for image in (frame.left, frame.right)]
+        """All images side by side (height, eyes width, 3), with what was seen in them."""
+        eyes = [np.ascontiguousarray(image).copy() for image in frame.images]
+        sights = [self.sights(image) for image in frame.images]
         if self._tags is not None:
-            for eye, image in zip(eyes, (frame.left, frame.right), strict=True):
+            for eye, image in zip(eyes, frame.images, strict=True):
                 for tag in self._tags.sights(image):
                     _draw_tag(eye, tag)
         for place, eye in enumerate(eyes):
             for sight in sights[place]:
                 self._draw_sight(eye, sight)
-            if isinstance(seen, MarkerMiss):
+            if isinstance(seen, MarkerMiss) and len(eyes) > 1:
                 for sight in sights[1 - place]:  # where the other eye's discs should be in this one
                     if sight.reason is None:
                         _row(eye, sight.centre_px[1], YELLOW)
@@ -95,6 +95,11 @@ class Annotator:
     def _draw_fix(self, eyes: list[ImageArray], fix: MarkerFix) -> None:
         """The marker as it would be seen at the fix, and its row in the other eye."""
         radius_px = self._calibration.focal_px * self._config.radius_m / float(fix.x[2]) if self._is_ball else 0.0
+        if not self._calibration.is_stereo:
+            u, v = self._calibration.project(fix.x)[:2].tolist()
+            if self._is_ball:
+                _circle(eyes[0], (u, v), radius_px, GREEN)
+            cv2.drawMarker(eyes[0], (round(u), round(v)), GREEN, cv2.MARKER_CROSS, 9)
         if fix.centres_px is None:
             return
         ul, vl, ur, vr = fix.centres_px

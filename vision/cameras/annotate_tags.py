@@ -61,15 +61,15 @@ class TagDrawing:
         shown = [corners @ turn.T + fix.x for corners in self._body.corners.values()]
         for corners in shown:
             if np.cross(corners[1] - corners[0], corners[3] - corners[0]) @ corners.mean(axis=0) > 0.0:
-                for image, px in zip(eyes, self._seen(corners), strict=True):
+                for image, px in zip(eyes, self._seen(corners), strict=False):
                     outline(image, px, colour)
         ends = fix.x + 0.75 * self._config.side_m * np.vstack([np.zeros(3), turn.T])
-        for image, px in zip(eyes, self._seen(ends), strict=True):
+        for image, px in zip(eyes, self._seen(ends), strict=False):
             for end, shade in zip(px[1:], AXES, strict=True):
                 cv2.line(image, _fixed(px[0]), _fixed(end), shade, 2, cv2.LINE_AA, SUBPIXEL_BITS)
 
     def _seen(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Where both eyes see points (n, 3), (n, 2) each [px]."""
+        """Where the left eye and a right one see points (n, 3), (n, 2) each [px]."""
         px = self._calibration.project(x)
         return px[:, :2], px[:, 2:]
 

@@ -17,7 +17,7 @@ Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
 Side = Annotated[int, Meta(ge=16, le=LARGEST_SIDE_PX)]
 
-LAYOUTS = ("two", "side_by_side", "images", "videos")
+LAYOUTS = ("one", "two", "side_by_side", "images", "videos")
 # Of a camera whose latency nobody has measured [s]: exposure, readout and transfer of a webcam.
 UNKNOWN_LATENCY_SIGMA_S = 0.015
 ENUMERATED = re.compile(r"\d+|/dev/video\d+")
@@ -45,6 +45,16 @@ class UvcSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     gain: NonNegative | None = None
     white_balance_k: Positive | None = None
     focus: NonNegative | None = None
+
+
+class OneConfig(UvcSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The table [vision.cameras.one]: one camera alone.
+
+    Attributes:
+        device: as /dev/v4l/by-id or by-path names it.
+    """
+
+    device: str
 
 
 class TwoConfig(UvcSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -75,7 +85,7 @@ class ImagesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """The table [vision.cameras.images]: image files in the place of cameras, in the order of their names.
 
     Attributes:
-        left, right: patterns relative to robot.toml, as in "left/*.png".
+        left, right: patterns relative to robot.toml, as in "left/*.png"; of one camera alone `left` only.
         times: a text file with the time of each pair [s], one a line; or
         name_ticks_per_s: the last number in each name is its time, so many to the second (1e9: nanoseconds); or
         fps: the time between two follows from it.
@@ -83,7 +93,7 @@ class ImagesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """
 
     left: str
-    right: str
+    right: str | None = None
     times: str | None = None
     name_ticks_per_s: Positive | None = None
     fps: Positive | None = None
@@ -94,7 +104,7 @@ class VideosConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """The table [vision.cameras.videos]: films in the place of cameras.
 
     Attributes:
-        left, right: a file for each eye, relative to robot.toml; or
+        left, right: a file for each eye, relative to robot.toml; of one camera alone `left` only; or
         side_by_side: one with both eyes' images in each frame, the left one at its left.
         times: a text file with the time of each frame [s], one a line; without it, it follows from
         fps: and without that from the rate that the file names.
@@ -110,7 +120,7 @@ class VideosConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [vision.cameras]: where images come from. Exactly one of the four layouts.
+    """The table [vision.cameras]: where images come from. Exactly one of the five layouts.
 
     Attributes:
         calibration: the file that `bodyschema calibrate cameras` wrote, relative to robot.toml. Without it the
@@ -122,15 +132,16 @@ class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     calibration: str | None = None
     latency_s: Annotated[float, Meta(ge=-1, le=1)] = 0.0
     latency_sigma_s: NonNegative | None = None
+    one: OneConfig | None = None
     two: TwoConfig | None = None
     side_by_side: SideBySideConfig | None = None
     images: ImagesConfig | None = None
     videos: VideosConfig | None = None
 
     @property
-    def layout(self) -> TwoConfig | SideBySideConfig | ImagesConfig | VideosConfig:
+    def layout(self) -> OneConfig | TwoConfig | SideBySideConfig | ImagesConfig | VideosConfig:
         """The one that is given; call `check` first."""
-        found = self.two or self.side_by_side or self.images or self.videos
+        found = self.one or self.two or self.side_by_side or self.images or self.videos
         if found is None:
             raise ConfigError("[vision.cameras] names no cameras")
         return found
@@ -139,11 +150,23 @@ class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     def devices(self) -> dict[str, str]:
         """The devices by what they are called; none where images come from files."""
         match self.layout:
+            case OneConfig() as one:
+                return {"camera": one.device}
             case TwoConfig() as two:
                 return {"left camera": two.left, "right camera": two.right}
             case SideBySideConfig() as one:
                 return {"stereo camera": one.device}
         return {}
+
+    @property
+    def eyes(self) -> int:
+        """How many eyes look: 1 or 2."""
+        match self.layout:
+            case OneConfig():
+                return 1
+            case ImagesConfig() | VideosConfig() as files if files.right is None:
+                return 2 if isinstance(files, VideosConfig) and files.side_by_side else 1
+        return 2
 
     @property
     def sigma_s(self) -> float:
@@ -161,7 +184,9 @@ class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
             raise ConfigError(f"{'.'.join(place)}: {what}", file=file, line=line_of(text, place), remedy=remedy)
 
         if not given:
-            refuse("no cameras are named", "Add one of its tables two, side_by_side, images, videos: docs/cameras.md")
+            refuse(
+                "no cameras are named", "Add one of its tables one, two, side_by_side, images, videos: docs/cameras.md"
+            )
         if len(given) > 1:
             refuse(f"images cannot come from both {given[0]} and {given[1]}", "Take one out", given[1])
         for name, device in self.devices.items():
@@ -178,9 +203,9 @@ class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         if self.images is not None and _count(self.images, "times", "name_ticks_per_s", "fps") != 1:
             refuse("the times have to come from one thing", "Give times, name_ticks_per_s or fps", "images")
         if self.videos is not None:
-            eyes = _count(self.videos, "left", "right")
-            if (eyes, self.videos.side_by_side is None) not in ((2, True), (0, False)):
-                refuse("which films?", "Give left and right, or side_by_side", "videos")
+            named = (self.videos.left is not None, self.videos.right is not None, self.videos.side_by_side is not None)
+            if named not in ((True, True, False), (True, False, False), (False, False, True)):
+                refuse("which films?", "Give left and right, side_by_side, or left alone for one camera", "videos")
             if _count(self.videos, "times", "fps") > 1:
                 refuse("the times have to come from one thing", "Give times or fps", "videos")
 

@@ -1,4 +1,4 @@
-"""Stereo images that were taken before, played."""
+"""Images of one eye or two that were taken before, played."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .look import of_image
 
 
 class Roll(Protocol):
-    """Stereo images in order."""
+    """Images of one eye or two in order."""
 
     @property
     def t(self) -> FloatArray:
@@ -34,7 +34,7 @@ class Roll(Protocol):
     @property
     def image_size_px(self) -> tuple[int, int]: ...
     @property
-    def serials(self) -> tuple[str, str]: ...
+    def serials(self) -> tuple[str, ...]: ...
 
     def open(self, place: int) -> None:
         """Be ready to give the pair at `place`."""
@@ -42,7 +42,7 @@ class Roll(Protocol):
 
     def close(self) -> None: ...
 
-    def next(self) -> tuple[ImageArray, ImageArray]:
+    def next(self) -> tuple[ImageArray, ...]:
         """The next pair; SourceError where it cannot be read."""
         ...
 
@@ -88,14 +88,15 @@ class Film:
         return self._made.image_size_px
 
     @property
-    def serials(self) -> tuple[str, str]:
-        """The files of the two eyes."""
+    def serials(self) -> tuple[str, ...]:
+        """The files of each eye."""
         return self._made.serials
 
     @property
     def health(self) -> tuple[str, ...]:
         """What is wrong with the light in the last pair; all else that is wrong with files is an error."""
-        light = (of_image(image, f"{name} eye") for name, image in zip(("left", "right"), self._shown, strict=False))
+        names = ("left eye", "right eye") if len(self._shown) > 1 else ("camera",)
+        light = (of_image(image, name) for name, image in zip(names, self._shown, strict=False))
         return tuple(text for text in light if text is not None)
 
     @property
@@ -137,7 +138,8 @@ class Film:
             images = self._caught_up(images)
         place, self._next, self._shown = self._next, self._next + 1, images
         t = self._due_s(place) if self._speed else float(roll.t[place])
-        return StereoFrame(t - self._latency_s, *images, float(np.hypot(roll.t_sigma[place], self._sigma_s)))
+        sigma = float(np.hypot(roll.t_sigma[place], self._sigma_s))
+        return StereoFrame(t - self._latency_s, images[0], images[1] if len(images) > 1 else None, sigma)
 
     def _due_s(self, place: int) -> float:
         return self._start_s + float(self._made.t[place] - self._made.t[0]) / self._speed
@@ -148,7 +150,7 @@ class Film:
             self._sleep(min(wait_s, timeout_s))
         return wait_s <= timeout_s
 
-    def _caught_up(self, images: tuple[ImageArray, ImageArray]) -> tuple[ImageArray, ImageArray]:
+    def _caught_up(self, images: tuple[ImageArray, ...]) -> tuple[ImageArray, ...]:
         """The newest pair that is due."""
         now = self._clock.now()
         while self._next + 1 < len(self._made.t) and self._due_s(self._next + 1) <= now:

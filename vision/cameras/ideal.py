@@ -12,7 +12,7 @@ from bodyschema.interfaces.records import StereoFrame
 
 
 class IdealCamera:
-    """A `StereoCamera` of eyes that [camera] describes as they are: ideal pinholes side by side."""
+    """A `StereoCamera` of eyes that [camera] describes as they are: ideal pinholes side by side, or one alone."""
 
     def __init__(self, eyes: StereoEyes, calibration: StereoCalibration) -> None:
         self._eyes, self._calibration = eyes, calibration
@@ -24,6 +24,13 @@ class IdealCamera:
 
     def __enter__(self) -> Self:
         self._eyes.__enter__()
+        if len(self._eyes.serials) != len(self._calibration.eyes_m):
+            self._eyes.__exit__(None, None, None)
+            raise ConfigError(
+                f"[vision.cameras] has {_eyes(len(self._eyes.serials))}, [camera] describes "
+                f"{_eyes(len(self._calibration.eyes_m))}",
+                remedy="Write eyes = 1 in [camera] for one camera alone, without baseline_m; else name two cameras",
+            )
         if self._eyes.image_size_px != self._calibration.image_size_px:
             self._eyes.__exit__(None, None, None)
             has, wants = (_words(eyes.image_size_px) for eyes in (self._eyes, self._calibration))
@@ -41,6 +48,10 @@ class IdealCamera:
     def read(self, timeout_s: float) -> StereoFrame | None:
         """The next frame; None when none came within `timeout_s`. Raises as the eyes do."""
         return self._eyes.read(timeout_s)
+
+
+def _eyes(count: int) -> str:
+    return "one eye" if count == 1 else "two eyes"
 
 
 def _words(size_px: tuple[int, int]) -> str:

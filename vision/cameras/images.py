@@ -19,7 +19,7 @@ NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
 class ImageRoll:
-    """The images that two patterns name, in the order of their names: numbers in them count as numbers.
+    """The images that a pattern for each eye names, in the order of their names: numbers in them count as numbers.
 
     Attributes:
         t: times [s] (n,). t_sigma: between the two eyes' [s] (n,).
@@ -33,35 +33,34 @@ class ImageRoll:
             ConfigError: no files are there, not as many of each eye, or without the times that are asked for.
             SourceError: a file is no image, or the two eyes' have not one size.
         """
-        self._left, self._right = _files(folder, config.left), _files(folder, config.right)
-        if len(self._left) != len(self._right):
+        patterns = (config.left,) if config.right is None else (config.left, config.right)
+        self._eyes = [_files(folder, pattern) for pattern in patterns]
+        if len({len(files) for files in self._eyes}) > 1:
             raise ConfigError(
-                f"{config.left} are {len(self._left)} images, {config.right} are {len(self._right)}",
+                f"{config.left} are {len(self._eyes[0])} images, {config.right} are {len(self._eyes[1])}",
                 file=folder,
                 remedy="Give as many of each eye",
             )
-        self.serials = (config.left, config.right)
+        self.serials = patterns
         self.t, self.t_sigma = self._times(config, folder)
-        left, right = _image(self._left[0]), _image(self._right[0])
-        if left.shape != right.shape:
+        first = [_image(files[0]) for files in self._eyes]
+        if first[0].shape != first[-1].shape:
             raise SourceError(
-                f"the eyes' images are of different sizes: {_size(left)} in {self._left[0]}, {_size(right)} in "
-                f"{self._right[0]}. Set both cameras to one resolution"
+                f"the eyes' images are of different sizes: {_size(first[0])} in {self._eyes[0][0]}, {_size(first[1])} "
+                f"in {self._eyes[1][0]}. Set both cameras to one resolution"
             )
-        self.image_size_px = (left.shape[1], left.shape[0])
+        self.image_size_px = (first[0].shape[1], first[0].shape[0])
         self._next = 0
 
     def _times(self, config: ImagesConfig, folder: Path) -> tuple[FloatArray, FloatArray]:
-        count = len(self._left)
+        count = len(self._eyes[0])
         together = frozen_array(np.zeros(count))
         if config.times is not None:
             return read_times(folder / config.times, count), together
         if config.name_ticks_per_s is not None:
-            first = _ticks(self._left[0], 0)
-            left, right = (
-                frozen_array([_ticks(file, int(first)) / config.name_ticks_per_s for file in files])
-                for files in (self._left, self._right)
-            )
+            since = int(_ticks(self._eyes[0][0], 0))
+            eyes = [[_ticks(file, since) / config.name_ticks_per_s for file in files] for files in self._eyes]
+            left, right = frozen_array(eyes[0]), frozen_array(eyes[-1])
             return checked_times(0.5 * (left + right), folder), frozen_array(np.abs(left - right))
         return frozen_array(np.arange(count) / (config.fps or 1.0)), together
 
@@ -72,14 +71,15 @@ class ImageRoll:
     def close(self) -> None:
         """Nothing is held open."""
 
-    def next(self) -> tuple[ImageArray, ImageArray]:
-        """The next pair; SourceError where a file is none, or of another size."""
-        pair = _image(self._left[self._next]), _image(self._right[self._next])
-        for file, image in zip((self._left[self._next], self._right[self._next]), pair, strict=True):
+    def next(self) -> tuple[ImageArray, ...]:
+        """The next image of each eye; SourceError where a file is none, or of another size."""
+        files = [each[self._next] for each in self._eyes]
+        images = tuple(_image(file) for file in files)
+        for file, image in zip(files, images, strict=True):
             if (image.shape[1], image.shape[0]) != self.image_size_px:
                 raise SourceError(f"{file} is {_size(image)}, the first image is {_words(self.image_size_px)}")
         self._next += 1
-        return pair
+        return images
 
 
 def _files(folder: Path, pattern: str) -> list[Path]:

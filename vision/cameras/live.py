@@ -1,4 +1,4 @@
-"""Cameras that send images now: two of them, or one with two eyes."""
+"""Cameras that send images now: one, two of them, or one with two eyes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import StereoFrame
 
 from .capture import Capture
-from .config import CamerasConfig, SideBySideConfig, TwoConfig
+from .config import CamerasConfig, OneConfig, SideBySideConfig, TwoConfig
 from .device import CameraDevice, OpenCapture, open_v4l2
 from .pairing import Pairing
 from .serials import serial_of
@@ -56,7 +56,7 @@ class LiveEyes:
     def __init__(
         self,
         config: CamerasConfig,
-        layout: TwoConfig | SideBySideConfig,
+        layout: OneConfig | TwoConfig | SideBySideConfig,
         clock: Clock,
         open_capture: OpenCapture = open_v4l2,
     ) -> None:
@@ -80,10 +80,10 @@ class LiveEyes:
         return self._layout.image_size_px
 
     @property
-    def serials(self) -> tuple[str, str]:
+    def serials(self) -> tuple[str, ...]:
         """Serial number of each eye's device; its name where it has none."""
-        found = [serial_of(device) for device in self._config.devices.values()]
-        return (found[0], found[1]) if len(found) == 2 else (f"{found[0]}/left", f"{found[0]}/right")
+        found = tuple(serial_of(device) for device in self._config.devices.values())
+        return (f"{found[0]}/left", f"{found[0]}/right") if isinstance(self._layout, SideBySideConfig) else found
 
     @property
     def health(self) -> tuple[str, ...]:
@@ -156,13 +156,17 @@ class LiveEyes:
     def _take(self, eye: int, shot: Shot) -> None:
         """An image came; in its camera's thread."""
         with self._changed:
-            frame = self._split(shot) if len(self._captures) == 1 else self._paired(eye, shot)
+            frame = self._whole(shot) if len(self._captures) == 1 else self._paired(eye, shot)
             if frame is not None and frame.t > self._last_t:
                 self.dropped += self._waiting is not None
                 self._waiting, self._last_t = frame, frame.t
             self._changed.notify_all()
 
-    def _split(self, shot: Shot) -> StereoFrame:
+    def _whole(self, shot: Shot) -> StereoFrame:
+        """The frame of a camera that is alone, cut where it shows two eyes' images."""
+        if isinstance(self._layout, OneConfig):
+            sigma = math.hypot(shot.t_sigma, self._config.sigma_s)
+            return StereoFrame(shot.t - self._config.latency_s, shot.image, None, sigma)
         width = self.image_size_px[0]
         left, right = np.ascontiguousarray(shot.image[:, :width]), np.ascontiguousarray(shot.image[:, width:])
         sigma = math.hypot(shot.t_sigma, self._config.sigma_s)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from bodyschema.interfaces.protocols import Clock
 
-from .config import CamerasConfig, ImagesConfig, SideBySideConfig, TwoConfig, VideosConfig
+from .config import CamerasConfig, ImagesConfig, OneConfig, SideBySideConfig, TwoConfig, VideosConfig
 from .device import OpenCapture, open_v4l2
 from .film import Film, Roll
 from .images import ImageRoll
@@ -25,7 +25,7 @@ def eyes_of(
         clock: the machine's monotonic one.
     """
     match config.layout:
-        case TwoConfig() | SideBySideConfig() as layout:
+        case OneConfig() | TwoConfig() | SideBySideConfig() as layout:
             return LiveEyes(config, layout, clock, open_capture)
         case ImagesConfig() as images:
             return _film(config, lambda: ImageRoll(images, folder), clock, images.speed)

@@ -15,7 +15,7 @@ from .film import read_times
 
 
 class VideoRoll:
-    """Two films, or one whose frames have both eyes' images.
+    """Two films, that of one camera alone, or one whose frames have both eyes' images.
 
     Attributes:
         t: times [s] (n,). t_sigma: zeros (n,).
@@ -30,7 +30,8 @@ class VideoRoll:
         """
         both = config.side_by_side
         self._files = [folder / name for name in ((both,) if both else (config.left, config.right)) if name]
-        self.serials = (f"{both}/left", f"{both}/right") if both else (str(config.left), str(config.right))
+        eyes = [str(name) for name in (config.left, config.right) if name is not None]
+        self.serials = (f"{both}/left", f"{both}/right") if both else tuple(eyes)
         self._captures: list[cv2.VideoCapture] = []
         sizes, counts, rates = zip(*(_measured(file) for file in self._files), strict=True)
         if len(set(sizes)) > 1:
@@ -70,8 +71,8 @@ class VideoRoll:
             capture.release()
         self._captures = []
 
-    def next(self) -> tuple[ImageArray, ImageArray]:
-        """The next pair; SourceError where the film is damaged."""
+    def next(self) -> tuple[ImageArray, ...]:
+        """The next image of each eye; SourceError where the film is damaged."""
         images: list[ImageArray] = []
         for file, capture in zip(self._files, self._captures, strict=True):
             is_there, image = capture.read()
@@ -79,7 +80,7 @@ class VideoRoll:
                 raise SourceError(f"{file} is damaged, or shorter than it says")
             images.append(np.asarray(image, np.uint8))
         if not self._is_split:
-            return images[0], images[1]
+            return tuple(images)
         width = self.image_size_px[0]
         return np.ascontiguousarray(images[0][:, :width]), np.ascontiguousarray(images[0][:, width:])
 

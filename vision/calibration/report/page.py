@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from html import escape
 from importlib.resources import files
 
@@ -13,8 +13,9 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.vision.calibration.calibrate import Calibrated
 from bodyschema.vision.calibration.gather import Gathered
 from bodyschema.vision.calibration.report import pictures
-from bodyschema.vision.calibration.view import EYES, Eye, View, all_px
+from bodyschema.vision.calibration.view import Eye, View, all_px, image_of
 from bodyschema.vision.rectified import Rectification
+from bodyschema.vision.rig import StereoRig
 
 _NORMAL_95 = 1.96
 _ARROW_SHARE = 0.04  # of the image's width: the arrow of a residual that is larger than 95 % of them
@@ -27,7 +28,7 @@ def page(found: Calibrated, gathered: Gathered) -> str:
     head = (
         f"<h1>Cameras calibrated: views that were not fitted are foretold to {rig.made.held_out_px:.2f} px</h1>"
         f'<p class="of">{escape(rig.made.board)} · {escape(rig.made.date[:10])} '
-        f"· left {escape(rig.serials[0] or 'not named')} · right {escape(rig.serials[1] or 'not named')}</p>"
+        f"· {' · '.join(_named(eye, serial) for eye, serial in _eyes(found, rig.serials))}</p>"
     )
     parts = (_tiles(found), _coverage(found), _residuals(found), _parameters(found), _views(found, gathered))
     return (
@@ -41,7 +42,7 @@ def _tiles(found: Calibrated) -> str:
     calibration = Rectification(rig).calibration
     rivals = ", ".join(f"{model} {px:.3f} px" for model, px in found.rivals_px.items())
     tiles = (
-        (f"{1e3 * rig.baseline_m:.2f} ± {_NORMAL_95 * 1e3 * rig.baseline_sigma_m:.2f} mm", "baseline, 95 %"),
+        *_baseline(found),
         (f"{rig.made.held_out_px:.3f} px", "RMS error of views not fitted, per coordinate"),
         (f"{rig.made.reprojection_px:.3f} px", "RMS error of the fit, per coordinate"),
         (f"{rig.made.views}", f"views; {rig.made.left_out} left out"),
@@ -52,11 +53,27 @@ def _tiles(found: Calibrated) -> str:
     return f'<section><div class="tiles">{shown}</div></section>'
 
 
+def _baseline(found: Calibrated) -> Iterator[tuple[str, str]]:
+    rig = found.rig
+    if isinstance(rig, StereoRig):
+        half = _NORMAL_95 * 1e3 * rig.baseline_sigma_m
+        yield f"{1e3 * rig.baseline_m:.2f} ± {half:.2f} mm", "baseline, 95 %"
+
+
+def _eyes(found: Calibrated, serials: Sequence[str]) -> list[tuple[str, str]]:
+    """What each eye is called, and its device; the only one has no name."""
+    return list(zip(found.coverage.eyes if len(serials) > 1 else ("",), serials, strict=True))
+
+
+def _named(eye: str, serial: str) -> str:
+    return f"{eye} {escape(serial or 'not named')}".strip()
+
+
 def _coverage(found: Calibrated) -> str:
     figures = "".join(
         f"<figure>{pictures.coverage(all_px(found.fitted.views, eye), found.coverage.covered(eye), _size(found), eye)}"
-        f"<figcaption>{eye}</figcaption></figure>"
-        for eye in EYES
+        f"<figcaption>{eye if len(found.coverage.eyes) > 1 else ''}</figcaption></figure>"
+        for eye in found.coverage.eyes
     )
     missing = found.coverage.missing()
     wishes = f"<ul>{''.join(f'<li>{escape(text)}' for text in missing)}</ul>" if missing else ""
@@ -68,13 +85,13 @@ def _coverage(found: Calibrated) -> str:
 
 
 def _residuals(found: Calibrated) -> str:
-    off = {eye: np.concatenate([np.zeros((0, 2)), *_eye_residuals(found, eye)]) for eye in EYES}
+    off = {eye: np.concatenate([np.zeros((0, 2)), *_eye_residuals(found, eye)]) for eye in found.coverage.eyes}
     lengths = np.linalg.norm(np.concatenate(list(off.values())), axis=1)
     stretch = _round(_ARROW_SHARE * _size(found)[0] / float(np.quantile(lengths, 0.95)))
     figures = "".join(
         f"<figure>{pictures.residuals(all_px(found.fitted.views, eye), off[eye], stretch, _size(found), eye)}"
-        f"<figcaption>{eye}</figcaption></figure>"
-        for eye in EYES
+        f"<figcaption>{eye if len(found.coverage.eyes) > 1 else ''}</figcaption></figure>"
+        for eye in found.coverage.eyes
     )
     return (
         f"<section><h2>What is left</h2><p>From where each corner should be to where it was found, {stretch:g} times "
@@ -90,7 +107,7 @@ def _parameters(found: Calibrated) -> str:
         for name, value, sigma in zip(rig.names, rig.vector.tolist(), rig.sigma.tolist(), strict=True)
     )
     return (
-        "<section><h2>Every parameter</h2><p>With 95 % intervals from the joint least-squares problem of both eyes. "
+        "<section><h2>Every parameter</h2><p>With 95 % intervals from the joint least-squares problem of all views. "
         f"Lengths contain that the board's size is known to {rig.made.scale_sigma:.2%}.</p>"
         f'<div class="scroll"><table><tr><th>parameter<th>value<th>95 %{rows}</table></div></section>'
     )
@@ -110,7 +127,8 @@ def _views(found: Calibrated, gathered: Gathered) -> str:
             text = f"left out: {each.rms_px:.2f} px, the others have {each.usual_px:.2f}"
         figures.append(_view(view, gathered, text, is_bad=view.name in left_out))
     faults = "".join(
-        f"<li>{escape(each.name)}, {each.eye} image: {escape(each.fault.text)}" for each in gathered.unusable
+        f"<li>{escape(each.name)}, {image_of(each.eye, gathered.eyes)}: {escape(each.fault.text)}"
+        for each in gathered.unusable
     )
     unusable = f"<h2>Images that could not be used</h2><ul>{faults}</ul>" if faults else ""
     return (
@@ -121,7 +139,7 @@ def _views(found: Calibrated, gathered: Gathered) -> str:
 
 def _view(view: View, gathered: Gathered, text: str, *, is_bad: bool) -> str:
     pair = gathered.images[view.name]
-    eyes = zip((pair.left, pair.right), EYES, strict=True)
+    eyes = zip(pair.images, gathered.eyes, strict=True)
     images = "".join(
         pictures.photograph(image, view.eye(eye), f"{escape(view.name, quote=True)}, {eye}") for image, eye in eyes
     )

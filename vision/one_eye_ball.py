@@ -1,0 +1,90 @@
+"""Follows one ball of known size through the images of one camera alone: its direction, and its depth from its size."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, StereoFrame, frozen_array
+
+from .ball_size import RADIUS_SIGMA
+from .blob import Disc, Region, find_patches, measure
+from .colour import gate_of
+from .config import VisionConfig
+from .images import check_calibration, check_images
+from .sphere import Pinhole
+
+# Distances that follow from the ball's size, each better than the last by a factor of its squared size in the image.
+_ROUNDS = 5
+
+
+class OneEyeBallTracker:
+    """Finds one coloured ball in the images of one camera.
+
+    The direction is as sharp as in a stereo image, the depth as sure as the ball's radius is known: nothing else tells
+    it, nor whether it is the ball. So two things that look like one are none.
+    """
+
+    def __init__(self, calibration: StereoCalibration, config: VisionConfig | None = None) -> None:
+        """Prepare for images of `calibration`; ConfigError when it describes no camera."""
+        check_calibration(calibration)
+        self.calibration = calibration
+        self.config = config or VisionConfig()
+        self._gate = gate_of(self.config)
+        self._eye = Pinhole(calibration.focal_px, calibration.principal_point_px)
+        self._whole = Region(0, 0, *calibration.image_size_px)
+
+    def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
+        """The marker in `frame`, in the camera's optical frame, or why there is none.
+
+        Raises:
+            SourceError: the image is not uint8 BGR of the calibration's size.
+        """
+        check_images(frame, self.calibration)
+        found = self._disc(frame)
+        located = self._located(found) if isinstance(found, Disc) else found
+        if isinstance(located, Reason):
+            return MarkerMiss(frame.t, located)
+        x, cov = located
+        return MarkerFix(frame.t, frozen_array(x), frozen_array(cov))
+
+    def forget(self) -> None:
+        """Every frame is looked at as if it were the first."""
+
+    def _disc(self, frame: StereoFrame) -> Disc | Reason:
+        """The one ball in the image."""
+        discs: list[Disc] = []
+        reason = Reason.NO_MARKER
+        for patch in find_patches(frame.left, self._whole, self._gate, self.config):
+            outcome = measure(frame.left, patch, self._eye, self._gate, self.config)
+            if isinstance(outcome, Reason):
+                reason = outcome if reason is Reason.NO_MARKER else reason
+            elif not any(outcome.is_same_as(disc) for disc in discs):
+                discs.append(outcome)
+        if len(discs) > 1:
+            return Reason.AMBIGUOUS
+        return discs[0] if discs else reason
+
+    def _located(self, disc: Disc) -> tuple[FloatArray, FloatArray] | Reason:
+        """Place (3,) [m] and its covariance (3, 3) [m²]."""
+        radius_m = self.config.radius_m
+        distance = radius_m * self._eye.distance_over_radius(disc.centre_px, disc.radius_px)
+        sight = self._sight(disc, distance)
+        for _ in range(_ROUNDS):
+            outline = self._eye.outline(distance * sight, radius_m)
+            if outline is None:
+                return Reason.SIZE_MISMATCH
+            distance *= outline.radius_px / disc.radius_px
+            sight = self._sight(disc, distance)
+        x = distance * sight
+        # A pixel turns the line of sight; what it adds along it is the size's to say.
+        across = (np.eye(3) - np.outer(sight, sight))[:, :2] * x[2] / self._eye.focal_px
+        pixels = disc.cov_px + self.calibration.pixel_sigma**2 * np.eye(2)
+        depth = (disc.radius_sigma_px / disc.radius_px) ** 2 + RADIUS_SIGMA**2
+        return x, across @ pixels @ across.T + depth * np.outer(x, x)
+
+    def _sight(self, disc: Disc, distance: float) -> FloatArray:
+        """The direction (3,) of the ball's centre, of length 1, if it is so far away [m]."""
+        centre_px = self._eye.sphere_centre(disc.centre_px, distance / self.config.radius_m)
+        ray = np.append((centre_px - np.array(self._eye.principal_point_px)) / self._eye.focal_px, 1.0)
+        return ray / np.linalg.norm(ray)
