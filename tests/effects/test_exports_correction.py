@@ -19,7 +19,9 @@ from bodyschema.interfaces.robot import RobotDescription
 
 READERS = Path(__file__).resolve().parents[2] / "examples" / "correction"
 NOT_OF_THE_ARM = {"camera_scale", "camera_focal", "lens_distortion", "camera_latency", "thermal_drift"}
-NAMES = tuple(name for name in KINDS if name not in NOT_OF_THE_ARM)
+# Their state depends on loads as well as on readings; the readers do not have them.
+NOT_IN_THE_READERS = {"hysteresis", "gravity_backlash", "payload"}
+NAMES = tuple(name for name in KINDS if name not in NOT_OF_THE_ARM | NOT_IN_THE_READERS)
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +80,13 @@ def test_python_agrees_effect_by_effect(name, robot, tmp_path) -> None:
         # On which side a play begins is known when the joint has moved.
         np.testing.assert_allclose([angles for angles, _ in found][1:], run.q[1:], rtol=0, atol=1e-12)
         np.testing.assert_allclose([pose[3::4] for _, pose in found][1:], run.measured[1:], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", sorted(NOT_IN_THE_READERS))
+def test_an_effect_that_readers_lack_is_reported(name, robot, tmp_path) -> None:
+    place = next(where for where in everywhere(robot) if where[0] == name)
+    told = write_correction(Simulation(robot, (sized(robot, place, 1.0),)), tmp_path / "c.json", "")
+    assert any(line.startswith(f"not in the file: {name}") for line in told)
 
 
 @pytest.mark.parametrize("language", ["python", "c++", "javascript"])
