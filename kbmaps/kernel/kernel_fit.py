@@ -1,7 +1,7 @@
 """Gaussian inference on KB-Maps with as many unknowns as pairs: no vector of 3^d numbers is formed.
 
 Positions are y = H β + r + e with features H whose coefficients are β ~ N(0, 1), a KB-Map r whose coefficients are
-N(0, τ²) each, so that r has the covariance τ² k(q, q'), and noise e of variance s². With λ = s² / τ² all of it
+N(0, τ²) each, so that r has the covariance τ² k(q, q'), and noise e of variance s². With λ = s² / τ² everything
 follows from one Cholesky factorisation of K + λ I (Rasmussen and Williams, Gaussian Processes for Machine Learning,
 2006, sections 2.2 and 2.7).
 """
@@ -23,27 +23,27 @@ from kbmaps.maps.noise_evidence import VARIANCE_FLOOR, LinearEvidence
 
 Precision = float | Literal["evidence"] | None
 
-# Limits of the search for λ and where it begins, relative to the mean diagonal of the Gram matrix.
+# Limits and start of the search for λ, relative to the mean diagonal of the Gram matrix.
 _SEARCH_LIMITS, _SEARCH_START = (1e-12, 1e6), 1e-4
-# Relative to the trace of the Gram matrix: just enough to keep its Cholesky factorisation alive.
+# Relative to the trace of the Gram matrix: just enough for a stable Cholesky factorisation.
 _VANISHING_RIDGE = 1e-15
-# The refinement of the exact solution ends when a step no longer lessens what is left to this share.
+# The refinement of the exact solution ends when a step no longer reduces the residual to this share.
 _REFINEMENTS, _PROGRESS = 200, 0.95
 _BLOCK = 256
 
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Pairs as the inference sees them: rows multiplied by `scale`, so that their noise is equal.
+    """Pairs in the form of the inference: rows multiplied by `scale`, so that their noise is equal.
 
     Attributes:
         weights: of every joint (n, d, 3).
         scale: roots (n,) of the pairs' weights.
-        errors: what the prior's mean leaves to explain, scaled (n, 3).
+        errors: scaled residuals of the prior's mean (n, 3).
         features: H, scaled (n, 3, p).
-        count: how many pairs the scaled ones are worth; less than n where some are partly forgotten.
-        log_weights: logarithms of the pairs' inverse variances, summed.
-        noise_known: whether the noise of the scaled errors is 1, or to be estimated.
+        count: effective number of pairs; less than n where some are partly forgotten.
+        log_weights: sum of the logarithms of the pairs' inverse variances.
+        noise_known: True if the noise of the scaled errors is 1; False if it is to be estimated.
     """
 
     weights: FloatArray
@@ -56,9 +56,11 @@ class Observations:
 
 
 class KernelFit:
-    """The posterior after some observations.
+    """Posterior after some observations.
 
     Args:
+        kernel: the product kernel.
+        observations: the pairs.
         precision: λ; "evidence" takes the most probable one; None explains the pairs exactly by the smallest
             coefficients (without features, where no pair contradicts another).
 
