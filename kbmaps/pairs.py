@@ -1,4 +1,4 @@
-"""Pairs of joint angles and measured positions, checked where they come in."""
+"""Pairs of joint angles and measured positions, and their validation."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Pairs:
 
     Attributes:
         unit: 1-sigma (n,) of each coordinate [m] up to a common factor.
-        known: whether that factor is 1; otherwise it has to be estimated.
+        known: True if that factor is 1; False if it has to be estimated.
     """
 
     q: FloatArray
@@ -33,14 +33,14 @@ class Pairs:
         return len(self.q)
 
     def chosen(self, mask: BoolArray) -> Pairs:
-        """Those of the mask (n,), in the same units."""
+        """Return the pairs of the mask (n,), in the same units."""
         return Pairs(self.q[mask], self.x[mask], self.unit[mask], self.known)
 
 
 def with_units(q: FloatArray, x: FloatArray, sigma: FloatArray) -> Pairs:
-    """Pairs from their sigma (n,) [m], NaN where it was not told.
+    """Return pairs from their sigma (n,) [m], NaN where unknown.
 
-    As soon as one was not told, the others count relative to their median, which stands for the missing ones too.
+    As soon as one is unknown, the others count relative to their median, which also replaces the missing ones.
     """
     told = ~np.isnan(sigma)
     if told.all():
@@ -51,10 +51,10 @@ def with_units(q: FloatArray, x: FloatArray, sigma: FloatArray) -> Pairs:
 
 
 def stored_pairs(arrays: Mapping[str, FloatArray], joints: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """q (n, d), x (n, 3) and sigma (n,), NaN where it was not told, of the arrays of a stored model.
+    """Return q (n, d), x (n, 3) and sigma (n,), NaN where unknown, from the arrays of a stored model.
 
     Raises:
-        ModelFormatError: they are missing, or no pairs.
+        ModelFormatError: they are missing, or not pairs.
     """
     with restoring("pairs"):
         q, x, sigma = rows("q", arrays["q"], joints), rows("x", arrays["x"], 3), arrays["sigma"]
@@ -68,7 +68,7 @@ def stored_pairs(arrays: Mapping[str, FloatArray], joints: int) -> tuple[FloatAr
 def checked_pairs(
     q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None, joints: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """q (n, d), x (n, 3) and sigma (n,), NaN for None, from many pairs or one.
+    """Return q (n, d), x (n, 3) and sigma (n,), NaN for None, from many pairs or one.
 
     Raises:
         ShapeError, NonFiniteError, SettingError: a sigma that is not positive.
@@ -92,6 +92,6 @@ def checked_pairs(
 
 
 def runs(told: BoolArray) -> list[slice]:
-    """Each run of pairs whose sigma was told, or was not (n,), as they can be learnt in one go."""
+    """Return runs of pairs that all have a sigma, or all lack one (n,), so that each can be learnt in one call."""
     ends = [0, *(np.flatnonzero(told[1:] != told[:-1]) + 1).tolist(), len(told)]
     return [slice(start, end) for start, end in itertools.pairwise(ends)] if len(told) else []

@@ -172,15 +172,18 @@ def fit_chain(
     near: bool = False,
     noise: NoiseKnowledge = NOTHING_KNOWN,
 ) -> RigidFit:
-    """The most probable change for at least one pair, on the way from `start` (size,).
+    """Fit the most probable change to at least one pair, starting from `start` (size,).
 
-    Graduated non-convexity (Yang et al. 2020): Geman-McClure weights, and with them the noise that weighs data against
-    prior, shrink from the largest residual to what is typical, so that neither outliers nor a marker far from its
-    place stop the way. Then least squares on all pairs that are no outliers, with the noise estimated from them.
+    First graduated non-convexity (Yang et al. 2020): Geman-McClure weights, and with them the noise that weighs data
+    against prior, shrink from the largest residual to the typical one. So neither outliers nor a marker far from its
+    nominal position stop the fit. Then least squares on all inliers, with the noise estimated from them.
 
     Args:
+        prior: Gaussian over the parameters before these pairs.
+        pairs: the pairs, at least one.
+        start: change (size,) to start from.
         near: the start is a fit to most of these pairs, so that least squares will do.
-        noise: what is known beforehand of a noise that is not told.
+        noise: prior of a noise that is not given.
     """
     fitter = _Fitter(prior, pairs, start)
     if not near:
@@ -189,9 +192,12 @@ def fit_chain(
 
 
 def folded(prior: ChainBelief, pairs: Pairs, change: FloatArray, noise: float) -> ChainBelief:
-    """What is believed after pairs, all good, that are linearised at a change (size,).
+    """Return the posterior after inlier pairs, linearised at a change (size,).
 
     Args:
+        prior: Gaussian over the parameters before these pairs.
+        pairs: the pairs, without outliers.
+        change: linearisation point (size,).
         noise: over the pairs' unit.
     """
     point = _Fitter(prior, pairs, change).point
@@ -221,7 +227,7 @@ def _polish(fitter: _Fitter, before: NoiseKnowledge) -> RigidFit:
     pairs = fitter.pairs
     typical = fitter.typical()
     inliers = fitter.point.norms <= OUTLIER_SIGMAS * typical
-    # Few pairs can be fitted with much noise or with little; what was told has the first say.
+    # Few pairs can be fitted with much noise or with little; a given noise is tried first.
     noise = 1.0 if pairs.known else typical
     freedom = 0.0
     for _ in range(_ROUNDS):
@@ -245,7 +251,7 @@ def _found_noise(square: float, freedom: float, before: NoiseKnowledge, fitter: 
 
 
 def _told_noise(square: float, freedom: float) -> float:
-    """1 unless the residuals are more than chance makes them: then the chain does not fit."""
+    """Return 1, or more if the residuals exceed chance: then the chain does not fit."""
     if freedom == 0.0 or chdtrc(freedom, square) >= _MISFIT_CHANCE:
         return 1.0
     return max(math.sqrt(square / freedom), 1.0)
@@ -270,7 +276,7 @@ def _summary(fitter: _Fitter, inliers: BoolArray, noise: float, freedom: float) 
 
 
 def _rank(design: FloatArray) -> int:
-    """How many directions of the parameters the rows show."""
+    """Return the number of parameter directions that the rows determine."""
     lengths = np.linalg.norm(design, axis=0)
     seen = lengths > 1e-12 * max(float(lengths.max(initial=0.0)), 1e-300)
     singular = np.linalg.svd(design[:, seen] / lengths[seen], compute_uv=False)
