@@ -79,10 +79,11 @@ class Contest:
         return self._pairs
 
     def add(self, squares: Mapping[str, ArrayLike]) -> None:
-        """Add a pair: the squared distance [m²] of each model that predicted it; values that are not finite are
-        ignored.
+        """Add a pair: the squared distance [m²] of each model that predicted it.
 
-        Several pairs can be added in their order: the squared distances (n,) of each model.
+        Values that are not finite are ignored. Several pairs can be added in their order: the squared distances (n,) of
+        each
+        model.
 
         Raises:
             ShapeError: the models have squared distances of different numbers of pairs; nothing has changed.

@@ -175,9 +175,7 @@ class Ladder:
         return dict(self._failures)
 
     def errors(self) -> dict[str, float]:
-        """Return the RMS distance between prediction and measurement on the last pairs, before learning them [m],
-        by model.
-        """
+        """Return each model's RMS prediction error on the last pairs, before learning them [m]."""
         return {
             name: math.sqrt(float(np.nanmean(squares)))
             for name, squares in self._contest.errors.items()
@@ -260,8 +258,9 @@ class Ladder:
         return Estimate(x, sigma, inside.in_support).like(angles)
 
     def to_bytes(self) -> bytes:
-        """Return the ladder with all its models and pairs; `from_bytes` restores the same predictions to the last
-        bit.
+        """Return the ladder with all its models and pairs.
+
+        `from_bytes` restores the same predictions to the last bit.
         """
         entries = [
             {

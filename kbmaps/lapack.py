@@ -1,5 +1,6 @@
-"""Typed access to the BLAS and LAPACK routines used here. They work on Fortran order and may overwrite their
-inputs.
+"""Typed access to the BLAS and LAPACK routines used here.
+
+They work on Fortran order and may overwrite their inputs.
 """
 
 from __future__ import annotations
@@ -18,9 +19,7 @@ _PANEL_COLUMNS = 32
 
 @cache
 def _routine(name: str, library: str = "lapack") -> Callable[..., Any]:
-    """Import scipy.linalg on the first call: it takes 0.2 s of CPU, and reading a robot's description does not need
-    it.
-    """
+    """Import scipy.linalg on first use: it takes 0.2 s of CPU, and not every command needs it."""
     return cast(Callable[..., Any], getattr(import_module(f"scipy.linalg.{library}"), name))
 
 

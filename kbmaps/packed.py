@@ -109,8 +109,10 @@ def number(value: Any, what: str) -> float:
 
 
 def count(value: Any, what: str) -> int:
-    """Return `value` if it is a whole number from 0 to 2^53, the range of every JSON reader. Raises
-    ModelFormatError.
+    """Return `value` if it is a whole number from 0 to 2^53, the range of every JSON reader.
+
+    Raises:
+        ModelFormatError: it is not.
     """
     if type(value) is not int or not 0 <= value <= _LARGEST_COUNT:
         raise ModelFormatError(f"{what} is not a whole number from 0 to {_LARGEST_COUNT}")

@@ -24,8 +24,7 @@ def student(freedom: float) -> float:
 
 
 def claimed_sigma(variance: FloatArray, pairs: Pairs, noise: float, freedom: float) -> FloatArray:
-    """Return the 1-sigma against the truth [m] of positions with this posterior variance [m²], after a fit to the
-    pairs.
+    """Return the 1-sigma against the truth [m] of positions with this posterior variance [m²].
 
     Where a given noise does not explain the residuals, the excess is added. Where the noise was estimated from few
     residuals, it is widened, because it may be larger than it seems.

@@ -51,11 +51,11 @@ def nearest_rotation(matrices: ArrayLike) -> FloatArray:
 
 
 def nearest_rotation_rates(matrices: FloatArray, derivatives: FloatArray) -> FloatArray:
-    """Return the angular velocities ω (..., 3, d) of the rotations R nearest to matrices (..., 3, 3): dR = [ω_k]× R
-    dq_k.
+    """Return the angular velocities ω (..., 3, d) of the rotations R nearest to matrices (..., 3, 3).
 
-    With M = R P, Rᵀ dM − dMᵀ R = Ω P + P Ω, and for [ω]× = Ω this is [(tr P · 1 − P) ω]×: exact, also where M is not
-    orthonormal.
+    dR = [ω_k]× R dq_k. With M = R P, Rᵀ dM − dMᵀ R = Ω P + P Ω, and for [ω]× = Ω this is [(tr P · 1 − P) ω]×: exact,
+    also
+    where M is not orthonormal.
 
     Args:
         matrices: M (..., 3, 3).

@@ -104,8 +104,9 @@ class TypeComparison(msgspec.Struct, frozen=True):
 
 
 def common_poses(coverages: Sequence[Mapping[str, JointRange]], joints: tuple[str, ...], seed: int = 0) -> FloatArray:
-    """Return poses (n, d) [rad, m] from the median ranges of the robots, so that one that hardly moved does not
-    matter.
+    """Return poses (n, d) [rad, m] from the median ranges of the robots.
+
+    One robot that hardly moved does not matter.
 
     Raises:
         RequestError: no robot reports the ranges of its joints.

@@ -21,9 +21,7 @@ _STYLES = {"explained": "green", "nothing_found": "blue", "undecided": "yellow",
 
 @contextmanager
 def progress(console: Console, count: int) -> Iterator[tuple[Told, Done]]:
-    """Yield the callbacks of `diagnose_all`: progress bars on a terminal, elsewhere a line for each finished
-    recording.
-    """
+    """Yield the callbacks of `diagnose_all`: progress bars on a terminal, elsewhere one line per recording."""
     if not console.is_terminal:
         finished = 0
 

@@ -45,8 +45,11 @@ class KnownArm:
         return KnownArm(self.chain.with_other_tool(OTHER_TOOL_M), self.tolerances, residual)
 
     def widened(self, columns: NDArray[np.intp], std: FloatArray) -> KnownArm:
-        """Return the same arm with the uncertainty of some chain parameters (k,) increased by `std` (k,) [rad, m]
-        (1-sigma).
+        """Return the same arm with the uncertainty of some chain parameters increased.
+
+        Args:
+            columns: indices (k,) of these parameters.
+            std: 1-sigma of each change (k,) [rad, m].
         """
         residual = None if self.residual is None else self.residual.widened(columns, std)
         return KnownArm(self.chain.widened(columns, std), self.tolerances, residual)

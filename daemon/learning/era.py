@@ -180,8 +180,12 @@ class Era:
         return doubted
 
     def _limits_m(self, where: Where, predicted: FloatArray, variances: FloatArray) -> FloatArray:
-        """Return the distance limits (n,) [m] from the predictions (n, 3) of pairs with these variances (n, 3)
-        [m²].
+        """Return the distance limits (n,) [m] of pairs from their predictions.
+
+        Args:
+            where: configurations of the pairs (n, d).
+            predicted: predictions (n, 3) [m].
+            variances: of the measurements (n, 3) [m²].
         """
         claimed = self._claims.of(self.answering, lambda _: predicted).variance_there(where).sum(axis=1)
         recent = np.maximum(self._claims.errors[self.answering].rms_m, np.sqrt(variances.sum(axis=1)))

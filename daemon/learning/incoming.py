@@ -14,9 +14,7 @@ ROUNDING = 1e-6
 
 
 def check_pair(pair: Pair, counters: Counters, joints: int) -> None:
-    """Raise RequestError if the pair is of another robot or store, not newer than the last one, or not a
-    measurement.
-    """
+    """Raise RequestError if a pair is of another robot or store, not new, or not a measurement."""
     if counters.store not in (None, pair.store):
         raise RequestError(
             f"pair {pair.seq} comes from the store {pair.store}, this learner learnt from {counters.store}"

@@ -175,8 +175,9 @@ class Learning:
             )
 
     def kept(self, limit: int) -> tuple[FloatArray, FloatArray]:
-        """Return at most `limit` of the kept pairs with the current tool, evenly spread: q (n, d) [rad, m], x (n,
-        3) [m].
+        """Return at most `limit` of the kept pairs, evenly spread: q (n, d) [rad, m], x (n, 3) [m].
+
+        Only pairs with the current tool.
         """
         with self._lock:
             memory = self._course.eras.memory

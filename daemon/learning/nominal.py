@@ -111,9 +111,7 @@ class NominalModel:
         return " and ".join(f"{name} = false" for name, known in flags if not known)
 
     def reach(self, angle: float) -> FloatArray:
-        """Return `angle` [rad] for each revolute joint, and the same share of its stroke [m] for a prismatic one
-        (d,).
-        """
+        """Return `angle` [rad] for a revolute joint, the same share of its stroke [m] for a prismatic one (d,)."""
         return np.where(self.chain.prismatic, angle * (self.upper - self.lower) / np.pi, angle)
 
     def fingerprint(self, tolerances: ChainTolerances) -> str:
@@ -141,9 +139,7 @@ class NominalModel:
         return KBMap(self.bases, net, prior.metadata)
 
     def _nodes(self) -> list[FloatArray] | None:
-        """Return the grid values of each joint over its range that determine a map; None if there would be too
-        many.
-        """
+        """Return the grid values of each joint over its range that determine a map; None for too large a grid."""
         count = next((n for n in (5, 4, 3) if n**self.joints <= LARGEST_GRID), None)
         if count is None:
             return None
@@ -171,8 +167,9 @@ class NominalModel:
         return known
 
     def placed(self, q: FloatArray, x: FloatArray) -> RigidChain:
-        """Return the chain with an unknown pose fitted to pairs, q (n, d) [rad] and x (n, 3) [m]; the marker is
-        nominal.
+        """Return the chain with an unknown pose fitted to pairs, q (n, d) [rad] and x (n, 3) [m].
+
+        Its marker is at its nominal position.
 
         Raises:
             DegenerateDataError: the pairs do not determine it.

@@ -57,8 +57,12 @@ class AngleMemory(msgspec.Struct):
     ratio: float = 0.0
 
     def add(self, angle: float, noise: float, claimed: float) -> None:
-        """Add an error of this angle [rad], with the expected squares of noise alone, and of noise and model
-        [rad²].
+        """Add an error of this angle [rad].
+
+        Args:
+            angle: of the error [rad].
+            noise: expected square of the measurement's noise [rad²].
+            claimed: expected square of noise and model error together [rad²].
         """
         self.weight = DISCOUNT * self.weight + 1.0
         self.angle = DISCOUNT * self.angle + angle

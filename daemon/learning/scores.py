@@ -58,9 +58,7 @@ class ErrorMemory(msgspec.Struct):
 
     @property
     def sigma(self) -> FloatArray:
-        """Uncertainty of the prediction against the truth, 1-sigma per axis (3,) [m], without the measurement's
-        noise.
-        """
+        """Uncertainty of the prediction against the truth, 1-sigma per axis (3,) [m]; noise is subtracted."""
         missing = max(WARM - self.weight, 0.0)
         square = (np.array(self.square) + missing * self.expected_m**2 / 3.0) / max(self.weight, WARM)
         noise = self.noise_variance

@@ -68,9 +68,7 @@ class Reference:
         return self.model.predict(q) - self.belief.predict(q)
 
     def derivatives(self, q: FloatArray) -> FloatArray:
-        """Return derivatives of the position by the joints' readings at q (n, d), (n, 3, d) [m/rad, or 1 if
-        prismatic].
-        """
+        """Return derivatives of the position by the readings at q (n, d): (n, 3, d) [m/rad; 1 if prismatic]."""
         parameters = self.belief.parameters
         return parameters.linearised(self.belief.mean, q)[1][:, :, parameters.zeros]
 
@@ -89,8 +87,11 @@ class Reference:
         return white + np.eye(3) * np.maximum(missed, SMALLEST_M**2)[:, None, :]
 
     def noise(self, covariances: FloatArray, white: FloatArray) -> SharedNoise:
-        """Return the noise of the whitened errors at pairs that it knows; their covariances and noise (n, 3, 3)
-        [m²].
+        """Return the noise of the reference's whitened errors at pairs that it knows.
+
+        Args:
+            covariances: of these errors (n, 3, 3) [m²].
+            white: of the noise (n, 3, 3) [m²].
         """
         errors = np.matvec(inverse_roots(covariances), self.x - self.model.predict(self.q))
         used = (4 * self.q.shape[1] + 3) * len(self.q) / self.known

@@ -34,14 +34,13 @@ class Made:
 
 
 def workmanship(belief: ChainBelief, tolerances: ChainTolerances) -> list[Made]:
-    """Return the probable tolerances of the arm, from the evidence of its pairs (MacKay 1992, "Bayesian
-    interpolation").
+    """Return the probable tolerances of the arm, from the evidence of its pairs.
 
-    The initial tolerances allow for an arm made by hand. Where the nominal chain is right to a millimetre, the pairs
-    show
-    it long before they determine each parameter. Narrow tolerances may apply to the arm alone, with its joint offsets,
-    or
-    with the cameras' pose too; an infinite tolerance stays infinite.
+    MacKay 1992, "Bayesian interpolation". The initial tolerances allow for an arm made by hand. Where the nominal chain
+    is
+    right to a millimetre, the pairs show it long before they determine each parameter. Narrow tolerances may apply to
+    the
+    arm alone, with its joint offsets, or with the cameras' pose too; an infinite tolerance stays infinite.
 
     Args:
         belief: posterior of the chain.

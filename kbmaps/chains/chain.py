@@ -77,8 +77,9 @@ class RigidChain:
         return len(self.axes)
 
     def poses(self, q: ArrayLike) -> FloatArray:
-        """Return the pose of the marker frame (4, 4) in the measurement frame for q (d,) [rad, m]; (n, 4, 4) for (n,
-        d).
+        """Return the pose of the marker frame (4, 4) for q (d,) [rad, m]; (n, 4, 4) for (n, d).
+
+        In the measurement frame.
 
         Raises:
             ShapeError, NonFiniteError

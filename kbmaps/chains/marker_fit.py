@@ -72,8 +72,13 @@ class MarkerKnowledge:
 
     @classmethod
     def before(cls, shift: FloatArray, covariance: FloatArray, noise: float, noise_count: float) -> Self:
-        """Return a prior: offset (3,) [m], its covariance (3, 3), and noise [m] with the weight of `noise_count`
-        coordinates.
+        """Return the prior of an offset and the noise.
+
+        Args:
+            shift: mean of the offset (3,) [m].
+            covariance: of the offset (3, 3) [m²].
+            noise: 1-sigma of a coordinate [m].
+            noise_count: number of coordinates that the noise counts for.
         """
         information: FloatArray = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
         return cls(
@@ -163,8 +168,9 @@ def fit_marker(
 
 
 def _near(pairs: Residuals, shift: FloatArray, outlier_sigmas: float) -> BoolArray:
-    """Return True for each pair (n,) within `outlier_sigmas` robust standard deviations, at least those of its
-    sigma.
+    """Return True for each pair (n,) within `outlier_sigmas` robust standard deviations.
+
+    The robust standard deviation is at least the given sigma.
     """
     norms = pairs.norms(shift)
     told = ~np.isnan(pairs.sigma)

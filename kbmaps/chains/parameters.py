@@ -130,8 +130,9 @@ class ChainParameters:
 
     @property
     def turning(self) -> BoolArray:
-        """True for each parameter (size,) that is an angle, and so curves the marker's path; the others are
-        lengths.
+        """True for each parameter (size,) that is an angle, and so curves the marker's path.
+
+        The others are lengths.
         """
         turning = np.zeros(self.size, dtype=np.bool_)
         turning[self.base_turn] = turning[self.tilts] = True
@@ -203,8 +204,9 @@ class ChainParameters:
         return x[0] if angles.ndim == 1 else x
 
     def jacobian(self, change: ArrayLike, q: ArrayLike) -> FloatArray:
-        """Return the derivative of the positions by the joints [m/rad, or m/m] (3, d) at q (d,), or (n, 3, d) at (n,
-        d).
+        """Return the derivative of the positions by the joints (3, d) at q (d,), or (n, 3, d) at (n, d).
+
+        Units: m/rad, or m/m.
 
         Raises:
             ShapeError, NonFiniteError
@@ -216,11 +218,11 @@ class ChainParameters:
         return columns[0] if angles.ndim == 1 else columns
 
     def linearised(self, change: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return positions (n, 3) and their derivatives (n, 3, size) by the change, at q (n, d); inputs are not
-        checked.
+        """Return positions (n, 3) and their derivatives (n, 3, size) by the change, at q (n, d).
 
-        With R_k the rotation before and R_{k+1} the one after joint k, and r the lever from its axis to the marker, a
-        tilt of the axis about u moves the marker by (R_k u − R_{k+1} u) × r, a shift by v moves it by
+        Inputs are not checked. With R_k the rotation before and R_{k+1} the one after joint k, and r the lever from its
+        axis
+        to the marker, a tilt of the axis about u moves the marker by (R_k u − R_{k+1} u) × r, a shift by v moves it by
         R_k v − R_{k+1} v.
         """
         geometry = self._geometry(change)

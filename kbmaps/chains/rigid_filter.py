@@ -238,10 +238,11 @@ class RigidFilter:
         return 0.25 * (square / self._reach) ** 2
 
     def _reestimate(self, distance: float, precision: FloatArray) -> None:
-        """Update noise² from the squared Mahalanobis distance of an innovation, which is 3 on average if noise² is
-        right.
+        """Update noise² from the squared Mahalanobis distance of an innovation.
 
-        Fisher scoring: an innovation carries information about the noise by the noise's share of its variance.
+        The distance is 3 on average if noise² is right. Fisher scoring: an innovation carries information about the
+        noise by
+        the noise's share of its variance.
         """
         share = self.noise_square * float(np.trace(precision)) / 3.0
         total = self.noise_coordinates + 3.0 * share**2

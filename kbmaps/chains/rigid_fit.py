@@ -38,9 +38,7 @@ class NoiseKnowledge:
     square: float = 0.0
 
     def found(self, square: float, freedom: float) -> float:
-        """Return the variance after residuals with a sum of squares [m²] and `freedom` degrees of freedom, above 0
-        in all.
-        """
+        """Return the variance from a sum of squared residuals [m²]; `freedom + coordinates` must exceed 0."""
         return (square + self.coordinates * self.square) / (freedom + self.coordinates)
 
 
@@ -83,9 +81,7 @@ class _Point:
     offset: FloatArray
 
     def reduced(self, roots: FloatArray) -> FloatArray:
-        """Return the triangular factor (f+1, f+1) of the rows [J, residual], each pair's multiplied by its root
-        (n,).
-        """
+        """Return the triangular factor (f+1, f+1) of the rows [J, residual], each pair's times its root (n,)."""
         rows = np.concatenate([self.jacobian, self.residuals[:, :, None]], axis=2) * roots[:, None, None]
         return cast(FloatArray, np.linalg.qr(rows.reshape(-1, rows.shape[2]), mode="r"))
 
@@ -131,9 +127,7 @@ class _Fitter:
         return max(float(np.partition(norms, rank)[rank]) / MEDIAN_NORM, self.least_noise)
 
     def improve(self, weights: FloatArray, noise: float) -> float:
-        """Take a Levenberg-Marquardt step; return its length in posterior standard deviations (0: no better step
-        found).
-        """
+        """Take a Levenberg-Marquardt step; return its length in posterior sigmas (0: no better step found)."""
         point, roots = self.point, np.sqrt(weights) / (self.pairs.unit * noise)
         factor = point.reduced(roots)
         design, target = factor[:, :-1], factor[:, -1]

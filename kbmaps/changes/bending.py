@@ -74,8 +74,9 @@ def log_ratios_if_it_bends(
 def log_evidence_of_bends(
     angles: FloatArray, errors: FloatArray, known: FloatArray, turning: FloatArray
 ) -> list[FloatArray]:
-    """Return the evidence about bends in pairs to which the belief was fitted; arguments as in
-    `log_ratios_if_it_bends`.
+    """Return the evidence about bends in pairs to which the belief was fitted.
+
+    Arguments as in `log_ratios_if_it_bends`.
     """
     starts = np.arange(0, len(angles), _LONGEST_RUN)
     return log_evidence(Runs.of(angles, known, turning, _without_outliers(errors), starts, fitted=True))

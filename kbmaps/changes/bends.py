@@ -120,9 +120,7 @@ class Bends:
     logs: FloatArray
 
     def sums(self, rows: FloatArray) -> FloatArray:
-        """Return weighted products of rows (m, 3, p) of runs, less the part explained by the known parameters (h,
-        p, p).
-        """
+        """Return weighted products (h, p, p) of rows (m, 3, p) of runs, less the part of the known parameters."""
         turned = np.tensordot(self.axes.T, rows, axes=1)
         products = np.tensordot(self.weights, turned.transpose(0, 2, 1) @ turned, axes=1)
         common = self.known @ turned.reshape(-1, rows.shape[2])

@@ -207,8 +207,9 @@ class ChangeDetector:
         return self.pairs > self._looked_at and (late or self._strange or self._log_odds > LOOK_CLOSELY)
 
     def sums(self) -> tuple[IntArray, FloatArray, FloatArray]:
-        """Return the information about all possible changes in the pairs since each onset (m,), in metres of marker
-        motion.
+        """Return the information about all possible changes in the pairs since each onset (m,).
+
+        Changes are in metres of marker motion.
 
         Returns:
             The onsets, and the information (m, c, c) and score (m, c) of changes in the order of the kinds.

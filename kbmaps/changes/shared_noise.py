@@ -55,18 +55,22 @@ class SharedNoise:
 
     @classmethod
     def claimed(cls, share: float) -> SharedNoise:
-        """Return the noise of residuals of unit variance, of which this share is a model's error, shared by
-        neighbours.
+        """Return the noise of unit-variance residuals that share a model's error with their neighbours.
+
+        Args:
+            share: of the variance, due to the model's error.
         """
         alike = 1.0 + share * np.arange(_LONGEST_RUN if share > 0.0 else 1, dtype=np.float64)
         return cls(alike, 1.0 + share * (USUALLY_SHARED - 1))
 
     @classmethod
     def repeated(cls, share: float) -> SharedNoise:
-        """Return the noise of residuals of unit variance, of which this share may repeat for some neighbours, and no
-        longer.
+        """Return the noise of unit-variance residuals of which a share may repeat for some neighbours.
 
         A joint that turns by whole ticks from pair to pair, or hardly at all, is rounded in the same way each time.
+
+        Args:
+            share: of the variance, due to that rounding.
         """
         alike = 1.0 + share * np.arange(USUALLY_SHARED, dtype=np.float64)
         return cls(alike, float(alike[-1]))
@@ -116,8 +120,9 @@ class SharedNoise:
 
 
 def _autocovariances(residuals: FloatArray, chance: float) -> FloatArray:
-    """Return autocovariances of residuals (n, 3) at lags 1, 2, ... while neighbours clearly share an error; may be
-    empty.
+    """Return autocovariances of residuals (n, 3) at lags 1, 2, ... while neighbours clearly share an error.
+
+    May be empty.
     """
     n = len(residuals)
     longest = min(int(n * _LONGEST_LAG_SHARE), _LONGEST_LAG) // 2 * 2

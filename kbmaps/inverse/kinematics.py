@@ -131,8 +131,9 @@ class InverseKinematics:
 
     @cached_property
     def lever(self) -> float:
-        """Length [m] at which a radian counts as much as a metre: RMS distance of reachable positions from their
-        mean.
+        """Length [m] at which a radian counts as much as a metre.
+
+        RMS distance of the reachable positions from their mean.
         """
         return max(float(np.sqrt(np.square(self._positions - self._positions.mean(axis=0)).sum(axis=1).mean())), 1e-6)
 

@@ -150,8 +150,9 @@ class KernelFit:
         return np.concatenate(products) * self._seen.scale[:, None]
 
     def _evidence_of_noise(self, precision: float) -> tuple[LinearEvidence, FloatArray]:
-        """Return the evidence of s² at λ, with K + λ I factorised, and the directions V (p, p) of β that belong to
-        it.
+        """Return the evidence of s² at λ, and the directions V (p, p) of β that belong to it.
+
+        K + λ I must be factorised.
         """
         seen = self._seen
         # Whitened by (K / λ + I)^(-1/2), the pairs are H β + e with equal independent noise.
@@ -200,8 +201,9 @@ class KernelFit:
         self._multipliers = multipliers + self._gram.solve(remaining)
 
     def _explain_exactly(self) -> None:
-        """Compute the smallest coefficients that explain the errors: iterated Tikhonov, as `ExactLearner` without
-        λ.
+        """Compute the smallest coefficients that explain the errors.
+
+        Iterated Tikhonov, as `ExactLearner` without λ.
         """
         errors = self._seen.errors
         ridge = _VANISHING_RIDGE * self._gram.trace

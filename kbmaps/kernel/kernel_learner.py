@@ -1,5 +1,6 @@
-"""Learner of KB-Maps of any number of joints, through their kernel: Ulbrich et al. 2009, eqs. (16)-(18), in dual
-form.
+"""Learner of KB-Maps of any number of joints, through their kernel.
+
+Ulbrich et al. 2009, eqs. (16)-(18), in dual form.
 """
 
 from __future__ import annotations

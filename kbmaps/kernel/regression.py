@@ -58,8 +58,10 @@ class KernelRegression(ABC):
 
     @property
     def noise(self) -> float:
-        """Noise of a measured coordinate, 1-sigma [m]: estimated, or given with the pairs. Raises
-        DegenerateDataError.
+        """Noise of a measured coordinate, 1-sigma [m]: estimated, or given with the pairs.
+
+        Raises:
+            DegenerateDataError: no pair has been learnt.
         """
         return math.sqrt(self._fitted().noise_variance) * self._pairs.mean_unit
 

@@ -167,10 +167,11 @@ class JointBasis:
 
     @classmethod
     def orthonormal(cls, low: float, high: float, scale: float = DEFAULT_SCALE) -> JointBasis:
-        """Return a basis orthogonal for θ uniform on [low, high] [rad]: the constant 1, then two functions of RMS
-        `scale`.
+        """Return a basis of the constant 1 and two functions of RMS `scale`, orthogonal on [low, high] [rad].
 
-        A scale below one makes a learner that changes the coefficients as little as possible prefer smooth changes.
+        Orthogonal for θ uniform on the range. A scale below one makes a learner that changes the coefficients as little
+        as
+        possible prefer smooth changes.
         """
         return cls("orthonormal", (float(low), float(high), float(scale)))
 
@@ -181,8 +182,9 @@ class JointBasis:
 
     @classmethod
     def prismatic_orthonormal(cls, low: float, high: float, scale: float = DEFAULT_SCALE) -> JointBasis:
-        """Return a basis orthogonal for q uniform on [low, high] [m]: the constant 1, then a linear one of RMS
-        `scale`.
+        """Return a basis of the constant 1 and a linear function of RMS `scale`, orthogonal on [low, high] [m].
+
+        Orthogonal for q uniform on the range.
         """
         return cls("prismatic_orthonormal", (float(low), float(high), float(scale)))
 

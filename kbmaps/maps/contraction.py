@@ -70,8 +70,9 @@ class NumpyNet:
         lapack.add_outer_in_place(self._planes, (error[:, None] * left).ravel(), right)
 
     def replay(self, q: FloatArray, x: FloatArray, order: IntArray, mu0: FloatArray) -> None:
-        """Take a step of mu0 (k,) for each index in `order` (k,) of the pairs q (n, d), x (n, outputs), all
-        unchecked.
+        """Take a step of mu0 (k,) for each index in `order` (k,) of the pairs q (n, d), x (n, outputs).
+
+        Inputs are not checked.
         """
         for start in range(0, len(order), _BLOCK):
             part = slice(start, start + _BLOCK)
@@ -113,8 +114,11 @@ class NumpyNet:
 
 
 def contracted(planes: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
-    """Return outputs (n, outputs) of planes (outputs · left_size, right_size) for halves (n, ·) of many rows'
-    weights.
+    """Return outputs (n, outputs) of many rows.
+
+    Args:
+        planes: the net (outputs · left_size, right_size).
+        left, right: halves (n, ·) of the rows' weights.
     """
     rows, width = left.shape
     by_left = (planes @ right.T).reshape(len(planes) // width, width, rows)

@@ -35,11 +35,11 @@ class NetKernel(Protocol):
 
 
 class FilterKernel(Protocol):
-    """Updates the state of a `RigidFilter` with pairs; returns their number, its noise² and that estimate's
-    coordinates.
+    """Compiled update of a `RigidFilter` with pairs.
 
-    `learn_one` checks its pair and writes it to a row (d + 4). It returns None, and changes nothing, if the pair is not
-    float64 of the right shape, or invalid.
+    `learn` returns the number of learnt pairs, the noise² and the number of coordinates that this rests on. `learn_one`
+    checks its pair and writes it to a row (d + 4). It returns None, and changes nothing, if the pair is not float64 of
+    the right shape, or invalid.
     """
 
     def learn(

@@ -80,8 +80,9 @@ class NLMS:
         return KBMap(self._bases, self._planes.reshape(self._outputs, *sizes))
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Return the position (3,) [m] at joint angles q (d,) [rad], or (n, 3) at (n, d), as `map` would, without a
-        copy.
+        """Return the marker position (3,) [m] at joint angles q (d,) [rad], or (n, 3) at (n, d).
+
+        Equal to `map.predict`, without a copy of the map.
 
         Raises:
             ShapeError, NonFiniteError

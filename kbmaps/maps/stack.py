@@ -46,8 +46,9 @@ class BasisStack:
 
     @property
     def tables(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Constant inputs of `joint_weights`: half phases (2, d), mixing matrices (d, 3, 3), 1 where prismatic
-        (d,).
+        """Constant inputs of `joint_weights`.
+
+        Half phases (2, d), mixing matrices (d, 3, 3), 1 where prismatic (d,).
         """
         return np.ascontiguousarray(self._half_phases), self._mix, self._slides.astype(np.float64)
 
@@ -136,10 +137,11 @@ class BasisStack:
         return (left[:, :, None] * right[:, None, :]).reshape(len(q), -1)
 
     def _kronecker(self, weights: FloatArray, begin: int, end: int) -> FloatArray:
-        """Return the Kronecker product for a batch, joint by joint from the last: less memory than gathering all
-        factors.
+        """Return the Kronecker product for a batch, joint by joint from the last.
 
-        Built transposed, for long inner loops over the rows, and returned as a transposed view.
+        Needs less memory than gathering all factors. Built transposed, for long inner loops over the rows, and returned
+        as a
+        transposed view.
         """
         count = len(weights)
         factors = np.ascontiguousarray(weights[:, begin:end].transpose(1, 2, 0))
@@ -150,10 +152,11 @@ class BasisStack:
 
 
 def _factor_index(sizes: tuple[int, ...], first_joint: int) -> IntArray:
-    """Return the indices (joints, entries) of the flat joint weights (3 per joint) that multiply to each product
-    entry.
+    """Return the indices (joints, entries) of the joint weights that multiply to each product entry.
 
-    For a single vector, gathering and reducing costs a third of a chain of outer products.
+    They count the flat joint weights, 3 per joint. For a single vector, gathering and reducing costs a third of a chain
+    of
+    outer products.
     """
     digits = (
         np.array(np.unravel_index(np.arange(math.prod(sizes)), sizes), dtype=np.intp) if sizes else np.empty((0, 1))

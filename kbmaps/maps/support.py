@@ -126,10 +126,11 @@ class SupportSet:
         return self.unexplained(q) <= limit
 
     def spread(self, q: ArrayLike) -> float | FloatArray:
-        """Return the standard deviation of a predicted coordinate at q (d,), for coefficients of prior standard
-        deviation 1.
+        """Return the standard deviation of a predicted coordinate at q (d,), or (n,) for q (n, d).
 
-        Times `ExactSolution.prior_std` it is the 1-sigma [m] that the fit leaves; (n,) for q (n, d).
+        For coefficients of prior standard deviation 1. Times `ExactSolution.prior_std` it is the 1-sigma [m] that the
+        fit
+        leaves.
 
         Raises:
             ShapeError, NonFiniteError

@@ -237,9 +237,7 @@ class GroupedModel:
         return Average(groups, mean, cast(FloatArray, np.linalg.qr(rows, mode="r")).T)
 
     def settle(self, rounds: int = _ROUNDS) -> None:
-        """Set the noise and the groups' variances to those that make the data most probable, by MacKay's fixed
-        point.
-        """
+        """Set the noise and the groups' variances that make the data most probable, by MacKay's fixed point."""
         for _ in range(rounds):
             posterior = self.posterior()
             used = sum(posterior.used.values())

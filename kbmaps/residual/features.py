@@ -292,8 +292,9 @@ def _for_each_axis(functions: FloatArray) -> FloatArray:
 
 
 def _products(prismatic: BoolArray, order: int) -> IntArray:
-    """Return indices (count, order) of the joint functions (two per joint) in each product of `order` different
-    joints.
+    """Return indices (count, order) of the joint functions in each product of `order` different joints.
+
+    A revolute joint has two functions, a prismatic one has one.
     """
     sizes = [1 if slides else 2 for slides in prismatic]
     chosen = [

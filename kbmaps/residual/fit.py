@@ -96,9 +96,7 @@ class _Fitter:
             start = end
 
     def step(self, select: bool) -> float:
-        """Step to the most probable weights; return the change of predictions over the weights' posterior
-        uncertainty.
-        """
+        """Step to the most probable weights; return the change of predictions over their uncertainty."""
         groups = self._considered() if select else tuple(self.variances)
         model = self._model(groups, select)
         model.variances = dict(self.variances)

@@ -186,8 +186,7 @@ class ResidualModel:
         return replace(widened, features=ResidualFeatures(parameters, scaling))
 
     def widened(self, columns: IntArray, std: FloatArray) -> Self:
-        """Return the same arm with the uncertainty of some chain parameters increased by `std` (k,) [rad, m]
-        (1-sigma).
+        """Return the same arm with the uncertainty of some chain parameters increased.
 
         Args:
             columns: indices (k,) of these parameters.
@@ -199,8 +198,9 @@ class ResidualModel:
         return replace(self, root=root)
 
     def to_bytes(self) -> bytes:
-        """Return the model as one self-describing byte string; `from_bytes` restores the same predictions to the
-        last bit.
+        """Return the model as one self-describing byte string.
+
+        `from_bytes` restores the same predictions to the last bit.
         """
         return pack(_KIND, {"scale": self.features.scaling.scale, "noise": self.noise}, self._arrays())
 

@@ -18,8 +18,9 @@ _DECADE = math.log(10.0)
 
 
 def core_equations(problem: TensorProblem, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return J (3 n, 36 d) and y (3 n,) of a problem linearised at z: y = J c + e for cores c (36 d,), with e ~
-    N(0, I).
+    """Return J (3 n, 36 d) and y (3 n,) of a problem linearised at z.
+
+    y = J c + e for cores c (36 d,), with e ~ N(0, I).
     """
     prior = problem.prior
     plain = CorePrior(prior.mean, np.tile(np.eye(CORE_NUMBERS), (prior.joints, 1, 1)))
@@ -54,8 +55,9 @@ def likely_ellipse_std(family: CoreFamily, jacobian: FloatArray, positions: Floa
 
 
 def _by_coordinates(family: CoreFamily, jacobian: FloatArray, residuals: FloatArray) -> list[float]:
-    """Return the log evidence of each of `ELLIPSE_STDS`; S Sᵀ is the rigid part plus the square of each times the
-    rest.
+    """Return the log evidence of each of `ELLIPSE_STDS`, from matrices of the size of the coordinates.
+
+    S Sᵀ is the rigid part plus the square of each standard deviation times the rest.
     """
     joints = len(family.mean)
     blocks = jacobian.reshape(-1, joints, CORE_NUMBERS).swapaxes(0, 1)

@@ -61,8 +61,7 @@ class CorePrior:
         ellipse_std: float,
         length: float,
     ) -> CorePrior:
-        """Return the prior of a nominal chain whose links are turned and shifted a little, and which is not quite
-        rigid.
+        """Return the prior of a nominal chain with uncertain links, which is not quite rigid.
 
         To first order, a small rigid motion before joint k changes its core along six directions, and a shift of the
         marker

@@ -64,8 +64,9 @@ def whitened_jacobian(weights: FloatArray, maps: FloatArray, prior: CorePrior) -
 
 
 def _core_jacobian(linear: FloatArray, weights: FloatArray, points: FloatArray) -> FloatArray:
-    """Return the derivative of the positions by one core (3 n, 36): rows L[o, a] w[j] (r, 1)[b] at (pair, o), (j,
-    a, b).
+    """Return the derivative of the positions by one core (3 n, 36).
+
+    Rows L[o, a] w[j] (r, 1)[b] at (pair, o), (j, a, b).
     """
     count = len(weights)
     right = np.empty((count, 3, 4))
@@ -155,8 +156,9 @@ def _normal_matrix(jacobian: FloatArray) -> tuple[FloatArray, bool]:
 def _damped_step(
     jacobian: FloatArray, normal: FloatArray, dual: bool, residual: FloatArray, z: FloatArray, damping: float
 ) -> FloatArray | None:
-    """Return δ minimising ‖residual − J δ‖² + ‖z + δ‖² + damping·mean(diag JᵀJ) ‖δ‖²; None if not positive
-    definite.
+    """Return the damped step δ; None if the matrix is not positive definite.
+
+    δ minimises ‖residual − J δ‖² + ‖z + δ‖² + damping·mean(diag JᵀJ) ‖δ‖².
     """
     shift = 1.0 + damping * float(normal.trace()) / jacobian.shape[1]
     shifted = np.array(normal, order="F")

@@ -19,14 +19,15 @@ _TELLING = 2.0
 
 
 def misfit_directions(train: TensorTrain, q: FloatArray) -> FloatArray:
-    """Return the effect of joint and instrument errors on the marker (n, 3, 5 d + 18) [m/rad, m/m], for checked q (n,
-    d).
+    """Return the effect of joint and instrument errors on the marker (n, 3, 5 d + 18) at q (n, d).
 
-    A joint's error is a second harmonic of its reading, or proportional to the moment of a force on the marker along
-    each
-    axis of the measurement frame. The first models eccentric encoders, gears and other periodic errors (a train has the
-    constant and the first harmonic), the second elastic joints. The instrument's error is any quadratic function of the
-    position, as of lenses (a train follows linear ones).
+    In m/rad, or m/m; q is not checked. A joint's error is a second harmonic of its reading, or proportional to the
+    moment
+    of a force on the marker along each axis of the measurement frame. The first models eccentric encoders, gears and
+    other
+    periodic errors (a train has the constant and the first harmonic), the second elastic joints. The instrument's error
+    is
+    any quadratic function of the position, as of lenses (a train follows linear ones).
     """
     slopes = train.jacobian(q)
     phases = _phases(train.bases, q)

@@ -84,8 +84,11 @@ class TensorPosterior:
         self.take(likely_misfit(directions, absorbed, residuals.ravel() / scale[:, 0], self._sizes), absorbed)
 
     def take(self, misfit: FloatArray, absorbed: FloatArray) -> None:
-        """Set the standard deviations (3,) [rad, m], and the part of the errors that the cores absorb (36 d, 5 d +
-        18).
+        """Set the standard deviations of the errors (3,) [rad, m], and the part that the cores absorb.
+
+        Args:
+            misfit: standard deviations (3,) [rad, m].
+            absorbed: part of the errors that the cores absorb (36 d, 5 d + 18).
         """
         self._misfit, self._absorbed, self._left = misfit, absorbed, None
 

@@ -117,8 +117,9 @@ def search(
     *,
     robust: bool = True,
 ) -> Fit:
-    """Return the best of several fits from random rigid chains. Ends early when one explains the pairs, or two
-    agree.
+    """Return the best of several fits from random rigid chains.
+
+    Ends early when one explains the pairs, or two agree.
     """
     some = pairs
     if len(pairs.x) > _SEARCH_PAIRS * len(bases):
@@ -184,8 +185,9 @@ def information(pairs: Pairs, prior: CorePrior, fit: Fit) -> tuple[FloatArray, F
 
 
 def effective_parameters(problem: TensorProblem, z: FloatArray) -> float:
-    """Return the number of parameters that the pairs determine against the prior: Σ λ / (1 + λ), eigenvalues of
-    JᵀJ.
+    """Return the number of parameters that the pairs determine against the prior.
+
+    Σ λ / (1 + λ) over the eigenvalues λ of JᵀJ.
     """
     jacobian = problem.scaled_jacobian(z)
     gram = jacobian @ jacobian.T if jacobian.shape[0] < jacobian.shape[1] else jacobian.T @ jacobian
@@ -194,8 +196,9 @@ def effective_parameters(problem: TensorProblem, z: FloatArray) -> float:
 
 
 def _settle(pairs: Pairs, prior: CorePrior, z: FloatArray, noise: float) -> Fit:
-    """Fit z and noise in turn until neither moves. The noise follows MacKay 1992: rss / (3 n − effective
-    parameters).
+    """Fit z and noise in turn until neither moves.
+
+    The noise follows MacKay 1992: rss / (3 n − effective parameters).
     """
     optimiser = LevenbergMarquardt()
     used = np.ones(len(pairs.x), dtype=np.bool_)
