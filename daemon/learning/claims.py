@@ -240,9 +240,8 @@ class Claims:
             predict: its positions (n, 3) [m] at q (n, d) [rad].
             q: configurations (n, d) [rad], in their order.
             errors: measured minus predicted (n, 3) [m].
-            instant: the same of the instant learner as it was when the solution was requested, NaN where it had learnt
-            the
-                pair by then: that would be an unfair advantage.
+            instant: the same of the instant learner as it was when the solution was requested. NaN where it had already
+                learnt the pair, which would be an unfair advantage.
             anew: True if it knows so much more than the last solution that the latter's errors no longer apply.
         """
         if anew:

@@ -45,7 +45,7 @@ def deviations(belief: ChainBelief, q: FloatArray, sigma: FloatArray) -> FloatAr
 def _sides(belief: ChainBelief, q: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Split a root of the belief: return the open part (size, k), the closed part (size, c), and (J W_c)⁺ (c, 3 n).
 
-    In units of the posterior, the eigenvalues of (J W)ᵀ J W are the shares of the prior's variance that the pairs removed.
+    In units of the posterior, the eigenvalues of (J W)ᵀ J W are the removed shares of the prior's variance.
     """
     free, triangle = squared(belief.root)
     root = np.zeros((len(belief.mean), len(free)))
