@@ -82,8 +82,7 @@ class Contest:
         """Add a pair: the squared distance [m²] of each model that predicted it.
 
         Values that are not finite are ignored. Several pairs can be added in their order: the squared distances (n,) of
-        each
-        model.
+        each model.
 
         Raises:
             ShapeError: the models have squared distances of different numbers of pairs; nothing has changed.
@@ -143,8 +142,7 @@ class Contest:
         """Return the model that shall answer: the most trusted one that no other beats.
 
         One beats another if the other's mean error is a fifth larger on the newest pairs of both, or if its squared
-        errors
-        are larger by more than chance on all pairs that are compared.
+        errors are larger by more than chance on all pairs that are compared.
 
         Args:
             trusted: the models, the most trusted first.

@@ -74,9 +74,8 @@ class Ladder:
     best of the models that may answers.
 
     A model that fails, has too few pairs yet, or predicts values that are not finite, is left out, without effect on
-    the
-    others. It keeps learning when due, and returns when its predictions are finite; its earlier predictions then do not
-    count.
+    the others. It keeps learning when due, and returns when its predictions are finite; its earlier predictions then do
+    not count.
 
     When `learn` gets many pairs at once, the answering model has learnt all of them on return. With single pairs, each
     model learns when it is due.
@@ -121,8 +120,7 @@ class Ladder:
         """Return the usual ladder for a nominal arm: rigid chain with residual, rigid chain, tensor train.
 
         The residual comes first, which suits pairs that are spread: for a rigid arm it errs nearly as the chain does,
-        and
-        for another arm the chain is far off. On guided paths, the chain placed first is better away from them.
+        and for another arm the chain is far off. On guided paths, the chain placed first is better away from them.
 
         Args:
             nominal: the nominal chain.

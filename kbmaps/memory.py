@@ -23,9 +23,8 @@ class Memory:
     Attributes:
         window: number of the last pairs that count; None means all.
         forgetting: factor by which each new pair reduces the weight of all before; 1 forgets nothing. The pairs are
-        then
-            worth about 1 / (1 − forgetting) in all. If that is fewer than the control points that they would have to
-            determine, the evidence keeps to the prior.
+            then worth about 1 / (1 − forgetting) in all. If that is fewer than the control points that they would have
+            to determine, the evidence keeps to the prior.
 
     Raises:
         SettingError: a window below 1, forgetting not within 0..1 or 0 itself.

@@ -18,8 +18,7 @@ class Estimate:
 
     A configuration is in support where the model is about as certain as at its pairs: its variance, summed over the
     axes, is at most `SUPPORT_FACTOR` times the greatest at any of the learnt pairs, outliers left out. So all inliers
-    are
-    in support, and nothing is before the first pair, or the first since a tool change. A model with another rule
+    are in support, and nothing is before the first pair, or the first since a tool change. A model with another rule
     documents it, with the reason, at its `estimate`.
 
     Attributes:

@@ -20,8 +20,7 @@ def descriptions(named: Sequence[Path]) -> list[Path]:
     """Return descriptions of robots, each once: files, and of a folder those in it and in its subfolders.
 
     Of a folder's TOML files, those with a table `[robot]` count, because calibrations and other files are there too. Of
-    a
-    subfolder, its robot.toml counts.
+    a subfolder, its robot.toml counts.
 
     Raises:
         ConfigError: a folder has none.

@@ -178,8 +178,7 @@ class Claims:
             predictions: of it (n, 3) [m] by model.
             variances: the measurements' (n, 3) [m²].
             delayed: predictions of the instant learner as old as the solutions (n, 3) [m]. On a path, a few pairs make
-            a
-                difference, so the models are compared at the same age.
+                a difference, so the models are compared at the same age.
         """
         for name, predicted in predictions.items():
             errors = x - predicted

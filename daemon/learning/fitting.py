@@ -78,8 +78,7 @@ class Fitting:
         """Return the prior that fits pairs q (n, d) [rad] and x (n, 3) [m] best; None if they do not determine it.
 
         With an unknown frame, that is the most probable chain. A frame alone, fitted to an inaccurate nominal chain,
-        would
-        absorb the arm's errors near the first pairs, and be far off everywhere else.
+        would absorb the arm's errors near the first pairs, and be far off everywhere else.
         """
         try:
             if self._before is not None:

@@ -50,8 +50,7 @@ class Learning:
             settings: of the learner.
             solver: of the models that need all pairs.
             together_s: maximum wait of pairs to be judged together [s], which costs a fraction of judging each. The
-            instant
-                learner does not wait.
+                instant learner does not wait.
         """
         self._nominal, self._settings = nominal, settings
         self._solving = Solving(solver, settings.solve_every)

@@ -24,8 +24,8 @@ class Members:
     """KB-Maps in the bases of the prior, and a chain with residual.
 
     Between two solutions, the solved models stay as they are. Instant steps on top of them would follow the newest
-    pairs,
-    and spoil them away from their path: measured, the error a few degrees away grew from 7 to 10 mm within 20 pairs.
+    pairs, and spoil them away from their path: measured, the error a few degrees away grew from 7 to 10 mm within 20
+    pairs.
     """
 
     def __init__(self, prior: KBMap, step_size: float) -> None:

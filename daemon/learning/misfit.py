@@ -22,8 +22,7 @@ def misfit(
 
     On a path, neighbours have the same discrepancy and, mostly, noise of their own: the shared part is the discrepancy,
     whatever noise the measurements claim. For poses far apart, only the claimed noise is available. There the errors
-    are
-    too small, because the solution was fitted to these pairs.
+    are too small, because the solution was fitted to these pairs.
 
     Args:
         errors: measured minus solved (n, 3) [m], in the pairs' order.

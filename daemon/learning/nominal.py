@@ -75,8 +75,7 @@ class NominalModel:
         """Return the nominal model of a robot with effects, in its state with all of them present.
 
         The rigid part of the effects is in the chain. The rest is in the prior, as far as a map can hold it: over the
-        joints'
-        ranges, and only if the measurement frame is known.
+        joints' ranges, and only if the measurement frame is known.
         """
         since = simulation.since.placed
         robot = since.robot

@@ -64,8 +64,7 @@ class Task:
         belief: prior of the chain before the first pair of this task.
         residual: prior of the arm beyond that; None without any.
         prior_stays: True if the exact map keeps to `prior`, not to the rigid chain: it stands for pairs that are no
-        longer
-            kept.
+            longer kept.
         tolerances: those of `belief`, if the pairs may select narrower ones; None: they may not.
     """
 
@@ -216,8 +215,7 @@ class DirectSolver:
         """Solve least squares around the rigid chain.
 
         The evidence finds the prior's precision if pairs are apart. On a guided path, neighbours share their errors,
-        which
-        the evidence would take for shape: there, left-out blocks choose it.
+        which the evidence would take for shape: there, left-out blocks choose it.
         """
         retune = self._precision is None or learner.pairs >= RETUNE * self._tuned_at
         try:

@@ -14,8 +14,7 @@ class Solving:
     """Keeps one solver up to date. For the background thread alone.
 
     Nothing is sent while the solver works: in a process of its own it does not read meanwhile, and the thread would
-    block
-    on the send.
+    block on the send.
     """
 
     def __init__(self, solver: Solver, solve_every: int) -> None:

@@ -58,7 +58,7 @@ class LearningHeader(msgspec.Struct, kw_only=True):
         claims: uncertainties and errors of the models.
         kept_of: number of pairs since the prior; the newest of them are kept.
         next_fit: number of pairs at which an unknown frame, or the tool after a change, is fitted again; None for
-        never.
+            never.
         first_fit: True if that is the first one.
         answering: the model that answers.
         doubted_in_a_row: number of consecutive outliers up to now.

@@ -37,10 +37,8 @@ def workmanship(belief: ChainBelief, tolerances: ChainTolerances) -> list[Made]:
     """Return the probable tolerances of the arm, from the evidence of its pairs.
 
     MacKay 1992, "Bayesian interpolation". The initial tolerances allow for an arm made by hand. Where the nominal chain
-    is
-    right to a millimetre, the pairs show it long before they determine each parameter. Narrow tolerances may apply to
-    the
-    arm alone, with its joint offsets, or with the cameras' pose too; an infinite tolerance stays infinite.
+    is right to a millimetre, the pairs show it long before they determine each parameter. Narrow tolerances may apply
+    to the arm alone, with its joint offsets, or with the cameras' pose too; an infinite tolerance stays infinite.
 
     Args:
         belief: posterior of the chain.
@@ -71,8 +69,7 @@ def best_made(belief: ChainBelief, tolerances: ChainTolerances, made: Sequence[M
     """Return the chain nearest to nominal that is not improbable, with the uncertainty of all candidates.
 
     Its covariance covers all candidate tolerances. Where these explain the pairs equally well, they differ only away
-    from
-    the pairs: there the nominal chain is more reliable than the noise.
+    from the pairs: there the nominal chain is more reliable than the noise.
 
     Args:
         belief: in an arm of the widest tolerances.

@@ -71,10 +71,8 @@ class _Fit:
         """Return a robust standard deviation [m] of one coordinate's error, at least `least`.
 
         Taken from the middle distance. Its rank lies above the median by the number of pairs that the fitted parameters
-        can
-        always explain (Rousseeuw and Leroy 1987, least median of squares). Otherwise a few pairs would fit perfectly
-        and
-        the others would count as outliers.
+        can always explain (Rousseeuw and Leroy 1987, least median of squares). Otherwise a few pairs would fit
+        perfectly and the others would count as outliers.
         """
         free_pairs = 2 * self.fit_pose + self.fit_marker
         rank = min(len(self.x) // 2 + free_pairs, len(self.x) - 1)

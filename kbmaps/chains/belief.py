@@ -65,8 +65,7 @@ class ChainBelief:
         """Return a Gaussian with this covariance (size, size); a row of zeros holds its parameter.
 
         The covariance is first scaled to correlations: lengths and angles, known and unknown ones, differ by many
-        orders
-        of magnitude.
+        orders of magnitude.
         """
         std = np.sqrt(np.diag(covariance))
         free = np.flatnonzero(std > 0.0)
@@ -125,8 +124,7 @@ class ChainBelief:
         """Return the posterior that narrower tolerances would have given for the same pairs, and its evidence.
 
         Only the tolerances that change are exchanged. So the posterior may combine pairs of several tools, provided
-        that
-        the tool's tolerance does not change. Both results are exact where positions are linear in the parameters.
+        that the tool's tolerance does not change. Both results are exact where positions are linear in the parameters.
 
         Args:
             before: the tolerances of the original prior.

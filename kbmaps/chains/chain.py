@@ -158,8 +158,7 @@ class RigidChain:
         """Convert the chain to a KB-Map, exact up to rounding, without any sampling.
 
         Each joint's 4x4 matrix is affine in its basis functions. The product of the chain is therefore a tensor product
-        of
-        them, and its last column is the control net.
+        of them, and its last column is the control net.
 
         Args:
             bases: one per joint.

@@ -123,8 +123,7 @@ class ChainParameters:
         """Constant inputs of `linearised`.
 
         Axes and points of the reference at q = 0 (d, 3), the tangents (d, 3, 2), 1 where prismatic (d,), and the
-        marker's
-        frame (4, 4).
+        marker's frame (4, 4).
         """
         return self._axes, self._points, self._tangents, self.reference.prismatic.astype(np.float64), self._frames[-1]
 
@@ -221,9 +220,8 @@ class ChainParameters:
         """Return positions (n, 3) and their derivatives (n, 3, size) by the change, at q (n, d).
 
         Inputs are not checked. With R_k the rotation before and R_{k+1} the one after joint k, and r the lever from its
-        axis
-        to the marker, a tilt of the axis about u moves the marker by (R_k u − R_{k+1} u) × r, a shift by v moves it by
-        R_k v − R_{k+1} v.
+        axis to the marker, a tilt of the axis about u moves the marker by (R_k u − R_{k+1} u) × r, a shift by v moves
+        it by R_k v − R_{k+1} v.
         """
         geometry = self._geometry(change)
         angles = q + geometry.zeros
@@ -254,8 +252,7 @@ class ChainParameters:
         """Return rotations R (n, 3, 3) of the marker frame at q (n, d), and Ω (n, 3, size); inputs are not checked.
 
         A small change δ turns them by dR = [Ω δ]× R. The parameters that turn them are those that act through a lever
-        in
-        `linearised`; shifts, tool and prismatic joints do not turn them.
+        in `linearised`; shifts, tool and prismatic joints do not turn them.
         """
         geometry = self._geometry(change)
         rotations = self._placed(geometry, q + geometry.zeros)[..., :3, :3]

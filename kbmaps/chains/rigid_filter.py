@@ -241,8 +241,7 @@ class RigidFilter:
         """Update noise² from the squared Mahalanobis distance of an innovation.
 
         The distance is 3 on average if noise² is right. Fisher scoring: an innovation carries information about the
-        noise by
-        the noise's share of its variance.
+        noise by the noise's share of its variance.
         """
         share = self.noise_square * float(np.trace(precision)) / 3.0
         total = self.noise_coordinates + 3.0 * share**2

@@ -160,8 +160,7 @@ class RigidLearner:
             q: joint values.
             x: measured positions.
             sigma: 1-sigma of the positions [m], () or (n,); None where it is to be estimated. Once one pair came
-            without,
-                the noise is estimated for all, and given sigmas count relative to their median.
+                without, the noise is estimated for all, and given sigmas count relative to their median.
 
         Raises:
             ShapeError, NonFiniteError, SettingError (a sigma that is not positive): nothing has changed.

@@ -147,8 +147,7 @@ class RecursiveRigidLearner:
             q: joint values.
             x: measured positions.
             sigma: 1-sigma of the positions [m], () or (n,); None where it is to be estimated. In a refit of pairs of
-            both
-                kinds, given sigmas count relative to their median.
+                both kinds, given sigmas count relative to their median.
 
         Raises:
             ShapeError, NonFiniteError, SettingError (a sigma that is not positive): nothing has changed.
@@ -204,9 +203,8 @@ class RecursiveRigidLearner:
         """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and the support by data.
 
         Where the given noise does not explain the residuals of a refit, the excess is added to sigma everywhere.
-        Support is
-        judged by the kept pairs, and by the most uncertain one of those before them. They are evaluated once after each
-        `learn` (5 ms at 1,000 kept pairs of 7 joints).
+        Support is judged by the kept pairs, and by the most uncertain one of those before them. They are evaluated once
+        after each `learn` (5 ms at 1,000 kept pairs of 7 joints).
 
         Raises:
             ShapeError, NonFiniteError

@@ -183,8 +183,7 @@ class ToolLayer:
 
         The model's own variance adds to that of δ. Every pair determines all of δ, so δ is equally certain at all
         configurations. Once there is a pair of the current tool, support is that of the model, or everywhere if the
-        model
-        has none.
+        model has none.
 
         Raises:
             ShapeError, NonFiniteError

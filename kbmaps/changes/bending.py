@@ -36,10 +36,9 @@ def log_ratios_if_it_bends(
     """Return the log likelihood ratio of each kind of change to none, for an arm that bends before and after.
 
     The errors of all pairs are the sum of these terms: the unknown part of the chain, a change from some pair on,
-    noise,
-    a smooth function of the joint values, and an error of each joint that is a smooth function of its own value. The
-    smooth function is a Gaussian process with variance a² exp(−Σ_j (1 − cos Δ_j) / ℓ²) on each coordinate. Its a and ℓ
-    and the noise are weighted by their probability given all pairs without a change.
+    noise, a smooth function of the joint values, and an error of each joint that is a smooth function of its own value.
+    The smooth function is a Gaussian process with variance a² exp(−Σ_j (1 − cos Δ_j) / ℓ²) on each coordinate. Its a
+    and ℓ and the noise are weighted by their probability given all pairs without a change.
 
     Args:
         angles: configurations (n, d) [rad, or for a prismatic joint the equivalent], n at most `MOST_PAIRS`.

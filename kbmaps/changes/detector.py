@@ -78,11 +78,10 @@ class ChangeDetector:
 
     with c the model's own uncertainty (narrowed by these errors), e the noise, partly shared by neighbours, and θ the
     change from pair t on. For each t that is kept and each kind, θ has a likelihood ratio (Willsky and Jones 1976,
-    there
-    maximised), averaged over sizes. Their sum over t is the statistic of Shiryaev and Roberts: without a change its
-    expectation after n pairs is n. So it first exceeds A after at least A pairs on average (Pollak 1987, "Average run
-    lengths of an optimal method of detecting a change in distribution"), and after more because it then exceeds A by
-    far.
+    there maximised), averaged over sizes. Their sum over t is the statistic of Shiryaev and Roberts: without a change
+    its expectation after n pairs is n. So it first exceeds A after at least A pairs on average (Pollak 1987, "Average
+    run lengths of an optimal method of detecting a change in distribution"), and after more because it then exceeds A
+    by far.
 
     Args:
         belief: posterior of the chain from pairs before the first of these.
@@ -142,8 +141,7 @@ class ChangeDetector:
         """Whitened errors (n, 3) of the newest pairs, n at most `MOST_SURPRISES`.
 
         Each is against the prediction from the pairs before it. They are in units of the noise: the model's own
-        uncertainty
-        is taken out.
+        uncertainty is taken out.
         """
         return np.array(self._surprises).reshape(-1, 3)
 
@@ -235,8 +233,7 @@ class ChangeDetector:
         """Return the probability of a change if the arm may bend, before and after; at least one pair.
 
         The bends are those that the pairs make probable. It costs some hundred times as much as `suspicion`: use it
-        when
-        that is an alarm.
+        when that is an alarm.
         """
         angles, known, changed, errors = (np.array(each) for each in zip(*self._rows, strict=True))
         scale = 1.0 / math.sqrt(self._noise.single)

@@ -80,10 +80,9 @@ class SharedNoise:
         """Estimate the noise of residuals (n, 3), n at least 2, in their order; an upper estimate.
 
         n Var(mean of n) = γ_0 + 2 Σ_{k<n} (1 − k/n) γ_k with the autocovariances γ, for as long as pairs of
-        neighbouring
-        lags stay positive (Geyer 1992, initial positive sequence). With a variance estimated from ν independent parts,
-        a
-        Gaussian becomes a Student variable, which has heavier tails: the variances are raised to match.
+        neighbouring lags stay positive (Geyer 1992, initial positive sequence). With a variance estimated from ν
+        independent parts, a Gaussian becomes a Student variable, which has heavier tails: the variances are raised to
+        match.
 
         Args:
             residuals: (n, 3).

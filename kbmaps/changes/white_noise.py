@@ -57,8 +57,7 @@ class WhiteNoise:
 
         Maximum likelihood variances of Gaussian differences, by the MM algorithm of Zhou, Hu, Zhou and Lange (2019, "MM
         algorithms for variance components models"). It keeps variances positive and each step increases the likelihood.
-        With
-        too few pairs, the noise is as claimed.
+        With too few pairs, the noise is as claimed.
 
         Args:
             errors: of a model's predictions (n, 3) [m], in the order of the pairs.

@@ -151,7 +151,7 @@ class InverseKinematics:
             x: target position (3,) [m].
             rotation: target orientation: a rotation matrix (3, 3) or a unit quaternion x, y, z, w (4,).
             start: the arm's configuration (d,); tried first, so that the answer is near to it if that leads to the
-            target.
+                target.
             posture: preferred configuration (d,), each joint measured in its half range, as far as the target leaves a
                 choice; `middle` keeps away from the limits. The answer is locally the nearest to the solution found
                 first.

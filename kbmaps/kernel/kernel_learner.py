@@ -111,13 +111,10 @@ class KernelLearner(KernelRegression):
         """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and the support by data.
 
         Support has its own rule here: a configuration is in support if the pairs leave at most `SUPPORT_LIMIT` of its
-        prior
-        variance. With fewer pairs than control points, each pair determines directions of its own and is known to its
-        noise
-        alone. By the rule of `Estimate`, almost nothing except the pairs themselves would then be in support. Where λ
-        is so
-        large that more than the limit remains even at the pairs, they are not in support either. Before the first pair,
-        sigma is infinite: only pairs can show the quality of the prior.
+        prior variance. With fewer pairs than control points, each pair determines directions of its own and is known to
+        its noise alone. By the rule of `Estimate`, almost nothing except the pairs themselves would then be in support.
+        Where λ is so large that more than the limit remains even at the pairs, they are not in support either. Before
+        the first pair, sigma is infinite: only pairs can show the quality of the prior.
 
         Raises:
             ShapeError, NonFiniteError
@@ -137,8 +134,7 @@ class KernelLearner(KernelRegression):
         """Return the learner with the pairs that count; `from_bytes` restores the same predictions to the last bit.
 
         A prior that is neither a `KBMap` nor a `RigidChain` is not stored. The one given in its place has to predict
-        the
-        same at the pairs, up to rounding; elsewhere predictions differ as the priors do.
+        the same at the pairs, up to rounding; elsewhere predictions differ as the priors do.
         """
         behind, arrays = packable(self._prior)
         fields: dict[str, Any] = {

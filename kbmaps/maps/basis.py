@@ -170,8 +170,7 @@ class JointBasis:
         """Return a basis of the constant 1 and two functions of RMS `scale`, orthogonal on [low, high] [rad].
 
         Orthogonal for θ uniform on the range. A scale below one makes a learner that changes the coefficients as little
-        as
-        possible prefer smooth changes.
+        as possible prefer smooth changes.
         """
         return cls("orthonormal", (float(low), float(high), float(scale)))
 

@@ -50,8 +50,7 @@ def blockwise_precision(prior: KBMap, q: ArrayLike, x: ArrayLike) -> float:
 
     The pairs are cut into runs of neighbours, and those of each run, at most `BLOCK_PAIRS`, are predicted from all
     other runs. Of the precisions that do this equally well, to one standard error, the largest is taken: the data do
-    not
-    require a more flexible map (Breiman et al., Classification and Regression Trees, 1984, section 3.4.3).
+    not require a more flexible map (Breiman et al., Classification and Regression Trees, 1984, section 3.4.3).
 
     Args:
         prior: in the bases that the learner works in.

@@ -22,10 +22,8 @@ class Design:
     """Matrix A (n, m) with the rows √weight · w(q)ᵀ, and the targets (n, outputs) likewise scaled.
 
     A pair takes (d + outputs + 1) numbers, and a product with A costs as much as predictions; w(q) is a Kronecker
-    product
-    and never formed. The sums for AᵀA are updated block by block once there are more pairs than unknowns. Inputs are
-    not
-    checked.
+    product and never formed. The sums for AᵀA are updated block by block once there are more pairs than unknowns.
+    Inputs are not checked.
     """
 
     def __init__(self, bases: Sequence[JointBasis], outputs: int) -> None:

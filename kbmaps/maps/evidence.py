@@ -15,8 +15,7 @@ def most_evident(log_evidence: Callable[[float], float], start: float, low: floa
     """Return the positive scale of the greatest evidence near `start`.
 
     Climbs in steps of a factor until both neighbours are lower. Then tries the vertex of the parabola through the
-    three,
-    unless that is next to the middle one.
+    three, unless that is next to the middle one.
 
     Args:
         log_evidence: of a scale. If the search ends where it started, the best scale is the last one evaluated.

@@ -79,9 +79,8 @@ class ExactLearner:
 
     The pairs are kept as they came. With more of them than control points, so are the sums for their Gram matrix. The
     prior is part of neither, so it may change (`rebase`). At d = 7 a pair takes 88 bytes, 6 µs to learn and 5 µs of
-    each
-    solve. The rest of a solve is one Cholesky factorisation of at most (3^d)², within 8 · 9^d bytes (38 MB). Where the
-    data are too one-sided for it, the solution comes from a QR factorisation of all pairs: exact, and slow.
+    each solve. The rest of a solve is one Cholesky factorisation of at most (3^d)², within 8 · 9^d bytes (38 MB). Where
+    the data are too one-sided for it, the solution comes from a QR factorisation of all pairs: exact, and slow.
 
     Args:
         prior: the solution in the directions that the data do not determine. If it has an orientation, that is learnt
@@ -178,12 +177,9 @@ class ExactLearner:
 
         Args:
             prior_precision: None: least squares without regularisation; where the pairs do not determine it, the
-            solution
-                nearest to the prior in the learner's bases. λ > 0: minimises Σ weight ‖f(q) − x‖² + λ ‖g − g0‖² over
-                the
-                coefficients g, the posterior mean for a Gaussian prior of variance noise² / λ around g0. "evidence": λ
-                of
-                the greatest marginal likelihood.
+                solution nearest to the prior in the learner's bases. λ > 0: minimises Σ weight ‖f(q) − x‖² + λ ‖g −
+                g0‖² over the coefficients g, the posterior mean for a Gaussian prior of variance noise² / λ around g0.
+                "evidence": λ of the greatest marginal likelihood.
 
         Raises:
             SettingError: prior_precision is neither None, "evidence", nor a number above 0.

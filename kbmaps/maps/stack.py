@@ -20,8 +20,7 @@ class BasisStack:
     """Evaluates all joints at once and keeps the weight vector factored into a left and a right half.
 
     The full weight vector is kron(left, right). With about as many joints on either side, both are of length 3^(d/2),
-    so
-    contracting a net of 3^d control points with them needs no vector of length 3^d. Inputs are not checked: callers
+    so contracting a net of 3^d control points with them needs no vector of length 3^d. Inputs are not checked: callers
     validate them.
     """
 
@@ -140,8 +139,7 @@ class BasisStack:
         """Return the Kronecker product for a batch, joint by joint from the last.
 
         Needs less memory than gathering all factors. Built transposed, for long inner loops over the rows, and returned
-        as a
-        transposed view.
+        as a transposed view.
         """
         count = len(weights)
         factors = np.ascontiguousarray(weights[:, begin:end].transpose(1, 2, 0))
@@ -155,8 +153,7 @@ def _factor_index(sizes: tuple[int, ...], first_joint: int) -> IntArray:
     """Return the indices (joints, entries) of the joint weights that multiply to each product entry.
 
     They count the flat joint weights, 3 per joint. For a single vector, gathering and reducing costs a third of a chain
-    of
-    outer products.
+    of outer products.
     """
     digits = (
         np.array(np.unravel_index(np.arange(math.prod(sizes)), sizes), dtype=np.intp) if sizes else np.empty((0, 1))

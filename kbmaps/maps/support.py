@@ -129,8 +129,7 @@ class SupportSet:
         """Return the standard deviation of a predicted coordinate at q (d,), or (n,) for q (n, d).
 
         For coefficients of prior standard deviation 1. Times `ExactSolution.prior_std` it is the 1-sigma [m] that the
-        fit
-        leaves.
+        fit leaves.
 
         Raises:
             ShapeError, NonFiniteError

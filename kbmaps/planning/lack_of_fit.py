@@ -22,9 +22,8 @@ def systematic_error(posterior: Posterior, q: ArrayLike, residuals: ArrayLike) -
 
     Noise is independent from pair to pair, while a bending joint or a distorting lens errs alike at poses near each
     other. The mean product of residuals of neighbours is therefore the systematic part, once the fit's own part has
-    been
-    removed: it makes the residuals of neighbours i and j share −R_i R_jᵀ. The result is a lower bound, since neighbours
-    are not the same pose: the sparser the poses, the more of it counts as noise.
+    been removed: it makes the residuals of neighbours i and j share −R_i R_jᵀ. The result is a lower bound, since
+    neighbours are not the same pose: the sparser the poses, the more of it counts as noise.
 
     Args:
         posterior: of the model that has learnt the pairs.

@@ -77,8 +77,7 @@ class ChainPosterior:
         Args:
             learner: the learner, which may go on learning.
             noise: 1-sigma of a coordinate of further pairs [m]; None takes that of the pairs so far. A recursive
-            learner
-                knows only the noise of pairs that came without their sigma.
+                learner knows only the noise of pairs that came without their sigma.
 
         Raises:
             DegenerateDataError: no noise was given and the learner has none, being without pairs.

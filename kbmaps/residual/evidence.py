@@ -104,8 +104,7 @@ class GroupedModel:
     """Weights N(centre, variance of their group), rows with noise of one variance.
 
     The group of the name "" is always active; its variance is 1 and its prior mean `centre`. The others' prior means
-    are
-    0 and their variances are estimated: groups that the evidence (MacKay 1992) does not support are left out.
+    are 0 and their variances are estimated: groups that the evidence (MacKay 1992) does not support are left out.
 
     Args:
         moments: over the columns of all groups.
@@ -198,8 +197,7 @@ class GroupedModel:
         """Return the average over the active groups and all sets that differ by one group less, more, or exchanged.
 
         Weighted by evidence and prior odds of e^−PRICE per group. Hoeting et al., "Bayesian model averaging",
-        Statistical
-        Science 14, 1999; improbable models are left out (Occam's window there).
+        Statistical Science 14, 1999; improbable models are left out (Occam's window there).
         """
         whole = self.posterior()
         models, log_odds = [(dict(self.variances), whole)], [0.0]

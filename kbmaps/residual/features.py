@@ -158,8 +158,7 @@ class ResidualFeatures:
         """Return positions at q (n, d) and their derivatives by the change, which gives `chain`, and by weights.
 
         Two second-order effects are left out of the derivatives, not of the positions: the camera magnifies changes of
-        p
-        slightly, and compliance changes the torque.
+        p slightly, and compliance changes the torque.
         """
         error, shapes = self._angle_errors(chain, weights, q, groups)
         p, jacobian = self.parameters.linearised(change, q + error)

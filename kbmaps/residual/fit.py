@@ -62,8 +62,7 @@ class _Fitter:
     """State of one fit: Gauss-Newton rounds, each of which selects groups and variances again.
 
     The prior's parameters, the chain's change and the weights of its groups, are the weights of the group "", counted
-    in
-    columns of the prior's root. Other weights, of the same groups or others, are added to them.
+    in columns of the prior's root. Other weights, of the same groups or others, are added to them.
     """
 
     def __init__(self, prior: ResidualModel, pairs: Pairs, change: FloatArray) -> None:

@@ -30,13 +30,10 @@ class ResidualLearner:
     """Fits a rigid chain around a nominal one, and smooth deviations from it where the pairs support them.
 
     Deviations come in groups: eccentric encoders, gear gains, compliant joints, a distorting camera, and smooth
-    functions
-    of one to three joints. The chain's tolerances and each group's variance are the prior; the variances are those that
-    make the pairs most probable. The prediction averages over the sets of groups that are about as probable as the
-    best.
-    Where the pairs support no group, it equals `RigidLearner` to a fraction of its sigma. Where no set with a group
-    comes
-    near in probability, as without noise, it is equal to the last bit.
+    functions of one to three joints. The chain's tolerances and each group's variance are the prior; the variances are
+    those that make the pairs most probable. The prediction averages over the sets of groups that are about as probable
+    as the best. Where the pairs support no group, it equals `RigidLearner` to a fraction of its sigma. Where no set
+    with a group comes near in probability, as without noise, it is equal to the last bit.
 
     Args:
         nominal: the nominal chain, or one found by `find_chain`.

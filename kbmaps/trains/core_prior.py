@@ -64,10 +64,8 @@ class CorePrior:
         """Return the prior of a nominal chain with uncertain links, which is not quite rigid.
 
         To first order, a small rigid motion before joint k changes its core along six directions, and a shift of the
-        marker
-        changes the last core along three. They carry the geometry's uncertainty. In addition, every number of every
-        core has
-        `ellipse_std` of its own, for deviations that no rigid chain can have.
+        marker changes the last core along three. They carry the geometry's uncertainty. In addition, every number of
+        every core has `ellipse_std` of its own, for deviations that no rigid chain can have.
 
         Args:
             chain: the nominal model.

@@ -111,8 +111,7 @@ class LevenbergMarquardt:
     """Damped Gauss–Newton on a TensorProblem.
 
     The damping is a multiple of the identity in whitened cores. Gauge freedoms (an affine change of the frame between
-    two
-    cores) need no further treatment: along them, the step follows the prior alone.
+    two cores) need no further treatment: along them, the step follows the prior alone.
     """
 
     damping: float = _FIRST_DAMPING

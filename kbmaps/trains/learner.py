@@ -147,8 +147,7 @@ class TensorLearner:
         """Minimum number of pairs for the first fit without a prior: 1.5 times one third of the free parameters.
 
         The train has Σ 12 m_k numbers over all joints but the last and 3 m_d of that, less 12 for the frame between any
-        two
-        cores: 24 d − 15 for revolute joints.
+        two cores: 24 d − 15 for revolute joints.
         """
         sizes = [basis.size for basis in self.bases]
         numbers = 12 * sum(sizes[:-1]) + 3 * sizes[-1] - 12 * (self.joints - 1)
@@ -215,10 +214,8 @@ class TensorLearner:
         """Allow for a marker that was moved: keep the posterior of all other cores, and forget the pairs.
 
         The current train becomes the prior's mean. Each core's covariance is the one with the others fixed, which pins
-        the
-        frames between them. The last core is as free as a marker moved by the tolerance: along the axes of its frame if
-        a
-        nominal chain gave them, otherwise in any direction.
+        the frames between them. The last core is as free as a marker moved by the tolerance: along the axes of its
+        frame if a nominal chain gave them, otherwise in any direction.
 
         Args:
             tolerance: 1-sigma of each component of the displacement [m].

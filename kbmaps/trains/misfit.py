@@ -22,12 +22,9 @@ def misfit_directions(train: TensorTrain, q: FloatArray) -> FloatArray:
     """Return the effect of joint and instrument errors on the marker (n, 3, 5 d + 18) at q (n, d).
 
     In m/rad, or m/m; q is not checked. A joint's error is a second harmonic of its reading, or proportional to the
-    moment
-    of a force on the marker along each axis of the measurement frame. The first models eccentric encoders, gears and
-    other
-    periodic errors (a train has the constant and the first harmonic), the second elastic joints. The instrument's error
-    is
-    any quadratic function of the position, as of lenses (a train follows linear ones).
+    moment of a force on the marker along each axis of the measurement frame. The first models eccentric encoders, gears
+    and other periodic errors (a train has the constant and the first harmonic), the second elastic joints. The
+    instrument's error is any quadratic function of the position, as of lenses (a train follows linear ones).
     """
     slopes = train.jacobian(q)
     phases = _phases(train.bases, q)
@@ -51,8 +48,7 @@ def likely_misfit(
     """Return the most likely standard deviation of each group of errors; 0 if the pairs support none.
 
     With y = J z + G w + e in units of the noise, z ~ N(0, I), w ~ N(0, D²) and z marginalised, the information about w
-    is
-    C = Gᵀ (I + J Jᵀ)⁻¹ G, and Gᵀ r of the residuals r at the best z:
+    is C = Gᵀ (I + J Jᵀ)⁻¹ G, and Gᵀ r of the residuals r at the best z:
 
         2 log p(D) - 2 log p(0) = rᵀ G D (I + D C D)⁻¹ D Gᵀ r - log |I + D C D|.
 

@@ -169,8 +169,7 @@ def information(pairs: Pairs, prior: CorePrior, fit: Fit) -> tuple[FloatArray, F
     """Return JᵀJ (36 d, 36 d) of the pairs that a fit used, by z: the information beyond the prior's unit matrix.
 
     Also returns the standard deviation of a coordinate of each (n,) [m] as weighted. Where every sigma was given but
-    the
-    residuals are larger, all are scaled up accordingly.
+    the residuals are larger, all are scaled up accordingly.
     """
     good = pairs.chosen(fit.used)
     problem = good.problem(prior, fit.noise)

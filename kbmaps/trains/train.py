@@ -24,9 +24,9 @@ KIND = "tensor train"
 class TensorTrain:
     """Marker positions as a product of affine maps, one per joint.
 
-    M_k(q_k) = Σ_j w_kj(q_k) B_kj with B_kj the upper three rows of an affine 4x4 matrix, and
-    x(q) = M_1(q_1) ∘ … ∘ M_d(q_d) applied to the origin. The control net of this map is a tensor train
-    (Oseledets 2011) of rank 4. Every rigid chain is one, and so is every chain whose joints move on ellipses.
+    M_k(q_k) = Σ_j w_kj(q_k) B_kj with B_kj the upper three rows of an affine 4x4 matrix, and x(q) = M_1(q_1) ∘ … ∘
+    M_d(q_d) applied to the origin. The control net of this map is a tensor train (Oseledets 2011) of rank 4. Every
+    rigid chain is one, and so is every chain whose joints move on ellipses.
 
     Attributes:
         bases: one basis per joint, in the order of q.
