@@ -238,7 +238,7 @@ class Ladder:
         return columns[0] if angles.ndim == 1 else columns
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and the support by data.
+        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and True where data is near.
 
         Raises:
             ShapeError, NonFiniteError

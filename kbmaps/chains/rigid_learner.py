@@ -189,7 +189,7 @@ class RigidLearner:
         return self._parameters.jacobian(self.belief.mean, q)
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and the support by data.
+        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and True where data is near.
 
         Where the given noise does not explain the residuals, the excess is added to sigma everywhere.
 

@@ -200,7 +200,7 @@ class RecursiveRigidLearner:
         return self._parameters.jacobian(self._filter.change, q)
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and the support by data.
+        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and True where data is near.
 
         Where the given noise does not explain the residuals of a refit, the excess is added to sigma everywhere.
         Support is judged by the kept pairs, and by the most uncertain one of those before them. They are evaluated once

@@ -179,7 +179,7 @@ class ToolLayer:
         return self._model.angular_jacobian(q)
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and the support by data.
+        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and True where data is near.
 
         The model's own variance adds to that of δ. Every pair determines all of δ, so δ is equally certain at all
         configurations. Once there is a pair of the current tool, support is that of the model, or everywhere if the

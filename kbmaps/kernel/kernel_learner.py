@@ -108,7 +108,7 @@ class KernelLearner(KernelRegression):
         self._prior, self._fit = prior, None
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and the support by data.
+        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and True where data is near.
 
         Support has its own rule here: a configuration is in support if the pairs leave at most `SUPPORT_LIMIT` of its
         prior variance. With fewer pairs than control points, each pair determines directions of its own and is known to

@@ -95,7 +95,7 @@ class StructuredLearner(KernelRegression):
         self._fit = None
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and the support by data.
+        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and True where data is near.
 
         Raises:
             ShapeError, NonFiniteError

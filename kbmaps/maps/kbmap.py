@@ -189,8 +189,8 @@ class KBMap:
             centre: the angle that −α and α are counted from [rad], likewise.
 
         Raises:
-            BasisError: an α that is not within 0..180 degrees (SingularAlphaError: within 80..100). ShapeError,
-                NonFiniteError
+            BasisError: an α that is not within 0..180 degrees (SingularAlphaError: within 80..100).
+            ShapeError, NonFiniteError
         """
         alphas, centres = _one_a_joint("alpha", alpha, self.joints), _one_a_joint("centre", centre, self.joints)
         return self.in_basis(

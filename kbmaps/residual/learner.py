@@ -136,7 +136,7 @@ class ResidualLearner:
         return self._rigid.jacobian(q) if self._is_rigid else self.model.jacobian(q)
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and the support by data.
+        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and True where data is near.
 
         Where the given noise does not explain the residuals, the excess is added to sigma everywhere.
 
