@@ -1,7 +1,7 @@
 """Kinematic Bézier Maps: forward kinematics that is linear in its parameters, and learners for it.
 
-Numpy and scipy only; no I/O, no clock, no logging. Angles [rad], lengths [m], float64. The innermost loops are compiled
-where a C compiler was there on installation: `kernels_in_use()` tells; BODYSCHEMA_PURE=1 goes without them.
+Needs only numpy and scipy: no I/O, no clock, no logging. Angles [rad], lengths [m], float64. The innermost loops are
+compiled if a C compiler was present at installation: see `kernels_in_use()`. BODYSCHEMA_PURE=1 disables them.
 """
 
 from importlib import import_module
@@ -160,7 +160,7 @@ __all__ = [
     "with_refitted_tool",
 ]
 
-# Each public name is imported with its module when it is first asked for: all of them take 0.7 s of CPU.
+# Each public name is imported on first use: importing all of them takes 0.7 s of CPU.
 _MODULES = {
     "autocorrelation": ["shared_by"],
     "chains.align": ["Alignment", "align"],

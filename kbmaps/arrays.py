@@ -1,4 +1,4 @@
-"""Array types and the checks made where arrays enter the package."""
+"""Array types, and validation of arrays that enter the package."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ IntArray: TypeAlias = NDArray[np.intp]
 
 
 def numbers(name: str, values: ArrayLike) -> FloatArray:
-    """`values` as a float64 array of any shape.
+    """Return `values` as a float64 array of any shape.
 
     Raises:
-        NotNumbersError: they are words, or rows of different lengths.
+        NotNumbersError: the values are not numbers, or the rows differ in length.
     """
     try:
         return np.asarray(values, dtype=np.float64)
@@ -28,14 +28,14 @@ def numbers(name: str, values: ArrayLike) -> FloatArray:
 
 
 def frozen(values: ArrayLike) -> FloatArray:
-    """A read-only float64 copy in C order."""
+    """Return a read-only float64 copy in C order."""
     copy = np.array(values, dtype=np.float64, order="C")
     copy.flags.writeable = False
     return copy
 
 
 def vector(name: str, values: ArrayLike, width: int) -> FloatArray:
-    """`values` as a finite float64 vector (width,).
+    """Return `values` as a finite float64 vector (width,).
 
     Raises:
         ShapeError, NonFiniteError, NotNumbersError
@@ -43,14 +43,14 @@ def vector(name: str, values: ArrayLike, width: int) -> FloatArray:
     array = numbers(name, values)
     if array.shape != (width,):
         raise ShapeError(name, f"({width},)", array.shape)
-    # A sum over a list is several times cheaper than np.isfinite on so few numbers.
+    # For so few numbers, summing a list is several times cheaper than np.isfinite.
     if not math.isfinite(sum(array.tolist())):
         raise NonFiniteError(name)
     return array
 
 
 def rows(name: str, values: ArrayLike, width: int) -> FloatArray:
-    """`values` as finite float64 rows (n, width).
+    """Return `values` as finite float64 rows (n, width).
 
     Raises:
         ShapeError, NonFiniteError, NotNumbersError
@@ -64,7 +64,7 @@ def rows(name: str, values: ArrayLike, width: int) -> FloatArray:
 
 
 def rows_or_vector(name: str, values: ArrayLike, width: int) -> FloatArray:
-    """`values` as a finite vector (width,) or finite rows (n, width); the result keeps which of the two it was.
+    """Return `values` as a finite vector (width,) or finite rows (n, width), whichever they were.
 
     Raises:
         ShapeError, NonFiniteError, NotNumbersError
@@ -80,7 +80,7 @@ def rows_or_vector(name: str, values: ArrayLike, width: int) -> FloatArray:
 
 
 def limits(name: str, values: ArrayLike, width: int) -> FloatArray:
-    """`values` as a float64 vector (width,) of which some may be infinite.
+    """Return `values` as a float64 vector (width,); infinite entries are allowed.
 
     Raises:
         ShapeError, NonFiniteError (NaN), NotNumbersError

@@ -1,4 +1,4 @@
-"""How much neighbours on a path share their errors."""
+"""Autocorrelation of residuals along a path."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ import numpy as np
 
 from kbmaps.arrays import FloatArray
 
-# A sum over longer lags than this share of the series would be more noise than sum.
+# Over longer lags than this share of the series, the sum would be dominated by noise.
 _LONGEST_LAG_SHARE = 0.25
 
 
 def shared_by(residuals: FloatArray) -> float:
-    """How many neighbouring residuals tell as much as one independent one would, at least 1.
+    """Return how many neighbouring residuals carry as much information as one independent residual, at least 1.
 
-    The integrated autocorrelation time 1 + 2 Σ ρ_k of the residuals (n, 3) in their order, summed over lags for as
-    long as pairs of neighbouring lags stay positive (Geyer 1992, initial positive sequence). The series is not centred:
-    a mean is an error too.
+    This is the integrated autocorrelation time 1 + 2 Σ ρ_k of the residuals (n, 3) in their order. The sum ends at the
+    first pair of neighbouring lags that is not positive (Geyer 1992, initial positive sequence). The series is not
+    centred: a mean is an error too.
     """
     n = len(residuals)
     longest = int(n * _LONGEST_LAG_SHARE)
     square = float(np.vdot(residuals, residuals)) / max(n, 1)
     if longest < 2 or square == 0.0:
         return 1.0
-    # By the fast Fourier transform of the padded series (Wiener-Khinchin).
+    # Fast Fourier transform of the padded series (Wiener-Khinchin).
     spectrum = np.fft.rfft(residuals, 2 * n, axis=0)
     products = np.fft.irfft(np.square(np.abs(spectrum)).sum(axis=1), 2 * n)[: longest + 1]
     correlation = products / (n - np.arange(longest + 1)) / square

@@ -1,4 +1,4 @@
-"""Which of several models predicts best, judged on pairs that none of them had learnt."""
+"""Comparison of several models by their errors on pairs that none of them had learnt."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from kbmaps.arrays import FloatArray
 from kbmaps.autocorrelation import shared_by
 from kbmaps.errors import ShapeError
 
-# Pairs that two models have to have predicted both before they are compared.
+# Minimum number of pairs predicted by both models for a comparison.
 FEWEST = 3
-# The last pairs that are compared: so many, or this share of all so far where that is more, up to a bound.
+# Number of the last pairs that are compared: at least this many, or this share of all so far, up to a bound.
 SHORTEST, SHARE, LONGEST = 100, 0.5, 1000
-# A model is worse than another when the difference of their squared errors is so many standard errors.
+# A model is worse than another when the difference of their squared errors is this many standard errors.
 CLEARLY = 2.0
 # A model whose mean error on the last so many pairs is so many times another one's does not answer: what fitted most of
 # the pairs may fail where the arm has just come to, and the cap below hides by how much. A share of 1.2 is what answers
@@ -25,13 +25,13 @@ CLEARLY = 2.0
 # Sensitivity, mean error on 90 pairs each of two measured arms (UR5 0.158 mm, UR10 0.409 mm), a solution every ten:
 # 0.3 to 3 times as many pairs change it by up to 1 %, 0.3 to 3 times the margin above 1 by -3 to +12 %.
 LATELY, WORSE = 50, 1.2
-# A difference that no camera sees [m].
+# A difference too small for any camera [m].
 _LEAST_M = 1e-6
-# Of the last pairs, a model has to have predicted so many to be listed beside the one that answers.
+# A model is listed next to the answering one if it has predicted this many of the last pairs.
 LISTED = 10
-# A squared error counts up to so many times the median of the better model: an outlier tells of neither.
+# A squared error is capped at this multiple of the better model's median: an outlier says nothing about either.
 _CAP = 9.0
-# No median is taken for smaller [m²]: where a model is exact, another one that errs still loses.
+# Lower bound of the median [m²]: where a model is exact, another one that errs still loses.
 _LEAST = 1e-30
 
 
@@ -40,7 +40,7 @@ class Recent:
     """Errors on the last pairs that all of these models predicted before they learnt them.
 
     Attributes:
-        pairs: how many pairs.
+        pairs: number of pairs.
         means: by model, the mean distance between prediction and measurement [m].
     """
 
@@ -51,12 +51,12 @@ class Recent:
 class Contest:
     """Squared distances between predictions and measurements, pair by pair, for the last pairs.
 
-    Two models meet the same noise at the same pair, so their difference there tells more than their own errors do:
-    prequential errors (Dawid 1984), compared in pairs.
+    Prequential errors (Dawid 1984), compared in pairs: two models meet the same noise at the same pair, so their
+    difference is more precise than their own errors.
 
     Args:
-        errors: where to go on: by model, the squared distances (k,) [m²] of the last k pairs, NaN where there was none.
-        pairs: how many pairs there were so far.
+        errors: state to resume: by model, the squared distances (k,) [m²] of the last k pairs, NaN where missing.
+        pairs: number of pairs so far.
 
     Raises:
         ShapeError: the models have squared distances of different numbers of pairs.
@@ -72,18 +72,19 @@ class Contest:
 
     @property
     def errors(self) -> Mapping[str, FloatArray]:
-        """By model, the squared distances (k,) [m²] of the last k pairs, NaN where there was none."""
+        """Squared distances (k,) [m²] of the last k pairs by model, NaN where missing."""
         return self._errors
 
     @property
     def pairs(self) -> int:
-        """How many pairs there were so far."""
+        """Number of pairs so far."""
         return self._pairs
 
     def add(self, squares: Mapping[str, ArrayLike]) -> None:
-        """One more pair: the squared distance [m²] of each model that predicted it. One that is not finite is none.
+        """Add a pair: the squared distance [m²] of each model that predicted it.
 
-        Or more pairs, in their order: the squared distances (n,) of each model.
+        Values that are not finite are ignored. Several pairs can be added in their order: the squared distances (n,) of
+        each model.
 
         Raises:
             ShapeError: the models have squared distances of different numbers of pairs; nothing has changed.
@@ -104,26 +105,26 @@ class Contest:
             self._errors[name] = kept[-self._length :]
 
     def add_late(self, name: str, squares: ArrayLike) -> None:
-        """The squared distances (n,) [m²] of a model found only now for the last pairs, none of which it has learnt.
+        """Add the squared distances (n,) [m²] of a new model for the last pairs, none of which it has learnt.
 
-        They take the place of those of an older model by this name. NaN where the model had learnt the pair.
+        They replace those of an older model of this name. NaN where the model had learnt the pair.
         """
         late = np.asarray(squares, dtype=np.float64)[-self._length :] if self._length else np.empty(0)
         values = self._errors.setdefault(name, np.full(self._length, math.nan))
         values[self._length - len(late) :] = np.where(np.isfinite(late), late, math.nan)
 
     def forget(self, name: str) -> None:
-        """A model is another one from now on."""
+        """Drop the errors of a model that has been replaced."""
         self._errors.pop(name, None)
 
     def compares(self, name: str) -> bool:
-        """Whether a model has predicted enough of the last pairs to be compared."""
+        """Return True if a model has predicted enough of the last pairs to be compared."""
         return name in self._errors and _count(self._errors[name]) >= FEWEST
 
     def recent(self, answering: str) -> Recent:
-        """Return the models' errors on the last pairs, the same for all of them.
+        """Return the models' errors on the last pairs, the same pairs for all of them.
 
-        A model that has predicted few of those that `answering` has is left out.
+        A model that has predicted few of the pairs of `answering` is left out.
         """
         last = {name: values[-LATELY:] for name, values in self._errors.items()}
         seen = {name: np.isfinite(values) for name, values in last.items()}
@@ -140,14 +141,14 @@ class Contest:
         return Recent(pairs, {name: float(np.sqrt(last[name][common]).mean()) for name in listed} if pairs else {})
 
     def best(self, trusted: Sequence[str], present: str) -> str:
-        """The model that shall answer: the most trusted one that no other beats.
+        """Return the model that shall answer: the most trusted one that no other beats.
 
-        One beats another where the other's mean error is a fifth larger on the newest pairs of both, or its squared
+        One beats another if the other's mean error is a fifth larger on the newest pairs of both, or if its squared
         errors are larger by more than chance on all pairs that are compared.
 
         Args:
             trusted: the models, the most trusted first.
-            present: who answers while too few pairs were predicted.
+            present: the model that answers while too few pairs were predicted.
         """
         errors = ((name, self._errors.get(name)) for name in trusted)
         tried = {name: values for name, values in errors if values is not None and _count(values) >= FEWEST}
@@ -179,9 +180,9 @@ def _clearly_worse(errors: FloatArray, others: FloatArray) -> bool:
     cap = _CAP * max(min(float(np.median(errors)), float(np.median(others))), _LEAST)
     losses = np.minimum(errors, cap) - np.minimum(others, cap)
     mean = float(losses.mean())
-    # A few losses are alike by chance: their spread is taken for no smaller than so few can tell.
+    # Few losses may be alike by chance: their spread is widened accordingly.
     error = float(losses.std(ddof=1)) / math.sqrt(count) * (1.0 + 3.0 / count)
     if mean <= CLEARLY * error:
         return False
-    # Neighbours on a path lose alike, and tell as much as one.
+    # Neighbours on a path have correlated losses, and count as one.
     return mean > CLEARLY * error * math.sqrt(shared_by((losses - mean)[:, None]))

@@ -1,8 +1,8 @@
-"""Everything that kbmaps refuses, as one tree.
+"""All errors raised by kbmaps, as one tree.
 
 KBMapsError
 ├── ShapeError            an array has the wrong shape
-├── NotNumbersError       what should be an array of numbers is none
+├── NotNumbersError       an argument is not an array of numbers
 ├── NonFiniteError        a number is NaN or infinite
 ├── BasisError            a basis cannot be built from these parameters
 │   ├── SingularAlphaError    alpha is too near to 90 degrees
@@ -10,7 +10,7 @@ KBMapsError
 ├── ChainError            transforms or axes do not describe a rigid chain
 ├── RotationError         matrices or quaternions do not describe rotations
 ├── SettingError          a learner's setting is outside its range
-├── DegenerateDataError   the data do not determine what is asked for
+├── DegenerateDataError   the data do not determine the requested result
 └── ModelFormatError      these bytes are not a stored map
 """
 
@@ -32,7 +32,7 @@ class ShapeError(KBMapsError):
 
 
 class NotNumbersError(KBMapsError):
-    """What should be an array of numbers is none."""
+    """An argument is not an array of numbers."""
 
     def __init__(self, name: str, got: object) -> None:
         shown = repr(got)
@@ -64,7 +64,7 @@ class SingularAlphaError(BasisError):
 
 
 class NetSizeError(BasisError):
-    """A control net would not fit into memory, or hardly."""
+    """A control net would be too large for memory."""
 
     def __init__(self, points: int, outputs: int) -> None:
         gibibytes = 8.0 * outputs * points / 2**30
@@ -92,7 +92,7 @@ class SettingError(KBMapsError):
 
 
 class DegenerateDataError(KBMapsError):
-    """The data do not determine what is asked for."""
+    """The data do not determine the requested result."""
 
 
 class ModelFormatError(KBMapsError):

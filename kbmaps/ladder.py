@@ -1,4 +1,4 @@
-"""Models side by side, of which the one that predicts best answers."""
+"""Several models side by side, of which the best predictor answers."""
 
 from __future__ import annotations
 
@@ -39,19 +39,19 @@ _STORED: tuple[type[Model], ...] = (
     TensorLearner,
     ToolLayer,
 )
-# What a model may raise on pairs that it cannot digest. It is out then, and the others go on. (numpy's LinAlgError is a
-# ValueError; others of these are mistakes in a model's code, which have to be seen.)
+# Errors that a model may raise on unsuitable pairs. It is then left out, and the others continue. Other errors are bugs
+# in a model's code and must surface. (numpy's LinAlgError is a ValueError.)
 _FAILURES = (KBMapsError, ArithmeticError, np.linalg.LinAlgError)
 
 
 @dataclass(frozen=True)
 class Rung:
-    """A model on a ladder, and how it is used.
+    """Model on a ladder, with its settings.
 
     Attributes:
-        model: it learns from now on through the ladder alone.
-        growth: it learns what has come when that is this share of what it has learnt. 0 learns each pair at once.
-        extrapolates: whether it may answer where no data was.
+        model: from now on it must learn through the ladder alone.
+        growth: it learns the new pairs once they are this share of those it has learnt. 0 learns each pair at once.
+        extrapolates: True if it may answer away from the data.
 
     Raises:
         SettingError: growth is negative or not finite.
@@ -67,21 +67,23 @@ class Rung:
 
 
 class Ladder:
-    """Holds models side by side, lets each learn at its own pace, and answers with the one that predicts best.
+    """Holds models side by side, lets each learn at its own pace, and answers with the best predictor.
 
-    Each pair is predicted by every model before it is learnt. The most trusted model answers that is not clearly
-    worse than another on the last pairs (`Contest`). Where it has no data and may not extrapolate, the best of those
-    answers that may. A model that fails, has too few pairs yet, or predicts what is not finite, is left out: it spoils
-    nothing. It learns on when it is due, and is back when its predictions are finite; what it had predicted before does
-    not count then.
+    Each pair is predicted by every model before it is learnt. The answer comes from the most trusted model that is not
+    clearly worse than another on the last pairs (`Contest`). Where that model has no data and may not extrapolate, the
+    best of the models that may answers.
 
-    When `learn` got many pairs at once, the model that answers has learnt all of them when it returns; with pairs one
-    by one, models learn when it is their time.
+    A model that fails, has too few pairs yet, or predicts values that are not finite, is left out, without effect on
+    the others. It keeps learning when due, and returns when its predictions are finite; its earlier predictions then do
+    not count.
+
+    When `learn` gets many pairs at once, the answering model has learnt all of them on return. With single pairs, each
+    model learns when it is due.
 
     Args:
-        rungs: the models by name, the most trusted first. What errs least where it is not the best one belongs there,
-            for a clear difference takes many pairs to show: a model that falls back by itself, or one that has fewer
-            free numbers.
+        rungs: the models by name, the most trusted first. A clear difference takes many pairs to show, so put first a
+            model that errs little even where it is not the best: one that falls back by itself, or one with fewer free
+            parameters.
 
     Raises:
         SettingError: no rung, none that extrapolates, models of different numbers of joints, or one that has learnt.
@@ -115,14 +117,14 @@ class Ladder:
 
     @classmethod
     def around(cls, nominal: RigidChain, tolerances: ChainTolerances, lower: ArrayLike, upper: ArrayLike) -> Ladder:
-        """The usual ladder for a drawn arm: rigid chain with residual, rigid chain, tensor train.
+        """Return the usual ladder for a nominal arm: rigid chain with residual, rigid chain, tensor train.
 
-        The residual comes first, for pairs that are spread: where the arm is rigid it errs next to as the chain does,
-        where it is not the chain is far off. On guided paths the chain first serves better away from them.
+        The residual comes first, which suits pairs that are spread: for a rigid arm it errs nearly as the chain does,
+        and for another arm the chain is far off. On guided paths, the chain placed first is better away from them.
 
         Args:
-            nominal: the chain as drawn.
-            tolerances: how far the real one may be from it.
+            nominal: the nominal chain.
+            tolerances: standard deviations of the real chain about it.
             lower, upper: joint limits (d,) [rad, m].
 
         Raises:
@@ -152,26 +154,26 @@ class Ladder:
 
     @property
     def pairs(self) -> int:
-        """How many pairs have come."""
+        """Number of pairs so far."""
         return len(self._q)
 
     @property
     def answering(self) -> str:
-        """The model that answers."""
+        """Name of the answering model."""
         return self._answering
 
     @property
     def models(self) -> Mapping[str, Model]:
-        """The models by name. Do not teach them."""
+        """Models by name. Do not call their `learn`."""
         return {name: rung.model for name, rung in self._rungs.items()}
 
     @property
     def failures(self) -> Mapping[str, str]:
-        """Why models have no say at present, by name."""
+        """Reasons why models are currently left out, by name."""
         return dict(self._failures)
 
     def errors(self) -> dict[str, float]:
-        """RMS distance between prediction and measurement on the last pairs, before learning them [m], by model."""
+        """Return each model's RMS prediction error on the last pairs, before learning them [m]."""
         return {
             name: math.sqrt(float(np.nanmean(squares)))
             for name, squares in self._contest.errors.items()
@@ -179,9 +181,11 @@ class Ladder:
         }
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
-        """Pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,), in the order in which they came.
+        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,), in the order of recording.
 
         Args:
+            q: joint values.
+            x: measured positions.
             sigma: 1-sigma of the positions [m], () or (n,); None where it is to be estimated.
 
         Raises:
@@ -204,11 +208,11 @@ class Ladder:
             self._catch_up()
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
+        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
 
         Raises:
             ShapeError, NonFiniteError
-            DegenerateDataError: no model that may extrapolate has pairs enough yet.
+            DegenerateDataError: no model that may extrapolate has enough pairs yet.
         """
         angles = rows_or_vector("q", q, self._joints)
         if self._rungs[self._answering].extrapolates:
@@ -216,11 +220,11 @@ class Ladder:
         return self.estimate(angles).x
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d), of who answers there.
+        """Return the answering model's derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d).
 
         Raises:
             ShapeError, NonFiniteError
-            DegenerateDataError: no model that may extrapolate has pairs enough yet.
+            DegenerateDataError: no model that may extrapolate has enough pairs yet.
         """
         angles = rows_or_vector("q", q, self._joints)
         rung = self._rungs[self._answering]
@@ -234,11 +238,11 @@ class Ladder:
         return columns[0] if angles.ndim == 1 else columns
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and whether data was there.
+        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and True where data is near.
 
         Raises:
             ShapeError, NonFiniteError
-            DegenerateDataError: no model that may extrapolate has pairs enough yet.
+            DegenerateDataError: no model that may extrapolate has enough pairs yet.
         """
         angles = rows_or_vector("q", q, self._joints)
         batch, rung = np.atleast_2d(angles), self._rungs[self._answering]
@@ -252,7 +256,10 @@ class Ladder:
         return Estimate(x, sigma, inside.in_support).like(angles)
 
     def to_bytes(self) -> bytes:
-        """The ladder with all its models and pairs; `from_bytes` gives the same predictions to the last bit."""
+        """Return the ladder with all its models and pairs.
+
+        `from_bytes` restores the same predictions to the last bit.
+        """
         entries = [
             {
                 "name": name,
@@ -272,13 +279,14 @@ class Ladder:
 
     @classmethod
     def from_bytes(cls, data: bytes, kinds: Sequence[type[Model]] = ()) -> Self:
-        """The ladder in `data`.
+        """Return the ladder in `data`.
 
         Args:
-            kinds: the classes of models on it that are not of this package.
+            data: the result of `to_bytes`.
+            kinds: the classes of its models that are not of this package.
 
         Raises:
-            ModelFormatError: it is none of this kind, or damaged, or has models of classes that are not known.
+            ModelFormatError: wrong type of model, or damaged, or has models of unknown classes.
         """
         fields, arrays = unpack(data, _KIND)
         classes = {kind.__name__: kind for kind in (*_STORED, *kinds)}
@@ -314,7 +322,7 @@ class Ladder:
             raise ModelFormatError("it is not said in words why a model is out")
 
     def _checked_joints(self) -> int:
-        """The models' number of joints. Raises SettingError: they make no ladder."""
+        """Return the models' number of joints. Raises SettingError: they cannot form a ladder."""
         joints = {rung.model.joints for rung in self._rungs.values()}
         if len(joints) != 1:
             raise SettingError(f"a ladder needs models of one number of joints, got {sorted(joints) or 'none'}")
@@ -326,11 +334,11 @@ class Ladder:
         return [name for name in self._rungs if name not in self._failures]
 
     def _answers_first(self) -> str:
-        """Who answers while there is nothing to compare: the first that may answer everywhere."""
+        """Return the model that answers while there is nothing to compare: the first that may answer everywhere."""
         return next(name for name in (*self._working(), *self._rungs) if self._rungs[name].extrapolates)
 
     def _due(self, name: str) -> float:
-        """How many pairs it takes until a model learns again, or tries to."""
+        """Return the number of pairs at which a model learns again, or tries to."""
         asked = self._asked[name]
         return asked + max(1.0, self._rungs[name].growth * asked)
 
@@ -338,7 +346,7 @@ class Ladder:
         return math.ceil(min(self._due(name) for name in self._rungs))
 
     def _judge(self, part: slice) -> None:
-        """Every model predicts pairs that it has not learnt."""
+        """Record every model's prediction of pairs that it has not learnt."""
         squares: dict[str, FloatArray] = {}
         for name in self._working():
             try:
@@ -346,13 +354,13 @@ class Ladder:
             except _FAILURES as error:
                 self._leave_out(name, str(error))
                 continue
-            with np.errstate(over="ignore"):  # an absurd prediction has an infinite error, which counts as none
+            with np.errstate(over="ignore"):  # an absurd prediction has an infinite error, which is ignored
                 squares[name] = np.square(errors).sum(axis=1)
         for k in range(part.stop - part.start):
             self._contest.add({name: float(values[k]) for name, values in squares.items()})
 
     def _teach(self, name: str, until: int) -> None:
-        """A model learns all pairs up to one, from that on which it says it learnt last."""
+        """Let a model learn all pairs up to `until`, from its own count on."""
         model = self._rungs[name].model
         part = slice(model.pairs, until)
         told = ~np.isnan(self._sigma[part])
@@ -367,7 +375,7 @@ class Ladder:
         self._hear(name, self._q[part])
 
     def _hear(self, name: str, q: FloatArray) -> None:
-        """A model that predicts finite positions at q (n, d) has a say, any other has none."""
+        """Admit a model whose predictions at q (n, d) are finite; leave out any other."""
         try:
             finite = bool(np.isfinite(self._rungs[name].model.predict(q)).all())
         except _FAILURES as error:
@@ -379,7 +387,7 @@ class Ladder:
             self._leave_out(name, "it predicted what is not finite")
 
     def _leave_out(self, name: str, reason: str) -> None:
-        """A model has no say until it has learnt on; what it was like before is nothing to compare it by then."""
+        """Leave a model out until it has learnt on; its earlier predictions then do not count."""
         self._failures[name] = reason
         self._contest.forget(name)
 
@@ -392,11 +400,11 @@ class Ladder:
         return self._contest.best(names, present or (names[0] if names else self._answers_first()))
 
     def _fallback(self) -> Model:
-        """Who answers where the model that answers has no data and may not extrapolate."""
+        """Return the model that answers where the answering model has no data and may not extrapolate."""
         return self._rungs[self._best([name for name in self._working() if self._rungs[name].extrapolates])].model
 
     def _catch_up(self) -> None:
-        """Who answers learns what has come; should that break it, the next best does."""
+        """Let the answering model learn all pairs; if it fails, continue with the next best."""
         while self._working() and self._asked[self._answering] < self.pairs:
             self._teach(self._answering, self.pairs)
             self._choose()
@@ -411,5 +419,5 @@ def _restored(entry: Mapping[str, Any], classes: Mapping[str, type[Model]]) -> R
 
 
 def _proper(tolerance: float, default: float) -> float:
-    """A tolerance that a Gaussian prior can have."""
+    """Return a tolerance that a Gaussian prior can have."""
     return tolerance if 0.0 < tolerance < math.inf else default

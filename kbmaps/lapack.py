@@ -1,4 +1,7 @@
-"""The few BLAS and LAPACK routines used here, typed. They work on Fortran order and may overwrite their inputs."""
+"""Typed access to the BLAS and LAPACK routines used here.
+
+They work on Fortran order and may overwrite their inputs.
+"""
 
 from __future__ import annotations
 
@@ -16,17 +19,17 @@ _PANEL_COLUMNS = 32
 
 @cache
 def _routine(name: str, library: str = "lapack") -> Callable[..., Any]:
-    """Import scipy.linalg with the first call: it takes 0.2 s of CPU, and a robot's description needs none of it."""
+    """Import scipy.linalg on first use: it takes 0.2 s of CPU, and not every command needs it."""
     return cast(Callable[..., Any], getattr(import_module(f"scipy.linalg.{library}"), name))
 
 
 def add_outer_in_place(matrix: FloatArray, column: FloatArray, row: FloatArray) -> None:
-    """matrix (n, m), in C order, += column (n,) ⊗ row (m,), without a temporary of its size."""
+    """Add column (n,) ⊗ row (m,) to the matrix (n, m), in C order, without a temporary of its size."""
     _routine("dger", "blas")(1.0, row, column, a=matrix.T, overwrite_a=1)
 
 
 def qr_in_place(square: FloatArray, targets: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """R (m, m) and Qᵀ·targets for a square matrix, overwriting both."""
+    """Return R (m, m) and Qᵀ·targets for a square matrix, overwriting both."""
     size = len(square)
     factor, tau, _, _ = _routine("dgeqrf")(square, lwork=64 * size, overwrite_a=1)
     rotated, _, _ = _routine("dormqr")("L", "T", factor, tau, targets, lwork=64 * size, overwrite_c=1)
@@ -38,7 +41,7 @@ def qr_in_place(square: FloatArray, targets: FloatArray) -> tuple[FloatArray, Fl
 def qr_append(
     factor: FloatArray, targets: FloatArray, rows: FloatArray, row_targets: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """R and Qᵀ·targets after rows were put below them.
+    """Return R and Qᵀ·targets after rows were appended below them.
 
     Overwrites all four.
     """
@@ -51,7 +54,7 @@ def qr_append(
 
 
 def cholesky_lower(symmetric: FloatArray) -> tuple[FloatArray, bool]:
-    """The matrix with its Cholesky factor in the lower triangle, and whether it was positive definite.
+    """Return the matrix with its Cholesky factor in the lower triangle, and True if it was positive definite.
 
     Overwrites the matrix; the part above the diagonal is neither read nor written.
     """
@@ -60,31 +63,31 @@ def cholesky_lower(symmetric: FloatArray) -> tuple[FloatArray, bool]:
 
 
 def cholesky_solve(lower: FloatArray, rhs: FloatArray) -> FloatArray:
-    """Solution of L Lᵀ y = rhs."""
+    """Return the solution of L Lᵀ y = rhs."""
     solution, _ = _routine("dpotrs")(lower, rhs, lower=1)
     return cast(FloatArray, solution)
 
 
 def lower_solve(lower: FloatArray, rhs: FloatArray) -> FloatArray:
-    """Solution of L y = rhs, of a lower triangular matrix without zeros on its diagonal."""
+    """Return the solution of L y = rhs, of a lower triangular matrix without zeros on its diagonal."""
     return cast(FloatArray, _routine("dtrtrs")(lower, rhs, lower=1)[0])
 
 
 def lower_inverse(lower: FloatArray) -> FloatArray:
-    """The inverse of a lower triangular matrix without zeros on its diagonal."""
-    # In C order it is the transpose of an upper one in Fortran order, which LAPACK takes as it is.
+    """Return the inverse of a lower triangular matrix without zeros on its diagonal."""
+    # In C order it is the transpose of an upper one in Fortran order, which LAPACK takes without a copy.
     inverse, _ = _routine("dtrtri")(lower.T, lower=0)
     return cast(FloatArray, inverse).T
 
 
 def cholesky_rcond(lower: FloatArray, norm: float) -> float:
-    """Estimated reciprocal condition number of L Lᵀ, whose norm is given."""
+    """Return the estimated reciprocal condition number of L Lᵀ, whose norm is given."""
     rcond, _ = _routine("dpocon")(lower, norm, uplo="L")
     return float(rcond)
 
 
 def triangular_solve(upper: FloatArray, rhs: FloatArray, smallest_rcond: float) -> FloatArray | None:
-    """Solution of U y = rhs; None if U is nearer to singular than smallest_rcond."""
+    """Return the solution of U y = rhs; None if U is nearer to singular than smallest_rcond."""
     rcond, _ = _routine("dtrcon")(upper, norm="1", uplo="U", diag="N")
     if not rcond > smallest_rcond:
         return None
@@ -92,13 +95,13 @@ def triangular_solve(upper: FloatArray, rhs: FloatArray, smallest_rcond: float) 
 
 
 def smallest_solution(rows: FloatArray, rhs: FloatArray, smallest_rcond: float) -> FloatArray | None:
-    """The solution (m, outputs) of least norm of rows (k, m) @ y = rhs with k <= m, by the QR factors of rowsᵀ.
+    """Return the least-norm solution (m, outputs) of rows (k, m) @ y = rhs with k <= m, by the QR factors of rowsᵀ.
 
     None if the rows are nearer to linearly dependent than smallest_rcond.
     """
     count, unknowns = rows.shape
     factor, tau, _, _ = _routine("dgeqrf")(rows.T.copy(order="F"), lwork=64 * count, overwrite_a=1)
-    # The reflectors below the diagonal are not read by the triangular routines.
+    # The triangular routines do not read the reflectors below the diagonal.
     upper = np.asfortranarray(factor[:count])
     rcond, _ = _routine("dtrcon")(upper, norm="1", uplo="U", diag="N")
     if not rcond > smallest_rcond:

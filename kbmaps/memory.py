@@ -1,4 +1,4 @@
-"""How much of the past a learner goes by."""
+"""Memory of a learner: the number of old pairs that count, and their weight."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from kbmaps.arrays import FloatArray
 from kbmaps.errors import SettingError
 from kbmaps.packed import count, named, number
 
-# What weighs less than this beside a new pair is no part of a sum in float64.
+# A smaller weight next to that of a new pair has no effect on a float64 sum.
 _NOTHING = 1e-20
 
 
 @dataclass(frozen=True)
 class Memory:
-    """What becomes of old pairs.
+    """Treatment of old pairs.
 
     Attributes:
-        window: how many of the last pairs count; None means all.
-        forgetting: the factor by which each new pair lessens the weight of all before; 1 forgets nothing. The pairs are
-            then worth about 1 / (1 − forgetting) in all, and the evidence holds to the prior if that is fewer than the
-            control points that they would have to pay for.
+        window: number of the last pairs that count; None means all.
+        forgetting: factor by which each new pair reduces the weight of all before; 1 forgets nothing. The pairs are
+            then worth about 1 / (1 − forgetting) in all. If that is fewer than the control points that they would have
+            to determine, the evidence keeps to the prior.
 
     Raises:
         SettingError: a window below 1, forgetting not within 0..1 or 0 itself.
@@ -42,22 +42,22 @@ class Memory:
             )
 
     def kept(self, pairs: int) -> int:
-        """How many of the last pairs count, of so many."""
+        """Return how many of the last pairs count, out of `pairs`."""
         longest = math.inf if self.forgetting == 1.0 else math.log(_NOTHING) / math.log(self.forgetting) + 1.0
         return int(min(pairs, longest if self.window is None else min(longest, self.window)))
 
     def weights(self, pairs: int) -> FloatArray:
-        """Weights (pairs,) of pairs in the order in which they came: 1 for the last."""
+        """Return weights (pairs,) of pairs in the order in which they came: 1 for the last."""
         return self.forgetting ** np.arange(pairs - 1, -1, -1.0)
 
 
 def describe_memory(memory: Memory) -> dict[str, float | None]:
-    """A memory as JSON holds it."""
+    """Return a memory as JSON holds it."""
     return {"window": memory.window, "forgetting": memory.forgetting}
 
 
 def parse_memory(value: Any) -> Memory:
-    """The memory that `describe_memory` gave. Raises ModelFormatError, SettingError."""
+    """Return the memory from `describe_memory`. Raises ModelFormatError, SettingError."""
     described = named(value, "the memory", ("window", "forgetting"))
     window = None if described["window"] is None else count(described["window"], "the window")
     return Memory(window, number(described["forgetting"], "forgetting"))

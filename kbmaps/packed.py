@@ -34,7 +34,7 @@ _LARGEST_COUNT = 2**53
 
 
 def pack(kind: str, fields: Mapping[str, Any], arrays: Mapping[str, FloatArray]) -> bytes:
-    """The byte string for a model of this kind; `fields` holds what JSON can: None in place of an infinite number."""
+    """Return the byte string for a model; `fields` holds JSON values, with None in place of an infinite number."""
     shapes = {name: list(array.shape) for name, array in arrays.items()}
     content = {"kind": kind, "fields": dict(fields), "arrays": shapes}
     header = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
@@ -44,10 +44,10 @@ def pack(kind: str, fields: Mapping[str, Any], arrays: Mapping[str, FloatArray])
 
 
 def unpack(data: bytes, kind: str) -> tuple[dict[str, Any], dict[str, FloatArray]]:
-    """Fields and arrays of a model of this kind. What the fields hold is for the caller to check.
+    """Return fields and arrays of a model of this kind. The caller checks the contents of the fields.
 
     Raises:
-        ModelFormatError: the bytes are damaged, truncated, of another kind, or something else.
+        ModelFormatError: the bytes are damaged, truncated, of another kind, or of another format.
     """
     if not isinstance(data, bytes | bytearray | memoryview):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise ModelFormatError(
@@ -67,7 +67,7 @@ def unpack(data: bytes, kind: str) -> tuple[dict[str, Any], dict[str, FloatArray
 
 
 def named(value: Any, what: str, keys: Sequence[str]) -> dict[str, Any]:
-    """`value` if it is an object with exactly these keys. Raises ModelFormatError."""
+    """Return `value` if it is an object with exactly these keys. Raises ModelFormatError."""
     if not isinstance(value, dict) or set(cast(dict[str, Any], value)) != set(keys):
         raise ModelFormatError(f"{what} must be an object with the keys {', '.join(keys)}")
     return cast(dict[str, Any], value)
@@ -75,9 +75,9 @@ def named(value: Any, what: str, keys: Sequence[str]) -> dict[str, Any]:
 
 @contextmanager
 def restoring(what: str) -> Generator[None]:
-    """Restores `what` from fields and arrays inside: whatever does not fit raises ModelFormatError.
+    """Convert errors while restoring `what` from fields and arrays to ModelFormatError.
 
-    What comes from outside may be missing, of another type, too large, or no possible setting of a model.
+    Outside data may be missing, of another type, too large, or an impossible setting of a model.
     """
     try:
         yield
@@ -88,7 +88,7 @@ def restoring(what: str) -> Generator[None]:
 
 
 def complete(arrays: Mapping[str, FloatArray], always: Sequence[str], *parts: Sequence[str]) -> None:
-    """Raises ModelFormatError unless the arrays are those always there and each part whole or not at all."""
+    """Raise ModelFormatError unless `always` and each part, whole or not at all, are exactly the arrays."""
     expected = set(always)
     for part in parts:
         expected |= set(part) if any(name in arrays for name in part) else set()
@@ -97,43 +97,47 @@ def complete(arrays: Mapping[str, FloatArray], always: Sequence[str], *parts: Se
 
 
 def numbers(fields: Mapping[str, Any]) -> dict[str, float]:
-    """Fields that are all numbers. Raises ModelFormatError."""
+    """Return fields that are all numbers. Raises ModelFormatError."""
     return {name: number(value, f"the field {name}") for name, value in fields.items()}
 
 
 def number(value: Any, what: str) -> float:
-    """`value` if it is a number. Raises ModelFormatError."""
+    """Return `value` if it is a number. Raises ModelFormatError."""
     if type(value) not in (int, float):
         raise ModelFormatError(f"{what} is not a number")
     return float(value)
 
 
 def count(value: Any, what: str) -> int:
-    """`value` if it is a whole number from 0 on that every reader of JSON can hold. Raises ModelFormatError."""
+    """Return `value` if it is a whole number from 0 to 2^53, the range of every JSON reader.
+
+    Raises:
+        ModelFormatError: it is not.
+    """
     if type(value) is not int or not 0 <= value <= _LARGEST_COUNT:
         raise ModelFormatError(f"{what} is not a whole number from 0 to {_LARGEST_COUNT}")
     return value
 
 
 def flag(value: Any, what: str) -> bool:
-    """`value` if it is true or false. Raises ModelFormatError."""
+    """Return `value` if it is true or false. Raises ModelFormatError."""
     if type(value) is not bool:
         raise ModelFormatError(f"{what} is neither true nor false")
     return value
 
 
 def unless_infinite(value: float) -> float | None:
-    """A number as JSON can hold it: None where it is infinite."""
+    """Return a number as JSON can hold it: None if it is infinite."""
     return None if math.isinf(value) else value
 
 
 def or_infinite(value: Any, what: str) -> float:
-    """The number that `unless_infinite` gave. Raises ModelFormatError."""
+    """Return the number from `unless_infinite`. Raises ModelFormatError."""
     return math.inf if value is None else number(value, what)
 
 
 def _split(view: memoryview) -> tuple[bytes, memoryview]:
-    """Header and arrays, once magic, version, lengths and checksum are right."""
+    """Return header and arrays, after checking magic, version, lengths and checksum."""
     if len(view) < _PREFIX.size + _CHECKSUM_BYTES:
         raise ModelFormatError(f"{len(view)} bytes are too few for a stored model")
     magic, version, header_length = cast(tuple[bytes, int, int], _PREFIX.unpack_from(view))

@@ -1,4 +1,4 @@
-"""Pairs of joint angles and measured positions, checked where they come in."""
+"""Pairs of joint angles and measured positions, and their validation."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Pairs:
 def with_units(q: FloatArray, x: FloatArray, sigma: FloatArray, shape: FloatArray | None = None) -> Pairs:
     """Pairs from their sigma (n,) [m], NaN where it was not told, and the shape of their errors, as `Pairs` has it.
 
-    As soon as one was not told, the others count relative to their median, which stands for the missing ones too.
+    As soon as one is unknown, the others count relative to their median, which also replaces the missing ones.
     """
     told = ~np.isnan(sigma)
     if told.all():
@@ -60,10 +60,10 @@ def with_units(q: FloatArray, x: FloatArray, sigma: FloatArray, shape: FloatArra
 
 
 def stored_pairs(arrays: Mapping[str, FloatArray], joints: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """q (n, d), x (n, 3) and sigma (n,), NaN where it was not told, of the arrays of a stored model.
+    """Return q (n, d), x (n, 3) and sigma (n,), NaN where unknown, from the arrays of a stored model.
 
     Raises:
-        ModelFormatError: they are missing, or no pairs.
+        ModelFormatError: they are missing, or not pairs.
     """
     with restoring("pairs"):
         q, x, sigma = rows("q", arrays["q"], joints), rows("x", arrays["x"], 3), arrays["sigma"]
@@ -77,7 +77,7 @@ def stored_pairs(arrays: Mapping[str, FloatArray], joints: int) -> tuple[FloatAr
 def checked_pairs(
     q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None, joints: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """q (n, d), x (n, 3) and sigma (n,), NaN for None, from many pairs or one.
+    """Return q (n, d), x (n, 3) and sigma (n,), NaN for None, from many pairs or one.
 
     Raises:
         ShapeError, NonFiniteError, SettingError: a sigma that is not positive.
@@ -120,6 +120,6 @@ def of_covariances(covariances: ArrayLike, pairs: int) -> tuple[FloatArray, Floa
 
 
 def runs(told: BoolArray) -> list[slice]:
-    """Each run of pairs whose sigma was told, or was not (n,), as they can be learnt in one go."""
+    """Return runs of pairs that all have a sigma, or all lack one (n,), so that each can be learnt in one call."""
     ends = [0, *(np.flatnonzero(told[1:] != told[:-1]) + 1).tolist(), len(told)]
     return [slice(start, end) for start, end in itertools.pairwise(ends)] if len(told) else []

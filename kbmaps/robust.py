@@ -1,4 +1,4 @@
-"""What residuals are judged by: when they are rounding, how large is usual, and what few of them prove."""
+"""Robust judgement of residuals: rounding, outliers, and uncertainty from few of them."""
 
 from __future__ import annotations
 
@@ -10,27 +10,29 @@ from kbmaps.pairs import Pairs
 
 # The norm of a residual with noise σ per axis has the median 1.538 σ in three dimensions (√ of χ²₃'s median).
 MEDIAN_NORM = 1.538
-# No residual below a nanometre says anything: on noise-free data that is rounding.
+# Residuals below a nanometre are rounding, even on noise-free data.
 ROUNDING_M = 1e-9
-# A pair this many sigma from where the others predict it is an outlier: of good ones 3 in 100,000 are farther out
-# (chi, three dimensions).
+# A pair this many sigma from its prediction by the others is an outlier: 3 in 100,000 good ones are farther out (chi,
+# three dimensions).
 OUTLIER_SIGMAS = 4.8
 _ONE_SIGMA = 0.841344746
 _HALVINGS = 40
 
 
 def student(freedom: float) -> float:
-    """What a sigma with an estimated noise must be multiplied by to cover as a Gaussian one does."""
+    """Return the factor by which a sigma with an estimated noise must be multiplied for Gaussian coverage."""
     return float(stdtrit(max(freedom, 1.0), _ONE_SIGMA))
 
 
 def claimed_sigma(variance: FloatArray, pairs: Pairs, noise: float, freedom: float) -> FloatArray:
-    """1-sigma against the truth [m] of positions with this posterior variance [m²], after a fit to the pairs.
+    """Return the 1-sigma against the truth [m] of positions with this posterior variance [m²].
 
-    Where the noise was told and does not explain the residuals, what is left over is added; where it was estimated
-    from few residuals, it may be larger than it seems.
+    Where a given noise does not explain the residuals, the excess is added. Where the noise was estimated from few
+    residuals, it is widened, because it may be larger than it seems.
 
     Args:
+        variance: posterior variance of each coordinate [m²].
+        pairs: the fitted pairs.
         noise: that of the fit, in the pairs' units.
         freedom: residual coordinates minus those that the parameters have used up.
     """

@@ -1,4 +1,4 @@
-"""Rotation matrices: from what is measured, the nearest one, how it turns, and how far two are apart."""
+"""Rotation matrices: validation, nearest rotation, exponential map, and angles between rotations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from kbmaps.errors import NonFiniteError, RotationError, ShapeError
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation  # pyright: ignore[reportMissingTypeStubs]
 
-# What a measured rotation may be off by: quaternions and matrices are often written with six digits.
+# Accepted deviation of a measured rotation: quaternions and matrices are often written with six digits.
 _TOLERANCE = 1e-4
 # Below this angle [rad] the quotients of the exponential map are taken from their series.
 SMALL_ANGLE = 1e-3
@@ -23,10 +23,10 @@ _CROSS = np.stack([np.cross(unit, _EYE).T.ravel() for unit in _EYE])
 
 
 def nearest_rotation(matrices: ArrayLike) -> FloatArray:
-    """The proper rotations (..., 3, 3) nearest to matrices (..., 3, 3) in the Frobenius norm.
+    """Return the proper rotations (..., 3, 3) nearest to matrices (..., 3, 3) in the Frobenius norm.
 
-    The orthogonal factor of the polar decomposition, with the smallest singular direction turned round where the
-    matrix is a reflection. Higham 1986, "Computing the polar decomposition"; Kabsch 1976 for the sign.
+    The orthogonal factor of the polar decomposition, with the smallest singular direction reversed where the matrix is
+    a reflection. Higham 1986, "Computing the polar decomposition"; Kabsch 1976 for the sign.
 
     Raises:
         ShapeError, NonFiniteError
@@ -50,10 +50,10 @@ def nearest_rotation(matrices: ArrayLike) -> FloatArray:
 
 
 def nearest_rotation_rates(matrices: FloatArray, derivatives: FloatArray) -> FloatArray:
-    """Angular velocities ω (..., 3, d) of the nearest rotations R of matrices (..., 3, 3): dR = [ω_k]× R dq_k.
+    """Return the angular velocities ω (..., 3, d) of the rotations R nearest to matrices (..., 3, 3).
 
-    With M = R P, Rᵀ dM − dMᵀ R = Ω P + P Ω, and for [ω]× = Ω this is [(tr P · 1 − P) ω]×: exact, also where M is not
-    orthonormal.
+    dR = [ω_k]× R dq_k. With M = R P, Rᵀ dM − dMᵀ R = Ω P + P Ω, and for [ω]× = Ω this is [(tr P · 1 − P) ω]×: exact,
+    also where M is not orthonormal.
 
     Args:
         matrices: M (..., 3, 3).
@@ -70,33 +70,33 @@ def nearest_rotation_rates(matrices: FloatArray, derivatives: FloatArray) -> Flo
 
 
 def _rotation_type() -> type[Rotation]:
-    """Import scipy's rotations when they are first needed: it takes 0.4 s of CPU, and most commands need none."""
+    """Import scipy's rotations on first use: it takes 0.4 s of CPU, and most commands do not need them."""
     from scipy.spatial.transform import Rotation  # pyright: ignore[reportMissingTypeStubs]
 
     return Rotation
 
 
 def rotation_vector(rotation: FloatArray) -> FloatArray:
-    """Axis times angle (3,) [rad], angle at most π, of a rotation matrix (3, 3)."""
+    """Return axis times angle (3,) [rad], angle at most π, of a rotation matrix (3, 3)."""
     return np.asarray(_rotation_type().from_matrix(rotation).as_rotvec(), dtype=np.float64)
 
 
 def rotation_vectors(rotations: FloatArray) -> FloatArray:
-    """Axis times angle (n, 3) [rad], angles at most π, of rotation matrices (n, 3, 3)."""
+    """Return axis times angle (n, 3) [rad], angles at most π, of rotation matrices (n, 3, 3)."""
     if not len(rotations):  # scipy refuses an empty batch
         return np.empty((0, 3))
     return np.asarray(_rotation_type().from_matrix(rotations).as_rotvec(), dtype=np.float64)
 
 
 def quaternions(rotations: FloatArray) -> FloatArray:
-    """Unit quaternions x, y, z, w (n, 4), with w not negative, of rotation matrices (n, 3, 3)."""
+    """Return unit quaternions x, y, z, w (n, 4), with w not negative, of rotation matrices (n, 3, 3)."""
     if not len(rotations):
         return np.empty((0, 4))
     return np.asarray(_rotation_type().from_matrix(rotations).as_quat(canonical=True), dtype=np.float64)
 
 
 def exponentials(turns: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rotations exp([φ]×) (n, 3, 3) of rotation vectors (n, 3) [rad], and their left Jacobians (n, 3, 3).
+    """Return rotations exp([φ]×) (n, 3, 3) of rotation vectors (n, 3) [rad], and their left Jacobians (n, 3, 3).
 
     Rodrigues' formula, and exp([φ + δ]×) = exp([J δ]×) exp([φ]×) to first order, with the left Jacobian J
     (Chirikjian 2012, section 10.8).
@@ -114,17 +114,18 @@ def exponentials(turns: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def cross_matrix(vectors: FloatArray) -> FloatArray:
-    """The matrices K (..., 3, 3) with K @ y = vectors × y, for vectors (..., 3)."""
-    # One product, since this is called for every pair that comes.
+    """Return the matrices K (..., 3, 3) with K @ y = vectors × y, for vectors (..., 3)."""
+    # A single product, because this is called for every incoming pair.
     return (vectors @ _CROSS).reshape(*vectors.shape, 3)
 
 
 def rotation_matrices(name: str, values: ArrayLike) -> FloatArray:
-    """Measured orientations as proper rotation matrices (3, 3) or (n, 3, 3).
+    """Return measured orientations as proper rotation matrices (3, 3) or (n, 3, 3).
 
     Args:
-        values: rotation matrices (3, 3) or (n, 3, 3), or unit quaternions x, y, z, w, (4,) or (n, 4). What they are off
-            by, up to 1e-4, is mended.
+        name: name of the argument, for error messages.
+        values: rotation matrices (3, 3) or (n, 3, 3), or unit quaternions x, y, z, w, (4,) or (n, 4). Deviations up to
+            1e-4 are corrected.
 
     Raises:
         ShapeError, NonFiniteError, RotationError: neither matrices nor quaternions of rotations.
@@ -139,7 +140,7 @@ def rotation_matrices(name: str, values: ArrayLike) -> FloatArray:
         off = np.abs(np.linalg.norm(given, axis=-1) - 1.0)
         if given.size and off.max() > _TOLERANCE:
             raise RotationError(name, "a quaternion is not of length 1")
-        # The empty batch is one that scipy refuses.
+        # scipy refuses an empty batch.
         return (
             np.asarray(_rotation_type().from_quat(given).as_matrix(), dtype=np.float64)
             if given.size

@@ -1,3 +1,3 @@
-"""Many robots at once: who is there, how their models differ, and the diagnosis of all their recordings."""
+"""Many robots at once: their processes, a comparison of their models, and the diagnosis of all their recordings."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The models of the fleet, asked for at common poses."""
+"""Queries of the fleet's models at common poses."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .roster import Fleet, Member
 
 
 def by_type(members: Sequence[Member]) -> tuple[dict[tuple[str, ...], list[Member]], list[str]]:
-    """The robots whose learners answer, by the names of their joints; and why the others are left out, in words."""
+    """Group the robots whose learners answer by the names of their joints; return also why others are left out."""
     types: dict[tuple[str, ...], list[Member]] = {}
     left_out: list[str] = []
     for member in members:
@@ -30,7 +30,7 @@ def by_type(members: Sequence[Member]) -> tuple[dict[tuple[str, ...], list[Membe
 
 
 def compare_types(fleet: Fleet, members: Sequence[Member]) -> tuple[list[TypeComparison], list[str]]:
-    """A comparison for each type of which at least two models answer; and who was left out and why."""
+    """Return a comparison for each type with at least two answering models, and who was left out and why."""
     types, left_out = by_type(members)
     found: list[TypeComparison] = []
     for joints, robots in types.items():

@@ -1,4 +1,4 @@
-"""Models of robots of one type side by side: how far each is from what most of them say, and in which figures."""
+"""Comparison of the models of robots of one type: distance from the median model, and outlying figures."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import FloatArray
 
 POSES = 400
-# Of two, nobody can say which is the odd one.
+# With two robots, an outlier cannot be attributed to either.
 FEWEST_TO_JUDGE = 3
-# A robot is off when one of its figures stands out; or its model is farther from the median than so many times what the
-# models claim, and what the robots are apart from it in the middle.
+# A robot is off if one of its figures stands out, or if its model's distance from the median exceeds this multiple of
+# both the models' predicted errors and the robots' median distance.
 FAR = 3.0
-# A figure stands out when chance brings it about so seldom, among all figures of all robots.
+# Probability that chance makes any figure of any robot stand out.
 CHANCE = 0.05
 ROUNDS = 20
 # Standard error of a median of normal numbers, over that of their mean.
@@ -31,12 +31,14 @@ MEDIAN_COSTS = math.sqrt(math.pi / 2.0)
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """What one robot's learner says at the common poses.
+    """Predictions of one robot's learner at the common poses.
 
     Attributes:
+        robot: its name.
         x: positions (n, 3) in its own measurement frame [m].
-        sigma_m: the error that it claims there, root mean square of the distance [m].
+        sigma_m: its predicted error there, root mean square of the distance [m].
         in_support: share of the poses that lie where it has data.
+        calibration: its calibration; None without one.
     """
 
     robot: str
@@ -47,7 +49,7 @@ class Model:
 
 
 class Odd(msgspec.Struct, frozen=True):
-    """A figure of a robot that differs from the others' by more than its uncertainty and what they differ by.
+    """Figure of a robot that differs from the others' by more than its uncertainty and their spread.
 
     Attributes:
         figure: in words, as in `zero of elbow`.
@@ -62,15 +64,16 @@ class Odd(msgspec.Struct, frozen=True):
 
 
 class Unit(msgspec.Struct, frozen=True, kw_only=True):
-    """One robot beside the others.
+    """One robot compared with the others.
 
     Attributes:
-        apart: its model from the median model, each laid on it as a whole: cameras may stand anywhere.
-        claimed_mm: the error that its learner claims at the poses, root mean square.
+        robot: its name.
+        apart: distance of its model from the median model, after a rigid alignment: cameras may stand anywhere.
+        claimed_mm: predicted error of its learner at the poses, root mean square.
         in_support: share of the poses that lie where it has data.
-        is_off: whether it is the odd one; null where there are too few robots to say.
+        is_off: true if it is an outlier; null if there are too few robots to decide.
         odd: its figures that stand out, the most improbable first.
-        camera_moved_mm, camera_turned_deg: from where its robot.toml says that the camera stands.
+        camera_moved_mm, camera_turned_deg: from the camera pose in its robot.toml.
     """
 
     robot: str
@@ -87,7 +90,10 @@ class TypeComparison(msgspec.Struct, frozen=True):
     """Robots with the same joints.
 
     Attributes:
+        joints: their names.
+        poses: number of common poses.
         low, high: the range of each joint that the poses are from [rad or m].
+        units: the robots.
     """
 
     joints: tuple[str, ...]
@@ -98,10 +104,12 @@ class TypeComparison(msgspec.Struct, frozen=True):
 
 
 def common_poses(coverages: Sequence[Mapping[str, JointRange]], joints: tuple[str, ...], seed: int = 0) -> FloatArray:
-    """Poses (n, d) [rad, m] from the ranges that robots have in common in the middle: one that hardly moved is no bar.
+    """Return poses (n, d) [rad, m] from the median ranges of the robots.
+
+    One robot that hardly moved does not matter.
 
     Raises:
-        RequestError: no robot tells where its joints have been.
+        RequestError: no robot reports the ranges of its joints.
     """
     ranges = [[(each[joint].low, each[joint].high) for joint in joints] for each in coverages]
     if not ranges:
@@ -111,7 +119,7 @@ def common_poses(coverages: Sequence[Mapping[str, JointRange]], joints: tuple[st
 
 
 def compared(joints: tuple[str, ...], q: FloatArray, models: Sequence[Model]) -> TypeComparison:
-    """The models, at the poses q (n, d), of at least two robots."""
+    """Compare the models of at least two robots, at the poses q (n, d)."""
     middle = median_model([model.x for model in models])
     apart = [Distances.of(laid_on(middle, model.x)[0] - middle) for model in models]
     typical = float(np.median([each.rms_mm for each in apart]))
@@ -138,9 +146,9 @@ def compared(joints: tuple[str, ...], q: FloatArray, models: Sequence[Model]) ->
 
 
 def median_model(positions: Sequence[FloatArray]) -> FloatArray:
-    """Positions (n, 3) that are the coordinates' median of all models' (n, 3), each laid on them as a whole.
+    """Return positions (n, 3), the coordinates' median of all models' (n, 3), each rigidly aligned to it.
 
-    Begins with the model that the others are nearest to, so that an odd one does not choose the frame.
+    Starts with the model that the others are nearest to, so that an outlier does not determine the frame.
     """
 
     def distance(x: FloatArray) -> float:
@@ -154,7 +162,7 @@ def median_model(positions: Sequence[FloatArray]) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class _Figure:
-    """One figure of all robots: values and half widths (m,), NaN where a robot's pairs do not tell it."""
+    """One figure of all robots: values and half widths (m,), NaN where a robot's pairs do not determine it."""
 
     name: str
     unit: str
@@ -184,7 +192,7 @@ def _figures(models: Sequence[Model]) -> list[_Figure]:
 
 
 def _odd(robot: int, figures: Sequence[_Figure]) -> tuple[Odd, ...]:
-    """The figures of the robot that stand out."""
+    """Return the figures of the robot that stand out."""
     tried = sum(int(np.isfinite(figure.values).sum()) for figure in figures)
     found: list[tuple[float, Odd]] = []
     for figure in figures:
@@ -199,7 +207,7 @@ def _odd(robot: int, figures: Sequence[_Figure]) -> tuple[Odd, ...]:
 
 
 def _spread(values: FloatArray) -> float:
-    """1-sigma by which most robots differ in a figure, from the median of their distances to the median."""
+    """Return the robust 1-sigma of a figure among robots, from the median of their distances to the median."""
     told = values[np.isfinite(values)]
     return float(np.median(np.abs(told - np.median(told))) / norm.ppf(0.75))
 

@@ -1,4 +1,4 @@
-"""Robots of one type side by side, shown."""
+"""Terminal view of a comparison of robots of one type."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .comparison import FEWEST_TO_JUDGE, Odd, TypeComparison, Unit
 
 
 def view(comparisons: Sequence[TypeComparison], left_out: Sequence[str]) -> RenderableType:
-    """A table for each type, then who was left out."""
+    """Return a table for each type, then who was left out."""
     parts: list[RenderableType] = []
     for comparison in comparisons:
         parts += [*map(Text, sentences(comparison)), Padding(_table(comparison.units), (1, 0, 1, 0))]
@@ -26,7 +26,7 @@ def view(comparisons: Sequence[TypeComparison], left_out: Sequence[str]) -> Rend
 
 
 def sentences(comparison: TypeComparison) -> list[str]:
-    """What was compared, and which robot is the odd one, in words."""
+    """Return the compared robots and the outliers, in words."""
     units = comparison.units
     said = [
         f"{len(units)} robots with the joints {', '.join(comparison.joints)}, at {comparison.poses} common poses, each "
@@ -45,7 +45,7 @@ def sentences(comparison: TypeComparison) -> list[str]:
 
 
 def figure_told(odd: Odd) -> str:
-    """A figure that stands out, as `zero of elbow +2.1 ± 0.2°`."""
+    """Return a figure that stands out, as `zero of elbow +2.1 ± 0.2°`."""
     factor, unit = (math.degrees(1.0), "°") if odd.unit == "rad" else (1e3, " mm")
     half = factor * odd.half_width
     digits = min(max(1 - math.floor(math.log10(half)), 0), 4) if half > 0.0 else 3

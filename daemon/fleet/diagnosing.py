@@ -1,6 +1,7 @@
-"""The diagnosis of many recordings on Dask: on this machine's cores, or wherever a scheduler has workers.
+"""Diagnosis of many recordings on Dask: on this machine's cores, or on the workers of a scheduler.
 
-What a worker gets is the recording and the robot's description, read here: it needs this package, and no file of ours.
+The recording and the robot's description are read here and sent to the worker. It needs this package, but none of our
+files.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from .recordings import Job
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-# A diagnosis that ended so many workers (for its memory, say) is not tried again.
+# A diagnosis that ended this many workers (by running out of memory, for example) is not tried again.
 WORKERS_LOST = 1
 CONNECT_LIMIT_S = 10.0
 TOPIC = "bodyschema"
@@ -35,13 +36,15 @@ TOPIC = "bodyschema"
 
 @dataclass(frozen=True)
 class Diagnosed:
-    """What came of one recording.
+    """Result for one recording.
 
     Attributes:
-        joints: of its robot; empty where its description could not be read.
-        file: the diagnosis; None where there is none.
-        timed: whether the recording has times.
-        error: why there is none.
+        job: the recording.
+        robot: name of its robot.
+        joints: of its robot; empty if its description could not be read.
+        file: the diagnosis; None if there is none.
+        timed: True if the recording has times.
+        error: the reason why there is none.
     """
 
     job: Job
@@ -54,7 +57,7 @@ class Diagnosed:
 
 @dataclass(frozen=True)
 class _Read:
-    """A recording that can be diagnosed."""
+    """Recording that can be diagnosed."""
 
     job: Job
     config: Config
@@ -73,16 +76,18 @@ def diagnose_all(
     told: Told,
     done: Done,
 ) -> list[Diagnosed]:
-    """Diagnose all recordings; one that fails is told as that, and ends no other.
+    """Diagnose all recordings; a failed one is reported as such, and does not end the others.
 
     Args:
-        out: a folder for each is written here.
-        cluster: a client of the scheduler; what is under way is cancelled when this ends early.
-        told: is called with a recording's name and what is done with it just now.
-        done: is called with each result as it comes.
+        jobs: the recordings.
+        asked: settings of the diagnoses.
+        out: a folder for each recording is written here.
+        cluster: a client of the scheduler; running work is cancelled if this ends early.
+        told: called with a recording's name and its current step.
+        done: called with each result as it comes.
 
     Returns:
-        What came of each, in the order of the jobs.
+        The results, in the order of the jobs.
 
     Raises:
         RecordingError: the folder cannot be written.
@@ -116,12 +121,13 @@ def diagnose_all(
 
 @contextmanager
 def workers(scheduler: str | None, jobs: int, count: int | None = None) -> Iterator[Client]:
-    """A client of the scheduler at an address; without one, of processes on this machine.
+    """Yield a client of the scheduler at an address; without one, of processes on this machine.
 
     Dask gives each process one thread of BLAS.
 
     Args:
-        jobs: so many recordings want a worker.
+        scheduler: its address; None starts processes here.
+        jobs: number of recordings.
         count: of processes; None: one for each core, and no more than jobs.
 
     Raises:
@@ -130,7 +136,7 @@ def workers(scheduler: str | None, jobs: int, count: int | None = None) -> Itera
     from dask import config
     from distributed import Client, LocalCluster
 
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters comes as errors of the diagnoses
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors that matter are reported by the diagnoses
     with safe_children(), config.set({"distributed.scheduler.allowed-failures": WORKERS_LOST}):
         if scheduler is not None:
             with _client_of(scheduler) as client:
@@ -169,12 +175,12 @@ def _client_of(scheduler: str) -> Client:
 
 
 def _leave_ctrl_c() -> None:
-    """On a worker of our terminal: Ctrl-C is for who started it, who ends it."""
+    """Ignore Ctrl-C on a worker of our terminal: the parent process handles it and ends the worker."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _read(job: Job) -> _Read | Diagnosed:
-    """The recording with its robot; why it cannot be diagnosed where it cannot be read."""
+    """Return the recording with its robot, or why it cannot be read."""
     try:
         config = Config.load(job.robot)
     except BodyschemaError as error:
@@ -186,9 +192,9 @@ def _read(job: Job) -> _Read | Diagnosed:
 
 
 def _work(read: _Read, asked: Asked, with_report: bool) -> tuple[bytes, Found | None] | str:
-    """On a worker: diagnosis.json, and what the other files are written from, where its paths mean something.
+    """Diagnose on a worker: return diagnosis.json, and the input of the other files if they are written.
 
-    Or why there is none: not every exception of ours survives the way back.
+    Returns the reason as text if there is none: not every exception of ours can be unpickled.
     """
     from distributed import get_worker
 
@@ -206,7 +212,7 @@ def _result(future: Future[Any], read: _Read, out: Path | None) -> Diagnosed:
         answer = future.result()
         if not isinstance(answer, str) and out is not None:
             written(answer[1], out / read.job.name)
-    except Exception as error:  # whatever a worker ran into is told in its row, and is no matter of the others
+    except Exception as error:  # a worker's error is reported in its row and does not concern the others
         answer = _why(error)
     if isinstance(answer, str):
         return Diagnosed(read.job, robot.name, robot.joints, error=answer)

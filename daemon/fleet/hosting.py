@@ -1,4 +1,4 @@
-"""The robots of one learner host, and the processes that they are spread over."""
+"""Robots of one learner host, and their distribution over processes."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from bodyschema.interfaces.limited import read_at_most
 
 
 def descriptions(named: Sequence[Path]) -> list[Path]:
-    """Descriptions of robots, each once: files, and of a folder those in it and a robot.toml in each folder of it.
+    """Return descriptions of robots, each once: files, and of a folder those in it and in its subfolders.
 
-    Of a folder's TOML files those count that have a table `[robot]`: calibrations and the like lie there too.
+    Of a folder's TOML files, those with a table `[robot]` count, because calibrations and other files are there too. Of
+    a subfolder, its robot.toml counts.
 
     Raises:
         ConfigError: a folder has none.
@@ -27,7 +28,7 @@ def descriptions(named: Sequence[Path]) -> list[Path]:
     found: list[Path] = []
     for path in named:
         inside = [path]
-        if os.path.isdir(path):  # False also where it may not be looked at: reading it tells why
+        if os.path.isdir(path):  # False also without permission: reading it reports the reason
             inside = sorted([*filter(_describes_a_robot, path.glob("*.toml")), *path.glob("*/robot.toml")])
         if not inside:
             raise ConfigError("no robot.toml is in this folder", file=path, remedy="Name the robots' descriptions")
@@ -39,11 +40,11 @@ def _describes_a_robot(file: Path) -> bool:
     try:
         return re.search(r"^\s*\[robot\]", read_at_most(file).decode("utf-8"), re.MULTILINE) is not None
     except (OSError, UnicodeDecodeError):
-        return True  # reading it as a description tells what is wrong
+        return True  # reading it as a description reports what is wrong
 
 
 def configs_of(files: Sequence[Path], state_dir: Path | None) -> list[Config]:
-    """The robots, with their states in `state_dir` when there is one, a folder each where they are several.
+    """Return the robots, with their states in `state_dir` if given, in a folder each if there are several.
 
     Raises:
         ConfigError: a description is wrong, or of a robot that cannot be learnt.
@@ -59,10 +60,10 @@ def configs_of(files: Sequence[Path], state_dir: Path | None) -> list[Config]:
 
 
 def shares(configs: Sequence[Config], processes: int) -> list[list[Config]]:
-    """The robots in so many shares at most, alike in size; robots of one learner's endpoint are not parted.
+    """Distribute the robots over at most `processes` shares of similar size; robots of one endpoint stay together.
 
     Raises:
-        ConfigError: the endpoints are too few for as many processes.
+        ConfigError: there are fewer endpoints than processes.
     """
     by_endpoint: dict[str, list[Config]] = {}
     for config in configs:
@@ -82,12 +83,12 @@ def spread(configs: Sequence[Config], processes: int, options: Sequence[str]) ->
     """Learn in several processes, each with its share of the robots, until SIGTERM or Ctrl-C.
 
     Raises:
-        ConfigError: they cannot be parted, or not be served by one process.
+        ConfigError: they cannot be distributed, or not be served by one process.
         BodyschemaError: a process refused to start.
     """
     children: list[Child] = []
     for number, share in enumerate(shares(configs, processes), 1):
-        session_settings(share)  # refuses here what would end the process
+        session_settings(share)  # refuse here what would end the process
         command = module_command("bodyschema", "learner", *options)
         for config in share:
             command += ["--robot", str(config.file)]

@@ -1,4 +1,4 @@
-"""Which recordings are diagnosed, and of which robot each is."""
+"""Selection of the recordings to diagnose, each with its robot."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ ENDINGS = (CSV, PARQUET, *STORE_ENDINGS)
 
 @dataclass(frozen=True)
 class Job:
-    """One recording to diagnose.
+    """Recording to diagnose.
 
     Attributes:
-        name: of the row and of the report's folder; no two are alike.
+        name: unique name of the row and of the report's folder.
+        recording: its file.
         robot: its robot.toml.
     """
 
@@ -30,13 +31,13 @@ class Job:
 
 
 def jobs(recordings: Sequence[Path], folder: Path | None, robot: Path | None) -> list[Job]:
-    """The recordings that were named and those in a folder, each with `robot` or the robot.toml beside it.
+    """Return the given recordings and those in a folder, each with `robot` or the robot.toml next to it.
 
-    A recording is called as its file; where two files are called alike, as the folder and the file.
+    A recording has the name of its file; if two files have the same name, that of the folder and the file.
 
     Raises:
-        RequestError: none was asked for.
-        RecordingError: the folder is none, or has none.
+        RequestError: no recording was given.
+        RecordingError: the folder does not exist, or has none.
     """
     found = [*recordings, *([] if folder is None else _in(folder))]
     files = list(dict.fromkeys(found))

@@ -1,4 +1,4 @@
-"""Who is there: robots by their liveliness tokens, and what their processes say of themselves."""
+"""Roster of the fleet: robots found by their liveliness tokens, with the status of their processes."""
 
 from __future__ import annotations
 
@@ -26,10 +26,11 @@ Status = TypeVar("Status", SamplerStatus, LearnerStatus)
 
 @dataclass(frozen=True)
 class Place:
-    """Where robots are looked for.
+    """Network route on which robots are looked for.
 
     Attributes:
-        robots: names of those that are expected there; others are found too, where one may ask for them.
+        route: the route.
+        robots: names of the expected robots; others are found too if queries for all are permitted.
     """
 
     route: Route
@@ -38,12 +39,13 @@ class Place:
 
 @dataclass(eq=False)
 class Member:
-    """One robot of the fleet as it is now.
+    """Current state of one robot of the fleet.
 
     Attributes:
-        alive: which of its processes are.
-        sampler, learner: what they say; None where one did not answer.
-        route: where its learner was found, else its sampler; None where neither was.
+        name: of the robot.
+        alive: its processes that are alive.
+        sampler, learner: their status; None if one did not answer.
+        route: the learner's route, else the sampler's; None if neither was found.
     """
 
     name: str
@@ -54,7 +56,7 @@ class Member:
 
     @property
     def joints(self) -> tuple[str, ...] | None:
-        """Names of its joints; None where nobody tells them."""
+        """Names of its joints; None if no process reports them."""
         if self.sampler is not None and self.sampler.coverage:
             return tuple(self.sampler.coverage)
         if self.learner is not None and self.learner.calibration is not None:
@@ -68,7 +70,7 @@ class Member:
 
     @property
     def health(self) -> list[str]:
-        """What is wrong, as sentences; empty when all is well."""
+        """Problems, as sentences; empty if all is well."""
         said = [sentence for status in (self.sampler, self.learner) if status is not None for sentence in status.health]
         if not self.alive:
             return ["neither its sampler nor its learner is alive"]
@@ -81,10 +83,10 @@ class Member:
 
 
 def places(endpoints: Sequence[str], files: Sequence[Path]) -> list[Place]:
-    """Where to look: endpoints of routers or processes, and what descriptions of robots name, each once.
+    """Return the routes to search: endpoints of routers or processes, and those in descriptions of robots, each once.
 
     Raises:
-        RequestError: something is no endpoint, or it takes certificates, which only a description names.
+        RequestError: something is not an endpoint, or it needs certificates, which only a description names.
         ConfigError: a description is wrong.
     """
     found: dict[Route, set[str]] = {}
@@ -106,10 +108,10 @@ def places(endpoints: Sequence[str], files: Sequence[Path]) -> list[Place]:
 
 
 class Fleet:
-    """Asks all robots for their states. Use as a context manager; robots, and places, may come and go.
+    """Queries the status of all robots. Use as a context manager; robots and routes may come and go.
 
     Attributes:
-        unreached: why places could not be asked the last time, in words.
+        unreached: reasons why routes could not be queried the last time.
     """
 
     def __init__(self, places: Sequence[Place]) -> None:
@@ -127,10 +129,10 @@ class Fleet:
         self._open.__exit__(kind, error, trace)
 
     def look(self) -> list[Member]:
-        """The robots now, by name.
+        """Return the robots now, by name.
 
         Raises:
-            BusError: none of the places can be reached.
+            BusError: none of the routes can be reached.
         """
         members = {name: Member(name) for place in self._places for name in place.robots}
         self.unreached = []
@@ -144,7 +146,7 @@ class Fleet:
         return [members[name] for name in sorted(members)]
 
     def bus(self, route: Route) -> Bus:
-        """The session to a place; BusError when nobody is there."""
+        """Return the session of a route; BusError if no process answers there."""
         if route not in self._sessions:
             self._sessions[route] = self._open.enter_context(Bus(connect=route, client=True))
         return self._sessions[route]
@@ -153,7 +155,7 @@ class Fleet:
         bus = self.bus(place.route)
         asked = [EVERYBODY]
         tokens = bus.alive(Keys(EVERYBODY).alive(EVERYBODY), timeout_s=ANSWER_LIMIT_S)
-        if not tokens:  # nobody is there, or one may ask for those alone whom one knows
+        if not tokens:  # no process answers, or only queries by name are permitted
             asked = list(place.robots)
             tokens = [token for name in asked for token in bus.alive(Keys(name).alive(EVERYBODY))]
         if not tokens:
@@ -174,5 +176,5 @@ class Fleet:
 def _states(bus: Bus, robots: str, process: str, kind: type[Status]) -> Iterator[Status]:
     for reply in bus.ask(Keys(robots).status(process), timeout_s=ANSWER_LIMIT_S):
         if reply.error is None:
-            with suppress(RequestError):  # of a version that speaks otherwise: it does not answer
+            with suppress(RequestError):  # another version's message counts as no answer
                 yield decode(reply.payload, kind)

@@ -1,4 +1,4 @@
-"""The fleet, shown."""
+"""Terminal view of the fleet's roster."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .roster import Member
 
 
 def as_json(members: Sequence[Member]) -> str:
-    """The robots as one line of JSON: name, who is alive, both states (null where one did not answer), health."""
+    """Return the robots as one line of JSON: name, live processes, both states (null without an answer), health."""
     return msgspec.json.encode(
         [
             {
@@ -35,7 +35,7 @@ def as_json(members: Sequence[Member]) -> str:
 
 
 def screen(members: Sequence[Member], unreached: Sequence[str]) -> RenderableType:
-    """A row a robot, then what is wrong."""
+    """Return a table with one row per robot, then the problems."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
     table.add_column("robot", overflow="fold")
     table.add_column("state", no_wrap=True)

@@ -1,4 +1,4 @@
-"""What the diagnoses of a fleet say together: which unit is off, and what all of a type share."""
+"""Summary of the diagnoses of a fleet: units that are off, and causes that all units of a type share."""
 
 from __future__ import annotations
 
@@ -11,20 +11,24 @@ from bodyschema.diagnosis.result import Cause, DiagnosisFile
 
 from .diagnosing import Diagnosed
 
-# Of so many units at least, a cause that more than half of them have is the description's rather than theirs.
+# With at least this many units, a cause of more than half of them is attributed to the description.
 FEWEST_TO_SHARE = 3
-# Causes that say how the robot is placed, which is no matter of its type.
+# Causes of the robot's placement, which do not concern its type.
 PLACED = ("camera_pose", "camera_moved", "tool_offset", "tool_slip")
 
 
 class Row(msgspec.Struct, frozen=True, kw_only=True):
-    """One recording.
+    """Row of one recording.
 
     Attributes:
         name: of the row, and of the report's folder.
-        causes: with their numbers, in words, the most telling first.
-        gain_percent: by how much the RMS falls on rows that were not fitted.
+        recording: its file.
+        robot: name of its robot.
+        verdict: of the diagnosis.
+        causes: with their numbers, in words, the most important first.
+        gain_percent: reduction of the RMS on held-out rows.
         aligned_mm, extended_mm: RMS there, without and with the causes.
+        sentence: the diagnosis in one sentence.
         error: why there is no diagnosis; then the others are null.
     """
 
@@ -41,12 +45,12 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Shared(msgspec.Struct, frozen=True):
-    """A cause that more than half of the units of a type have.
+    """Cause that more than half of the units of a type have.
 
     Attributes:
         cause: effect and joint.
-        units: which have it.
-        of: how many units were diagnosed.
+        units: the units that have it.
+        of: number of diagnosed units.
     """
 
     cause: str
@@ -58,9 +62,10 @@ class Type(msgspec.Struct, frozen=True):
     """Units with the same joints.
 
     Attributes:
-        well: units with which nothing is wrong.
-        off: by unit, what it alone, or hardly another, has.
-        shared: what most have: look at the description that they share.
+        joints: their names.
+        well: units without a finding.
+        off: by unit, the causes that few other units have.
+        shared: causes of most units: check their common description.
     """
 
     joints: tuple[str, ...]
@@ -70,14 +75,14 @@ class Type(msgspec.Struct, frozen=True):
 
 
 class Summary(msgspec.Struct, frozen=True):
-    """All of it."""
+    """Summary of all recordings."""
 
     rows: tuple[Row, ...]
     types: tuple[Type, ...]
 
 
 def summary(results: Sequence[Diagnosed]) -> Summary:
-    """The summary of what came of the recordings."""
+    """Return the summary of the recordings' results."""
     types: dict[tuple[str, ...], list[Diagnosed]] = {}
     for result in results:
         if result.file is not None:
@@ -86,7 +91,7 @@ def summary(results: Sequence[Diagnosed]) -> Summary:
 
 
 def row(result: Diagnosed) -> Row:
-    """One recording's row."""
+    """Return one recording's row."""
     file = result.file
     return Row(
         name=result.job.name,
@@ -107,7 +112,7 @@ def _by_share(file: DiagnosisFile) -> list[Cause]:
 
 
 def _told(cause: Cause, timed: bool) -> str:
-    """A cause with its numbers, as `joint_scale at elbow: scale +2.01 ± 0.03 %`."""
+    """Return a cause with its numbers, as `joint_scale at elbow: scale +2.01 ± 0.03 %`."""
     numbers = ", ".join(f"{number.label} {number}" for number in telling(numbers_of(cause, timed=timed)))
     return f"{place(cause)}: {numbers}" if numbers else place(cause)
 

@@ -1,4 +1,4 @@
-"""The diagnoses of a fleet, shown while they run and in the end."""
+"""Terminal view of a fleet's diagnoses, during the run and at the end."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _STYLES = {"explained": "green", "nothing_found": "blue", "undecided": "yellow",
 
 @contextmanager
 def progress(console: Console, count: int) -> Iterator[tuple[Told, Done]]:
-    """What `diagnose_all` tells: bars that change on a terminal; elsewhere a line for each recording that is done."""
+    """Yield the callbacks of `diagnose_all`: progress bars on a terminal, elsewhere one line per recording."""
     if not console.is_terminal:
         finished = 0
 
@@ -53,7 +53,7 @@ def _outcome(result: Diagnosed) -> str:
 
 
 def view(summary: Summary) -> RenderableType:
-    """A row a recording, why some failed, then which unit of a type is off."""
+    """Return a table with one row per recording, the failures, then the units of each type that are off."""
     with_robots = len({row.robot for row in summary.rows if row.error is None}) > 1
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
     table.add_column("recording", overflow="fold")
@@ -75,7 +75,7 @@ def view(summary: Summary) -> RenderableType:
 
 
 def sentences(one: Type) -> list[str]:
-    """Which units of a type are off and why, in words."""
+    """Return the units of a type that are off and why, in words."""
     units = len(one.well) + len(one.off)
     said = [f"{name} is off: {'; '.join(why)}." for name, why in one.off.items()]
     if one.well:
@@ -89,7 +89,7 @@ def sentences(one: Type) -> list[str]:
 
 
 def _cells(row: Row) -> tuple[RenderableType, ...]:
-    """All but the names."""
+    """Return all cells except the names."""
     if row.error is not None or row.verdict is None:
         return Text("failed", style="red"), "-", "-", "-"
     return (

@@ -1,4 +1,4 @@
-"""What the learner does with pairs, without I/O and without a clock."""
+"""Online learner of pairs, without I/O and without a clock."""
 
 from __future__ import annotations
 

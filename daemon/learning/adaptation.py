@@ -1,4 +1,4 @@
-"""Going on after a change: what changed is forgotten, what did not stays known."""
+"""Adaptation after a change: relearn the changed part and keep the rest."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from .change import NAMED, TOOL
 from .solver import fitted_belief
 from .watch import Noticed
 
-# A kind less probable than this need not be forgotten for a change that is not named yet.
+# An unnamed change widens every kind at least this probable.
 IMPROBABLE = 0.02
-# What changed may be anywhere within so many times its most probable change (1-sigma), and so many noises.
+# 1-sigma of the changed part: this multiple of its most probable change, and at least this many noises.
 WIDER, LEAST_NOISES = 3.0, 3.0
-# Runs of neighbours that are left out in turn to hold the new model against the old one.
+# Number of runs of neighbours left out in turn to compare the new model with the old one.
 FOLDS = 4
-# Pairs farther from a prediction than so many sigmas count as that far.
+# Pairs farther from a prediction than this many sigmas are clipped.
 _CLIPPED = 5.0
-# Of fewer pairs nothing is learnt of what was known already.
+# Minimum number of pairs before the change that update the previous posterior.
 _FEWEST_BEFORE = 10
 
 
 @dataclass(frozen=True, eq=False)
 class Adapted:
-    """Where learning goes on.
+    """State from which learning continues.
 
     Attributes:
         prior: the map to learn on top of.
-        arm: what is known before the first pair since the change.
-        belief: what is believed of the chain after these pairs.
+        arm: prior of the arm before the first pair since the change.
+        belief: posterior of the chain after these pairs.
     """
 
     prior: KBMap
@@ -43,11 +43,11 @@ class Adapted:
 
 
 class Origin:
-    """The arm as it was known before a change, and what the pairs since say of the change.
+    """Knowledge of the arm before a change, with the evidence of the pairs since.
 
     Args:
         noticed: the change.
-        arm: what was known of the arm before the first pair of its era; how well it may be made is taken from it.
+        arm: prior of the arm before the first pair of its regime; it supplies the tolerances.
     """
 
     def __init__(self, noticed: Noticed, arm: KnownArm) -> None:
@@ -60,9 +60,9 @@ class Origin:
         self._before = arm.updated(wide, self._reference.residual)
 
     def explain(self, q: FloatArray, x: FloatArray) -> list[Explanation]:
-        """How probable each kind of change is after the pairs since then, q (n, d) [rad] and x (n, 3) [m].
+        """Return the probability of each kind of change after the pairs since then, q (n, d) [rad] and x (n, 3) [m].
 
-        The first ones, which may be of before, say nothing once there are as many that are not.
+        The first pairs may be from before the change. They are left out once as many others are available.
         """
         noticed, belief = self._noticed, self._before.chain
         doubtful = max(noticed.latest - noticed.first, 0)
@@ -72,10 +72,12 @@ class Origin:
         return explanations(belief, kinds, q, self._of_chain(q, x), noticed.noise_m, noticed.shared)
 
     def adapt(self, found: Sequence[Explanation], q: FloatArray, x: FloatArray) -> Adapted:
-        """Forget what may have changed, and learn it from the pairs since, q (n, d) [rad] and x (n, 3) [m].
+        """Widen what may have changed, and relearn it from the pairs since, q (n, d) [rad] and x (n, 3) [m].
 
         Args:
-            found: how probable each kind of change is, the most probable first.
+            found: probability of each kind of change, the most probable first.
+            q: joint values since the change.
+            x: positions since the change.
         """
         arm = self._forgetful(found)
         belief = fitted_belief(arm.chain, q, self._of_chain(q, x))
@@ -84,7 +86,7 @@ class Origin:
         return Adapted(KBMap(bases, net), arm, belief)
 
     def is_better(self, found: Sequence[Explanation], q: FloatArray, x: FloatArray) -> bool:
-        """Whether an adapted model predicts pairs since the change that it does not know better than the old one.
+        """Return True if an adapted model predicts held-out pairs since the change better than the old one.
 
         Runs of q (n, d) [rad] and x (n, 3) [m], n at least 2, are left out in turn.
         """
@@ -99,7 +101,7 @@ class Origin:
         return float(np.square(new).sum()) < float(np.square(old).sum())
 
     def _of_chain(self, q: FloatArray, x: FloatArray) -> FloatArray:
-        """What of positions x (n, 3) [m] the chain has to explain: what the model knows beyond it stays as it is."""
+        """Return the part of positions x (n, 3) [m] that the chain must explain: the model's other terms are kept."""
         return x - self._reference.beyond_chain(q)
 
     def _forgetful(self, found: Sequence[Explanation]) -> KnownArm:

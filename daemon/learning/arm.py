@@ -1,4 +1,4 @@
-"""What is believed of the arm itself, whatever its tool."""
+"""Posterior of the arm itself, independent of its tool."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.records import FloatArray
 from kbmaps import ChainBelief, ChainTolerances, ResidualModel
 
-# How far another tool may hold the marker from where the last one did, and a marker whose place is not known from where
-# it is drawn, 1-sigma of each coordinate [m].
+# 1-sigma of each coordinate [m] of the marker's displacement by another tool, and of an unknown marker position about
+# the nominal one.
 OTHER_TOOL_M = 0.25
 
 
 @dataclass(frozen=True, eq=False)
 class KnownArm:
-    """The arm as far as it is known.
+    """Current knowledge of the arm.
 
     Attributes:
-        chain: as a rigid chain.
-        tolerances: those that this began with.
-        residual: as a chain and what it errs by; None: nothing is known of that.
+        chain: posterior as a rigid chain.
+        tolerances: those of its prior.
+        residual: posterior as a chain with deviations; None if there is none.
     """
 
     chain: ChainBelief
@@ -31,20 +31,25 @@ class KnownArm:
 
     @classmethod
     def from_bytes(cls, chain: bytes, tolerances: ChainTolerances, residual: bytes | None) -> KnownArm:
-        """Read what `to_bytes` of its parts wrote."""
+        """Return the arm from the bytes of its parts' `to_bytes`."""
         known = None if residual is None else ResidualModel.from_bytes(residual)
         return cls(ChainBelief.from_bytes(chain), tolerances, known)
 
     def updated(self, chain: ChainBelief | None, residual: ResidualModel | None) -> KnownArm:
-        """With what was found since; None: as before."""
+        """Return the arm with newer posteriors; None keeps the current one."""
         return KnownArm(chain or self.chain, self.tolerances, residual or self.residual)
 
     def with_other_tool(self) -> KnownArm:
-        """The same arm with a marker that is elsewhere on the hand."""
+        """Return the same arm with a marker elsewhere on the hand."""
         residual = None if self.residual is None else self.residual.with_other_tool(OTHER_TOOL_M)
         return KnownArm(self.chain.with_other_tool(OTHER_TOOL_M), self.tolerances, residual)
 
     def widened(self, columns: NDArray[np.intp], std: FloatArray) -> KnownArm:
-        """The same arm where some of the chain's parameters (k,) were changed, by `std` (k,) [rad, m] (1-sigma)."""
+        """Return the same arm with the uncertainty of some chain parameters increased.
+
+        Args:
+            columns: indices (k,) of these parameters.
+            std: 1-sigma of each change (k,) [rad, m].
+        """
         residual = None if self.residual is None else self.residual.widened(columns, std)
         return KnownArm(self.chain.widened(columns, std), self.tolerances, residual)

@@ -1,23 +1,23 @@
-"""What is said of a change, and which part of the arm it leaves known."""
+"""Record of a change, and the part of the arm that it concerns."""
 
 from __future__ import annotations
 
 import msgspec
 
 TOOL, CAMERA, JOINT = "tool", "camera", "joint"
-# A kind that is so probable is named.
+# A kind at least this probable is named.
 NAMED = 0.95
-# A change is named, or named otherwise, within so many pairs; after them what is open stays open.
+# A change is named or renamed within this many pairs; after them it stays as it is.
 NAMED_WITHIN = 500
 
 
 class KindOfChange(msgspec.Struct, frozen=True):
-    """One kind of change and its probability.
+    """Kind of change with its probability.
 
     Attributes:
         name: `tool`, `camera`, `joint` or `other`.
-        joint: which joint's zero (from 0); None where it is no joint's.
-        probability: that it is this one.
+        joint: index of the joint (from 0) whose offset changed; None for other kinds.
+        probability: of this kind.
     """
 
     name: str
@@ -26,15 +26,15 @@ class KindOfChange(msgspec.Struct, frozen=True):
 
 
 class ChangeRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """The last change.
+    """Last change.
 
     Attributes:
         first_seq: sequence number of the most probable first pair after it.
-        earliest_seq, latest_seq: between which that pair is, with 95 % probability.
-        noticed_seq: the pair with which it was noticed; of a change that was told, the last one before it.
-        found: in the pairs; else it was told.
-        kinds: what it may be, the most probable first.
-        moved_m: by how much it moved the marker at the pairs since, root mean square [m]; None where nobody knows.
+        earliest_seq, latest_seq: 95 % interval of that number.
+        noticed_seq: the pair at which it was detected; of a reported change, the last one before it.
+        found: True if it was detected in the pairs, False if it was reported.
+        kinds: possible kinds, the most probable first.
+        moved_m: motion of the marker at the pairs since, root mean square [m]; None if unknown.
     """
 
     first_seq: int
@@ -47,15 +47,16 @@ class ChangeRecord(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def named(self) -> KindOfChange | None:
-        """What it is; None while that is not decided. What no motion tells from it counts with it."""
+        """Named kind; None while undecided. Kinds that no motion can separate count together."""
         best = self.kinds[0]
         same = [kind for kind in self.kinds[1:] if kind.name == self.alike(best) or self.alike(kind) == best.name]
         return best if best.probability + sum(kind.probability for kind in same) >= NAMED else None
 
     def alike(self, kind: KindOfChange) -> str | None:
-        """The kind that no motion tells from this one.
+        """Return the kind that no motion can separate from this one.
 
-        The last joint's zero moves the marker on the hand, the first one's turns all that the camera sees.
+        An offset of the last joint equals a displacement of the marker; one of the first joint equals a turn of the
+        camera.
         """
         joints = [each.joint for each in self.kinds if each.joint is not None]
         ends = {} if not joints else {0: CAMERA, max(joints): TOOL}
@@ -63,7 +64,7 @@ class ChangeRecord(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def told(cls, last_seq: int) -> ChangeRecord:
-        """Of the tool, after the pair `last_seq`."""
+        """Return the record of a reported tool change after the pair `last_seq`."""
         first = last_seq + 1
         return cls(
             first_seq=first,
@@ -76,7 +77,7 @@ class ChangeRecord(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def unnamed(cls, first_seq: int, noticed_seq: int, joints: int) -> ChangeRecord:
-        """One that was found when too little was known of the arm to tell what it was."""
+        """Return the record of a change detected when the arm was too poorly known to identify its kind."""
         zeros = [KindOfChange(JOINT, joint, 1.0 / (3.0 * joints)) for joint in range(joints)]
         return cls(
             first_seq=first_seq,

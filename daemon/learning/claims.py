@@ -1,4 +1,4 @@
-"""What each model is said to be wrong by: at the data, away from it, and as its predictions have shown."""
+"""Predictive uncertainty of each model: in-sample, extrapolated, and calibrated on prequential errors."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _SUPPORT, _CONTEST = "support_q", "squares_"
 
 @dataclass(frozen=True)
 class Claim:
-    """The 1-sigma of a model.
+    """Predictive uncertainty of a model.
 
     Attributes:
-        inside: where data was, per axis (3,) [m].
-        layers: what the data that the model knows leave open.
-        surprise: by how much its predictions were worse than claimed, at least 1.
+        inside: 1-sigma at the data, per axis (3,) [m].
+        layers: variance terms that the model's data leave.
+        surprise: ratio of the prediction errors to the predicted ones, at least 1.
     """
 
     inside: FloatArray
@@ -34,33 +34,33 @@ class Claim:
     surprise: float = 1.0
 
     def variance(self, q: FloatArray) -> FloatArray:
-        """Variance per axis of predictions at q (n, d) [rad], shape (n, 3) [m²]."""
+        """Return the variance per axis of predictions at q (n, d) [rad], shape (n, 3) [m²]."""
         return self.variance_there(Where(q))
 
     def variance_there(self, where: Where) -> FloatArray:
-        """As `variance`."""
+        """Return the variance as in `variance`."""
         left_open = sum((layer.variance(where) for layer in self.layers), np.zeros((len(where.q), 3)))
         return self.surprise**2 * (self.inside**2 + left_open)
 
     def beyond_chain(self, q: FloatArray) -> FloatArray:
-        """The part of it that is no uncertainty of the chain's numbers at q (n, d) [rad], shape (n, 3) [m²]."""
+        """Return the part that is not uncertainty of the chain's parameters, at q (n, d) [rad], shape (n, 3) [m²]."""
         where = Where(q)
         open_layers = (layer.variance(where) for layer in self.layers if isinstance(layer, Layer) and layer.sigma > 0.0)
         return self.inside**2 + sum(open_layers, np.zeros((len(q), 3)))
 
 
 class ClaimsState(msgspec.Struct, kw_only=True):
-    """The part of the claims that is not arrays.
+    """State of the uncertainties, without arrays.
 
     Attributes:
         errors: prequential errors, by model.
-        judged: how many pairs there were for the contest so far.
+        judged: number of compared pairs so far.
         trusted: the models, the most trusted first.
         residuals: errors of the instant learner on pairs that it has learnt already; None before any.
-        misfits: what each solution misses at pairs that it knows, 1-sigma per axis [m].
-        misfits_before: what each missed with the last tool, 1-sigma per axis [m].
-        belief: what the pairs let believe of the chain, as bytes; None before that was asked.
-        wide: the same, were it not for how well the arm seems to be made.
+        misfits: discrepancy of each solution at pairs that it knows, 1-sigma per axis [m].
+        misfits_before: the same with the last tool, 1-sigma per axis [m].
+        belief: posterior of the chain, as bytes; None before a solution was requested.
+        wide: the same without the selection of narrower tolerances.
         residual: the chain with residual, as bytes; None before its first solution.
     """
 
@@ -76,11 +76,11 @@ class ClaimsState(msgspec.Struct, kw_only=True):
 
 
 class Claims:
-    """Follows errors and data of all models since the prior was made.
+    """Tracks the errors and the data support of all models since the prior was made.
 
     Args:
-        bases: what is learnt in.
-        expected_m: RMS distance between prior and reality that is expected before there are errors [m].
+        bases: bases of the learnt maps.
+        expected_m: expected RMS distance between prior and reality before there are errors [m].
     """
 
     def __init__(self, bases: Sequence[JointBasis], expected_m: float) -> None:
@@ -104,46 +104,46 @@ class Claims:
         self._residual: ResidualModel | None = None
 
     def best(self, present: str) -> str:
-        """The model that shall answer; `present` while there is nothing to compare."""
+        """Return the model that shall answer; `present` while there is nothing to compare."""
         return self._contest.best(self._trusted, present)
 
     def best_map(self, present: str) -> str:
-        """The best of the models that are KB-Maps; `present` while there is nothing to compare."""
+        """Return the best of the models that are KB-Maps; `present` while there is nothing to compare."""
         return self._contest.best([name for name in self._trusted if name != RESIDUAL], present)
 
     def recent(self, answering: str) -> Recent:
-        """How far the models were off on the last pairs, each as old as the newest solution."""
+        """Return the models' errors on the last pairs, each as old as the newest solution."""
         return self._contest.recent(answering)
 
     @property
     def support(self) -> SupportSet | None:
-        """Where data with the present tool was; None before any."""
+        """Support of the data with the current tool; None without data."""
         return self._support.view
 
     @property
     def noise_m(self) -> float:
-        """RMS distance between measurement and truth [m], as the measurements say."""
+        """Noise of the measurements: RMS distance from the truth [m], as claimed with them."""
         return float(np.sqrt(self.errors[PRIOR].noise_variance.sum()))
 
     @property
     def belief(self) -> ChainBelief | None:
-        """What the pairs with the present tool let believe of the chain; None before that was asked."""
+        """Posterior of the chain from the pairs with the current tool; None before a solution was requested."""
         return self._belief
 
     @property
     def wide(self) -> ChainBelief | None:
-        """The same, were it not for how well the arm seems to be made: what pairs with another tool are added to."""
+        """Posterior without the selection of narrower tolerances: the one to update with pairs of another tool."""
         return self._wide
 
     @property
     def residual(self) -> ResidualModel | None:
-        """What the pairs with the present tool let believe of the arm as no rigid chain; None before that is solved."""
+        """Posterior of the arm as a chain with residual, with the current tool; None before its first solution."""
         return self._residual
 
     def change_tool(self, expected_m: float, answered: str = PRIOR) -> None:
-        """Another tool: nothing is known of the models' errors; what is believed of the arm, `expect` says anew.
+        """Reset the models' errors for another tool; `expect` sets the posterior of the arm.
 
-        The solved model that answered with the last tool is trusted first with this one: the arm is the same.
+        The solved model that answered with the last tool is trusted first with this one, because the arm is the same.
         """
         if answered in SOLVED:
             self._trusted = (answered, *(name for name in TRUSTED if name != answered))
@@ -151,15 +151,15 @@ class Claims:
         self._begin(expected_m)
 
     def expect(self, belief: ChainBelief) -> None:
-        """What is believed of the chain before the first pair with the present tool."""
+        """Set the prior of the chain before the first pair with the current tool."""
         self._expected = belief
 
     def fitted(self, belief: ChainBelief) -> None:
-        """What the first pairs let believe of the chain, before any solution."""
+        """Set the posterior of the chain from the first pairs, before any solution."""
         self._belief = self._wide = belief
 
     def untried(self, name: str) -> bool:
-        """Whether there is a solution for this model that has predicted too few pairs to be compared."""
+        """Return True if this model has a solution that has predicted too few pairs to be compared."""
         return name in self._misfits and not self._contest.compares(name)
 
     def predicted(
@@ -170,15 +170,15 @@ class Claims:
         variances: FloatArray,
         delayed: FloatArray | None = None,
     ) -> None:
-        """Pairs, in their order, each of which was predicted before it was learnt.
+        """Record pairs, in their order, each of which was predicted before it was learnt.
 
         Args:
             where: their q (n, d) [rad].
-            x: what was measured (n, 3) [m].
+            x: measured positions (n, 3) [m].
             predictions: of it (n, 3) [m] by model.
             variances: the measurements' (n, 3) [m²].
-            delayed: what the instant learner as old as the solutions predicts (n, 3) [m]. On a path a few pairs are
-                far, so the models are compared at the same age.
+            delayed: predictions of the instant learner as old as the solutions (n, 3) [m]. On a path, a few pairs make
+                a difference, so the models are compared at the same age.
         """
         for name, predicted in predictions.items():
             errors = x - predicted
@@ -188,16 +188,16 @@ class Claims:
         self._contest.add({name: np.square(x - each).sum(axis=1) for name, each in compared.items()})
 
     def learnt(self, q: FloatArray) -> None:
-        """Pairs have been learnt at q (n, d) [rad]."""
+        """Record that pairs have been learnt at q (n, d) [rad]."""
         self._support.add(q)
 
     def replayed(self, errors: FloatArray) -> None:
-        """Errors (n, 3) [m] of the instant learner at pairs that it has learnt before."""
+        """Record errors (n, 3) [m] of the instant learner at pairs that it has learnt before."""
         self._residuals = self._residuals or ErrorMemory(self._expected_m)
         self._residuals.add(errors, self.errors[PRIOR].noise_variance)
 
     def solution_asked(self) -> None:
-        """The solver works on all pairs up to here."""
+        """Record that the solver works on all pairs so far."""
         self._asked = self._support.view
 
     def solution_taken(
@@ -209,13 +209,14 @@ class Claims:
         *,
         neighbours: bool,
     ) -> None:
-        """A solution answers for this model from now on.
+        """Record a solution that answers for this model from now on.
 
         Args:
+            name: the model.
             errors: its errors (n, 3) [m] at pairs that it knows, in their order.
-            belief: what is believed of the arm now; None: as before.
-            wide: of a chain, the same, were it not for how well it seems to be made.
-            neighbours: whether these pairs follow a path.
+            belief: new posterior of the arm; None: unchanged.
+            wide: of a chain, the same without the selection of narrower tolerances.
+            neighbours: True if these pairs follow a path.
         """
         self.errors.setdefault(name, ErrorMemory(self._expected_m))
         self._solved[name] = self._asked
@@ -231,15 +232,16 @@ class Claims:
     def predicted_late(
         self, name: str, predict: Predict, q: FloatArray, errors: FloatArray, instant: FloatArray, *, anew: bool
     ) -> None:
-        """A solution that was found only now predicts the last pairs, of which it knows none.
+        """Record the errors of a new solution on the last pairs, none of which it knows.
 
         Args:
+            name: the model.
             predict: its positions (n, 3) [m] at q (n, d) [rad].
-            q: where (n, d) [rad], in their order.
+            q: configurations (n, d) [rad], in their order.
             errors: measured minus predicted (n, 3) [m].
-            instant: the same of the instant learner as it was when the solution was asked for, NaN where it had learnt
-                the pair by then: what that gains it is no merit.
-            anew: whether it knows so much more than the last one that what that predicted says nothing of it.
+            instant: the same of the instant learner as it was when the solution was requested. NaN where it had already
+                learnt the pair, which would be an unfair advantage.
+            anew: True if it knows so much more than the last solution that the latter's errors no longer apply.
         """
         if anew:
             self._contest.forget(name)
@@ -251,21 +253,22 @@ class Claims:
         self.errors[name].add(errors, noise, np.square(errors).sum(axis=1) / claimed.sum(axis=1))
 
     def forget_contest(self) -> None:
-        """Some pairs were no pairs of this tool after all."""
+        """Drop the comparison, because some pairs turned out not to belong to this tool."""
         self._contest = Contest()
 
     def prior_changed(self, errors: FloatArray) -> None:
-        """Another prior for the same pairs; its errors (n, 3) [m] at them."""
+        """Record another prior for the same pairs; its errors (n, 3) [m] at them."""
         noise = self.errors[PRIOR].noise_variance
         self.errors[PRIOR] = ErrorMemory(self._expected_m)
         self._contest.forget(PRIOR)
         self.errors[PRIOR].add(errors, noise)
 
     def of(self, name: str, predict: Predict | None = None) -> Claim:
-        """What is claimed for one model.
+        """Return the predictive uncertainty of one model.
 
         Args:
-            predict: its positions (n, 3) [m] at q (n, d) [rad]; None where there is no model yet.
+            name: the model.
+            predict: its positions (n, 3) [m] at q (n, d) [rad]; None before the model exists.
         """
         memory = self.errors.get(name, ErrorMemory(self._expected_m))
         belief = self._belief or self._expected
@@ -276,7 +279,7 @@ class Claims:
             chain = self._residual if name == RESIDUAL and self._residual is not None else belief
             return Claim(self._misfits.get(name, none), (ChainLayer(chain), self._rest(name)), memory.surprise)
         if name == PRIOR:
-            # The prior is a chain as well, or was learnt with the last tool; it misses what such a chain does.
+            # The prior is a chain too, or was learnt with the last tool; it has the discrepancy of such a chain.
             inside = self._misfits.get(RIGID, self._misfits_before.get(RIGID, none))
             departure = DepartureLayer(predict, belief)
         else:
@@ -285,12 +288,12 @@ class Claims:
         return Claim(inside, (ChainLayer(belief), departure, self._rest(RIGID)), memory.surprise)
 
     def _rest(self, name: str) -> Layer:
-        """Where no data was, the arm may differ from the chain by as much again as it was seen to."""
+        """Return the layer for the arm's deviation from the chain away from data: as large as seen at the data."""
         missed = self._misfits.get(RESIDUAL if name == RESIDUAL else RIGID, np.zeros(3))
         return Layer(self._solved.get(name), float(np.sqrt(np.square(missed).mean())))
 
     def state(self) -> ClaimsState:
-        """Everything needed to go on from here that is not in `arrays`."""
+        """Return everything needed to resume, except `arrays`."""
         return ClaimsState(
             errors=self.errors,
             judged=self._contest.pairs,
@@ -304,13 +307,13 @@ class Claims:
         )
 
     def arrays(self) -> dict[str, FloatArray]:
-        """The configurations (n, d) [rad] that stand for all data, and squared errors (k,) [m²] by model."""
+        """Return the configurations (n, d) [rad] that represent all data, and squared errors (k,) [m²] by model."""
         return {_SUPPORT: self._support.configurations} | {
             _CONTEST + name: values.copy() for name, values in self._contest.errors.items()
         }
 
     def restore(self, state: ClaimsState, arrays: Mapping[str, FloatArray]) -> None:
-        """Go on from a state and its `arrays`."""
+        """Resume from a state and its `arrays`."""
         self._support.add(arrays[_SUPPORT])
         self.errors, self._residuals = dict(state.errors), state.residuals
         squares = {name.removeprefix(_CONTEST): v for name, v in arrays.items() if name.startswith(_CONTEST)}

@@ -1,4 +1,4 @@
-"""The course of learning: pairs in, one era after another, with all that is counted. It has no lock of its own."""
+"""State machine of learning: pairs in, one regime after another, with counters. It has no lock of its own."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from .incoming import check_pair
 from .nominal import NominalModel
 from .state import Counters, LearningState
 
-# So many pairs are judged together at most, and as this share of those that are known: at first each tells much.
+# Maximum number of pairs judged together, absolute and as a share of the known ones: early pairs matter more.
 MOST_TOGETHER, TOGETHER = 25, 0.1
 
 
 class Course:
-    """What was learnt up to now.
+    """Everything learnt so far.
 
     Args:
-        nominal: where learning starts.
+        nominal: the nominal model, where learning starts.
         settings: of the learner.
-        together_s: pairs wait for so long at most to be judged together [s].
+        together_s: maximum wait of pairs to be judged together [s].
 
     Attributes:
-        eras: what is learnt.
-        counters: all that is counted; who reads it at other times than the course's own takes a copy.
-        curve: the error [m] of the model that answered, on the last pairs before each of these.
-        newest_utc: when the last pair that was learnt was stored, ISO 8601; None: none was.
+        eras: the regimes and their models.
+        counters: all counters; readers outside the learner's own calls must copy them.
+        curve: the error [m] of the answering model on the last pairs, at some numbers of pairs.
+        newest_utc: storage time of the last learnt pair, ISO 8601; None before any.
     """
 
     def __init__(self, nominal: NominalModel, settings: LearnerConfig, together_s: float) -> None:
@@ -49,16 +49,16 @@ class Course:
 
     @property
     def can_roll_back(self) -> bool:
-        """Whether the state before the last change is kept."""
+        """True if the state before the last change is kept."""
         return self._before is not None
 
     @property
     def settled(self) -> bool:
-        """Whether all pairs that came are judged."""
+        """True if all pairs so far have been judged."""
         return self.eras.present is None or not self.eras.present.met
 
     def learn(self, pair: Pair, now: float) -> None:
-        """Learn one pair at once; where pairs are judged together, with the instant learner alone.
+        """Learn one pair at once; if pairs are judged together, with the instant learner only.
 
         Raises:
             RequestError: it is not a pair of this robot and store, or not newer than the last one; nothing changed.
@@ -81,11 +81,11 @@ class Course:
                 self.judge()
 
     def judge_due(self, now: float) -> bool:
-        """Whether pairs have waited for long enough to be judged."""
+        """Return True if pairs have waited long enough to be judged."""
         return not self.settled and now - self._met_at >= self._together_s
 
     def judge(self) -> None:
-        """Judge all pairs that wait for it: compare models there, doubt some, look for a change; and keep them."""
+        """Judge all waiting pairs: compare models, gate outliers, look for a change; and keep the pairs."""
         while (era := self.eras.present) is not None and era.met:
             self._judged(era, *era.judge())
             if self.eras.present is not None and self.eras.present is not era:
@@ -93,7 +93,7 @@ class Course:
                     self.eras.present.meet(pair)
 
     def tool_changed(self) -> None:
-        """From now on another tool: pairs so far no longer count, what they taught is where learning starts again."""
+        """Start with another tool: drop the pairs so far, and continue from the learnt model."""
         self.judge()
         if self.eras.present is None:
             self.eras = self._at_nominal()
@@ -105,10 +105,10 @@ class Course:
         self.counters.since_change = 0
 
     def rollback(self) -> None:
-        """Go on as if the last change had not been, and the pairs since then had not come.
+        """Undo the last change, together with the pairs since then.
 
         Raises:
-            RequestError: there was no change, or learning began anew since; nothing is changed.
+            RequestError: there was no change, or learning was reset since; nothing is changed.
         """
         if self._before is None:
             raise RequestError("there was no change since learning began, so there is no older model to go back to")
@@ -117,7 +117,7 @@ class Course:
         self.eras, self._before, self.counters.since_change = eras, self._before.before, since_change
 
     def reset_to_prior(self, *, forget_store: bool) -> None:
-        """Forget what was learnt. With `forget_store`, pairs may come from another store, from its first one on."""
+        """Forget the learnt model. With `forget_store`, pairs may come from another store, from its first one on."""
         if forget_store:
             self.counters = Counters(refused=self.counters.refused)
             self.curve, self.newest_utc = Curve(), None
@@ -125,12 +125,12 @@ class Course:
         self.eras, self._before = self._at_nominal(), None
 
     def state(self) -> LearningState:
-        """Everything needed to go on from here."""
+        """Return everything needed to resume."""
         self.judge()
         return self.eras.state(self.counters, self.curve).with_before(self._before)
 
     def restore(self, state: LearningState) -> None:
-        """Go on from a state.
+        """Resume from a state.
 
         Raises:
             StateError: it belongs to another nominal model, or to other tolerances; nothing is changed.
@@ -143,7 +143,7 @@ class Course:
         return Eras.at_nominal(self._nominal, self._settings, self._task_numbers)
 
     def _judged(self, era: Era, pairs: Sequence[Pair], doubted: BoolArray) -> None:
-        """Count what `era` has learnt of these pairs and what it doubts, and follow a change that they show."""
+        """Count the pairs that `era` has learnt or gated as outliers, and follow a change that they show."""
         error_m = era.recent.means.get(era.answering)
         first = self.counters.pairs - len(era.met) - len(pairs) + 1
         if error_m is not None:
@@ -155,7 +155,7 @@ class Course:
             self.counters.since_change = self.eras.memory.count + len(era.met)
 
     def _followed(self, era: Era, pair: Pair, *, learnt: bool) -> bool:
-        """Whether the pairs up to this one show a change, and another era has begun with it."""
+        """Return True if the pairs up to this one show a change, and another regime has begun with it."""
         noticed = self.eras.noticed(era, pair)
         if noticed is None and (learnt or not era.doubts.perhaps_changed):
             return False
@@ -168,7 +168,7 @@ class Course:
         return True
 
     def _state_before(self, first: int) -> LearningState:
-        """The state without the present era's pairs from number `first` on."""
+        """Return the state without the current regime's pairs from number `first` on."""
         state = self.eras.state_before(first, self.counters, self.curve)
         state.header.counters.since_change -= 0 if self.eras.present is None else len(self.eras.present.met)
         return state

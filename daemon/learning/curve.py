@@ -1,4 +1,4 @@
-"""The learning curve, thinned out as it grows."""
+"""Learning curve, thinned out as it grows."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ class Curve:
 
     @property
     def points(self) -> list[CurvePoint]:
-        """The curve so far."""
+        """Copy of the curve so far."""
         return list(self._points)
 
     def add(self, pairs: int, error_m: float) -> None:
-        """The prequential error at so many pairs; not every one is kept."""
+        """Add the prequential error after this many pairs, unless the thinning skips it."""
         if pairs % self.stride:
             return
         self._points.append(CurvePoint(pairs, error_m))

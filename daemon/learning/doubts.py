@@ -1,4 +1,4 @@
-"""The pairs that are doubted in a row, and whether they are the beginning of something new."""
+"""Runs of consecutive outliers, which may be the start of a changed arm or tool."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from .memory import PairMemory
 
 
 class Doubts:
-    """Counts the doubted pairs in a row, and keeps the newest of them: they may be the first of another era.
+    """Counts consecutive outliers, and keeps the newest of them: they may be the first pairs of another regime.
 
-    Doubted pairs that stand alone are outliers. Nothing is learnt from them later, so they are not kept.
+    Isolated outliers are never learnt later, so they are not kept.
     """
 
     def __init__(self, joints: int) -> None:
@@ -20,21 +20,21 @@ class Doubts:
 
     @property
     def in_a_row(self) -> int:
-        """How many pairs in a row have been doubted up to now."""
+        """Number of consecutive outliers up to now."""
         return self._gate.in_a_row
 
     @property
     def changed(self) -> bool:
-        """Whether so many are in a row that the world must have changed."""
+        """True if the run of outliers is long enough to prove a change."""
         return self._gate.changed
 
     @property
     def perhaps_changed(self) -> bool:
-        """Whether so many are in a row that it has, if one explanation fits them."""
+        """True if the run of outliers is long enough for a change, provided that one explanation fits them."""
         return self.in_a_row >= FEWEST_FOR_CHANGE
 
     def doubt(self, q: FloatArray, x: FloatArray, distance_m: float, limit_m: float) -> bool:
-        """Whether to doubt the pair at q (d,), x (3,) that lies `distance_m` from its prediction."""
+        """Return True if the pair at q (d,), x (3,), `distance_m` from its prediction, is an outlier."""
         doubted = self._gate.doubts(distance_m, limit_m)
         if doubted:
             self._memory.append(q[None], x[None])
@@ -43,10 +43,10 @@ class Doubts:
         return doubted
 
     def run(self) -> tuple[FloatArray, FloatArray]:
-        """The newest doubted pairs in a row, as many as make a change: q (n, d), x (n, 3)."""
+        """Return the newest consecutive outliers, at most as many as prove a change: q (n, d), x (n, 3)."""
         return self._memory.all()
 
     def restore(self, q: FloatArray, x: FloatArray, in_a_row: int) -> None:
-        """Go on from the run q (n, d), x (n, 3), of which `in_a_row` were counted."""
+        """Resume from the run q (n, d), x (n, 3), of which `in_a_row` were counted."""
         self._memory.restore(q, x, in_a_row)
         self._gate = Gate(in_a_row)

@@ -1,4 +1,4 @@
-"""An era: what is learnt with one tool on top of one prior."""
+"""Regime: the models learnt with one tool on top of one prior."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ from .unknowns import Where
 from .watch import LOOKED_BACK as KNOWN_PAIRS
 from .watch import Reference, Watch
 
-# So many of the learnt pairs say how well a model fits what it knows.
+# Number of learnt pairs on which a model's fit is assessed.
 LOOKED_BACK = 500
-# Pairs from which the errors of a prior that was fitted anew are taken, and that are replayed on top of it.
+# Number of pairs that determine the errors of a refitted prior, and that are replayed on top of it.
 RECENT = 200
 REPLAY_STEPS = 64
-# So many of the pairs that came while the solver worked judge its solution.
+# Maximum number of pairs received during a solve that judge its solution.
 JUDGED_LATE = 100
-# With so many new pairs for each that a solution knows, the last solution was another one: it is judged by these alone.
+# With this share of new pairs, the last solution no longer applies: the new one is judged by these pairs alone.
 JUDGED_ANEW = 0.25
 LOOKED_BACK_IN_REPLAY = 4
-# Of so many pairs, the chain is believed before it has predicted any. Of fewer, one that is wrong would not show.
+# Minimum number of pairs to trust the chain before it has predicted any; fewer cannot expose a wrong chain.
 FEWEST_TO_BELIEVE = 3
 NO_TURN = (math.nan,) * 4
 
@@ -45,26 +45,26 @@ BoolArray = NDArray[np.bool_]
 
 
 class Era:
-    """Learns side by side the models of one tool, and chooses the one that answers.
+    """Learns the models of one tool side by side, and chooses the one that answers.
 
-    It has no lock of its own. What the eras before it taught comes as `prior`, `arm` and `claims`.
+    It has no lock of its own. The results of earlier regimes come as `prior`, `arm` and `claims`.
 
     Args:
         prior: the map to learn on top of.
-        arm: what is known of the arm before the first pair.
-        claims: what the models are said to be wrong by; followed here while the era lasts.
+        arm: prior of the arm before the first pair.
+        claims: uncertainties of the models; updated here while the regime lasts.
         settings: of the learner.
-        task_numbers: numbers for the solver's tasks that no other era has.
+        task_numbers: numbers for the solver's tasks that no other regime has.
 
     Attributes:
         members: the models.
         memory: the pairs with this tool.
-        doubts: those that are doubted.
-        orientations: how the marker is turned, where pairs say so.
-        watch: whether the pairs show a change.
-        arm: as given, or with the last solutions where these stand for pairs that are no longer kept.
+        doubts: the outlier gate.
+        orientations: models of the marker's orientation, where pairs have one.
+        watch: the change monitor.
+        arm: as given, or with the last solutions if these stand for pairs that are no longer kept.
         answering: the model that answers.
-        task_number: of the solver's present task.
+        task_number: of the solver's current task.
     """
 
     def __init__(
@@ -89,17 +89,17 @@ class Era:
 
     @property
     def model(self) -> LearntModel:
-        """The model that answers."""
+        """Answering model."""
         return self.members.model(self.answering)
 
     @property
     def map(self) -> KBMap:
-        """The answering model if it is a KB-Map, else the best that is one."""
+        """Answering model if it is a KB-Map, else the best one."""
         return self.members.map(self._answering_map)
 
     @property
     def task(self) -> Task:
-        """What the solver has to solve."""
+        """Current task of the solver."""
         known = self._solver_prior
         prior = known or self.members.prior
         return Task(
@@ -113,7 +113,7 @@ class Era:
 
     @property
     def owes_replays(self) -> bool:
-        """Whether there are replay steps to do."""
+        """True if replay steps are due."""
         return self._replays_due >= 1.0 and len(self.memory) > 0
 
     @property
@@ -122,24 +122,24 @@ class Era:
         return [pair for pair, _ in self._met]
 
     def limit_m(self, pair: Pair) -> float:
-        """How far from its prediction the pair may lie before it is doubted [m]."""
+        """Return the distance from its prediction beyond which the pair is an outlier [m]."""
         where = Where(pair.q[None])
         predicted = self.members.predict(self.answering, where.q)
         return float(self._limits_m(where, predicted, np.diag(pair.cov)[None])[0])
 
     def learn(self, pair: Pair) -> bool:
-        """Learn one pair, and judge it; False if it is doubted."""
+        """Learn one pair, and judge it; return False if it is an outlier."""
         predicted = self.members.predict(INSTANT, pair.q)
         doubted = self._judged([pair], predicted[None])[0]
-        # Of a doubted pair, a step no longer than any other.
+        # An outlier gets a step no longer than any other pair.
         self.members.learn(pair.q, pair.x - predicted, self._limit_m / DOUBT if doubted else np.inf)
         return not doubted
 
     def meet(self, pair: Pair) -> None:
         """Let the instant learner learn one pair, and no other model yet: `judge` will.
 
-        Whether it is to be doubted is not known yet. Where it seems so by the pairs before, its step is no longer than
-        any other.
+        Whether it is an outlier is not known yet. If it seems one by the pairs before, its step is no longer than any
+        other.
         """
         predicted = self.members.predict(INSTANT, pair.q)
         if not math.isfinite(self._limit_m):
@@ -149,9 +149,9 @@ class Era:
         self._met.append((pair, predicted))
 
     def judge(self) -> tuple[Sequence[Pair], BoolArray]:
-        """Learn the pairs met, as `learn` does, and which of them (n,) are doubted.
+        """Learn the pairs met, as `learn` does; return them with True for each outlier (n,).
 
-        Not those after a doubted pair with which there may have been a change: these are still `met`.
+        Stops at an outlier with which a change may have begun: the pairs after it are still `met`.
         """
         pairs = self.met
         doubted = self._judged(pairs, np.array([predicted for _, predicted in self._met]))
@@ -159,9 +159,9 @@ class Era:
         return pairs[: len(doubted)], doubted
 
     def _judged(self, pairs: Sequence[Pair], instant: FloatArray) -> BoolArray:
-        """Learn pairs but for the instant learner, which predicted `instant` (n, 3) [m]; which (k,) are doubted.
+        """Learn pairs except with the instant learner, which predicted `instant` (n, 3) [m]; return the outliers (k,).
 
-        It ends, k < n, with a doubted pair with which there may have been a change.
+        It ends, k < n, with an outlier with which a change may have begun.
         """
         q, x = np.array([pair.q for pair in pairs]), np.array([pair.x for pair in pairs])
         variances = np.array([pair.cov.diagonal() for pair in pairs])
@@ -180,7 +180,13 @@ class Era:
         return doubted
 
     def _limits_m(self, where: Where, predicted: FloatArray, variances: FloatArray) -> FloatArray:
-        """How far (n,) [m] from what was predicted (n, 3) pairs with these variances (n, 3) [m²] may lie."""
+        """Return the distance limits (n,) [m] of pairs from their predictions.
+
+        Args:
+            where: configurations of the pairs (n, d).
+            predicted: predictions (n, 3) [m].
+            variances: of the measurements (n, 3) [m²].
+        """
         claimed = self._claims.of(self.answering, lambda _: predicted).variance_there(where).sum(axis=1)
         recent = np.maximum(self._claims.errors[self.answering].rms_m, np.sqrt(variances.sum(axis=1)))
         return limits_m(recent, np.sqrt(claimed))
@@ -205,8 +211,10 @@ class Era:
         """Learn pairs, q (n, d) and x (n, 3), that waited for the prior: each once, in their order.
 
         Args:
+            q: joint values (n, d).
+            x: positions (n, 3).
             turns: their orientations, quaternions (n, 4), NaN where a pair has none.
-            belief: what they let believe of the chain.
+            belief: posterior of the chain from them.
         """
         self._claims.fitted(belief)
         variances = np.full((1, 3), belief.noise**2)
@@ -221,12 +229,12 @@ class Era:
         self._replays_due += self._replays_per_pair * len(q)
 
     def begin_with(self, q: FloatArray, x: FloatArray) -> None:
-        """Learn pairs, q (n, d) and x (n, 3), that were doubted until they began this era."""
+        """Learn pairs, q (n, d) and x (n, 3), that were outliers until they began this regime."""
         self._keep(q, x)
         self.members.replay(q, x)
 
     def replay(self) -> int:
-        """Some of the steps that are owed; how many they were."""
+        """Take some of the replay steps that are due; return their number."""
         if not self.owes_replays:
             return 0
         places = self._order.take(min(REPLAY_STEPS, int(self._replays_due)), len(self.memory))
@@ -238,9 +246,9 @@ class Era:
         return len(places)
 
     def set_aside(self, prior: KBMap) -> int:
-        """Leave out those of the first pairs that `prior`, a robust fit to them, contradicts; how many they were.
+        """Drop those of the first pairs that `prior`, a robust fit to them, contradicts; return their number.
 
-        They are perhaps still those of the old tool.
+        They may still belong to the old tool.
         """
         (q, x), turns = self.memory.all(), self.memory.turns_since(0)
         belongs = sound(np.linalg.norm(x - prior.predict(q), axis=1), self._claims.noise_m)
@@ -254,7 +262,7 @@ class Era:
         return int((~belongs).sum())
 
     def change_prior(self, prior: KBMap) -> None:
-        """Another prior was fitted to the same pairs."""
+        """Replace the prior by another one fitted to the same pairs."""
         q, x = self.memory.all()
         self.members.start_again(prior, q, x)
         self._claims.prior_changed(x[-RECENT:] - prior.predict(q[-RECENT:]))
@@ -262,13 +270,13 @@ class Era:
         self._replays_due += self._replays_per_pair * min(len(q), RECENT)
 
     def ask(self) -> None:
-        """The solver works on all pairs up to here."""
+        """Record that the solver works on all pairs so far."""
         self._claims.solution_asked()
         self.members.ask()
         self.watch.asked()
 
     def take(self, solved: Solved, model: LearntModel, fed: int) -> None:
-        """A solution of this era's task, for one of the models; the solver has `fed` pairs."""
+        """Take a solution of this regime's task, for one of the models; the solver has `fed` pairs."""
         self.members.take(solved.name, model)
         q, x = self.memory.some(fed, LOOKED_BACK)
         neighbours = follow_a_path(self.members.prior, q)
@@ -280,7 +288,7 @@ class Era:
             self._offer(fed)
 
     def _offer(self, known: int) -> None:
-        """The model that answers, of `known` pairs, may be what later pairs are held against."""
+        """Offer the answering model, of `known` pairs, as the reference of the change monitor."""
         belief, wide = self._claims.belief, self._claims.wide
         if belief is None or wide is None:
             return
@@ -291,22 +299,22 @@ class Era:
         self.watch.offer(Reference(self.model, self.map, belief, wide, residual, claim, known, q, x, variance))
 
     def take_orientation(self, solution: OrientationSolution) -> None:
-        """A solution of this era's task for the orientations."""
+        """Take a solution of this regime's task for the orientations."""
         self.orientations.take(solution)
 
     @property
     def orientation(self) -> OrientationModel | None:
-        """The model that answers how the marker is turned; None where nothing was learnt of it."""
+        """Answering model of the marker's orientation; None without any."""
         return self.orientations.model(self._claims.support)
 
     def solve_from_what_is_known(self) -> None:
-        """Where pairs are no longer kept, the last solutions stand for them in the place of what was before."""
+        """Let the last solutions stand for the pairs before them, if pairs are no longer kept."""
         if EXACT in self.members.names and not self.memory.complete:
             self._solver_prior = self.members.map(EXACT)
             self.arm = self.arm.updated(self._claims.wide, self._claims.residual)
 
     def store(self, header: LearningHeader) -> dict[str, FloatArray]:
-        """Write into `header` what `restore` has to know; the arrays that it needs beside the kept pairs."""
+        """Write the state for `restore` into `header`; return its arrays, without the kept pairs."""
         header.answering, header.replays_due = self.answering, self._replays_due
         header.doubted_in_a_row = self.doubts.in_a_row
         header.belief = self.arm.chain.to_bytes()
@@ -317,7 +325,7 @@ class Era:
         return {"doubted_q": q, "doubted_x": x} | {NET + name: net for name, net in self.members.nets().items()}
 
     def restore(self, header: LearningHeader, arrays: Mapping[str, FloatArray]) -> None:
-        """Go on from a state of an era with this prior and arm."""
+        """Resume from a state of a regime with this prior and arm."""
         nets = {name.removeprefix(NET): net for name, net in arrays.items() if name.startswith(NET)}
         self.members.restore(nets, self._claims.residual)
         self.memory.restore(arrays["q"], arrays["x"], header.kept_of, arrays.get("turns"))
@@ -330,7 +338,7 @@ class Era:
         self.solve_from_what_is_known()
 
     def _judge_late(self, name: str, model: LearntModel, pairs: int, fed: int) -> None:
-        """What came while the solver worked is new to its solution: a pair that it had not learnt judges it fairly."""
+        """Compare a solution on the pairs received while the solver worked: it has not learnt them."""
         q, x, _ = self.memory.since(max(pairs, self.memory.count - JUDGED_LATE))
         if len(q) == 0:
             return
@@ -351,7 +359,7 @@ class Era:
 
     @property
     def recent(self) -> Recent:
-        """How far the models were off on the last pairs, before they learnt them."""
+        """Errors of the models on the last pairs, before they learnt them."""
         return self._claims.recent(self.answering)
 
     def _choose(self) -> None:

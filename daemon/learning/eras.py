@@ -1,4 +1,4 @@
-"""One era after another: what is learnt since the nominal model, with whatever tools, cameras and zeros."""
+"""Sequence of regimes since the nominal model: other tools, cameras and joint offsets."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ from .nominal import PAIRS_TO_REFIT, NominalModel, chain_tolerances
 from .state import NET, Counters, LearningHeader, LearningState, StateError
 from .watch import LOOK_AGAIN, Noticed
 
-# RMS distance between a nominal model and reality that surprises nobody [m].
+# Ordinary RMS distance between a nominal model and reality [m].
 EXPECTED_M = 0.1
-# So many pairs can be held against each other without knowing them.
+# Minimum number of pairs for a held-out comparison.
 FEWEST_TO_ADAPT = 3
 
 
 class Eras:
-    """Begins the first era when the frame is known, and another one with each change.
+    """Begins the first regime when the frame is known, and another one with each change.
 
     Args:
-        nominal: where learning starts.
+        nominal: the nominal model, where learning starts.
         settings: of the learner.
         task_numbers: numbers for the solver's tasks that were never used.
 
     Attributes:
-        present: the present era; None before the frame is known.
-        claims: what its models are said to be wrong by. What they were in earlier eras counts.
-        fitting: what is fitted as a whole.
-        waiting: the pairs that wait for the first era.
+        present: the current regime; None before the frame is known.
+        claims: uncertainties of its models, including experience from earlier regimes.
+        fitting: fits of the frame or the tool as a whole.
+        waiting: the pairs that wait for the first regime.
         change: the last change; None: there was none.
     """
 
@@ -62,7 +62,7 @@ class Eras:
 
     @classmethod
     def at_nominal(cls, nominal: NominalModel, settings: LearnerConfig, task_numbers: Iterator[int]) -> Eras:
-        """Before any pair."""
+        """Return the state before any pair."""
         eras = cls(nominal, settings, task_numbers)
         if nominal.frame_known:
             eras.present = eras._era(nominal.prior(), eras._drawn(nominal.chain))
@@ -72,11 +72,10 @@ class Eras:
     def restored(
         cls, state: LearningState, nominal: NominalModel, settings: LearnerConfig, task_numbers: Iterator[int]
     ) -> Eras:
-        """As they were when `state` was taken.
+        """Return the regimes as they were when `state` was taken.
 
         Raises:
-            StateError: it belongs to another nominal model, or to other tolerances, or has numbers that
-                cannot be.
+            StateError: it belongs to another nominal model, or to other tolerances, or has impossible numbers.
         """
         header, arrays = state.header, state.arrays
         eras = cls(nominal, settings, task_numbers)
@@ -98,7 +97,7 @@ class Eras:
         return eras
 
     def state(self, counters: Counters, curve: Curve) -> LearningState:
-        """Everything that `restored` needs, with what is counted beside it."""
+        """Return everything that `restored` needs, with the counters."""
         q, x = self.memory.all()
         header = LearningHeader(
             fingerprint=self._fingerprint,
@@ -121,11 +120,11 @@ class Eras:
 
     @property
     def memory(self) -> PairMemory:
-        """The pairs with the present tool."""
+        """Pairs with the current tool."""
         return self.waiting if self.present is None else self.present.memory
 
     def state_before(self, first: int, counters: Counters, curve: Curve) -> LearningState:
-        """What `restored` needs to go on as if the pairs learnt from number `first` of the present era had not come."""
+        """Return the state as if the pairs from number `first` of the current regime had not come."""
         state = self.state(counters, curve)
         kept = self.memory.place_of(first)
         arrays = {name: each[:kept] if name in ("q", "x", "turns") else each for name, each in state.arrays.items()}
@@ -136,11 +135,11 @@ class Eras:
         return LearningState(state.header, arrays)
 
     def change_tool(self, era: Era) -> None:
-        """From now on another tool than in `era`; nothing is known of it."""
+        """Begin the regime of another tool, of which nothing is known, after `era`."""
         self.present, self._origin = self._next(era, EXPECTED_M), None
 
     def follow_change(self, era: Era, pair: Pair) -> bool:
-        """Begin the era of another tool if the pairs that `era` doubted in a row are its first; `pair` is the last."""
+        """Begin the regime of another tool if the consecutive outliers of `era`, up to `pair`, are its first pairs."""
         doubts = era.doubts
         if not (doubts.changed or (doubts.perhaps_changed and self._moved_together(era, era.limit_m(pair) / DOUBT))):
             return False
@@ -153,7 +152,7 @@ class Eras:
         return True
 
     def noticed(self, era: Era, pair: Pair) -> Noticed | None:
-        """The change that the pairs of `era` show, `pair` the last of them; None: they show none."""
+        """Return the change that the pairs of `era` show, `pair` the last of them; None if they show none."""
         if not era.watch.ready:
             return None
         doubts = era.doubts
@@ -162,7 +161,7 @@ class Eras:
         return None if noticed is None or len(noticed.q) - noticed.first < FEWEST_TO_ADAPT else noticed
 
     def adapt(self, era: Era, noticed: Noticed) -> bool:
-        """Begin the era after a change, if that predicts pairs since then better that it does not know."""
+        """Begin the regime after a change, if that improves the held-out predictions of the pairs since."""
         q, x = noticed.q[noticed.first :], noticed.x[noticed.first :]
         origin = Origin(noticed, era.arm)
         found = origin.explain(q, x)
@@ -186,11 +185,11 @@ class Eras:
 
     @property
     def looking(self) -> bool:
-        """Whether it is time to look again what it was that changed."""
+        """True if it is time to identify the change again."""
         return self._origin is not None and self.memory.count >= self._look_at
 
     def look_again(self) -> bool:
-        """Name the change by all pairs since; whether what is forgotten of the arm is another part of it now."""
+        """Identify the change by all pairs since; return True if a different part of the arm is relearnt now."""
         if self._origin is None or self.change is None or self.present is None:
             return False
         origin, was, (q, x) = self._origin, self.change.named, self.memory.all()
@@ -206,7 +205,7 @@ class Eras:
         return other
 
     def _begin_adapted(self, era: Era, adapted: Adapted, q: FloatArray, x: FloatArray, turns: FloatArray) -> None:
-        """The era of what was learnt before, but for what changed, and of pairs q (n, d), x (n, 3) since then."""
+        """Begin the regime that keeps everything except the changed part, with pairs q (n, d), x (n, 3) since then."""
         belongs = sound(np.linalg.norm(x - adapted.prior.predict(q), axis=1), self.claims.noise_m)
         self.fitting.rest(adapted.belief.chain)
         self.claims.change_tool(max(math.sqrt(3.0) * adapted.belief.noise, self.claims.noise_m), era.answering)
@@ -214,7 +213,7 @@ class Eras:
         self.present.learn_waiting(q[belongs], x[belongs], turns[belongs], adapted.belief)
 
     def fitted(self, fit: Fit | None, pairs: int) -> int:
-        """Go on from what was fitted to the first `pairs` pairs; how many of them are doubted now."""
+        """Continue from a fit to the first `pairs` pairs; return the number of new outliers."""
         is_first = self.fitting.is_first
         self.fitting.done(pairs, fit)
         if fit is None:
@@ -226,7 +225,7 @@ class Eras:
         return doubted
 
     def _begin_first(self, fit: Fit, belief: ChainBelief) -> int:
-        """The frame is known: the pairs that waited for it are learnt now, but for those that the fit contradicts."""
+        """Learn the pairs that waited for the frame, except those that the fit contradicts."""
         (q, x), turns = self.waiting.all(), self.waiting.turns_since(0)
         belongs = sound(np.linalg.norm(x - fit.prior.predict(q), axis=1), self.claims.noise_m)
         self.waiting.clear()
@@ -235,17 +234,17 @@ class Eras:
         return int((~belongs).sum())
 
     def _next(self, era: Era, expected_m: float, first_fit: int = PAIRS_TO_REFIT) -> Era:
-        """That of another tool, which begins where `era` ends."""
+        """Return the regime of another tool, which begins where `era` ends."""
         prior, arm = era.map, era.arm.updated(self.claims.wide, self.claims.residual)
         self.fitting.change_tool(prior, self._hand, first_fit)
         self.claims.change_tool(expected_m, era.answering)
         return self._era(prior, arm.with_other_tool())
 
     def _moved_together(self, era: Era, expected_m: float) -> bool:
-        """Whether one other place of the marker on the hand explains the doubted pairs in a row."""
+        """Return True if one other position of the marker on the hand explains the consecutive outliers."""
         q, x = era.doubts.run()
         answer = era.model.predict(q)
-        # Without what the answering model knows beyond the map: it knows that with any tool.
+        # Without the answering model's terms beyond the map: they hold for any tool.
         of_map = x - (answer - era.map.predict(q))
         moved = self._nominal.with_other_tool(era.map, self._hand, q, of_map)
         left = np.linalg.norm(of_map - moved.predict(q), axis=1)
@@ -253,7 +252,7 @@ class Eras:
 
     @property
     def _hand(self) -> RigidChain:
-        """The chain that knows best how the hand is turned."""
+        """Chain that knows the orientation of the hand best."""
         belief = self.claims.belief
         return self.fitting.chain if belief is None else belief.chain
 

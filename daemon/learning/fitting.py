@@ -1,4 +1,4 @@
-"""What is fitted as a whole before anything is learnt on top of it: an unknown frame, or a changed tool."""
+"""Fits of an unknown frame or a changed tool as a whole, before anything is learnt on top."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from .solver import fitted_belief
 
 @dataclass(frozen=True)
 class Fit:
-    """A prior that was fitted to pairs.
+    """Prior that was fitted to pairs.
 
     Attributes:
         prior: the map to learn on top of.
-        chain: the nominal chain, placed; after a tool change what says how the hand is turned.
-        belief: what the pairs let believe of the chain; None after a tool change, where only the tool is fitted.
+        chain: the nominal chain, placed; after a tool change, the chain that gives the orientation of the hand.
+        belief: posterior of the chain; None after a tool change, where only the tool is fitted.
     """
 
     prior: KBMap
@@ -28,7 +28,7 @@ class Fit:
 
 
 class Fitting:
-    """Tells when a fit is due, at first after few pairs and then whenever they have doubled, and makes it."""
+    """Schedules and makes the fits: at first after few pairs, then whenever they have doubled."""
 
     def __init__(self, nominal: NominalModel, tolerances: ChainTolerances) -> None:
         self._nominal, self._tolerances = nominal, tolerances
@@ -39,44 +39,46 @@ class Fitting:
 
     @property
     def due_at(self) -> int | None:
-        """How many pairs it takes until the next fit; None when nothing is to be fitted."""
+        """Number of pairs at the next fit; None if nothing is to be fitted."""
         return self._due_at
 
     @property
     def is_first(self) -> bool:
-        """Whether nothing has been fitted yet."""
+        """True if nothing has been fitted yet."""
         return self._is_first
 
     @property
     def chain(self) -> RigidChain:
-        """The nominal chain, placed; after a tool change what says how the hand is turned."""
+        """Nominal chain, placed; after a tool change, the chain that gives the orientation of the hand."""
         return self._chain
 
     def due(self, pairs: int) -> bool:
-        """Whether it is time to fit."""
+        """Return True if it is time to fit."""
         return self._due_at is not None and pairs >= self._due_at
 
     def change_tool(self, before: KBMap, hand: RigidChain, first_at: int = PAIRS_TO_REFIT) -> None:
-        """From now on another tool is fitted on top of the map `before`, at first to so many pairs.
+        """Fit another tool on top of the map `before` from now on, at first to `first_at` pairs.
 
         Args:
-            hand: a chain that says how the hand is turned.
+            before: the map to fit on top of.
+            hand: a chain that gives the orientation of the hand.
+            first_at: number of pairs at the first fit.
         """
         self._before, self._chain, self._due_at, self._is_first = before, hand, first_at, True
 
     def rest(self, hand: RigidChain) -> None:
-        """From now on nothing is fitted as a whole.
+        """Stop fitting.
 
         Args:
-            hand: a chain that says how the hand is turned.
+            hand: a chain that gives the orientation of the hand.
         """
         self._before, self._chain, self._due_at, self._is_first = None, hand, None, False
 
     def fit(self, q: FloatArray, x: FloatArray) -> Fit | None:
-        """The prior that fits pairs q (n, d) [rad] and x (n, 3) [m] best; None when they do not determine it.
+        """Return the prior that fits pairs q (n, d) [rad] and x (n, 3) [m] best; None if they do not determine it.
 
-        Where the frame is not known, that is the most probable chain. A frame alone, fitted to a drawing that is wrong,
-        takes what is wrong of the arm near the first pairs for its own, and is far off everywhere else.
+        With an unknown frame, that is the most probable chain. A frame alone, fitted to an inaccurate nominal chain,
+        would absorb the arm's errors near the first pairs, and be far off everywhere else.
         """
         try:
             if self._before is not None:
@@ -88,19 +90,19 @@ class Fitting:
         return Fit(belief.chain.to_kbmap(self._nominal.bases), placed, belief)
 
     def done(self, pairs: int, fit: Fit | None) -> None:
-        """That many pairs were fitted."""
+        """Record a fit to this many pairs."""
         if fit is None:
             self._due_at = pairs + max(self._nominal.pairs_to_align, PAIRS_TO_REFIT)
         else:
             self._due_at, self._chain, self._is_first = 2 * pairs, fit.chain, False
 
     def arrays(self) -> dict[str, FloatArray]:
-        """What a checkpoint has to keep beside `due_at` and `is_first`."""
+        """Return the arrays of a checkpoint, in addition to `due_at` and `is_first`."""
         kept = {"chain_fixed": self._chain.fixed}
         return kept if self._before is None else kept | {"before_change": self._before.net}
 
     def restore(self, due_at: int | None, is_first: bool, arrays: Mapping[str, FloatArray]) -> None:
-        """Go on from these and from `arrays`."""
+        """Resume from these and from `arrays`."""
         nominal = self._nominal.chain
         self._due_at, self._is_first = due_at, is_first
         self._chain = RigidChain(arrays["chain_fixed"], nominal.axes, nominal.prismatic)

@@ -1,4 +1,4 @@
-"""Which pairs to doubt: one gross outlier must not spoil the map, a changed tool must be followed."""
+"""Outlier gate: one gross outlier must not spoil the map, and a changed tool must be followed."""
 
 from __future__ import annotations
 
@@ -9,43 +9,44 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray
 
-# A pair this many times farther from the prediction than expected is doubted.
+# A pair is an outlier if it is this many times farther from the prediction than expected.
 DOUBT = 5.0
 # Median length of errors to their 1-sigma per axis, three equal axes: 1 / sqrt(2.366).
 MEDIAN_TO_SIGMA = 0.6501
-# No robot is that exact: distances below are never doubted for what they are [m].
+# No robot is this exact: an expected distance is never taken to be smaller [m].
 SMALLEST_M = 1e-3
-# So many doubted pairs in a row are no outliers: the world has changed.
+# This many consecutive outliers prove a change.
 CHANGE = 6
-# So many are enough where one other place of the marker explains them: their distances from it are at most so many
-# times what is expected, and at most this share of those from the prediction.
+# This many are enough if one other position of the marker explains them: their remaining distances are at most this
+# multiple of the expected ones, and at most this share of those from the prediction.
 FEWEST_FOR_CHANGE = 3
 TOGETHER = 2.0
 LEFT_OVER = 0.2
 
 
 class Gate:
-    """Counts doubted pairs in a row."""
+    """Counts consecutive outliers."""
 
     def __init__(self, in_a_row: int = 0) -> None:
         self.in_a_row = in_a_row
 
     def doubts(self, distance_m: float, limit_m: float) -> bool:
-        """Whether to doubt a pair that lies `distance_m` from its prediction."""
+        """Return True if a pair that lies `distance_m` from its prediction is an outlier."""
         doubted = distance_m > limit_m
         self.in_a_row = self.in_a_row + 1 if doubted else 0
         return doubted
 
     @property
     def changed(self) -> bool:
-        """Whether the run of doubted pairs is a change."""
+        """True after `CHANGE` consecutive outliers."""
         return self.in_a_row >= CHANGE
 
 
 def sound(distances_m: FloatArray, noise_m: float) -> NDArray[np.bool_]:
-    """Which of a few pairs belong together, by their distances (n,) [m] from a robust fit to them, shape (n,).
+    """Return True for each of a few pairs that fits the others, by distances (n,) [m] from a robust fit, shape (n,).
 
     Args:
+        distances_m: distances (n,) [m] from the fit.
         noise_m: RMS distance between measurement and truth.
     """
     rms = math.sqrt(3.0) * MEDIAN_TO_SIGMA * float(np.median(distances_m))
@@ -53,16 +54,16 @@ def sound(distances_m: FloatArray, noise_m: float) -> NDArray[np.bool_]:
 
 
 def explained(before_m: FloatArray, after_m: FloatArray, expected_m: float) -> bool:
-    """Whether an explanation takes a run of pairs from the distances `before_m` (n,) [m] to `after_m` (n,) [m]."""
+    """Return True if an explanation reduces a run's distances from `before_m` (n,) [m] to `after_m` (n,) [m]."""
     before, after = (float(np.sqrt(np.square(distances).mean())) for distances in (before_m, after_m))
     return after <= min(TOGETHER * expected_m, LEFT_OVER * before)
 
 
 def limits_m(inside_m: FloatArray, open_m: FloatArray) -> FloatArray:
-    """How far from their predictions pairs may lie (n,) [m].
+    """Return the distances from their predictions beyond which pairs are outliers (n,) [m].
 
     Args:
         inside_m: RMS distance of recent pairs from their predictions (n,).
-        open_m: RMS distance that the data so far leave open where the pairs lie (n,).
+        open_m: RMS distance that the data so far leave where the pairs lie (n,).
     """
     return DOUBT * np.maximum(np.hypot(inside_m, open_m), SMALLEST_M)

@@ -1,4 +1,4 @@
-"""Which pairs are taken at all."""
+"""Validation of incoming pairs."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from bodyschema.interfaces.records import FARTHEST_M, LARGEST_Q, Pair
 
 from .state import Counters
 
-# Of a covariance's largest eigenvalue: so far below zero the smallest may be rounded.
+# As a share of a covariance's largest eigenvalue: rounding may push the smallest this far below zero.
 ROUNDING = 1e-6
 
 
 def check_pair(pair: Pair, counters: Counters, joints: int) -> None:
-    """RequestError when it is no pair of this robot and store, not newer than the last one, or no measurement."""
+    """Raise RequestError if a pair is of another robot or store, not new, or not a measurement."""
     if counters.store not in (None, pair.store):
         raise RequestError(
             f"pair {pair.seq} comes from the store {pair.store}, this learner learnt from {counters.store}"

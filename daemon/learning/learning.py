@@ -1,7 +1,7 @@
-"""The learner: pairs in, models side by side, a snapshot that answers.
+"""Online learner: pairs in, models side by side, a snapshot that answers.
 
 Two threads may use one object: one calls `learn`, the other `work`, and each holds the lock for short pieces only.
-Whoever answers queries takes `snapshot`, which needs no lock.
+Query threads take `snapshot`, which needs no lock.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from .solver import Solver
 from .solving import Solving
 from .state import Counters, LearningState
 
-# Pairs that a model has to have predicted before its errors say what is to be expected.
+# Number of predicted pairs before a model's errors give an expected error.
 FEWEST_TO_CLAIM = 5.0
 FEED_PAIRS = 256
 REGION_RAD = np.radians(3.0)
@@ -37,17 +37,20 @@ REGION_SAMPLES = 256
 class Learning:
     """Learns the forward kinematics of one robot from pairs.
 
-    What is learnt is in its `Eras`. Here it is counted, kept apart for the two threads, and published.
+    The models are in its `Eras`. This class counts, synchronises the two threads, and publishes.
     """
 
     def __init__(
         self, nominal: NominalModel, settings: LearnerConfig, solver: Solver, *, together_s: float = 0.0
     ) -> None:
-        """Before any pair.
+        """Initialise before any pair.
 
         Args:
-            together_s: pairs wait for so long at most to be judged together [s], which costs a fraction of judging
-                each. The instant learner waits for nothing.
+            nominal: the nominal model, where learning starts.
+            settings: of the learner.
+            solver: of the models that need all pairs.
+            together_s: maximum wait of pairs to be judged together [s], which costs a fraction of judging each. The
+                instant learner does not wait.
         """
         self._nominal, self._settings = nominal, settings
         self._solving = Solving(solver, settings.solve_every)
@@ -57,27 +60,27 @@ class Learning:
 
     @property
     def snapshot(self) -> Snapshot:
-        """The model that answers now."""
+        """Snapshot of the answering model."""
         return self._snapshot
 
     @property
     def belief(self) -> ChainBelief | None:
-        """What the pairs with the present tool let believe of the chain; None before the first solution."""
+        """Posterior of the chain from the pairs with the current tool; None before the first solution."""
         return self._course.eras.claims.belief
 
     @property
     def nominal(self) -> NominalModel:
-        """Where learning starts."""
+        """Nominal model, where learning starts."""
         return self._nominal
 
     @property
     def aligning(self) -> bool:
-        """Whether the frame is not known yet."""
+        """True while the frame is not known."""
         return self._course.eras.present is None
 
     @property
     def at_rest(self) -> bool:
-        """Whether no work is left with the pairs that came: nothing to fit, to solve or to replay.
+        """True if no work is left with the pairs so far: nothing to fit, to solve or to replay.
 
         For the thread that calls `work`.
         """
@@ -89,35 +92,35 @@ class Learning:
 
     @property
     def counters(self) -> Counters:
-        """A copy of all that is counted."""
+        """Copy of all counters."""
         with self._lock:
             return copy.copy(self._course.counters)
 
     @property
     def curve(self) -> list[CurvePoint]:
-        """The error [m] of the model that answered, on the last pairs before each of these."""
+        """Error [m] of the answering model on the last pairs, at some numbers of pairs."""
         with self._lock:
             return self._course.curve.points
 
     @property
     def change(self) -> ChangeRecord | None:
-        """The last change that was told or found; None: there was none, or it was rolled back."""
+        """Last change, reported or detected; None: there was none, or it was rolled back."""
         with self._lock:
             return self._course.eras.change
 
     @property
     def can_roll_back(self) -> bool:
-        """Whether the state before the last change is kept."""
+        """True if the state before the last change is kept."""
         return self._course.can_roll_back
 
     def recent(self) -> Recent:
-        """Return the models' errors on the last pairs, which each predicted before it learnt them."""
+        """Return the models' errors on the last pairs, each predicted before it was learnt."""
         with self._lock:
             era = self._course.eras.present
             return Recent(0, {}) if era is None else era.recent
 
     def claimed_error_m(self) -> float | None:
-        """Mean distance to the truth [m] that is claimed in the data's region; None while there are too few pairs.
+        """Return the expected mean distance to the truth [m] in the data's region; None while there are too few pairs.
 
         The region: within a few degrees (`REGION_RAD` per joint) of the kept pairs.
         """
@@ -130,13 +133,13 @@ class Learning:
         return snapshot.expected_error_m(region)
 
     def _region(self, era: Era) -> FloatArray:
-        """Poses (n, d) [rad, m] that stand for where the data is; the same for the same pairs."""
+        """Return poses (n, d) [rad, m] that represent the data's region; the same for the same pairs."""
         rng = np.random.default_rng(0)
         q, _ = era.memory.at(rng.integers(len(era.memory), size=REGION_SAMPLES))
         return q + rng.normal(0.0, 1.0, q.shape) * self._nominal.reach(REGION_RAD)
 
     def orientation_status(self) -> OrientationStatus | None:
-        """How well it is known how the marker is turned; None where no pair with the present tool said it."""
+        """Return the accuracy of the marker's orientation; None if no pair with the current tool has one."""
         with self._lock:
             era, model = self._course.eras.present, self._snapshot.orientation
             if era is None or model is None:
@@ -146,7 +149,7 @@ class Learning:
         return OrientationStatus(pairs, model.name, errors, claimed)
 
     def known(self) -> Known | None:
-        """What is known of the chain now; None before the first solution with the present tool.
+        """Return the evidence for a data outlook; None before the first solution with the current tool.
 
         For the thread that calls `work`.
         """
@@ -155,7 +158,7 @@ class Learning:
             if era is None or claims.belief is None or not self._solving.works_on(era.task_number):
                 return None
             seen, _ = era.memory.some(era.memory.count, LOOKED_BACK)
-            q, x, _ = era.memory.since(self._solving.fed - LOOKED_BACK, LOOKED_BACK)  # those that the solver knows
+            q, x, _ = era.memory.since(self._solving.fed - LOOKED_BACK, LOOKED_BACK)  # pairs that the solver knows
             return Known(
                 nominal=self._nominal,
                 belief=claims.belief,
@@ -171,7 +174,10 @@ class Learning:
             )
 
     def kept(self, limit: int) -> tuple[FloatArray, FloatArray]:
-        """At most `limit` of the kept pairs with the present tool, evenly spread: q (n, d) [rad, m], x (n, 3) [m]."""
+        """Return at most `limit` of the kept pairs, evenly spread: q (n, d) [rad, m], x (n, 3) [m].
+
+        Only pairs with the current tool.
+        """
         with self._lock:
             memory = self._course.eras.memory
             places = np.unique(np.linspace(0, len(memory) - 1, min(limit, len(memory))).astype(np.intp))
@@ -188,14 +194,14 @@ class Learning:
             self._publish()
 
     def judge_due(self, now: float) -> None:
-        """Judge the pairs that have waited for long enough."""
+        """Judge the pairs that have waited long enough."""
         with self._lock:
             if self._course.judge_due(now):
                 self._course.judge()
                 self._publish()
 
     def refuse(self) -> None:
-        """Count a pair that could not be taken."""
+        """Count a pair that could not be accepted."""
         with self._lock:
             self._course.counters.refused += 1
 
@@ -205,54 +211,54 @@ class Learning:
             self._course.counters.gaps_recovered += pairs
 
     def missed(self, pairs: int) -> None:
-        """Count pairs that nobody keeps any more."""
+        """Count pairs that are lost."""
         with self._lock:
             self._course.counters.missed += pairs
 
     def tool_changed(self) -> None:
-        """From now on another tool: pairs so far no longer count, what they taught is where learning starts again."""
+        """Start with another tool: drop the pairs so far, and continue from the learnt model."""
         with self._lock:
             self._course.tool_changed()
             self._publish()
 
     def rollback(self) -> None:
-        """Go on as if the last change had not been, and the pairs since then had not come.
+        """Undo the last change, together with the pairs since then.
 
         Raises:
-            RequestError: there was no change, or learning began anew since; nothing is changed.
+            RequestError: there was no change, or learning was reset since; nothing is changed.
         """
         with self._lock:
             self._course.rollback()
             self._publish()
 
     def reset_to_prior(self, *, forget_store: bool = False) -> None:
-        """Forget what was learnt. With `forget_store`, pairs may come from another store, from its first one on."""
+        """Forget the learnt model. With `forget_store`, pairs may come from another store, from its first one on."""
         with self._lock:
             self._course.reset_to_prior(forget_store=forget_store)
             self._publish()
 
     def restart_solver(self) -> None:
-        """The solver has lost its pairs: give them to it again. For the thread that calls `work`."""
+        """Give a solver that has lost its pairs all of them again. For the thread that calls `work`."""
         self._solving.restart()
         with self._lock:
             if self._course.eras.present is not None:
                 self._course.eras.present.solve_from_what_is_known()
 
     def solve_soon(self) -> None:
-        """Let the solver catch up although fewer than `solve_every` pairs are new. For that thread too."""
+        """Let the solver catch up even with fewer than `solve_every` new pairs. For the same thread."""
         self._solving.solve_soon()
 
     def work(self) -> bool:
-        """One small piece of background work; False when there is none."""
+        """Do one small piece of background work; return False if there is none."""
         return self._fit() or self._look_again() or self._serve_solver() or self._replay()
 
     def state(self) -> LearningState:
-        """Everything needed to go on from here."""
+        """Return everything needed to resume."""
         with self._lock:
             return self._course.state()
 
     def restore(self, state: LearningState) -> None:
-        """Go on from a state; the solver gets the kept pairs again in the background.
+        """Resume from a state; the solver gets the kept pairs again in the background.
 
         Raises:
             StateError: it belongs to another nominal model, or to other tolerances.
@@ -262,7 +268,7 @@ class Learning:
             self._publish()
 
     def _look_again(self) -> bool:
-        """Name what changed, by more pairs."""
+        """Identify the last change again, with more pairs."""
         with self._lock:
             if not self._course.eras.looking:
                 return False
@@ -273,7 +279,7 @@ class Learning:
         return True
 
     def _fit(self) -> bool:
-        """Fit what is not known, or a changed tool, when it is due."""
+        """Fit an unknown frame or a changed tool, when it is due."""
         with self._lock:
             memory = self._course.eras.memory
             if not self._course.eras.fitting.due(memory.count):
@@ -283,13 +289,13 @@ class Learning:
         fit = fitting.fit(q, x)
         with self._lock:
             self._course.judge()
-            if memory is self._course.eras.memory:  # else another era has begun
+            if memory is self._course.eras.memory:  # else another regime has begun
                 self._course.counters.doubted += self._course.eras.fitted(fit, count)
                 self._publish()
         return True
 
     def _serve_solver(self) -> bool:
-        """Give the solver its pairs, ask it from time to time, take what it found."""
+        """Give the solver its pairs, request solutions from time to time, take its results."""
         solving = self._solving
         with self._lock:
             if self._course.eras.present is None:
@@ -305,7 +311,7 @@ class Learning:
                 return True
             asking = solving.due and solving.fed == era.memory.count
             if asking:
-                self._course.judge()  # the solver shall know whatever the instant learner knows
+                self._course.judge()  # the solver shall know everything that the instant learner knows
                 if self._course.eras.present is not era:
                     return True
                 era.ask()

@@ -1,4 +1,4 @@
-"""What a model that answers has to be able to do."""
+"""Interface of an answering model."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from kbmaps import PositionModel
 
 
 class LearntModel(PositionModel, Protocol):
-    """A map from joint angles to positions that later learning does not touch."""
+    """Map from joint angles to positions that later learning does not change."""
 
     @property
     def digest(self) -> str:
-        """Hash that tells it from any other."""
+        """Hash that identifies the model."""
         ...
 
     def to_bytes(self) -> bytes:
-        """The model as one self-describing byte string."""
+        """Return the model as one self-describing byte string."""
         ...

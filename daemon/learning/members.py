@@ -1,4 +1,4 @@
-"""The models that learn side by side: the prior, the instant learner and the solver's last solutions."""
+"""Models that learn side by side: the prior, the instant learner and the solver's last solutions."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ from kbmaps import NLMS, KBMap, NonFiniteError
 from .learnt import LearntModel
 
 PRIOR, INSTANT, RIGID, RESIDUAL, EXACT = "prior", "nlms", "rigid", "residual", "exact"
-# The instant learner's map as it was when the present solutions were asked for, among the stored nets.
+# Stored net of the instant learner at the time when the current solutions were requested.
 _DELAYED = "delayed"
 SOLVED = (RIGID, RESIDUAL, EXACT)
-# Who is believed first when the errors do not tell. Pairs come along guided paths, where errors tell of the path only:
-# what has fewer numbers says more about places beside it. (`Ladder.around` is for spread pairs, and has another order.)
+# Order of trust while errors do not decide. Pairs come along guided paths, where errors are known on the path only: a
+# model with fewer parameters is better away from it. (`Ladder.around` is for spread pairs, and has another order.)
 TRUSTED = (RIGID, RESIDUAL, EXACT, PRIOR, INSTANT)
 
 
 class Members:
     """KB-Maps in the bases of the prior, and a chain with residual.
 
-    Between two solutions the solved ones stay as they are. Instant steps on top of them would follow the newest pairs,
-    and spoil them beside their path: measured, the error a few degrees away grew from 7 to 10 mm within 20 pairs.
+    Between two solutions, the solved models stay as they are. Instant steps on top of them would follow the newest
+    pairs, and spoil them away from their path: measured, the error a few degrees away grew from 7 to 10 mm within 20
+    pairs.
     """
 
     def __init__(self, prior: KBMap, step_size: float) -> None:
@@ -38,67 +39,67 @@ class Members:
 
     @property
     def delayed(self) -> KBMap | None:
-        """The instant learner as it was when the present solutions were asked for; None before any."""
+        """Map of the instant learner when the current solutions were requested; None before any."""
         return self._delayed
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Those of the present models."""
+        """Names of the current models."""
         return (*self._fixed, INSTANT) if self._residual is None else (*self._fixed, INSTANT, RESIDUAL)
 
     @property
     def maps(self) -> Mapping[str, KBMap]:
-        """Those of the present models that are KB-Maps; none of them is touched by later learning."""
+        """Current models that are KB-Maps; later learning does not change them."""
         return {name: self.map(name) for name in self.names if name != RESIDUAL}
 
     @property
     def prior(self) -> KBMap:
-        """Where learning started."""
+        """Prior map, where learning started."""
         return self._fixed[PRIOR]
 
     def model(self, name: str) -> LearntModel:
-        """One of the present models, untouched by later learning."""
+        """Return one of the current models; later learning does not change it."""
         return self._residual if name == RESIDUAL and self._residual is not None else self.map(name)
 
     def map(self, name: str) -> KBMap:
-        """One of those that are KB-Maps. The instant learner's is copied when somebody wants it, not with each pair."""
+        """Return one of the KB-Maps. The instant learner's is copied on demand, not with each pair."""
         if name != INSTANT:
             return self._fixed[name]
         if self._instant_map is None:
             try:
                 self._instant_map = self._instant.map
-            except NonFiniteError:  # overflow on absurd numbers: begin again rather than answer NaN
+            except NonFiniteError:  # overflow on absurd numbers: restart from the prior instead of answering NaN
                 return self._begun_again()
         return self._instant_map
 
     def predict(self, name: str, q: FloatArray) -> FloatArray:
-        """What one of the models predicts at q (d,) or (n, d) [rad]: (3,) or (n, 3) [m]."""
+        """Return the prediction of one of the models at q (d,) or (n, d) [rad]: (3,) or (n, 3) [m]."""
         if name != INSTANT or self._instant_map is not None:
             return self.model(name).predict(q)
         predicted = self._instant.predict(q)
         return predicted if np.isfinite(predicted).all() else self._begun_again().predict(q)
 
     def predictions(self, q: FloatArray, instant: FloatArray) -> dict[str, FloatArray]:
-        """Positions (n, 3) [m] at q (n, d) [rad] by model; those of the instant learner, another one then, as given."""
+        """Return positions (n, 3) [m] at q (n, d) [rad] by model; those of the instant learner are given."""
         return {name: instant if name == INSTANT else self.predict(name, q) for name in self.names}
 
     def learn(self, q: FloatArray, error: FloatArray, limit_m: float) -> None:
-        """One step of the instant learner for the pair at q (d,), where its error (3,) [m] counts up to `limit_m`."""
+        """Take one step of the instant learner for the pair at q (d,); its error (3,) [m] is clipped to `limit_m`."""
         counted = error * min(1.0, limit_m / max(float(np.linalg.norm(error)), 1e-300))
         self._instant.learn(q, self.predict(INSTANT, q) + counted)
         self._instant_map = None
 
     def replay(self, q: FloatArray, x: FloatArray) -> None:
-        """Steps of the instant learner for q (n, d), x (n, 3), in their order."""
+        """Take steps of the instant learner for q (n, d), x (n, 3), in their order."""
         self._instant.replay(q, x)
         self._instant_map = None
 
     def ask(self) -> None:
-        """The solver works on all pairs up to here."""
+        """Record that the solver works on all pairs so far."""
         self._asked = self.map(INSTANT)
 
     def take(self, name: str, solution: LearntModel) -> None:
-        """The solver's solution for one of the models of what it was asked."""
+        """Take the solver's solution for one of the models."""
         if isinstance(solution, KBMap):
             self._fixed[name] = solution
         else:
@@ -106,7 +107,7 @@ class Members:
         self._delayed = self._asked
 
     def start_again(self, prior: KBMap, q: FloatArray, x: FloatArray) -> None:
-        """Another prior for the same pairs, q (n, d) and x (n, 3): the instant learner learns them on top of it.
+        """Use another prior for the same pairs, q (n, d) and x (n, 3): the instant learner learns them on top of it.
 
         The solutions stay: they fit the pairs.
         """
@@ -115,18 +116,18 @@ class Members:
         self.replay(q, x)
 
     def nets(self) -> dict[str, FloatArray]:
-        """What `restore` needs beside the chain with residual."""
+        """Return the nets for `restore`, without the chain with residual."""
         nets = {name: kbmap.net for name, kbmap in self.maps.items()}
         return nets if self._delayed is None else nets | {_DELAYED: self._delayed.net}
 
     def restore(self, nets: Mapping[str, FloatArray], residual: LearntModel | None) -> None:
-        """Go on from `nets` and the chain with residual."""
+        """Resume from `nets` and the chain with residual."""
         maps = {name: KBMap(self.prior.bases, net) for name, net in nets.items()}
         self._residual, self._delayed, self._instant_map = residual, maps.pop(_DELAYED, None), maps.pop(INSTANT)
         self._fixed |= maps
         self._instant = NLMS(self._instant_map, self._step_size)
 
     def _begun_again(self) -> KBMap:
-        """The map of an instant learner that begins at the prior again."""
+        """Return the map of an instant learner restarted from the prior."""
         self._instant, self._instant_map = NLMS(self.prior, self._step_size), self.prior
         return self._instant_map

@@ -1,4 +1,4 @@
-"""The pairs that are kept for replay, and the order in which they are replayed."""
+"""Memory of the pairs for replay, and the order of replay."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from bodyschema.interfaces.records import FloatArray
 
 IntArray = NDArray[np.intp]
 
-# So many neighbours are looked back at together.
+# Number of neighbours that are sampled together.
 RUN = 20
 
 
 class PairMemory:
-    """The newest `capacity` pairs, in arrays. Pairs are counted from the last `clear`."""
+    """Newest `capacity` pairs, in arrays. Pairs are counted from the last `clear`."""
 
     def __init__(self, joints: int, capacity: int) -> None:
         self._q = np.empty((capacity, joints))
@@ -24,21 +24,23 @@ class PairMemory:
 
     @property
     def count(self) -> int:
-        """Pairs added since the last `clear`, kept or not."""
+        """Number of pairs added since the last `clear`, kept or not."""
         return self._count
 
     @property
     def complete(self) -> bool:
-        """Whether all of them are kept."""
+        """True if all of them are kept."""
         return self._oldest == 0
 
     def __len__(self) -> int:
         return self._count - self._oldest
 
     def append(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None) -> None:
-        """Keep pairs, q (n, d) and x (n, 3); the oldest make room.
+        """Keep pairs, q (n, d) and x (n, 3); drop the oldest to make room.
 
         Args:
+            q: joint values (n, d).
+            x: positions (n, 3).
             turns: their orientations, quaternions (n, 4), NaN where a pair has none; None: none has any.
         """
         places = np.arange(self._count, self._count + len(q)) % len(self._q)
@@ -51,35 +53,35 @@ class PairMemory:
         self._count = self._first = 0
 
     def place_of(self, count: int) -> int:
-        """How many of the kept pairs are older than the one numbered `count` (from 0)."""
+        """Return the number of kept pairs older than the one numbered `count` (from 0)."""
         return min(max(count - self._oldest, 0), len(self))
 
     def restore(self, q: FloatArray, x: FloatArray, count: int, turns: FloatArray | None = None) -> None:
-        """Hold the pairs q (n, d), x (n, 3), with `turns` as `turns_since` gives them: the newest of `count`."""
+        """Hold the pairs q (n, d), x (n, 3), with `turns` as in `turns_since`: the newest of `count`."""
         self._count = self._first = count - len(q)
         self.append(q, x, turns)
 
     def since(self, count: int, limit: int | None = None) -> tuple[FloatArray, FloatArray, int]:
-        """The kept pairs from the one numbered `count` (from 0) on: q (n, d), x (n, 3), and the count after them."""
+        """Return the kept pairs from number `count` (from 0) on: q (n, d), x (n, 3), and the count after them."""
         begin = max(count, self._oldest)
         end = self._count if limit is None else min(self._count, begin + limit)
         return *self._numbered(np.arange(begin, end)), end
 
     def turns_since(self, count: int, limit: int | None = None) -> FloatArray:
-        """Orientations (n, 4) of the pairs that `since` gives: quaternions x, y, z, w, NaN where a pair has none."""
+        """Return orientations (n, 4) of the pairs of `since`: quaternions x, y, z, w, NaN where a pair has none."""
         begin = max(count, self._oldest)
         end = self._count if limit is None else min(self._count, begin + limit)
         return self._turns[np.arange(begin, end) % len(self._turns)]
 
     def all(self) -> tuple[FloatArray, FloatArray]:
-        """All kept pairs in order: q (n, d), x (n, 3)."""
+        """Return all kept pairs in order: q (n, d), x (n, 3)."""
         q, x, _ = self.since(0)
         return q, x
 
     def some(self, end: int, limit: int) -> tuple[FloatArray, FloatArray]:
-        """At most `limit` of the kept pairs before the one numbered `end`, in order: q (n, d), x (n, 3).
+        """Return at most `limit` of the kept pairs before the one numbered `end`, in order: q (n, d), x (n, 3).
 
-        They come in evenly spread runs of `RUN` neighbours, which show what neighbours on a path share.
+        They come in evenly spread runs of `RUN` neighbours, which show the errors that neighbours on a path share.
         """
         kept = max(end - self._oldest, 0)
         if kept <= limit:
@@ -88,7 +90,7 @@ class PairMemory:
         return self._numbered((begins[:, None] + np.arange(min(RUN, limit))).ravel())
 
     def at(self, places: IntArray) -> tuple[FloatArray, FloatArray]:
-        """The kept pairs at places 0 (the oldest) ... len − 1: q (n, d), x (n, 3)."""
+        """Return the kept pairs at places 0 (the oldest) ... len − 1: q (n, d), x (n, 3)."""
         return self._numbered(self._oldest + places)
 
     @property
@@ -101,7 +103,7 @@ class PairMemory:
 
 
 class Permutations:
-    """Places to replay: in each epoch every place once, in a random order that follows from seed and epoch."""
+    """Places to replay: in each epoch every place once, in a random order determined by seed and epoch."""
 
     def __init__(self, seed: int) -> None:
         self._seed = seed
@@ -110,11 +112,11 @@ class Permutations:
 
     @property
     def position(self) -> tuple[int, int, int]:
-        """What `restore` needs: epochs begun, the places of the present one, and how many of them were taken."""
+        """State for `restore`: epochs begun, the places of the current one, and the number of them taken."""
         return self._epoch, self._places, self._taken
 
     def take(self, count: int, places: int) -> IntArray:
-        """Up to `count` of the places 0 ... places − 1; fewer at the end of an epoch."""
+        """Return up to `count` of the places 0 ... places − 1; fewer at the end of an epoch."""
         if self._taken == self._places:
             self._begin(self._epoch + 1, places)
         taken = self._order[self._taken : self._taken + count]
@@ -122,11 +124,11 @@ class Permutations:
         return taken
 
     def restart(self) -> None:
-        """Drop what is left of the epoch: the places have changed their meaning."""
+        """Drop the rest of the epoch: the places have changed their meaning."""
         self._taken = self._places
 
     def restore(self, position: tuple[int, int, int]) -> None:
-        """Go on from there."""
+        """Resume from a position."""
         epoch, places, taken = position
         self._begin(epoch, places)
         self._taken = taken

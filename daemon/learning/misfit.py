@@ -1,4 +1,4 @@
-"""What a solution misses although it knows the pairs: the arm is no such chain, or the map cannot bend like it."""
+"""Model discrepancy: errors of a solution at pairs that it knows, because the arm or the map is of another form."""
 
 from __future__ import annotations
 
@@ -9,28 +9,27 @@ import numpy as np
 from bodyschema.interfaces.records import FloatArray
 from kbmaps.robust import OUTLIER_SIGMAS
 
-# What is smaller than so many of its standard errors may be chance.
+# A discrepancy below this many standard errors may be chance.
 CLEARLY = 2.0
-# Below this number of pairs, what was seen with the last tool counts.
+# Below this number of pairs, the discrepancy with the last tool counts too.
 WARM = 10.0
 
 
 def misfit(
     errors: FloatArray, noise_variance: FloatArray, before: FloatArray, *, neighbours: bool, scatter: float = 0.0
 ) -> FloatArray:
-    """1-sigma per axis (3,) [m] of what is missed, the measurements' noise left out; 0 where that may be chance.
+    """Return the model discrepancy, 1-sigma per axis (3,) [m], without the measurements' noise; 0 if due to chance.
 
-    On a path, neighbours have the same misfit and, mostly, noise of their own: what they share is the misfit, whatever
-    noise the measurements claim. Of poses far apart that claim is all there is to go by, and there the errors are too
-    small by what the solution's own numbers have taken from them: it knows these pairs.
+    On a path, neighbours have the same discrepancy and, mostly, noise of their own: the shared part is the discrepancy,
+    whatever noise the measurements claim. For poses far apart, only the claimed noise is available. There the errors
+    are too small, because the solution was fitted to these pairs.
 
     Args:
         errors: measured minus solved (n, 3) [m], in the pairs' order.
         noise_variance: of the measurements (3,) [m²].
-        before: what was missed of the same arm with another tool (3,) [m].
-        neighbours: whether the pairs follow a path.
-        scatter: 1-sigma of a coordinate around the solution [m], with the numbers that it has used up allowed for; 0
-            where that is not known.
+        before: discrepancy of the same arm with another tool (3,) [m].
+        neighbours: True if the pairs follow a path.
+        scatter: 1-sigma of a coordinate around the solution [m], corrected for its degrees of freedom; 0 if unknown.
     """
     errors = _without_outliers(errors, scatter) if scatter > 0.0 else errors
     n = len(errors)
@@ -48,6 +47,6 @@ def misfit(
 
 
 def _without_outliers(errors: FloatArray, scatter: float) -> FloatArray:
-    """Those that the fit has not left out; all where these would be the fewer: then it is the fit that is off."""
+    """Return the errors that the fit has not left out; all if these are the minority: then the fit is off."""
     near = np.linalg.norm(errors, axis=1) <= OUTLIER_SIGMAS * scatter
     return errors[near] if near.mean() > 0.5 else errors

@@ -1,4 +1,4 @@
-"""The nominal model: where learning starts."""
+"""Nominal model, where learning starts."""
 
 from __future__ import annotations
 
@@ -28,25 +28,25 @@ from kbmaps import (
 
 from .arm import OTHER_TOOL_M
 
-# Pairs after a tool change with which the tool is first fitted; with as many more as there were, it is again.
+# Number of pairs after a tool change at which the tool is first fitted; later fits follow at doubled numbers.
 PAIRS_TO_REFIT = 5
 # A narrower stroke would make the basis needlessly stiff, and equal limits impossible.
 NARROWEST_STROKE_M = 0.1
 LARGEST_FIT = 1000
-# Postures at which an extended simulation is asked for a prior.
+# Maximum number of postures at which an extended simulation is evaluated for a prior.
 LARGEST_GRID = 20_000
 
 
 @dataclass(frozen=True)
 class NominalModel:
-    """The chain as robot.toml and URDF describe it, and which parts of it are only roughly known.
+    """Chain of robot.toml and URDF, with the parts of it that are only roughly known.
 
     Attributes:
         chain: measurement frame to marker.
         lower, upper: joint limits, shape (d,) [rad or m].
         pose_known, marker_known: as in robot.toml.
-        extended: the simulation whose rigid part the chain is, where there is more in it than that.
-        bases: what is learnt in: scaled orthonormal bases over the whole turn, or the stroke of a joint that slides.
+        extended: the simulation whose rigid part the chain is, if it has other effects too.
+        bases: bases of the learnt maps: scaled orthonormal over the whole turn, or the stroke of a prismatic joint.
     """
 
     chain: RigidChain
@@ -67,15 +67,15 @@ class NominalModel:
 
     @classmethod
     def of(cls, robot: RobotDescription) -> NominalModel:
-        """The nominal model of a robot description."""
+        """Return the nominal model of a robot description."""
         return cls(robot.chain, robot.lower, robot.upper, robot.camera.pose_known, robot.robot.marker_known)
 
     @classmethod
     def extended_by(cls, simulation: Simulation) -> NominalModel:
-        """The nominal model of a robot with effects, as it is since they are all there.
+        """Return the nominal model of a robot with effects, in its state with all of them present.
 
-        What a rigid chain can have in it is in the chain. The rest is in the prior, as far as a map has it: over the
-        joints' ranges, and only where the measurement frame is known.
+        The rigid part of the effects is in the chain. The rest is in the prior, as far as a map can hold it: over the
+        joints' ranges, and only if the measurement frame is known.
         """
         since = simulation.since.placed
         robot = since.robot
@@ -90,36 +90,36 @@ class NominalModel:
 
     @property
     def size(self) -> int:
-        """Number of control points of a map: 3^d where all joints turn."""
+        """Number of control points of a map: 3^d if all joints are revolute."""
         return math.prod(basis.size for basis in self.bases)
 
     @property
     def frame_known(self) -> bool:
-        """Whether predictions mean something before any pair."""
+        """True if predictions are meaningful before any pair."""
         return self.pose_known and self.marker_known
 
     @property
     def pairs_to_align(self) -> int:
-        """Pairs to wait for before what is not known is fitted: twice what determines it, and some spread."""
+        """Number of pairs before an unknown frame or marker is fitted: twice the minimum, and some spread."""
         return 0 if self.frame_known else 5 if self.pose_known else 10
 
     @property
     def unknown(self) -> str:
-        """What robot.toml calls not known, in its own words."""
+        """Settings of robot.toml that declare a part unknown, as written there."""
         flags = (("[camera] pose_known", self.pose_known), ("[robot] marker_known", self.marker_known))
         return " and ".join(f"{name} = false" for name, known in flags if not known)
 
     def reach(self, angle: float) -> FloatArray:
-        """`angle` [rad] for each joint that turns, and as much of its stroke [m] for each that slides (d,)."""
+        """Return `angle` [rad] for a revolute joint, the same share of its stroke [m] for a prismatic one (d,)."""
         return np.where(self.chain.prismatic, angle * (self.upper - self.lower) / np.pi, angle)
 
     def fingerprint(self, tolerances: ChainTolerances) -> str:
-        """Tells this nominal model with these tolerances from any other; a state only fits those it came from."""
+        """Return a hash of this nominal model with these tolerances; a state only fits the ones it came from."""
         said = f"{self.pose_known} {self.marker_known} {tolerances} {self.prior().digest}"
         return hashlib.blake2b(said.encode(), digest_size=8).hexdigest()
 
     def prior(self) -> KBMap:
-        """The chain as a map in the learning bases, bent as the extended simulation is."""
+        """Return the chain as a map in the learning bases, with the bends of the extended simulation."""
         return self._prior
 
     @cached_property
@@ -133,12 +133,12 @@ class NominalModel:
         for k, basis in enumerate(self.bases):
             solve = np.linalg.pinv(basis.weights(nodes[k]))
             net = np.moveaxis(np.tensordot(solve, net, axes=(1, k + 1)), 0, k + 1)
-        # A map that has the marker's axes too keeps them as the chain has them.
+        # A map that also has the marker's axes keeps them as in the chain.
         net = np.concatenate([prior.net[:3] + net, prior.net[3:]])
         return KBMap(self.bases, net, prior.metadata)
 
     def _nodes(self) -> list[FloatArray] | None:
-        """Values of each joint over its range, of which the grid tells a map; None where that would be too many."""
+        """Return the grid values of each joint over its range that determine a map; None for too large a grid."""
         count = next((n for n in (5, 4, 3) if n**self.joints <= LARGEST_GRID), None)
         if count is None:
             return None
@@ -148,25 +148,27 @@ class NominalModel:
         return [a + (b - a) * shares for a, b in zip(low, high, strict=True)]
 
     def belief(self, chain: RigidChain, tolerances: ChainTolerances) -> ChainBelief:
-        """What is believed of the real chain before any pair.
+        """Return the prior of the real chain before any pair.
 
         Args:
-            chain: the nominal chain, placed where none is known.
+            chain: the nominal chain, placed if its pose is unknown.
             tolerances: of a chain whose frame and marker are known.
         """
         return ChainBelief.from_tolerances(ChainParameters(chain), self.tolerances(tolerances))
 
     def tolerances(self, known: ChainTolerances) -> ChainTolerances:
-        """Those of the nominal chain, where `known` are those of one whose frame and marker are known."""
+        """Return the tolerances of the nominal chain, given those of one whose frame and marker are known."""
         if not self.pose_known:
             known = replace(known, base_rotation=math.inf, base_translation=math.inf)
         if not self.marker_known:
-            # A marker is on the hand. First pairs along a short path would be fitted as well by one metres away.
+            # A marker is on the hand. First pairs along a short path would fit one metres away just as well.
             known = replace(known, tool=OTHER_TOOL_M)
         return known
 
     def placed(self, q: FloatArray, x: FloatArray) -> RigidChain:
-        """The chain with an unknown pose fitted to pairs, q (n, d) [rad] and x (n, 3) [m]; its marker is as drawn.
+        """Return the chain with an unknown pose fitted to pairs, q (n, d) [rad] and x (n, 3) [m].
+
+        Its marker is at its nominal position.
 
         Raises:
             DegenerateDataError: the pairs do not determine it.
@@ -175,10 +177,13 @@ class NominalModel:
         return align(self.chain, q[chosen], x[chosen], pose_known=self.pose_known, marker_known=True).chain
 
     def with_other_tool(self, kbmap: KBMap, chain: RigidChain, q: FloatArray, x: FloatArray) -> KBMap:
-        """A learnt map with its marker moved to where pairs since the tool change, q (n, d) and x (n, 3), see it.
+        """Return a learnt map with its marker moved to fit pairs since the tool change, q (n, d) and x (n, 3).
 
         Args:
+            kbmap: the learnt map.
             chain: the nominal chain in the frame that the map was learnt in; it gives the hand's orientation.
+            q: joint values since the tool change.
+            x: positions since the tool change.
 
         Raises:
             DegenerateDataError: there are no pairs.
@@ -188,7 +193,7 @@ class NominalModel:
 
 
 def chain_tolerances(settings: LearnerConfig) -> ChainTolerances:
-    """How far a real chain, its frame and its marker may be from what is drawn."""
+    """Return the tolerances of a real chain, its frame and its marker about their nominal values."""
     angle, place = math.radians(settings.angle_tolerance_deg), settings.place_tolerance_m
     return ChainTolerances(
         axes=angle,
@@ -202,5 +207,5 @@ def chain_tolerances(settings: LearnerConfig) -> ChainTolerances:
 
 
 def _spread(pairs: int) -> NDArray[np.intp]:
-    """Places of at most `LARGEST_FIT` pairs out of so many, evenly spread."""
+    """Return places of at most `LARGEST_FIT` out of `pairs` pairs, evenly spread."""
     return np.linspace(0, pairs - 1, min(pairs, LARGEST_FIT)).round().astype(np.intp)

@@ -1,4 +1,4 @@
-"""How the marker is turned: models side by side, of which the one that predicts best answers."""
+"""Orientation of the marker: several models side by side, of which the best predictor answers."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from .orientation_solver import OrientationSolution
 from .scores import DISCOUNT
 from .unknowns import unexplained
 
-# Who is believed first when the errors do not tell.
+# Order of trust while errors do not decide.
 TRUSTED = (RIGID, EXACT, PRIOR)
-# The turn of the marker on the hand as drawn is fitted to at most so many of the first pairs, whenever they double.
+# The marker's rotation on the nominal chain's hand is fitted to at most this many first pairs, whenever they double.
 FIRST = 64
-# Of so many pairs, the solved chain is believed before it has predicted any.
+# Minimum number of pairs to trust the solved chain before it has predicted any.
 FEWEST_TO_BELIEVE = 3
 # Mean length of a Gaussian turn over its RMS length, three equal axes.
 MEAN_OVER_RMS = 0.9213
@@ -43,11 +43,11 @@ class AngleMemory(msgspec.Struct):
     """Discounted sums over one model's recent prediction errors.
 
     Attributes:
-        weight: how many errors count.
+        weight: effective number of errors.
         angle: sum of their angles [rad].
         square: sum of their squares [rad²].
-        noise: sum of the measurements' variances, all three axes [rad²]; of those that tell none, 0.
-        ratio: sum of their squares over what was claimed.
+        noise: sum of the measurements' variances, all three axes [rad²]; 0 where not given.
+        ratio: sum of their squares over the predicted ones.
     """
 
     weight: float = 0.0
@@ -57,7 +57,13 @@ class AngleMemory(msgspec.Struct):
     ratio: float = 0.0
 
     def add(self, angle: float, noise: float, claimed: float) -> None:
-        """One more error of this angle [rad], where the squares of these were expected: of noise, of both [rad²]."""
+        """Add an error of this angle [rad].
+
+        Args:
+            angle: of the error [rad].
+            noise: expected square of the measurement's noise [rad²].
+            claimed: expected square of noise and model error together [rad²].
+        """
         self.weight = DISCOUNT * self.weight + 1.0
         self.angle = DISCOUNT * self.angle + angle
         self.square = DISCOUNT * self.square + angle**2
@@ -71,16 +77,16 @@ class AngleMemory(msgspec.Struct):
 
     @property
     def surprise(self) -> float:
-        """How many times larger than claimed the errors were, at least 1."""
+        """Ratio of the errors to the predicted ones, at least 1."""
         few = max(10.0 - self.weight, 0.0)
         return math.sqrt(max((self.ratio + few) / max(self.weight, 10.0), 1.0))
 
 
 class OrientationState(msgspec.Struct, kw_only=True):
-    """What a checkpoint holds.
+    """State of the orientation models in a checkpoint.
 
     Attributes:
-        pairs: how many pairs had an orientation.
+        pairs: number of pairs with an orientation.
         answering: the model that answers.
         errors: prequential errors, by model.
         prior, chain, map: the models, as bytes; None before there are any.
@@ -100,15 +106,15 @@ class OrientationState(msgspec.Struct, kw_only=True):
 
 @dataclass(frozen=True, eq=False)
 class OrientationModel:
-    """The model that answers, with what is claimed of its error; later learning does not touch it.
+    """Answering model with its predicted error; later learning does not change it.
 
     Attributes:
-        name: which one it is.
-        chain: the rigid chain that says how uncertain it is, and answers itself unless there is a map.
+        name: of the model.
+        chain: the rigid chain that gives the uncertainty, and answers itself unless there is a map.
         map: of e1, e2, e3.
-        inside: 1-sigma about each axis where data is, besides what the chain leaves open [rad].
-        surprise: by how much predictions were worse than claimed, at least 1.
-        support: where data was; None before any.
+        inside: 1-sigma about each axis at the data, in addition to the chain's uncertainty [rad].
+        surprise: ratio of the prediction errors to the predicted ones, at least 1.
+        support: support of the data; None without data.
     """
 
     name: str
@@ -119,34 +125,34 @@ class OrientationModel:
     support: SupportSet | None
 
     def rotations(self, q: FloatArray) -> FloatArray:
-        """Orientations (n, 3, 3) at q (n, d) [rad]."""
+        """Return orientations (n, 3, 3) at q (n, d) [rad]."""
         return self.chain.orientation(q) if self.map is None else self.map.orientation(q, orthonormal=True)
 
     def predict(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Orientations (n, 3, 3) at q (n, d) [rad], and their variance about each axis (n, 3) [rad²]."""
+        """Return orientations (n, 3, 3) at q (n, d) [rad], and their variance about each axis (n, 3) [rad²]."""
         rotations, left_open = self.chain.orientation_with_variance(q)
         if self.map is not None:
             of_chain, rotations = rotations, self.rotations(q)
-            # Away from the data the map is no better than the chain; how far apart they are says how bad.
+            # Away from the data the map is no better than the chain; their difference measures its error.
             departure = rotation_vectors(rotations @ of_chain.swapaxes(1, 2))
             left_open = left_open + unexplained(self.support, q)[:, None] * np.square(departure)
         return rotations, self.surprise**2 * (self.inside**2 + left_open)
 
     def planes(self, kbmap: KBMap) -> KBMap:
-        """`kbmap` with the nine planes of e1, e2, e3 in its bases."""
+        """Return `kbmap` with the nine planes of e1, e2, e3 in its bases."""
         turned = self.map if self.map is not None else self.chain.chain.to_kbmap(kbmap.bases, orientation=True)
         return KBMap(kbmap.bases, np.concatenate([kbmap.net[:3], turned.net[3:]]), kbmap.metadata)
 
     def expected_error(self, q: FloatArray) -> float:
-        """Mean angle to the truth [rad] that the sigmas at q (n, d) [rad] claim."""
+        """Return the expected mean angle to the truth [rad], from the sigmas at q (n, d) [rad]."""
         return MEAN_OVER_RMS * float(np.sqrt(self.predict(q)[1].sum(axis=1)).mean())
 
 
 class Orientations:
-    """Learns how one marker is turned. It has no lock of its own.
+    """Learns the orientation of one marker. It has no lock of its own.
 
     Args:
-        chain: the nominal chain, placed; what the orientations are predicted with before anything is solved.
+        chain: the nominal chain, placed; it predicts orientations before anything is solved.
     """
 
     def __init__(self, chain: RigidChain) -> None:
@@ -162,20 +168,21 @@ class Orientations:
         self.errors: dict[str, AngleMemory] = {}
 
     def model(self, support: SupportSet | None) -> OrientationModel | None:
-        """The model that answers; None before the first orientation."""
+        """Return the answering model; None before the first orientation."""
         return self._named(self.answering, support) if self.answering in self._names else None
 
     def prequential_rad(self) -> dict[str, float]:
-        """Recent mean angle between prediction and measurement, before learning [rad], by model."""
+        """Return the recent mean angle between prediction and measurement, before learning [rad], by model."""
         return {name: memory.mean_rad for name, memory in self.errors.items() if memory.weight}
 
     def learn(self, q: FloatArray, turn: FloatArray, cov: FloatArray | None, support: SupportSet | None) -> None:
-        """One pair: its orientation is predicted before it is learnt.
+        """Learn one pair: its orientation is predicted before it is learnt.
 
         Args:
             q: joint angles (d,) [rad].
             turn: unit quaternion x, y, z, w (4,).
             cov: covariance of it (3, 3) [rad²], if it is known.
+            support: support of the data; None without data.
         """
         measured = rotation_matrices("R", turn / np.linalg.norm(turn))
         noise = 0.0 if cov is None else float(np.trace(cov))
@@ -192,7 +199,7 @@ class Orientations:
         self._choose()
 
     def take(self, solution: OrientationSolution) -> None:
-        """The solver's solution for the orientations so far."""
+        """Take the solver's solution for the orientations so far."""
         self._chains[RIGID] = solution.chain
         self._map, self._map_noise = solution.map, solution.map_noise
         if solution.map is None and self.answering == EXACT:
@@ -200,7 +207,7 @@ class Orientations:
         self._choose()
 
     def state(self) -> OrientationState:
-        """Everything that `restore` needs."""
+        """Return everything that `restore` needs."""
         packed = {name: chain.to_bytes() for name, chain in self._chains.items()}
         return OrientationState(
             pairs=self.pairs,
@@ -214,7 +221,7 @@ class Orientations:
         )
 
     def restore(self, state: OrientationState) -> None:
-        """Go on from a state."""
+        """Resume from a state."""
         self.pairs, self.answering, self.errors = state.pairs, state.answering, dict(state.errors)
         packed: Mapping[str, bytes | None] = {PRIOR: state.prior, RIGID: state.chain}
         self._chains = {name: OrientedChain.from_bytes(data) for name, data in packed.items() if data is not None}
@@ -234,9 +241,9 @@ class Orientations:
         return OrientationModel(name, chain, mapped, self._misfit(around), surprise, support)
 
     def _misfit(self, around: float) -> float:
-        """1-sigma of the truth around a model [rad], about one axis, of that of the measurements.
+        """Return the 1-sigma of the truth around a model [rad], about one axis, given that of the measurements.
 
-        What the measurements say of their own noise is taken out, as far as so many pairs can tell.
+        The measurements' claimed noise is subtracted, within the resolution of this number of pairs.
         """
         resolution = math.sqrt(2.0 / (3.0 * max(self.pairs, 1)))
         return math.sqrt(max(around**2 - self._noise, around**2 * resolution if self._noise else around**2))

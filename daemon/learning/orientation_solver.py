@@ -1,4 +1,4 @@
-"""What orientations say of all pairs at once: the rigid chain, its marker turned, and maps of e1, e2, e3 around it."""
+"""Batch solver of orientations: the rigid chain with its marker's rotation, and maps of e1, e2, e3 around it."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from kbmaps import (
     rotation_matrices,
 )
 
-# So many of the newest pairs bend the maps.
+# Number of the newest pairs that the maps are fitted to.
 WINDOW = 20_000
-# So many of the newest orientations are kept; a chain is fitted to so many of them, evenly spread.
+# Number of the newest orientations that are kept, and of those that a chain is fitted to, evenly spread.
 KEPT, FITTED = 4000, 1000
-# Solved anew when the pairs have grown by this factor; the maps' precision is looked for anew with it.
+# Growth of the number of pairs before the next solution, with a new search for the maps' precision.
 GROWTH = 1.15
-# Fewer orientations than this bend no map: the chain says it all.
+# Minimum number of orientations for a map: with fewer, the chain suffices.
 FEWEST_FOR_MAP = 30
 # An entry of a rotation matrix errs by this much of a small turn's 1-sigma about one axis: √(2/3).
 ENTRY_OF_TURN = 0.8165
@@ -35,12 +35,12 @@ ENTRY_OF_TURN = 0.8165
 
 @dataclass(frozen=True)
 class OrientationSolution:
-    """What was found for all orientations so far.
+    """Solution for all orientations so far.
 
     Attributes:
-        pairs: how many pairs had one.
+        pairs: number of pairs with an orientation.
         chain: the rigid chain.
-        map: 12 planes, of which those of e1, e2, e3 count; None where a map would be too large, or the pairs too few.
+        map: 12 planes, of which those of e1, e2, e3 count; None if a map would be too large, or the pairs too few.
         map_noise: 1-sigma of an orientation about one axis around the map [rad].
     """
 
@@ -54,8 +54,8 @@ class OrientationSolver:
     """Keeps the pairs that have an orientation, and solves for them.
 
     Args:
-        bases: what is learnt in.
-        with_map: whether a map of these bases is small enough to be solved for.
+        bases: bases of the learnt maps.
+        with_map: True if a map of these bases is small enough to be solved for.
     """
 
     def __init__(self, bases: tuple[JointBasis, ...], *, with_map: bool) -> None:
@@ -66,11 +66,11 @@ class OrientationSolver:
 
     @property
     def due(self) -> bool:
-        """Whether there are enough new orientations to solve anew."""
+        """True if there are enough new orientations for another solution."""
         return self._pairs > 0 and self._pairs >= GROWTH * self._solved_at
 
     def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray) -> None:
-        """More pairs q (n, d), x (n, 3) and quaternions (n, 4), NaN where a pair has none."""
+        """Add pairs q (n, d), x (n, 3) and quaternions (n, 4), NaN where a pair has none."""
         told = np.isfinite(turns).all(axis=1)
         self._pairs += int(told.sum())
         self._q, self._x = np.vstack([self._q, q[told]]), np.vstack([self._x, x[told]])
@@ -80,7 +80,7 @@ class OrientationSolver:
         self._q, self._x, self._turns = self._q[-KEPT:], self._x[-KEPT:], self._turns[-KEPT:]
 
     def solve(self, belief: ChainBelief) -> OrientationSolution:
-        """The solution around what is believed of the chain; there has to be an orientation."""
+        """Return the solution around the posterior of the chain; at least one orientation is required."""
         self._solved_at = self._pairs
         chosen = np.linspace(0, len(self._q) - 1, min(len(self._q), FITTED)).round().astype(np.intp)
         chain = fitted_orientation(belief, self._q[chosen], self._turns[chosen])
@@ -97,13 +97,13 @@ class OrientationSolver:
         self._exact.rebase(prior)
         try:
             solution = self._exact.solve(self._precision(prior))
-        except SettingError:  # lost in rounding: the chain goes on answering
+        except SettingError:  # lost in rounding: the chain keeps answering
             return OrientationSolution(self._pairs, chain)
         noise = (solution.orientation_noise_std or 0.0) / ENTRY_OF_TURN
         return OrientationSolution(self._pairs, chain, solution.map, noise if math.isfinite(noise) else 0.0)
 
     def _precision(self, prior: KBMap) -> float:
-        """What left-out blocks speak for, asked of the axis e1: neighbours on a path share their errors."""
+        """Return the precision chosen by left-out blocks, for the axis e1: neighbours on a path share their errors."""
         axis = KBMap(prior.bases, prior.net[3:6])
         rotations = rotation_matrices("turns", self._turns)
         return blockwise_precision(axis, self._q, rotations[:, :, 0])

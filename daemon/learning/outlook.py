@@ -1,4 +1,4 @@
-"""Whether there is enough data: what further pairs would still gain, and which motion would gain most."""
+"""Data outlook: the expected gain of further pairs, and the motion that gains most."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ from .nominal import NominalModel
 from .snapshot import MEAN_OVER_RMS
 
 FURTHER = (100, 300)
-# Poses of a motion, and those that stand for where the arm is used. More would make the figures no steadier than the
-# belief is.
+# Number of poses of a motion, and of the region where the arm is used. More would not make the figures steadier than
+# the posterior is.
 POSES = 100
-# A motion that gains so little more than going on as so far is not worth a word.
+# A motion that gains this little more than continuing as so far is not reported.
 WORTH = 0.05
-# A gain below this share of the noise of a single measurement is one that nobody notices.
+# A gain below this share of the noise of a single measurement is not noticeable.
 NOTICED = 0.1
-# Noise below this is none that a camera has; there has to be some [m].
+# Lower bound of the noise [m]: no camera is better, and the formulas need a positive value.
 LEAST_NOISE_M = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """What the learner knows of the chain at one moment.
+    """Evidence for a data outlook at one moment.
 
     Attributes:
-        nominal: where learning started.
-        belief: what the pairs with the present tool let believe of the chain.
-        wide: the same, were it not for how well it seems to be made.
-        tolerances: how far from the nominal chain it was believed to be at first.
-        claim: of the model that answers.
-        solved: whether that is a solution, of whose error the belief tells.
-        pairs: how many pairs with the present tool were learnt.
-        region: poses (m, d) [rad, m] that stand for where the data is.
+        nominal: the nominal model.
+        belief: posterior of the chain from the pairs with the current tool.
+        wide: the same without the selection of narrower tolerances.
+        tolerances: those of the first prior.
+        claim: uncertainty of the answering model.
+        solved: True if that model is a solution, whose error the belief describes.
+        pairs: number of learnt pairs with the current tool.
+        region: poses (m, d) [rad, m] that represent the data's region.
         seen: poses (n, d) [rad, m] of some of them, evenly spread.
         q, x: the newest that the solver knows, (m, d) [rad, m] and (m, 3) [m].
     """
@@ -62,12 +62,12 @@ class Known:
 
 @dataclass(frozen=True)
 class Scatter:
-    """How the newest pairs lie around the most probable chain.
+    """Scatter of the newest pairs around the most probable chain.
 
     Attributes:
-        noise_m: 1-sigma of a measured coordinate [m], what no chain explains included.
-        outliers: pairs that are too far away for this noise.
-        shared: so many neighbours on the path tell as much as one pair.
+        noise_m: 1-sigma of a measured coordinate [m], including errors that no chain explains.
+        outliers: number of pairs too far away for this noise.
+        shared: number of neighbours on the path that carry as much information as one pair.
     """
 
     noise_m: float
@@ -76,11 +76,11 @@ class Scatter:
 
     @classmethod
     def of(cls, known: Known) -> Scatter:
-        """That of the newest pairs."""
+        """Return the scatter of the newest pairs."""
         predicted, variance = known.belief.predict_with_variance(known.q)
         missed = known.x - predicted
         distances = np.linalg.norm(missed, axis=1)
-        # What the fit takes from the residuals is what it is still unsure of at the same places.
+        # The part of the residuals that the fit absorbs equals its uncertainty at the same places.
         noise = math.hypot(MEDIAN_TO_SIGMA * float(np.median(distances)), math.sqrt(float(np.median(variance))))
         noise = max(noise, LEAST_NOISE_M)
         inliers = distances <= OUTLIER_SIGMAS * noise
@@ -88,11 +88,13 @@ class Scatter:
 
 
 def foreseen(known: Known, scatter: Scatter, joints: tuple[str, ...]) -> Outlook:
-    """What further pairs would gain where the arm has been, of a solution that answers.
+    """Return the expected gain of further pairs where the arm has been, for an answering solution.
 
-    The error now is the one that is claimed for predictions there. The forecast says by which factor it falls.
+    The current error is the predicted one there. The forecast gives the factor by which it falls.
 
     Args:
+        known: the evidence of the learner.
+        scatter: of the newest pairs.
         joints: their names.
     """
     rng = np.random.default_rng(0)  # the same pairs have the same outlook
@@ -124,7 +126,7 @@ def foreseen(known: Known, scatter: Scatter, joints: tuple[str, ...]) -> Outlook
 
 
 def _mean_error_m(claim: Claim, q: FloatArray) -> float:
-    """Mean distance to the truth [m] that is claimed at q (n, d) [rad]."""
+    """Return the expected mean distance to the truth [m] at q (n, d) [rad]."""
     return MEAN_OVER_RMS * float(np.sqrt(claim.variance(q).sum(axis=1)).mean())
 
 

@@ -1,4 +1,4 @@
-"""Prequential errors: every pair is predicted before it is learnt, which says how well a model does."""
+"""Prequential errors: every pair is predicted before it is learnt, which measures a model's accuracy."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from bodyschema.interfaces.records import FloatArray
 
 # Weight of the error one pair back: the memory is about 50 pairs long.
 DISCOUNT = 0.98
-# Below this many pairs the expectation from before the data counts.
+# Below this many pairs the prior expectation counts too.
 WARM = 10.0
 
 
@@ -20,10 +20,10 @@ class ErrorMemory(msgspec.Struct):
 
     Attributes:
         expected_m: RMS distance expected before there were errors [m].
-        weight: how many errors count.
+        weight: effective number of errors.
         square: sums of their squares per axis [m²].
         noise: sums of the measurements' variances per axis [m²].
-        ratio: sum of their squares over what was claimed.
+        ratio: sum of their squares over the predicted ones.
         discount: weight of the error one pair back.
     """
 
@@ -35,12 +35,12 @@ class ErrorMemory(msgspec.Struct):
     ratio: float = 0.0
 
     def add(self, errors: FloatArray, variances: FloatArray, ratios: FloatArray | float = 1.0) -> None:
-        """More errors, in their order.
+        """Add errors, in their order.
 
         Args:
             errors: prediction against measurement (n, 3) [m].
             variances: the measurements', per axis (n, 3), or (3,) of all [m²].
-            ratios: the errors' squares over what was claimed for prediction and measurement together (n,), or of all.
+            ratios: the errors' squares over the predicted squares of prediction and measurement (n,), or of all.
         """
         count = len(errors)
         kept, faded = self.discount**count, self.discount ** np.arange(count - 1.0, -1.0, -1.0)
@@ -52,13 +52,13 @@ class ErrorMemory(msgspec.Struct):
 
     @property
     def rms_m(self) -> float:
-        """RMS distance between prediction and measurement [m], leaning on what was expected while errors are few."""
+        """RMS distance between prediction and measurement [m], shrunk to the expected one while errors are few."""
         missing = max(WARM - self.weight, 0.0)
         return math.sqrt((sum(self.square) + missing * self.expected_m**2) / max(self.weight, WARM))
 
     @property
     def sigma(self) -> FloatArray:
-        """1-sigma per axis of the prediction against the truth (3,) [m]: the measurement's noise is taken out."""
+        """Uncertainty of the prediction against the truth, 1-sigma per axis (3,) [m]; noise is subtracted."""
         missing = max(WARM - self.weight, 0.0)
         square = (np.array(self.square) + missing * self.expected_m**2 / 3.0) / max(self.weight, WARM)
         noise = self.noise_variance
@@ -71,13 +71,13 @@ class ErrorMemory(msgspec.Struct):
 
     @property
     def surprise(self) -> float:
-        """How many times larger than claimed the errors were, at least 1."""
+        """Ratio of the errors to the predicted ones, at least 1."""
         missing = max(WARM - self.weight, 0.0)
         return math.sqrt(max((self.ratio + missing) / max(self.weight, WARM), 1.0))
 
 
 def _resolution(samples: float) -> float:
-    """Relative standard deviation of a variance that was estimated from so many samples."""
+    """Return the relative standard deviation of a variance that was estimated from this many samples."""
     return math.sqrt(2.0 / max(samples, 2.0))
 
 

@@ -1,4 +1,4 @@
-"""What queries are answered from: a model that later learning does not touch."""
+"""Snapshot of a model that answers queries; later learning does not change it."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from .orientation import OrientationModel
 from .solver import LARGEST_NET
 from .unknowns import unexplained
 
-# Beyond this share of the prior's variance left open, joint angles do not lie where data was.
+# With a larger share of the prior's variance remaining, joint angles are not in the data's support.
 IN_SUPPORT = 0.25
 # Mean length of a Gaussian error over its RMS length, three equal axes: sqrt(8 / π) / sqrt(3).
 MEAN_OVER_RMS = 0.9213
 
 
 class NoFrameError(RequestError):
-    """There is no model yet: the frame that positions would be given in is not known."""
+    """There is no model yet: the frame of the positions is not known."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class Prediction:
     Attributes:
         x: positions in the measurement frame (n, 3) [m].
         sigma: their 1-sigma per axis (n, 3) [m].
-        in_support: whether each row lies where data was (n,).
-        R: orientations in the measurement frame, quaternions x, y, z, w (n, 4); None where none are learnt.
+        in_support: True for each row near data (n,).
+        R: orientations in the measurement frame, quaternions x, y, z, w (n, 4); None if none are learnt.
         sigma_R: their 1-sigma about each axis of the measurement frame (n, 3) [rad]; None likewise.
     """
 
@@ -49,18 +49,18 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The model that answers, at one moment.
+    """Answering model at one moment.
 
     Attributes:
-        answering: which one it is.
+        answering: its name.
         model: None while the frame is not known.
-        map: the best of the models that are KB-Maps, for whoever wants a file; mostly the same one.
-        claim: what is claimed of its error.
-        support: where data with the present tool was; None before any.
-        pairs: how many pairs it had learnt.
-        newest_utc: when the last of them was stored, ISO 8601; None before any since the learner started.
+        map: the best of the models that are KB-Maps, for export to a file; mostly the same one.
+        claim: its predictive uncertainty.
+        support: support of the data with the current tool; None without data.
+        pairs: number of pairs it had learnt.
+        newest_utc: storage time of the last of them, ISO 8601; None before any since the learner started.
         waiting_for: what is missing while there is no model.
-        orientation: the model of how the marker is turned; None where nothing was learnt of it.
+        orientation: the model of the marker's orientation; None if none was learnt.
     """
 
     answering: str
@@ -79,20 +79,20 @@ class Snapshot:
         return self.model.digest if self.model is not None else ""
 
     def require_model(self) -> LearntModel:
-        """The model; NoFrameError when there is none yet."""
+        """Return the model. Raises NoFrameError: there is none yet."""
         if self.model is None:
             raise NoFrameError(self.waiting_for)
         return self.model
 
     def require_map(self) -> KBMap:
-        """The best KB-Map, with the planes of e1, e2, e3 where they are learnt; NoFrameError when there is none yet."""
+        """Return the best KB-Map, with the planes of e1, e2, e3 if learnt. Raises NoFrameError: there is none yet."""
         if self.map is None:
             raise NoFrameError(self.waiting_for)
         turned = self.orientation
         return self.map if turned is None or self.map.size > LARGEST_NET else turned.planes(self.map)
 
     def predict(self, q: FloatArray) -> Prediction:
-        """Predictions for joint angles q (n, d) [rad].
+        """Return predictions for joint angles q (n, d) [rad].
 
         Raises:
             NoFrameError: there is no model.
@@ -108,6 +108,6 @@ class Snapshot:
         return Prediction(x, sigma, in_support, quaternions(rotations), np.sqrt(variance))
 
     def expected_error_m(self, q: FloatArray) -> float:
-        """Mean distance to the truth [m] that the sigmas of predictions at q (n, d) [rad] claim."""
+        """Return the expected mean distance to the truth [m], from the sigmas of predictions at q (n, d) [rad]."""
         variance = np.square(self.predict(q).sigma).sum(axis=1)
         return MEAN_OVER_RMS * float(np.sqrt(variance).mean())

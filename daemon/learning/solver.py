@@ -1,4 +1,4 @@
-"""What is solved for all pairs at once: the rigid chain, the map around it, and the chain with what it errs by."""
+"""Batch solver of all pairs at once: the rigid chain, the map around it, and the chain with residual."""
 
 from __future__ import annotations
 
@@ -36,37 +36,36 @@ log = logging.getLogger(__name__)
 
 # Memory and time grow with the square and the cube of the control points: 3^7 take 77 MB and 0.2 s.
 LARGEST_NET = 2187
-# So many of the newest pairs bend the exact map: with more, time and memory would grow without end, and what older ones
-# say of the arm as a chain is kept. Measured where a chain misses 10 mm (docs/learner.md).
+# Number of the newest pairs that the exact map is fitted to, which bounds time and memory; the chain keeps the
+# information of older ones. Measured where a chain misses 10 mm (docs/learner.md).
 WINDOW = 20_000
-# The prior's precision is looked for anew when the pairs have grown by this factor.
+# Growth of the number of pairs before the next search for the prior's precision.
 RETUNE = 1.25
-# So many of the newest pairs are kept for what needs the pairs themselves; what the older ones say of the chain is
-# folded into what is believed before them, so many at a time.
+# Number of the newest pairs kept as pairs; the information of older ones about the chain is folded into its prior, this
+# many at a time.
 KEPT, FOLDED = 4000, 2000
-# Of so many pairs, evenly spread, a chain is fitted.
+# Number of pairs that a chain is fitted to, evenly spread.
 FITTED = 2000
-# The chain with residual takes longest, up to a second: it is solved anew when the pairs have grown by this factor.
+# The chain with residual takes longest, up to a second: it waits for this growth of the number of pairs.
 RESIDUAL_GROWTH = 1.15
-# With so many times the pairs of the last solution, this share of them is solved for first, if it is so many.
+# With this growth of the number of pairs, this share of them is solved for first, if it is at least this many.
 FIRST_GROWTH, FIRST_SHARE, FEWEST_FIRST = 1.5, 0.75, 5
-# From so many neighbours on that count as one, their errors are no chance.
+# Minimum number of neighbours counting as one at which their correlation is not chance.
 SHARED = 1.5
 
 
 @dataclass(frozen=True)
 class Task:
-    """What is to be solved.
+    """Task of a solver.
 
     Attributes:
-        number: tells it from other tasks.
-        prior: the map to start from; its bases are what is learnt in.
-        belief: what is believed of the chain before the first pair of this task.
-        residual: what is known of the arm beyond that; None: nothing.
-        prior_stays: whether the exact map holds to `prior`, and not to the rigid chain: it stands for pairs that are
-            no longer kept.
-        tolerances: those that `belief` began with, where the pairs may say that the arm is made better; None: it may
-            not be.
+        number: identifies it.
+        prior: the map to start from, in the bases of the learnt maps.
+        belief: prior of the chain before the first pair of this task.
+        residual: prior of the arm beyond that; None without any.
+        prior_stays: True if the exact map keeps to `prior`, not to the rigid chain: it stands for pairs that are no
+            longer kept.
+        tolerances: those of `belief`, if the pairs may select narrower ones; None: they may not.
     """
 
     number: int
@@ -79,18 +78,18 @@ class Task:
 
 @dataclass(frozen=True)
 class Solved:
-    """What a solver found for one model.
+    """Solution for one model.
 
     Attributes:
         task: number of the task it belongs to.
-        pairs: how many pairs it is the solution of.
-        name: the model; empty when these pairs have no solution.
-        model: None when these pairs have no solution.
-        belief: what is believed of the arm now; None where that is as before.
-        last: whether this is all that one `solve` gives.
-        wide: of a rigid chain, what would be believed of it were it not for how well it seems to be made; what other
-            pairs are added to.
-        orientation: what was found for the orientations; None: nothing new.
+        pairs: number of pairs of the solution.
+        name: the model; empty if these pairs have no solution.
+        model: None if these pairs have no solution.
+        belief: new posterior of the arm; None if unchanged.
+        last: True if this is the last result of one `solve`.
+        wide: of a rigid chain, its posterior without the selection of narrower tolerances, the one to update with other
+            pairs.
+        orientation: solution for the orientations; None: nothing new.
     """
 
     task: int
@@ -111,19 +110,21 @@ class Solver(Protocol):
         ...
 
     def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None) -> None:
-        """More pairs, q (n, d) [rad] and x (n, 3) [m].
+        """Add pairs, q (n, d) [rad] and x (n, 3) [m].
 
         Args:
+            q: joint values.
+            x: positions.
             turns: their orientations, quaternions (n, 4), NaN where a pair has none; None where no pair has any.
         """
         ...
 
     def solve(self) -> None:
-        """Ask for the solutions of all pairs so far; `poll` gives them one by one, perhaps later."""
+        """Request the solutions of all pairs so far; `poll` returns them one by one, perhaps later."""
         ...
 
     def poll(self) -> Solved | None:
-        """The next answer to a `solve`, without waiting."""
+        """Return the next answer to a `solve`, without waiting."""
         ...
 
 
@@ -155,7 +156,7 @@ class DirectSolver:
         self._q, self._x = np.empty((0, task.prior.joints)), np.empty((0, 3))
 
     def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None) -> None:
-        """More pairs, q (n, d) [rad], x (n, 3) [m] and orientations (n, 4), NaN where a pair has none."""
+        """Add pairs, q (n, d) [rad], x (n, 3) [m] and orientations (n, 4), NaN where a pair has none."""
         if self._orientations is not None and turns is not None:
             self._orientations.learn(q, x, turns)
         if self._exact is not None:
@@ -173,11 +174,11 @@ class DirectSolver:
         self._solved += self.solutions()
 
     def poll(self) -> Solved | None:
-        """The next answer to the last `solve`."""
+        """Return the next answer to the last `solve`."""
         return self._solved.pop(0) if self._solved else None
 
     def solutions(self) -> Iterator[Solved]:
-        """Each model's solution as it is found, the rigid chain first: it is the quickest."""
+        """Yield each model's solution as it is found, the rigid chain first: it is the quickest."""
         task = self._started
         if self._pairs >= FIRST_GROWTH * self._solved_at:
             yield from self._solved_of_some(task)
@@ -203,7 +204,7 @@ class DirectSolver:
             yield Solved(task.number, self._pairs, orientation=turns.solve(rigid.belief))
 
     def _solved_of_some(self, task: Task) -> Iterator[Solved]:
-        """The chain of the first pairs only: the others can judge it, even if none come after them."""
+        """Yield the chain of the first pairs only: the others can judge it, even if none come after them."""
         some = int(len(self._q) * FIRST_SHARE)
         if some >= FEWEST_FIRST:
             wide = fitted_belief(self._before, self._q[:some], self._x[:some])
@@ -211,16 +212,16 @@ class DirectSolver:
             yield replace(_solved_chain(task, pairs, wide, _ways_made(wide, task)), last=False)
 
     def _solve_exact(self, task: Task, learner: ExactLearner, *, last: bool) -> Solved:
-        """Least squares around the rigid chain.
+        """Solve least squares around the rigid chain.
 
-        The evidence finds the prior's precision where pairs are apart. On a guided path neighbours share their
-        errors, and it would take those for shape: there, left-out blocks speak.
+        The evidence finds the prior's precision if pairs are apart. On a guided path, neighbours share their errors,
+        which the evidence would take for shape: there, left-out blocks choose it.
         """
         retune = self._precision is None or learner.pairs >= RETUNE * self._tuned_at
         try:
             solution = learner.solve(self._sought_precision(learner.prior) if retune else self._precision)
         except SettingError:
-            # The precision was lost in rounding: without a solution the others go on answering.
+            # The precision was lost in rounding: without a solution, the other models keep answering.
             self._precision = None
             return Solved(task.number, learner.pairs, last=last)
         if retune:
@@ -238,14 +239,14 @@ class DirectSolver:
 
     @property
     def _before(self) -> ChainBelief:
-        """What is believed of the chain before the pairs that are kept."""
+        """Posterior of the chain before the kept pairs."""
         if self._folded is None:
             raise RuntimeError("start a task first")
         return self._folded
 
     @property
     def _residual_before(self) -> ChainBelief | ResidualModel:
-        """What is believed of the arm before the pairs that are kept."""
+        """Posterior of the arm before the kept pairs."""
         if self._folded_residual is None:
             raise RuntimeError("start a task first")
         return self._folded_residual
@@ -261,14 +262,14 @@ def _solved_chain(task: Task, pairs: int, wide: ChainBelief, made: Sequence[Made
 
 
 def _as_made(belief: ChainBelief, task: Task, made: Sequence[Made]) -> ChainBelief:
-    """What is believed of a chain that may be made in these ways; as it is where nobody knows any."""
+    """Return the posterior of a chain averaged over these tolerances; unchanged if there are none."""
     return belief if task.tolerances is None or not made else best_made(belief, task.tolerances, made)
 
 
 def fitted_belief(prior: ChainBelief, q: FloatArray, x: FloatArray) -> ChainBelief:
-    """What is believed of a chain after pairs q (n, d) [rad] and x (n, 3) [m] along a path.
+    """Return the posterior of a chain after pairs q (n, d) [rad] and x (n, 3) [m] along a path.
 
-    Neighbours share part of their errors. So many pairs count as one as do so.
+    Neighbours share part of their errors; as many as share them count as one.
     """
     q, x = _spread(q, x)
     learner = RigidLearner(prior.parameters.reference, ChainTolerances(), prior)
@@ -283,9 +284,9 @@ def fitted_belief(prior: ChainBelief, q: FloatArray, x: FloatArray) -> ChainBeli
 
 
 def fitted_residual(prior: ChainBelief | ResidualModel, q: FloatArray, x: FloatArray) -> ResidualModel | None:
-    """What is believed of an arm that is no rigid chain after pairs q (n, d) [rad] and x (n, 3) [m] along a path.
+    """Return the posterior of a non-rigid arm after pairs q (n, d) [rad] and x (n, 3) [m] along a path.
 
-    None where it was lost in rounding: the other models go on answering.
+    None if it was lost in rounding: the other models keep answering.
     """
     q, x = _spread(q, x)
     parameters = prior.parameters if isinstance(prior, ChainBelief) else prior.features.parameters
@@ -299,6 +300,6 @@ def fitted_residual(prior: ChainBelief | ResidualModel, q: FloatArray, x: FloatA
 
 
 def _spread(q: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """At most `FITTED` of the pairs, evenly spread."""
+    """Return at most `FITTED` of the pairs, evenly spread."""
     chosen = np.linspace(0, len(q) - 1, min(len(q), FITTED)).round().astype(np.intp)
     return q[chosen], x[chosen]

@@ -1,4 +1,4 @@
-"""The learner's state as plain values and arrays: what a checkpoint holds."""
+"""State of the learner as plain values and arrays: the contents of a checkpoint."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from .claims import ClaimsState
 from .members import PRIOR
 from .orientation import OrientationState
 
-# Names of the arrays of the state before a change begin with this.
+# Prefix of the arrays of the state before a change.
 BEFORE = "before/"
-# Names of stored nets begin with this.
+# Prefix of stored nets.
 NET = "net_"
 
 
@@ -28,14 +28,14 @@ class StateError(BodyschemaError):
 
 
 class Counters(msgspec.Struct, kw_only=True):
-    """Everything that is counted. `pairs` are learnt online, each once; `last_seq` is the newest of them.
+    """All counters. `pairs` are learnt online, each once; `last_seq` is the newest of them.
 
     Attributes:
         store: identity of the store the pairs came from.
         since_change: pairs since the last change, or since the beginning.
-        changes: changes of the tool, or of something else, that were told or found.
+        changes: changes of the tool, or of another part, that were reported or detected.
         doubted: pairs that looked like gross outliers.
-        missed: pairs that the sampler no longer kept when they were asked for.
+        missed: pairs that the sampler no longer kept when they were requested.
     """
 
     store: str | None = None
@@ -51,23 +51,24 @@ class Counters(msgspec.Struct, kw_only=True):
 
 
 class LearningHeader(msgspec.Struct, kw_only=True):
-    """The part of the state that is not arrays. What has a default belongs to an era.
+    """Part of the state without arrays. Fields with a default belong to a regime.
 
     Attributes:
         fingerprint: of the nominal model and the tolerances it started from.
-        claims: what is known of each model's errors.
-        kept_of: how many pairs there were since the prior; the newest of them are kept.
-        next_fit: pairs at which what is not known, or the tool after a change, is fitted again; None when nothing is.
-        first_fit: whether that is the first one.
+        claims: uncertainties and errors of the models.
+        kept_of: number of pairs since the prior; the newest of them are kept.
+        next_fit: number of pairs at which an unknown frame, or the tool after a change, is fitted again; None for
+            never.
+        first_fit: True if that is the first one.
         answering: the model that answers.
-        doubted_in_a_row: length of the present run of doubted pairs.
-        replays_due: replay steps that are still owed.
-        replay_position: how far they are: epochs begun, pairs of the present one, and how many of these were replayed.
-        belief: what was believed of the chain before the first of these pairs, as bytes; None before the alignment.
-        residual: what was known of the arm beyond that, as bytes; None if nothing was.
-        orientation: what is known of how the marker is turned; None in a checkpoint of an older version.
-        change: the last change; None where there was none.
-        before: the state before it, for rollback; None where there is none. Its arrays' names begin with `BEFORE`.
+        doubted_in_a_row: number of consecutive outliers up to now.
+        replays_due: replay steps that are still due.
+        replay_position: their position: epochs begun, pairs of the current one, and the number of these replayed.
+        belief: prior of the chain before the first of these pairs, as bytes; None before the alignment.
+        residual: prior of the arm beyond that, as bytes; None without any.
+        orientation: state of the orientation models; None in a checkpoint of an older version.
+        change: the last change; None if there was none.
+        before: the state before it, for rollback; None if there is none. Its arrays' names begin with `BEFORE`.
     """
 
     fingerprint: str
@@ -91,10 +92,10 @@ class LearningHeader(msgspec.Struct, kw_only=True):
 
 @dataclass(frozen=True)
 class LearningState:
-    """A learner's state.
+    """State of a learner.
 
-    `arrays` are the nets by model, the kept pairs, those doubted in a row, what the claims need, and what a tool is
-    fitted to.
+    `arrays` are the nets by model, the kept pairs, the consecutive outliers, the arrays of the uncertainties, and the
+    inputs of a tool fit.
     """
 
     header: LearningHeader
@@ -102,21 +103,21 @@ class LearningState:
 
     @property
     def before(self) -> LearningState | None:
-        """The state before the last change; None where there is none."""
+        """State before the last change; None if there is none."""
         if self.header.before is None:
             return None
         arrays = {name.removeprefix(BEFORE): each for name, each in self.arrays.items() if name.startswith(BEFORE)}
         return LearningState(self.header.before, arrays)
 
     def with_before(self, before: LearningState | None) -> LearningState:
-        """The same state that can be rolled back to another one."""
+        """Return the same state with another one to roll back to."""
         if before is None:
             return self
         header = msgspec.structs.replace(self.header, before=before.header)
         return LearningState(header, {**self.arrays, **{BEFORE + name: each for name, each in before.arrays.items()}})
 
     def poisoned(self) -> str | None:
-        """Return the name of a net, or of what the pairs were, that cannot be; None when all is well."""
+        """Return the name of a net, or of an array of pairs, with impossible values; None if all is well."""
         nets = dict.fromkeys((name for name in self.arrays if name.startswith(NET)), np.inf)
         limits = {**nets, "q": LARGEST_Q, "x": FARTHEST_M}
         for name, limit in limits.items():

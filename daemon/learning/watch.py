@@ -1,4 +1,4 @@
-"""Watching for a change: what the model of some time ago makes of the pairs that came since."""
+"""Change monitor: compares an earlier model's predictions with the pairs that came since."""
 
 from __future__ import annotations
 
@@ -18,36 +18,36 @@ from kbmaps.changes.white_noise import inverse_roots
 from .claims import Claim
 from .learnt import LearntModel
 
-# A model of fewer pairs says too little, and may be too far off to be held against others.
+# Minimum number of pairs of a reference model: with fewer it may be too far off.
 FEWEST_KNOWN = 100
-# A newer model takes the place of the present one after half as many pairs as it knows, within these limits: a change
-# that took longer to show would be a part of it.
+# A newer model replaces the reference after half as many pairs as it knows, within these limits. It would absorb a
+# change that took longer to show.
 SHORTEST_TRIAL, LONGEST_TRIAL = 50, 1000
-# Where no newer model comes, the older half of so many pairs is no longer held against the present one.
+# If no newer model comes, the older half of this many pairs is dropped.
 MOST_WATCHED = 5000
-# So many of the pairs that a model knows show its noise.
+# Number of the model's own pairs that show its noise.
 LOOKED_BACK = 1000
-# An alarm that a bent arm explains is looked at again when the pairs since the change have grown by this factor, or the
-# alarm's log odds by so much.
+# An alarm that a bent arm explains is evaluated again when the pairs since the change have grown by this factor, or the
+# alarm's log odds by this much.
 LOOK_AGAIN, GROWN_ODDS = 1.25, 4.0
-# A model is the chain alone where it is that near to it, over the noise of a pair.
+# A model counts as the chain alone if it is this near to it, over the noise of a pair.
 _ALONE = 0.1
-# No measurement is more exact, whatever it says [m].
+# Lower bound of a measurement's noise, whatever it claims [m].
 SMALLEST_M = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """A model that knows no pair of the watched ones, and what is believed with it.
+    """Model that knows none of the monitored pairs, with its posterior.
 
     Attributes:
-        model: what answered.
-        map: the best that was a map.
-        belief: what was believed of the chain.
-        wide: the same, were it not for how well the arm seems to be made.
-        residual: what was known of the arm beyond that; None: nothing.
-        claim: what was claimed of the model.
-        known: how many pairs it knows.
+        model: the answering model.
+        map: the best KB-Map.
+        belief: posterior of the chain.
+        wide: the same without the selection of narrower tolerances.
+        residual: posterior of the arm beyond that; None without any.
+        claim: predictive uncertainty of the model.
+        known: number of pairs it knows.
         q, x: some of the last of these, in their order (n, d) [rad] and (n, 3) [m].
         variance: of these measurements, as claimed (3,) [m²].
     """
@@ -64,20 +64,21 @@ class Reference:
     variance: FloatArray
 
     def beyond_chain(self, q: FloatArray) -> FloatArray:
-        """Positions (n, 3) [m] of the model at q (n, d) [rad] minus those of the chain."""
+        """Return positions (n, 3) [m] of the model at q (n, d) [rad] minus those of the chain."""
         return self.model.predict(q) - self.belief.predict(q)
 
     def derivatives(self, q: FloatArray) -> FloatArray:
-        """Of the position by the joints' readings at q (n, d), shape (n, 3, d) [m/rad, or 1 for a sliding joint]."""
+        """Return derivatives of the position by the readings at q (n, d): (n, 3, d) [m/rad; 1 if prismatic]."""
         parameters = self.belief.parameters
         return parameters.linearised(self.belief.mean, q)[1][:, :, parameters.zeros]
 
     def covariances(self, q: FloatArray, white: FloatArray, claimed: FloatArray) -> FloatArray:
-        """Of errors at q (n, d) but for the chain's numbers (n, 3, 3) [m²].
+        """Return covariances of errors at q (n, d), without the chain's parameters (n, 3, 3) [m²].
 
-        What seemed to be missed by the model is noise as far as that is more than was claimed.
+        Noise beyond the claimed one explains part of the model's apparent discrepancy, which is reduced accordingly.
 
         Args:
+            q: joint values (n, d).
             white: of the noise (n, 3, 3).
             claimed: of the measurements (n, 3, 3).
         """
@@ -86,7 +87,12 @@ class Reference:
         return white + np.eye(3) * np.maximum(missed, SMALLEST_M**2)[:, None, :]
 
     def noise(self, covariances: FloatArray, white: FloatArray) -> SharedNoise:
-        """Of its whitened errors, as the pairs show it that it knows; their covariances and noise (n, 3, 3) [m²]."""
+        """Return the noise of the reference's whitened errors at pairs that it knows.
+
+        Args:
+            covariances: of these errors (n, 3, 3) [m²].
+            white: of the noise (n, 3, 3) [m²].
+        """
         errors = np.matvec(inverse_roots(covariances), self.x - self.model.predict(self.q))
         used = (4 * self.q.shape[1] + 3) * len(self.q) / self.known
         share = 1.0 - float((_traces(white) / _traces(covariances)).mean())
@@ -95,18 +101,18 @@ class Reference:
 
 @dataclass(frozen=True, eq=False)
 class Noticed:
-    """A change, as it was noticed.
+    """Detected change.
 
     Attributes:
         reference: the model before it.
-        kinds: what may have changed.
+        kinds: the possible kinds.
         noise_m: 1-sigma of a coordinate of one measurement around the model [m].
-        shared: how many neighbours say as much as one would.
-        first: the most probable first pair since the change, of those watched.
-        earliest, latest: between which it is, with 95 % probability.
-        seqs: sequence numbers of the watched pairs (n,).
-        kept: which of them (n,) were learnt, and not doubted.
-        q, x: the watched pairs, (n, d) [rad] and (n, 3) [m].
+        shared: number of neighbours that carry as much information as one independent pair.
+        first: the most probable first pair since the change, of those monitored.
+        earliest, latest: its 95 % interval.
+        seqs: sequence numbers of the monitored pairs (n,).
+        kept: True for each of them (n,) that was learnt, not an outlier.
+        q, x: the monitored pairs, (n, d) [rad] and (n, 3) [m].
         turns: their orientations, quaternions (n, 4), NaN where a pair has none.
     """
 
@@ -136,12 +142,12 @@ class _Watched:
 
 @dataclass(frozen=True, eq=False)
 class _Shown:
-    """How far pairs lay from models that did not know them.
+    """Distances of pairs from models that did not know them.
 
     Attributes:
-        q: where (n, d) [rad].
+        q: configurations (n, d) [rad].
         claimed: covariances of the measurements (n, 3, 3) [m²].
-        off: each against what was expected after the pairs before it (n, 3) [m], but for what was not known.
+        off: each against the prediction from the pairs before it (n, 3) [m], without the model's own uncertainty.
     """
 
     q: FloatArray
@@ -149,7 +155,7 @@ class _Shown:
     off: FloatArray
 
     def with_newer(self, other: _Shown) -> _Shown:
-        """The newest of both."""
+        """Return the newest of both."""
         return _Shown(
             *(
                 np.concatenate([getattr(self, name), getattr(other, name)])[-MOST_SURPRISES:]
@@ -159,10 +165,10 @@ class _Shown:
 
 
 class Watch:
-    """Holds the pairs since a reference against it, and renews the reference while nothing changes.
+    """Compares the pairs since a reference with it, and renews the reference while nothing changes.
 
-    How far pairs that a model does not know lie from it is seen from such pairs alone: fitted to its own ones, a chain
-    that is wrong looks right. So the first reference is tried out before it can raise an alarm.
+    The distance of unknown pairs from a model can only be measured on such pairs: on its own pairs, a wrong chain looks
+    right. So the first reference is tried out before it can raise an alarm.
     """
 
     def __init__(self) -> None:
@@ -180,45 +186,45 @@ class Watch:
 
     @property
     def ready(self) -> bool:
-        """Whether there is a model that pairs are held against, and it was tried out."""
+        """True if there is a reference that has been tried out."""
         return self._detector is not None and self._shown is not None
 
     @property
     def detector(self) -> ChangeDetector | None:
-        """What holds the pairs against the present reference; None before there is one."""
+        """Detector that compares the pairs with the current reference; None before there is one."""
         return self._detector
 
     @property
     def held(self) -> int:
-        """How many pairs are kept, at most `MOST_WATCHED` but for those since an alarm."""
+        """Number of kept pairs, at most `MOST_WATCHED` except for those since an alarm."""
         return len(self._pairs)
 
     @property
     def alarmed(self) -> bool:
-        """Whether there was a change: an arm that bends would not show the same without one."""
+        """True if there was a change that a bending arm would not explain."""
         return self._change is not None
 
     @property
     def wants_reference(self) -> bool:
-        """Whether the model that was solved for last can become the next reference."""
+        """True if the model solved last can become the next reference."""
         return self._next is None or self._next_at == self._asked_at
 
     def asked(self) -> None:
-        """The solver works on all pairs up to here."""
+        """Record that the solver works on all pairs so far."""
         if self._reference is None and self._next is None:
-            self._drop(len(self._pairs))  # what comes first after the model that is the first reference counts
+            self._drop(len(self._pairs))  # only pairs after the first reference model count
         self._asked_at = len(self._pairs)
 
     def offer(self, reference: Reference) -> None:
-        """A model of the pairs up to the last `asked`."""
+        """Offer a model of the pairs up to the last `asked`."""
         if reference.known < FEWEST_KNOWN or not self.wants_reference:
             return
         self._next, self._next_at = reference, self._asked_at
 
     def add(self, *pairs: Pair, kept: ArrayLike) -> None:
-        """One more pair or several, learnt or, not `kept` (n,), doubted."""
+        """Add one or several pairs, learnt or, if not `kept` (n,), outliers."""
         if self._reference is None:
-            self._renew()  # not with the offer: that comes at low priority, and this takes a while
+            self._renew()  # not in `offer`: that runs at low priority, and this takes a while
         if len(self._pairs) + len(pairs) > MOST_WATCHED and not self.alarmed:
             self._shorten()
         for pair, learnt in zip(pairs, np.broadcast_to(kept, len(pairs)).tolist(), strict=True):
@@ -239,7 +245,7 @@ class Watch:
             self._renew()
 
     def refute(self) -> None:
-        """What seemed to be a change is none, as far as the pairs tell so far."""
+        """Reject the suspected change, until the pairs give more evidence."""
         since = 0 if self._change is None else len(self._pairs) - self._change.onset
         self._change, self._look_at = None, len(self._pairs) + int((LOOK_AGAIN - 1.0) * since) + 1
         self._refuted_odds = self._odds
@@ -254,10 +260,10 @@ class Watch:
                 self.refute()
 
     def noticed(self, run: int = 0) -> Noticed | None:
-        """The change that the pairs show; None: they do not, or there is nothing to hold them against.
+        """Return the change that the pairs show; None if they show none, or there is no reference.
 
         Args:
-            run: so many of the last pairs have shown it in another way: it began there if not before.
+            run: number of the last pairs that have shown it in another way: it began there if not before.
         """
         reference, detector = self._reference, self._detector
         if reference is None or detector is None or not self.ready or not (self.alarmed or run):
@@ -283,24 +289,24 @@ class Watch:
         )
 
     def _show(self) -> None:
-        """The pairs have shown how far they lie from a model that does not know them."""
+        """Record the distances of the pairs from a model that does not know them."""
         if self._detector is None or self._reference is None:
             return
         surprises = self._detector.surprises
         pairs = self._pairs[-len(surprises) :]
         q, _, covariances = self._measured(self._reference, pairs)
-        # In metres: how pairs are weighted next is not how they were.
+        # In metres, because the next weighting of pairs may differ.
         off = np.matvec(np.linalg.inv(inverse_roots(covariances)), surprises)
         shown = _Shown(q, _stacked(pairs)[2], off)
         self._shown = shown if self._shown is None else self._shown.with_newer(shown)
 
     def _drop(self, count: int) -> None:
-        """So many of the first pairs are watched no longer; they still show the noise."""
+        """Stop monitoring the first `count` pairs; they still show the noise."""
         self._earlier.extend(self._pairs[:count])
         del self._pairs[:count]
 
     def _shorten(self) -> None:
-        """The older half of the pairs goes."""
+        """Drop the older half of the pairs."""
         gone = len(self._pairs) // 2
         self._drop(gone)
         self._asked_at, self._next_at = max(self._asked_at - gone, 0), max(self._next_at - gone, 0)
@@ -308,7 +314,7 @@ class Watch:
             self._hold(self._reference)
 
     def _renew(self) -> None:
-        """The next reference takes its place."""
+        """Replace the reference by the next one."""
         if self._next is not None:
             self._drop(self._next_at)
             self._asked_at, self._next_at = max(self._asked_at - self._next_at, 0), 0
@@ -316,7 +322,7 @@ class Watch:
             self._hold(self._reference)
 
     def _hold(self, reference: Reference) -> None:
-        """Hold all pairs against this reference, with the noise that was shown."""
+        """Compare all pairs with this reference, with the measured noise."""
         known = [each for each in (*self._earlier, *self._pairs) if each.kept][-LOOKED_BACK:]
         self._white = WhiteNoise.as_claimed(reference.q.shape[1])
         if known:
@@ -334,7 +340,7 @@ class Watch:
         distance_m = float(np.linalg.norm(reference.x, axis=1).mean())
         self._detector = ChangeDetector(reference.belief, noise, noise_m, distance_m)
         if float(np.square(reference.beyond_chain(q)).mean()) < (_ALONE * noise_m) ** 2:
-            # What else a model was taught of these pairs would hide how the arm bends.
+            # Terms that another model learnt from these pairs would hide the arm's bends.
             self._detector.recall(q, reference.x - reference.belief.predict(q), covariances)
         self._change, self._look_at = None, 0
         self._odds = self._refuted_odds = -math.inf
@@ -350,14 +356,14 @@ class Watch:
             self._detector.add(*self._measured(self._reference, pairs))
 
     def _measured(self, reference: Reference, pairs: Sequence[_Watched]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Joint values (n, d), errors (n, 3) [m] and the covariances of these (n, 3, 3) [m²]."""
+        """Return joint values (n, d), errors (n, 3) [m] and the covariances of these (n, 3, 3) [m²]."""
         q, x, claimed = _stacked(pairs)
         white = self._white.covariances(claimed, reference.derivatives(q))
         return q, x - reference.model.predict(q), reference.covariances(q, white, claimed)
 
 
 def _stacked(pairs: Sequence[_Watched]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Joint values (n, d), positions (n, 3) and their covariances (n, 3, 3) as claimed."""
+    """Return joint values (n, d), positions (n, 3) and their covariances (n, 3, 3) as claimed."""
     return (
         np.array([each.q for each in pairs]),
         np.array([each.x for each in pairs]),

@@ -1,4 +1,4 @@
-"""How well an arm is made, as its pairs tell."""
+"""Selection of an arm's tolerances by the evidence of its pairs."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.records import FloatArray
 from kbmaps import ChainBelief, ChainTolerances
 
-# Tilt of an axis [rad] and its shift [m], 1-sigma, from a milled arm to a kit.
+# Candidate tilts of an axis [rad] and shifts [m], 1-sigma, from a milled arm to a kit.
 WORKMANSHIP = ((0.0003, 0.0001), (0.001, 0.0005), (0.003, 0.001), (0.01, 0.003), (0.03, 0.01), (0.06, 0.03))
-# Workmanship that is less probable than this is not considered.
+# Less probable tolerances are not considered.
 LEAST_SHARE = 0.01
-# So many times as probable another way has to be before an arm is taken to be made worse.
+# Narrower tolerances are kept unless wider ones are more probable by more than the inverse of this.
 LIKELY = 1.0 / 3.0
 
 
 @dataclass(frozen=True)
 class Made:
-    """How an arm may be made, and how probable that is.
+    """Candidate tolerances of an arm, with their probability.
 
     Attributes:
-        tolerances: those that the nominal chain is drawn to.
-        share: the probability.
+        tolerances: of the nominal chain.
+        share: their probability.
     """
 
     tolerances: ChainTolerances
@@ -34,18 +34,18 @@ class Made:
 
 
 def workmanship(belief: ChainBelief, tolerances: ChainTolerances) -> list[Made]:
-    """How the arm may be made, from the evidence of its pairs (MacKay 1992, "Bayesian interpolation").
+    """Return the probable tolerances of the arm, from the evidence of its pairs.
 
-    The tolerances that learning begins with have room for an arm made by hand. Where the drawing is right to a
-    millimetre, the pairs say so long before they show it number by number. Well made may be the arm alone, with its
-    zeros, or with the cameras' place too; an infinite tolerance stays, nobody claims to know that.
+    MacKay 1992, "Bayesian interpolation". The initial tolerances allow for an arm made by hand. Where the nominal chain
+    is right to a millimetre, the pairs show it long before they determine each parameter. Narrow tolerances may apply
+    to the arm alone, with its joint offsets, or with the cameras' pose too; an infinite tolerance stays infinite.
 
     Args:
-        belief: what the pairs let believe of the chain.
-        tolerances: those that it began with.
+        belief: posterior of the chain.
+        tolerances: those of its prior.
 
     Returns:
-        The probable ways, the best workmanship last.
+        The probable candidates, the narrowest last.
     """
     candidates = [tolerances, *(each for made in reversed(WORKMANSHIP) for each in _narrower(tolerances, *made))]
     kept, shares = probable(np.array([belief.tightened(tolerances, each)[1] for each in candidates]))
@@ -54,7 +54,7 @@ def workmanship(belief: ChainBelief, tolerances: ChainTolerances) -> list[Made]:
 
 
 def probable(evidence: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
-    """Which of several explanations are probable at all, the most probable first, and their shares.
+    """Return the indices of the probable explanations, the most probable first, and their shares.
 
     Args:
         evidence: log marginal likelihood of each (m,) (MacKay 1992, "Bayesian interpolation").
@@ -66,15 +66,15 @@ def probable(evidence: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
 
 
 def best_made(belief: ChainBelief, tolerances: ChainTolerances, made: Sequence[Made]) -> ChainBelief:
-    """The chain that is nearest to its drawing without being improbable, as far as it may be another one.
+    """Return the chain nearest to nominal that is not improbable, with the uncertainty of all candidates.
 
-    What is claimed of it is that of all the ways in which it may be made. But where these explain the pairs alike, they
-    differ in places without pairs only: there the drawing says more than the noise does.
+    Its covariance covers all candidate tolerances. Where these explain the pairs equally well, they differ only away
+    from the pairs: there the nominal chain is more reliable than the noise.
 
     Args:
         belief: in an arm of the widest tolerances.
         tolerances: those.
-        made: the ways.
+        made: the candidates.
     """
     beliefs = [belief.tightened(tolerances, each.tolerances)[0] for each in made]
     likely = max(each.share for each in made)

@@ -1,1 +1,1 @@
-"""The check that a recording can be of this robot: its columns, frames, units and zeros."""
+"""Plausibility check of a recording against its robot: columns, frames, units and joint offsets."""

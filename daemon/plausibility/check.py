@@ -1,7 +1,7 @@
-"""The one check whether a recording can be of this robot, before anything is fitted that would be believed.
+"""Check that a recording can be of this robot, before any fit of it is trusted.
 
-A rigid chain with free links fits a recording with a flipped joint or a zero 90° off as well as the right one: its
-links are then nonsense. So the drawn links are kept, and the pose of the camera, the marker and the joint zeros are
+A rigid chain with free links fits a recording with a flipped joint or an offset of 90° as well as the right one: its
+links are then nonsense. So the links are kept at nominal. The pose of the camera, the marker and the joint offsets are
 fitted to many ways to read the columns.
 """
 
@@ -25,31 +25,32 @@ from kbmaps.chains.placement import place
 from .limits import KNOWN_TOOL_M, MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD, reach_m, spread_m
 from .reading import QUARTER, Reading
 
-# Rows that are read in other ways, evenly spread. Twice as many cost twice the time and change no verdict of the tests.
+# Number of rows to be read in other ways, evenly spread. Twice as many cost twice the time and change no verdict of the
+# tests.
 ROWS = 80
 # With fewer rows nothing is refused: a wrong reading may fit by chance.
 FEWEST_ROWS = 40
-# Readings of which the neighbours are tried, and how often: zeros of up to four joints a quarter turn off are found.
+# Width and depth of the search over readings: offsets of up to four joints by a quarter turn are found.
 WIDTH, DEPTH = 4, 5
-# Readings whose errors differ by less are one: zeros of the first and of the last joint make no difference.
+# Readings whose errors differ by less count as one: offsets of the first and of the last joint make no difference.
 SAME = 0.005
-# Shares of the positions' spread that a fit may leave to be the last: of the columns as they are, and read otherwise.
+# The search ends at a fit with these shares of the positions' spread: of the columns as they are, and read otherwise.
 ENOUGH_AS_IT_IS, ENOUGH = 0.03, 0.01
-# Another reading is named when the pairs fit so many times better, and mentioned from `AS_GOOD` times on. Arms with
-# tolerances of 0.5° and 1 mm, zeros off by 10° and noise of 10 mm stay below 1.15 with all wrong readings.
+# Another reading is reported if the pairs fit this many times better, and mentioned from `AS_GOOD` times on. Arms with
+# tolerances of 0.5° and 1 mm, offsets of 10° and noise of 10 mm stay below 1.15 with all wrong readings.
 MUCH_BETTER, AS_GOOD = 1.5, 1.15
-# ... and so much more probable [nats], each change of the reading costing some.
+# ... and if it is more probable by this much [nats], less a penalty for each change of the reading.
 CERTAIN, A_CHANGE = 10.0, 3.0
-# A fit that leaves so large a share of the positions' spread, and of the arm's reach, is of no arm like the drawn one.
+# A fit with residuals above these shares of the positions' spread and of the arm's reach is not of this arm.
 UNEXPLAINED, OF_REACH = 0.25, 0.02
-# ... and so many times the noise that is known.
+# ... and above this multiple of the known noise.
 NOISES = 5.0
-# A reading with one change is named where it leaves half of this share of the spread, with two a third, and so on.
-# Right readings of real arms leave up to 0.032, wrong ones down to 0.03 with four changes and 0.09 with two.
+# A reading with one change is reported if it leaves at most half of this share of the spread, with two a third, and so
+# on. Right readings of real arms leave up to 0.032, wrong ones down to 0.03 with four changes and 0.09 with two.
 NAMED = 0.12
-# A zero this far off is mentioned. Of 300 generated arms whose zeros are off by up to 10°, one is.
+# A joint offset above this is mentioned: that of one in 300 generated arms with offsets of up to 10°.
 FAR_ZERO_RAD = math.radians(20.0)
-# A camera is not turned by so much against a pose that is known.
+# A known camera pose is not off by this much.
 TURNED_RAD = math.radians(30.0)
 # Share of its tolerance that a zero is given which is to stay as drawn.
 HELD = 1e-3
@@ -60,20 +61,20 @@ LAST_ZERO_RAD = math.radians(3.0)
 NEARER = 5.0
 # So many other readings that fit as well are told.
 LISTED = 2
-# Distances below this share of the reach are no longer told apart.
+# Distances below this share of the reach are not distinguished.
 EXACT = 1e-5
 
 
 @dataclass(frozen=True, slots=True)
 class Plausibility:
-    """What a recording looks like.
+    """Result of the plausibility check.
 
     Attributes:
-        refusal: why it cannot be of this robot as it is, or None.
+        refusal: why the recording cannot be of this robot as it is, or None.
         remedy: what to do about that.
         misread: another reading of the columns was found that fits.
-        warnings: sentences about what may be wrong.
-        undirected: joints of which these pairs do not show which way they count.
+        warnings: sentences about possible problems.
+        undirected: joints whose sign these pairs do not determine.
     """
 
     refusal: str | None = None
@@ -84,15 +85,15 @@ class Plausibility:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """All that is wrong or may be."""
+        """All problems and warnings as sentences."""
         refused = () if self.refusal is None else (f"{self.refusal}. {self.remedy}",)
         return tuple(f"{text[0].upper()}{text[1:]}." for text in (*refused, *self.warnings))
 
     def require(self, file: Path | str, *, force: bool) -> tuple[str, ...]:
-        """What is left to say of a recording that is fitted.
+        """Return the warnings for a recording that is fitted.
 
         Args:
-            file: what the recording is of.
+            file: the recording's file.
             force: fit what would be refused.
 
         Raises:
@@ -105,7 +106,7 @@ class Plausibility:
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """How well a reading fits.
+    """Quality of a reading's fit.
 
     Attributes:
         error: RMS distance of the nearest pairs, in the recording's own unit.
@@ -123,7 +124,7 @@ class _Fit:
 
 
 def told_sigma(recording: Recording) -> float | None:
-    """1-sigma of a coordinate [m], where the recording has it."""
+    """Return the 1-sigma of a coordinate [m], if the recording has it."""
     if recording.cov is None:
         return None
     return float(np.sqrt(np.trace(recording.cov, axis1=1, axis2=2).mean() / 3.0))
@@ -137,11 +138,14 @@ def plausibility(
     chain: RigidChain | None = None,
     sigma_m: float | None = None,
 ) -> Plausibility:
-    """Check pairs q (n, d) [rad, m] and x (n, 3) [m] before a fit to them is believed.
+    """Check pairs q (n, d) [rad, m] and x (n, 3) [m] before a fit to them is trusted.
 
     Args:
-        chain: the nominal chain where it is another one than the robot's.
-        sigma_m: 1-sigma of a coordinate [m] where it is known.
+        robot: the robot's description.
+        q: joint values (n, d) [rad, m].
+        x: positions (n, 3) [m].
+        chain: the nominal chain if it is not the robot's.
+        sigma_m: 1-sigma of a coordinate [m] if known.
     """
     chain = chain or robot.chain
     reach, spread = reach_m(robot), spread_m(x)
@@ -196,11 +200,11 @@ def plausibility(
 
 
 def _hardly(before: str, after: str, nearest: str) -> Plausibility:
-    """Refuse a recording that no reading explains.
+    """Return the refusal of a recording that no reading explains.
 
     Args:
         before, after: distances of the pairs as they are, and in the nearest reading.
-        nearest: what that reading says of the recording; empty where it is the columns as they are.
+        nearest: that reading in words; empty if it is the columns as they are.
     """
     doubted = f". The nearest reading is that {nearest}, and it does not fit" if nearest else ""
     return Plausibility(
@@ -216,12 +220,12 @@ def _drawn_arm_misses(before: str) -> str:
 
 
 def _nameable(reading: Reading, fit: _Fit, spread: float) -> bool:
-    """Return True where a fit is so good that no wrong reading with as many changes has one like it."""
+    """Return True if a fit is better than that of any wrong reading with as many changes."""
     return fit.error < NAMED / (1 + reading.changes) * spread
 
 
 def _turned(chain: RigidChain, q: FloatArray, x: FloatArray, fit: _Fit) -> Plausibility | None:
-    """The measurement frame is turned against robot.toml, which says that it is known; None where it is not."""
+    """Return a refusal if the measurement frame is turned against a pose that robot.toml declares known; else None."""
     angle = float(Rotation.from_matrix(fit.rotation).magnitude())
     if angle < TURNED_RAD:
         return None
@@ -247,7 +251,7 @@ def _turned_last(names: tuple[str, ...], as_it_is: _Fit, reading: Reading, fit: 
 
 
 def _frame(rotation: FloatArray, mirrored: bool) -> str:
-    """The order and signs in which x, y, z are given, where they are those of the frame that robot.toml tells."""
+    """Return the order and signs in which x, y, z are given, if they are axes of the frame in robot.toml; else ""."""
     given = np.diag([-1.0 if mirrored else 1.0, 1.0, 1.0]) @ rotation
     which = np.abs(given).argmax(axis=1)
     along = np.abs(given).max(axis=1)
@@ -258,7 +262,7 @@ def _frame(rotation: FloatArray, mirrored: bool) -> str:
 
 
 class _Search:
-    """Readings of the same pairs and how well they fit."""
+    """Search over readings of the same pairs, with their fits."""
 
     def __init__(self, chain: RigidChain, q: FloatArray, x: FloatArray, exact_m: float, pose_known: bool) -> None:
         self._chain, self._q, self._x, self._exact_m, self._pose_known = chain, q, x, exact_m, pose_known
@@ -267,12 +271,12 @@ class _Search:
         self.fits: dict[Reading, _Fit] = {}
 
     def verdict(self) -> tuple[Reading, Reading, list[Reading]]:
-        """The columns as they are, the simplest reading that fits as well as any, and others nearly as simple."""
+        """Return the columns as they are, the simplest reading among the best, and others nearly as simple."""
         as_it_is = Reading.plain(self._chain.joints)
         slides: list[bool] = self._chain.prismatic.tolist()
         self._try([as_it_is, *as_it_is.neighbours(slides)])
         if self._best()[0] != as_it_is:
-            # With a marker far from its place, a fit of the right reading may have ended in a wrong place.
+            # With a marker far from nominal, the fit of the right reading may have ended in a local minimum.
             self._fit([as_it_is] * 6, tools=TOOL_M * np.concatenate([np.eye(3), -np.eye(3)]))
         expanded, spread = [as_it_is], spread_m(self._x)
         for depth in range(1, DEPTH):
@@ -304,7 +308,7 @@ class _Search:
         return as_it_is, good[0], others[:LISTED]
 
     def _aligned_tool(self) -> FloatArray:
-        """Where the marker is (1, 3) [m] when the zeros are as drawn: its fit starts from many places."""
+        """Return the marker's offset (1, 3) [m] with nominal joint offsets: its fit starts from many places."""
         try:
             return align(self._chain, self._q, self._x, pose_known=False, marker_known=False).marker_shift[None]
         except DegenerateDataError:
@@ -335,7 +339,7 @@ class _Search:
         return (best, fit) if clearly else None
 
     def undirected(self, names: tuple[str, ...]) -> tuple[str, ...]:
-        """Joints whose sign makes no difference."""
+        """Return the joints whose sign makes no difference."""
         plain = Reading.plain(len(names))
         fits = (
             (name, self.fits.get(reading))
@@ -344,11 +348,11 @@ class _Search:
         return tuple(name for name, fit in fits if fit is not None and self._as_good(fit, self.fits[plain]))
 
     def _best(self) -> list[Reading]:
-        """All readings, the best first."""
+        """Return all readings, the best first."""
         return sorted(self.fits, key=lambda reading: self.fits[reading].nats + A_CHANGE * reading.changes)
 
     def _distinct(self, expanded: list[Reading]) -> list[Reading]:
-        """The best readings that fit otherwise than those that were expanded, and than each other."""
+        """Return the best readings whose fits differ from those already expanded, and from each other."""
         seen, new = [self.fits[reading].error for reading in expanded if reading in self.fits], list[Reading]()
         for reading in self._best():
             error = self.fits[reading].error
@@ -374,8 +378,9 @@ class _Search:
         """Fit readings, and keep the best fit of each.
 
         Args:
-            held: keep the zeros as drawn.
-            tools: moves of the marker (s, 3) [m] to start from.
+            new: the readings.
+            held: keep the joint offsets at nominal.
+            tools: marker offsets (s, 3) [m] to start from.
         """
         std = self._std * (HELD if held else 1.0)
         for reading, fit in self._placed(new, std=std, tools=tools).items():

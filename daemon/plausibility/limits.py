@@ -1,4 +1,4 @@
-"""What a robot's limits and reach say of a recording's units."""
+"""Check of a recording's units against the robot's limits and reach."""
 
 from __future__ import annotations
 
@@ -17,46 +17,49 @@ from kbmaps import RigidChain
 
 BoolArray = NDArray[np.bool_]
 
-# Positions in the middle lie so far from the middle position, in units of the arm's reach, only in another unit.
+# Only in another unit can the median distance from the median position reach this many times the arm's reach.
 FARTHEST = 2.0
-# A joint of limited range is never so far beyond its limits [rad]: encoders wrap after a turn at the latest.
+# A joint of limited range is never this far beyond its limits [rad]: encoders wrap after a turn at the latest.
 BEYOND_LIMITS_RAD = 2.0 * math.pi
-# So large a share of rows makes it a matter of units, not of single wrong readings.
+# A share of rows this large indicates wrong units, not single wrong readings.
 MANY = 0.1
-# By how much to divide what is given in another unit, for metres.
+# Divisors that convert other units to metres.
 UNITS_PER_METRE = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 39.37, "feet": 3.281}
-# Share of the rows, the nearest ones, that a fit is measured by: outliers and rows with another tool are left out.
+# A fit is measured by this share of the rows, the nearest ones: outliers and rows with another tool are left out.
 MEASURED = 0.7
-# How far zeros and marker may be off (1-sigma). Of arms with zeros off by 10° and a marker by 0.3 m all are placed.
+# 1-sigma of joint offsets and marker. All arms with offsets of 10° and a marker off by 0.3 m are placed.
 ZEROS_RAD, SLIDES_M, TOOL_M = 0.15, 0.05, 0.3
 # ... and a marker whose place is known, by ruler.
 KNOWN_TOOL_M = 0.01
 # Rows by which a unit of length is told, and the share of the drawn positions' spread that a fit in it leaves at most.
 FITTED_ROWS, FITTING = 80, 0.1
-# Where none fits, units are told by the size of the positions: the next one too where it is off by less than a factor.
+# If none fits, the unit is guessed from the size of the positions: the next one too if it is off by less than a factor.
 ALSO = 2.0
 _UNITS_PER_SECOND = (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9))
-# An arm that is guided, or goes from pose to pose, is never so slow in the middle [rad/s]; it is about so fast.
+# Median speed of an arm that is guided or goes from pose to pose [rad/s]: lower bound, and usual value.
 SLOWEST, USUAL = 0.005, 0.3
-# So far on a slide counts as one radian [m]; so many moves there must be to judge by.
+# Stroke that counts as one radian [m], and the minimum number of moves for a verdict.
 A_RADIAN_M, FEWEST_MOVES = 0.1, 20
 
 
 def reach_m(robot: RobotDescription) -> float:
-    """How far from the first joint the marker can be at most [m]: all links and ways end to end."""
+    """Return an upper bound of the marker's distance from the first joint [m]: all links and strokes end to end."""
     chain = robot.chain
     ways = np.maximum(np.abs(robot.lower), np.abs(robot.upper))[chain.prismatic]
     return float(np.linalg.norm(chain.fixed[1:, :3, 3], axis=1).sum() + ways.sum())
 
 
 def beyond_limits(robot: RobotDescription, q: FloatArray, by: float = 0.0) -> BoolArray:
-    """Which joints poses (..., d) [rad, m] put beyond their limits by more than `by`; a continuous joint has none."""
+    """Return True for each joint that poses (..., d) [rad, m] put more than `by` beyond its limits.
+
+    A continuous joint has no limits.
+    """
     limited = np.array([robot.tree.joint(name).kind != "continuous" for name in robot.joints])
     return limited & (np.maximum(robot.lower - q, q - robot.upper) > by)
 
 
 def limits_text(robot: RobotDescription, joint: int) -> str:
-    """A joint's limits for people, as in `-2.6 to 2.6 rad (-149° to 149°)`."""
+    """Return a joint's limits for people, as in `-2.6 to 2.6 rad (-149° to 149°)`."""
     lower, upper = robot.lower[joint], robot.upper[joint]
     if robot.tree.joint(robot.joints[joint]).kind not in REVOLUTE:
         return f"{lower:.4g} to {upper:.4g} m"
@@ -67,7 +70,9 @@ def require_units(robot: RobotDescription, recording: Recording, file: Path) -> 
     """Refuse angles and positions that no arm has in radians and metres.
 
     Args:
-        file: what the recording is of.
+        robot: the robot's description.
+        recording: the recording.
+        file: its file.
 
     Raises:
         RecordingError: angles far beyond the limits, positions farther apart than the arm reaches, or times in which
@@ -105,8 +110,8 @@ def _require_metres(robot: RobotDescription, recording: Recording, file: Path) -
 
 
 def _likely_units(chain: RigidChain, recording: Recording) -> list[str]:
-    """The unit in which the drawn arm fits the positions; where it fits in none, one or two by their size."""
-    from kbmaps.chains.placement import place  # with scipy, which `predict` starts without
+    """Return the unit in which the nominal arm fits the positions; if it fits in none, one or two by their size."""
+    from kbmaps.chains.placement import place  # imports scipy, which `predict` starts without
 
     rows = np.unique(np.linspace(0, len(recording.q) - 1, FITTED_ROWS).astype(np.intp))
     q, x, factors = recording.q[rows], recording.x[rows], np.array(list(UNITS_PER_METRE.values()))
@@ -149,5 +154,5 @@ def _require_seconds(robot: RobotDescription, recording: Recording, file: Path) 
 
 
 def spread_m(x: FloatArray) -> float:
-    """Middle distance (n, 3) [m] from the middle position."""
+    """Return the median distance [m] of positions (n, 3) from the median position."""
     return float(np.median(np.linalg.norm(x - np.median(x, axis=0), axis=1)))

@@ -1,4 +1,4 @@
-"""Ways to read a recording's columns: order, directions and zeros of the joints, units, and the frame of x, y, z."""
+"""Ways to read a recording's columns: order, signs and offsets of the joints, units, and the frame of x, y, z."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from .limits import UNITS_PER_METRE
 
 METRES = "metres"
 QUARTER = math.pi / 2.0
-# A zero this near to a quarter turn counts as one: assembled arms are off by less.
+# A joint offset this near to a quarter turn counts as one: assembled arms are off by less.
 NEAR_RAD = math.radians(12.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """One way to read the columns; the default of everything but the order is as they are.
+    """One way to read the columns; all defaults except the order leave them as they are.
 
     A joint is its column times its sign, plus its quarter turns.
 
     Attributes:
-        order: place of the column of each joint.
+        order: index of the column of each joint.
         signs: 1 or -1 for each joint.
         quarters: quarter turns to add to each joint, 2 to -1.
         mirrored: the positions are given in a left-handed frame.
         unit: of the positions.
         degrees: the angles are in degrees.
-        millimetres: the readings of sliding joints are in millimetres.
+        millimetres: the readings of prismatic joints are in millimetres.
     """
 
     order: tuple[int, ...]
@@ -46,33 +46,33 @@ class Reading:
 
     @classmethod
     def plain(cls, joints: int) -> Reading:
-        """The columns as they are."""
+        """Return the columns as they are."""
         return cls(tuple(range(joints)), (1,) * joints, (0,) * joints)
 
     @property
     def scale(self) -> float:
-        """By what positions are divided to be in metres."""
+        """Divisor that converts positions to metres."""
         return UNITS_PER_METRE.get(self.unit, 1.0)
 
     def angles(self, q: FloatArray, slides: NDArray[np.bool_]) -> FloatArray:
-        """Joint angles (n, d) [rad, m] of the columns q (n, d)."""
+        """Return joint angles (n, d) [rad, m] of the columns q (n, d)."""
         units = np.where(slides, 1e-3 if self.millimetres else 1.0, math.radians(1.0) if self.degrees else 1.0)
         return (q[:, self.order] * units) * np.array(self.signs) + QUARTER * np.array(self.quarters)
 
     def positions(self, x: FloatArray) -> FloatArray:
-        """Positions (n, 3) [m] of the columns x (n, 3)."""
+        """Return positions (n, 3) [m] of the columns x (n, 3)."""
         return x * np.array([-1.0 if self.mirrored else 1.0, 1.0, 1.0]) / self.scale
 
     def turned(self, quarters: Sequence[int]) -> Reading:
-        """With so many quarter turns more (d,)."""
+        """Return the reading with these quarter turns added (d,)."""
         both = zip(self.quarters, quarters, strict=True)
         return replace(self, quarters=tuple((own + more + 1) % 4 - 1 for own, more in both))
 
     def neighbours(self, slides: Sequence[bool]) -> Iterator[Reading]:
-        """All readings with one change more.
+        """Yield all readings with one more change.
 
         Args:
-            slides: which joints (d,) slide: they have no quarter turns.
+            slides: True for each joint (d,) that is prismatic: it has no quarter turns.
         """
         joints = range(len(self.order))
         for k in joints:
@@ -88,7 +88,7 @@ class Reading:
             yield replace(self, millimetres=not self.millimetres)
 
     def doubles(self, slides: Sequence[bool]) -> Iterator[Reading]:
-        """All readings with two signs more, or two quarter turns: one alone may fit no better than none."""
+        """Yield all readings with two more signs, or two more quarter turns: one alone may not improve the fit."""
         joints = range(len(self.order))
         for j, k in itertools.combinations(joints, 2):
             yield replace(self, signs=_replaced(self.signs, {j: -self.signs[j], k: -self.signs[k]}))
@@ -98,12 +98,12 @@ class Reading:
                 yield self.turned([turns * (i == j) + others * (i == k) for i in joints])
 
     def mixed(self, slides: Sequence[bool]) -> Iterator[Reading]:
-        """All readings with a sign and a quarter turn more."""
+        """Yield all readings with one more sign and one more quarter turn."""
         for k in range(len(self.order)):
             yield from self._with_sign(k)._turnings(slides)
 
     def mixed_exchanges(self, slides: Sequence[bool]) -> Iterator[Reading]:
-        """All readings with two columns exchanged, and a sign or a quarter turn more."""
+        """Yield all readings with two columns exchanged, and one more sign or quarter turn."""
         joints = range(len(self.order))
         for j, k in itertools.combinations(joints, 2):
             reading = self._exchanged(j, k)
@@ -112,7 +112,7 @@ class Reading:
 
     @property
     def changes(self) -> int:
-        """How much is read otherwise than it is; all joints counting the other way are one change."""
+        """Number of changes from the columns as they are; all signs reversed together count as one."""
         moved, turned = sum(k != column for k, column in enumerate(self.order)), self.signs.count(-1)
         return (
             max(moved - 1, 0)
@@ -122,31 +122,32 @@ class Reading:
         )
 
     def looks(self, joints: Sequence[str], zeros: FloatArray) -> str:
-        """What it says of the recording, as in `the columns q1 and q2 are exchanged`.
+        """Return the changes in words, as in `the columns q1 and q2 are exchanged`.
 
         Args:
-            zeros: fitted to the joints (d,) beside the quarter turns [rad, m].
+            joints: their names.
+            zeros: joint offsets (d,) besides the quarter turns [rad, m].
         """
         return _listed([looks for looks, _ in self._said(joints, zeros)])
 
     def remedy(self, joints: Sequence[str], zeros: FloatArray) -> str:
-        """What to do; arguments as of `looks`."""
+        """Return what to do; arguments as in `looks`."""
         remedies = "; ".join(remedy for _, remedy in self._said(joints, zeros))
         return f"{remedies[0].upper()}{remedies[1:]}"
 
     def _with_sign(self, k: int) -> Reading:
-        """With the joint k counting the other way."""
+        """Return the reading with the sign of joint k reversed."""
         return replace(self, signs=_replaced(self.signs, {k: -self.signs[k]}))
 
     def _turnings(self, slides: Sequence[bool]) -> Iterator[Reading]:
-        """Each joint in turn by a quarter turn more; those of the ends are left to the camera and the marker."""
+        """Yield readings with another quarter turn of one joint; the first and last are left to camera and marker."""
         joints = range(len(self.order))
         for k in joints[1:-1]:
             if not slides[k]:
                 yield from (self.turned([turns * (j == k) for j in joints]) for turns in (1, -1, 2))
 
     def _exchanged(self, j: int, k: int) -> Reading:
-        """With the columns of the joints j and k exchanged, together with their signs."""
+        """Return the reading with the columns of the joints j and k exchanged, together with their signs."""
         return replace(
             self,
             order=_replaced(self.order, {j: self.order[k], k: self.order[j]}),
@@ -172,7 +173,7 @@ class Reading:
             )
         for joint, quarters, zero in zip(joints, self.quarters, zeros, strict=True):
             if quarters:
-                # What is near a quarter turn is one, and the rest a tolerance.
+                # An offset near a quarter turn counts as one, the rest as tolerance.
                 degrees = 90 * quarters + (0 if abs(zero) < NEAR_RAD else round(math.degrees(zero)))
                 yield (
                     f"the zero of {joint} is about {abs(degrees)}° off",

@@ -1,3 +1,3 @@
-"""A recording goes through sampler and learner as live, and what was learnt is judged on rows that were left out."""
+"""Replay of a recording through sampler and learner as live, with errors measured on held-out rows."""
 
 from __future__ import annotations

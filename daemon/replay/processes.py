@@ -31,7 +31,7 @@ class Process:
     popen: subprocess.Popen[bytes]
 
     def check(self) -> None:
-        """BusError with its last words when it has ended."""
+        """Raise BusError with its last output if it has ended."""
         code = self.popen.poll()
         if code is None:
             return
@@ -39,7 +39,7 @@ class Process:
         raise BusError(f"the {self.name} ended with exit code {code}: {lines[-1].removeprefix('bodyschema: ')}")
 
     def wait_for(self, endpoint: str, token: str) -> None:
-        """Return as soon as it is alive on `endpoint`; BusError when it ends before, or is not in time.
+        """Return as soon as it is alive on `endpoint`; raise BusError if it ends before, or is too late.
 
         Listening is not enough: it is alive when it answers.
         """
@@ -51,7 +51,7 @@ class Process:
             time.sleep(0.1)
 
     def end(self) -> None:
-        """Ask it to end; kill it when it does not in time."""
+        """Ask it to end; kill it after a time limit."""
         if self.popen.poll() is None:
             self.popen.send_signal(signal.SIGTERM)
         try:
@@ -63,9 +63,9 @@ class Process:
 
 @contextmanager
 def started(name: str, arguments: list[str], environment: Mapping[str, str], log: Path) -> Iterator[Process]:
-    """`bodyschema NAME ARGUMENTS` from here to the end of the with statement."""
+    """Run `bodyschema NAME ARGUMENTS` for the duration of the with statement."""
     with log.open("wb") as stream:
-        # In a process group of its own: Ctrl-C in a terminal is the parent's to handle.
+        # In a process group of its own: the parent handles Ctrl-C in a terminal.
         popen = subprocess.Popen(
             module_command("bodyschema", name, *arguments),
             stdin=subprocess.DEVNULL,
@@ -82,12 +82,12 @@ def started(name: str, arguments: list[str], environment: Mapping[str, str], log
 
 
 def override(table: str, key: str, value: object) -> dict[str, str]:
-    """One key of robot.toml as an environment variable, which goes before the file."""
+    """Return one key of robot.toml as an environment variable, which overrides the file."""
     return {f"BODYSCHEMA_{table}_{key}".upper(): json.dumps(value)}
 
 
 def free_endpoint() -> str:
-    """An endpoint on the loopback that nobody listens on."""
+    """Return an unused endpoint on the loopback interface."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

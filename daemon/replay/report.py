@@ -1,4 +1,4 @@
-"""What a replay found, as JSON and as text."""
+"""Report of a replay, as JSON and as text."""
 
 from __future__ import annotations
 
@@ -26,16 +26,17 @@ class Figures(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, figures: ErrorFigures) -> Figures:
-        """The same in mm."""
+        """Return the figures in mm."""
         metres = (figures.mean_m, figures.rms_m, figures.median_m, figures.p95_m, figures.max_m)
         return cls(*(1e3 * value for value in metres))
 
 
 class AngleFigures(msgspec.Struct, frozen=True):
-    """Angles between predicted and measured orientation on the held-out rows [°], and the learner's claim.
+    """Angles between predicted and measured orientation on the held-out rows [°], and the learner's predicted error.
 
     Attributes:
-        claimed_deg: mean angle to the truth that the learner claims where data is, or null.
+        mean_deg, median_deg, p95_deg: of the angles.
+        claimed_deg: mean angle to the truth that the learner predicts in its support, or null.
     """
 
     mean_deg: float
@@ -45,7 +46,7 @@ class AngleFigures(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, angles_rad: FloatArray, claimed_rad: float | None) -> AngleFigures:
-        """Those of angles (n,) [rad]."""
+        """Return the figures of angles (n,) [rad]."""
         mean, median, p95 = np.degrees(
             [angles_rad.mean(), np.median(angles_rad), np.quantile(angles_rad, 0.95)]
         ).tolist()
@@ -53,26 +54,26 @@ class AngleFigures(msgspec.Struct, frozen=True):
 
 
 class ReplayReport(msgspec.Struct, frozen=True, kw_only=True):
-    """What a replay found.
+    """Results of a replay.
 
     Attributes:
         rows: in the recording.
-        held_out: of these, rows that were left out, in `held_out_blocks` of 10 contiguous blocks.
+        held_out: of these, held-out rows, in `held_out_blocks` of 10 contiguous blocks.
         accepted: pairs that the sampler made of the others; `rejected` by reason.
-        any_step: whether the sampler's step and speed rules were relaxed.
-        before: best alignment of what robot.toml calls not known, fitted to the rows that were learnt.
-        after: the learner's predictions, asked for over zenoh.
-        fitted: what `before` fitted, in robot.toml's words.
+        any_step: True if the sampler's step and speed rules were relaxed.
+        before: best alignment of what robot.toml declares unknown, fitted to the learnt rows.
+        after: the learner's predictions, queried over zenoh.
+        fitted: what `before` fitted, as named in robot.toml.
         answering: the model that answered.
         prequential_mm: recent mean error on pairs before they were learnt, by model [mm].
-        claimed_mm: mean error to the truth that the learner claims where data is [mm], or null.
-        in_support_share: share of held-out rows that the learner says lie where data was.
-        within_sigma_share: share of held-out coordinates within the 1-sigma claimed and the noise that was stated.
+        claimed_mm: mean error to the truth that the learner predicts in its support [mm], or null.
+        in_support_share: share of held-out rows in the learner's support.
+        within_sigma_share: share of held-out coordinates within 1-sigma of prediction and stated noise together.
         replayed: replay steps of the instant learner.
-        outlook: what the learner expects of further pairs, or null.
-        doubt: what may be wrong with the recording, or null: columns read wrongly, another robot.
+        outlook: gain that the learner expects of further pairs, or null.
+        doubt: possible problems of the recording, or null: columns read wrongly, another robot.
         learning_s: time from the first pair to the end of learning [s].
-        angle: of the marker's orientation; null where the recording has none.
+        angle: of the marker's orientation; null if the recording has none.
     """
 
     recording: str
@@ -102,7 +103,7 @@ class ReplayReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def as_text(report: ReplayReport, width: int = 80) -> str:
-    """The report for a terminal of so many columns; figures in columns are not wrapped."""
+    """Return the report for a terminal of `width` columns; figures in columns are not wrapped."""
     rejected = ", ".join(f"{count} {reason}" for reason, count in sorted(report.rejected.items())) or "none"
     fitted = f"the nominal model with {' and '.join(report.fitted)} fitted" if report.fitted else "the nominal model"
     lines = [

@@ -1,4 +1,4 @@
-"""The replay itself: feed, wait until all is learnt, ask for predictions, judge them."""
+"""Replay of a recording: feed it, wait for the learner, query predictions, measure their errors."""
 
 from __future__ import annotations
 
@@ -29,22 +29,25 @@ from .steps import Steps
 GLANCE_S = 0.25
 STALL_LIMIT_S = 120.0
 BATCH = 2000
-# Live pairs come at the rate of the frames at most, and over some time: background learning is made for that.
+# Live pairs come at most at the frame rate, and over some time: background learning is designed for that.
 LIVE_ROWS_PER_S = 30.0
 SHORTEST_S = 20.0
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """What to replay.
+    """Settings of a replay.
 
     Attributes:
+        config: the robot's configuration.
+        recording: the recording.
+        split: its held-out rows.
         speed: 1 as recorded, 0 as fast as the sampler takes it; None at `LIVE_ROWS_PER_S` on average,
             but in `SHORTEST_S` at least.
-        sigma_m: 1-sigma of the positions where the recording has none [m]; None as robot.toml says.
+        sigma_m: 1-sigma of the positions if the recording has none [m]; None as in robot.toml.
         any_step: relax the sampler's step and speed rules.
-        folder: for store, checkpoint, logs and the rows that are learnt.
-        warnings: what may be wrong with the recording.
+        folder: for store, checkpoint, logs and the learnt rows.
+        warnings: possible problems of the recording.
     """
 
     config: Config
@@ -58,7 +61,7 @@ class Job:
 
     @property
     def drivers(self) -> dict[str, float]:
-        """What the table [drivers] has to say for this job."""
+        """Keys of the table [drivers] for this job."""
         times = self.learnt_rows.play_times
         live = float(times[-1] - times[0]) / max(len(times) / LIVE_ROWS_PER_S, SHORTEST_S)
         keys = {"speed": live if self.speed is None else self.speed}
@@ -66,7 +69,7 @@ class Job:
 
     @property
     def noise_m(self) -> FloatArray | float:
-        """1-sigma of the held-out positions [m] as the recording (n, 3) or the command says; 0 where neither does."""
+        """Noise of the held-out positions, 1-sigma [m], from the recording (n, 3) or the command; 0 if unknown."""
         cov = self.held_out_rows.cov
         if cov is not None:
             return np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
@@ -75,18 +78,18 @@ class Job:
 
     @property
     def learnt_rows(self) -> Recording:
-        """The rows that are fed."""
+        """Rows that are fed."""
         return self.recording.rows(~self.split.held_out)
 
     @property
     def held_out_rows(self) -> Recording:
-        """The rows that are left out."""
+        """Rows that are held out."""
         return self.recording.rows(self.split.held_out)
 
 
 @dataclass(frozen=True, slots=True)
 class Learnt:
-    """The state of things when all was learnt."""
+    """Status of both processes when all was learnt."""
 
     sampler: SamplerStatus
     learner: LearnerStatus
@@ -94,13 +97,14 @@ class Learnt:
 
 
 def replay(job: Job, report: Callable[[SamplerStatus, LearnerStatus], None]) -> ReplayReport:
-    """Replay a recording and judge what was learnt.
+    """Replay a recording and measure the errors of the learnt model.
 
     Args:
-        report: called with the state of things about four times a second.
+        job: settings of the replay.
+        report: called with the status of both processes about four times a second.
 
     Raises:
-        EvaluationError: the recording does not determine what robot.toml calls not known.
+        EvaluationError: the recording does not determine what robot.toml declares unknown.
         RecordingError: the sampler accepted nothing.
         BusError: a process ended, or made no progress.
         RequestError: the learner cannot answer yet.
@@ -166,7 +170,7 @@ class _Live:
         self._stall_limit_s = STALL_LIMIT_S + float(pauses_s.max(initial=0.0))
 
     def until_learnt(self, report: Callable[[SamplerStatus, LearnerStatus], None]) -> Learnt:
-        """Wait until the recording is through, every pair is learnt, and the learner has come to rest."""
+        """Wait until the recording has ended, every pair is learnt, and the learner is at rest."""
         begin = changed = time.monotonic()
         last: tuple[object, ...] = ()
         while True:
@@ -190,7 +194,7 @@ class _Live:
             time.sleep(GLANCE_S)
 
     def predictions(self, q: FloatArray) -> PredictReply:
-        """The learner's predictions for q (n, d), in batches."""
+        """Return the learner's predictions for q (n, d), queried in batches."""
         replies = [
             decode(
                 self._learner_bus.ask_one(
@@ -222,14 +226,14 @@ class _Live:
 
 @contextmanager
 def _running(job: Job) -> Iterator[_Live]:
-    """Both processes; the learner is there before the first pair, as in a live system."""
+    """Run both processes; the learner starts before the first pair, as in a live system."""
     fed = job.folder / "learnt_rows.csv"
     job.learnt_rows.write_csv(fed)
     sampler_endpoint, learner_endpoint, keys = free_endpoint(), free_endpoint(), Keys(job.config.robot.name)
     environment = {
         **override("zenoh", "sampler", sampler_endpoint),
         **override("zenoh", "learner", learner_endpoint),
-        **override("zenoh", "router", ""),  # the live robot's is no concern of this one
+        **override("zenoh", "router", ""),  # the live robot's router must not be used
         **override("drivers", "recording", str(fed.resolve())),
         **{name: text for key, value in job.drivers.items() for name, text in override("drivers", key, value).items()},
         **override("daemon", "any_step", job.any_step),

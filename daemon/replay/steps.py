@@ -1,4 +1,4 @@
-"""Whether a recording is a guided path, or single poses far apart."""
+"""Distinction between a guided path and single poses far apart."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ MOST = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """The steps between neighbouring rows, by the sampler's rule.
+    """Steps between neighbouring rows, by the sampler's rule.
 
     Attributes:
-        count: how many there are.
-        too_far: how many are larger than `max_step_deg`.
+        count: their number.
+        too_far: number of steps larger than `max_step_deg`.
         median_deg: their median.
+        max_step_deg: the sampler's limit.
     """
 
     count: int
@@ -32,7 +33,7 @@ class Steps:
 
     @classmethod
     def of(cls, recording: Recording, robot: RobotDescription, rules: DaemonConfig) -> Steps:
-        """The steps of a recording of at least two rows."""
+        """Return the steps of a recording of at least two rows."""
         prismatic = robot.chain.prismatic
         units = np.where(prismatic, 1 / rules.metres_per_degree, 180 / np.pi)
         steps_deg = np.linalg.norm(joint_difference(recording.q[1:], recording.q[:-1], prismatic) * units, axis=1)
@@ -41,7 +42,7 @@ class Steps:
 
     @property
     def is_path(self) -> bool:
-        """Whether most rows follow from their predecessors."""
+        """True if most rows follow from their predecessors."""
         return self.too_far <= MOST * self.count
 
     def __str__(self) -> str:
@@ -52,7 +53,7 @@ class Steps:
 
 
 def require_path(steps: Steps, recording: Recording) -> None:
-    """RecordingError when the rows are single poses far apart."""
+    """Raise RecordingError if the rows are single poses far apart."""
     if not steps.is_path:
         raise RecordingError(
             f"{steps}: these are single poses, not a guided path, and the sampler's step and speed rules do not "

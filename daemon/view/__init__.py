@@ -1,7 +1,7 @@
-"""A page to look at: what sampler and learner do, live in a browser on this machine.
+"""Live page in a browser on this machine that shows the work of sampler and learner.
 
-Everything comes over zenoh, so this is a process of its own, beside the others or elsewhere. Needs the extra `view`;
-nothing else imports this package.
+All data come over zenoh, so this is a process of its own, next to the others or elsewhere. It needs the extra `view`;
+no other package imports it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The page's addresses."""
+"""HTTP routes of the page."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from .hub import Follower, Hub, HubFullError
 
 STATIC = Path(__file__).parent / "static"
 LARGEST_BODY = 4096
-# Said to an idle browser, so that whoever is between them does not think that it is over.
+# Interval of keep-alive comments to an idle browser, so that proxies do not close the connection.
 HEARTBEAT_S = 10.0
-# How soon a browser asks again.
+# Delay after which a browser reconnects.
 RETRY_MS = 1000
 _JSON, _EVENTS = "application/json", "text/event-stream"
 # The report is one file with its own style, and no script.
@@ -38,38 +38,38 @@ Endpoint = Callable[[Request], Awaitable[Response]]
 
 
 class PageCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a button of the page may tell a process; resetting and torque are not among them."""
+    """Command of a button of the page; reset and torque are not available."""
 
     process: Process
     command: Literal["pause", "resume", "tool_changed"]
 
 
 class Commands(Protocol):
-    """Tells processes what to do."""
+    """Sends commands to processes."""
 
     def command(self, process: Process, name: CommandName) -> str:
-        """Its words; BusError when it does not answer, RequestError when it refuses."""
+        """Return the process's reply; BusError if it does not answer, RequestError if it refuses."""
         ...
 
 
 class Diagnosing(Protocol):
-    """Diagnoses, one after the other."""
+    """Runs diagnoses, one after the other."""
 
     def start(self) -> int:
-        """Begin one, its number; RequestError when one is running."""
+        """Start a diagnosis and return its number; RequestError if one is running."""
         ...
 
     def stop(self) -> None:
-        """End the one that runs; RequestError when none does."""
+        """End the running diagnosis; RequestError if none is running."""
         ...
 
     def report(self) -> bytes | None:
-        """The last one's page; None while there is none."""
+        """Return the last report; None if there is none."""
         ...
 
 
 def application(hub: Hub, commands: Commands, diagnoses: Diagnosing) -> Starlette:
-    """The page over what is in `hub`."""
+    """Return the page's application on the documents of `hub`."""
 
     async def index(_: Request) -> Response:
         return FileResponse(STATIC / "index.html")
@@ -78,7 +78,7 @@ def application(hub: Hub, commands: Commands, diagnoses: Diagnosing) -> Starlett
         return Response(hub.all(), media_type=_JSON)
 
     async def events(request: Request) -> Response:
-        if request.method == "HEAD":  # an answer that would never end
+        if request.method == "HEAD":  # otherwise the answer would never end
             return Response(media_type=_EVENTS)
         try:
             return _EventStream(hub, hub.follow())
@@ -117,7 +117,7 @@ def application(hub: Hub, commands: Commands, diagnoses: Diagnosing) -> Starlett
 
 
 def _explained(endpoint: Endpoint) -> Endpoint:
-    """The endpoint, with errors of ours told as JSON."""
+    """Return the endpoint with our errors reported as JSON."""
 
     async def explained(request: Request) -> Response:
         try:
@@ -142,7 +142,7 @@ async def _body(request: Request) -> bytes:
 
 
 class _EventStream(StreamingResponse):
-    """Server-sent events: each new document under its topic, until the hub is closed or the browser has gone."""
+    """Server-sent events: each new document under its topic, until the hub closes or the browser disconnects."""
 
     def __init__(self, hub: Hub, follower: Follower) -> None:
         super().__init__(_events(hub, follower), media_type=_EVENTS)

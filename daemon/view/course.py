@@ -1,4 +1,4 @@
-"""The course of learning, as far as the view has looked on."""
+"""History of learning since the page's process started."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Series:
         pairs_per_s: float | None,
         predict_s: float | None,
     ) -> None:
-        """The figures at one time, as in `SeriesDocument`; not every one is kept."""
+        """Add the figures at one time, as in `SeriesDocument`, unless the thinning skips them."""
         is_kept = self._offered % self._stride == 0
         self._offered += 1
         if not is_kept:
@@ -39,13 +39,13 @@ class Series:
 
     @property
     def document(self) -> SeriesDocument:
-        """All of them, by columns."""
+        """All figures, by columns."""
         columns = [list(column) for column in zip(*self._rows, strict=True)] or [[] for _ in range(5)]
         return SeriesDocument(*columns)
 
 
 class Course:
-    """Changes and the models that answered, from one state of the learner to the next."""
+    """History of changes and answering models, from the learner's successive states."""
 
     def __init__(self) -> None:
         self._changes: dict[tuple[int | None, int | None], Change] = {}
@@ -54,11 +54,11 @@ class Course:
 
     @property
     def document(self) -> CourseDocument:
-        """What is known now."""
+        """History so far."""
         return CourseDocument(list(self._changes.values()), list(self._versions))
 
     def note(self, status: LearnerStatus, now: float) -> None:
-        """What the learner said at this time, UTC [s since 1970]."""
+        """Add the learner's status at this time, UTC [s since 1970]."""
         begun_anew = self._versions and status.pairs < self._versions[-1].pairs
         if begun_anew or status.store != self._store:
             self._changes, self._versions, self._store = {}, [], status.store
@@ -67,7 +67,7 @@ class Course:
             self._note_version(status, now, changed=changed)
 
     def _note_change(self, status: LearnerStatus, now: float) -> bool:
-        """Note the change that is in force; those after it were rolled back. Return True when it is new."""
+        """Record the current change; those after it were rolled back. Return True if it is new."""
         at, last = status.pairs - status.pairs_since_change, status.last_change
         key = (at, None) if last is None else (None, last.noticed_seq)
         if at <= 0:

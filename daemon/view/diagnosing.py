@@ -1,4 +1,4 @@
-"""Diagnoses that the page asks for: a process of its own, on pairs that were copied from the sampler."""
+"""Diagnoses requested on the page: each runs in a process of its own, on pairs copied from the sampler."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from .documents import DiagnosisDocument
 
 log = logging.getLogger(__name__)
 
-# More would take many minutes, and say little more.
+# More pairs would take many minutes, and hardly change the result.
 NEWEST_PAIRS = 4000
-# It has time; learner and sampler have not.
+# Sampler and learner have priority.
 NICENESS = 10
 END_LIMIT_S = 5.0
 RECORDING = "newest_pairs.csv"
 
 
 class Diagnoses:
-    """One diagnosis after the other, while the with statement lasts."""
+    """Runs one diagnosis after the other, while the with statement lasts."""
 
     def __init__(
         self,
@@ -46,11 +46,13 @@ class Diagnoses:
         history: Callable[[int], History],
         tell: Callable[[DiagnosisDocument], None],
     ) -> None:
-        """None was asked for yet.
+        """Initialise without a diagnosis.
 
         Args:
-            history: so many of the newest pairs.
-            tell: given the state whenever it changes, from any thread.
+            robot_file: the robot's description.
+            joints: their names.
+            history: returns this number of the newest pairs.
+            tell: called with the state whenever it changes, from any thread.
         """
         self._robot_file, self._joints, self._history, self._tell = robot_file, joints, history, tell
         self._lock = threading.Lock()
@@ -73,7 +75,7 @@ class Diagnoses:
         self._folder.cleanup()
 
     def start(self) -> int:
-        """Begin one; its number.
+        """Start a diagnosis and return its number.
 
         Raises:
             RequestError: one is running.
@@ -89,17 +91,17 @@ class Diagnoses:
         return number
 
     def stop(self) -> None:
-        """End the one that runs.
+        """End the running diagnosis.
 
         Raises:
-            RequestError: none runs.
+            RequestError: none is running.
         """
         if self._thread is None or not self._thread.is_alive():
             raise RequestError("no diagnosis is running")
         self._end()
 
     def report(self) -> bytes | None:
-        """The last diagnosis' page; None while there is none."""
+        """Return the page of the last diagnosis; None if there is none."""
         number = self._document.report
         return None if number is None else (self._out(number) / REPORT).read_bytes()
 
@@ -140,7 +142,7 @@ class Diagnoses:
         with self._lock:
             if self._stopping:
                 raise RequestError("stopped")
-            # This thread waits for the child, which may not outlive it.
+            # This thread waits for the child, which must not outlive it.
             self._child = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
@@ -161,7 +163,7 @@ class Diagnoses:
         self._say(state="done", said=file.sentence, verdict=file.verdict, report=number)
 
     def _follow(self, child: subprocess.Popen[str]) -> str:
-        """Tell each step; the last line that the child said."""
+        """Report each step; return the last line of the child's output."""
         last = ""
         assert child.stderr is not None
         with child.stderr:

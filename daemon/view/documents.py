@@ -1,4 +1,4 @@
-"""The documents that the page is made of, besides both processes' own states."""
+"""Documents of the page, besides both processes' own states."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Process = Literal["sampler", "learner"]
 
 
 class RobotDocument(msgspec.Struct, frozen=True):
-    """What does not change: the robot's name, its joints, which of them slide, and this version."""
+    """Constants: the robot's name, its joints, its prismatic joints, and the version of this software."""
 
     robot: str
     joints: tuple[str, ...]
@@ -19,14 +19,14 @@ class RobotDocument(msgspec.Struct, frozen=True):
 
 
 class ProcessDocument(msgspec.Struct, frozen=True):
-    """One of the processes.
+    """State of one process.
 
     Attributes:
-        answers: whether it is there now.
-        endpoint: where it ought to be.
-        heard: when it was heard last, UTC [s since 1970]; null before.
-        problem: why what it said was not understood; null when it was.
-        status: what it said last, with fields that this version does not know; null before.
+        answers: true if it is alive now.
+        endpoint: its expected endpoint.
+        heard: time of its last message, UTC [s since 1970]; null before.
+        problem: why its last message could not be decoded; null if it could.
+        status: its last status, including fields unknown to this version; null before.
     """
 
     answers: bool
@@ -37,14 +37,14 @@ class ProcessDocument(msgspec.Struct, frozen=True):
 
 
 class SeriesDocument(msgspec.Struct, frozen=True):
-    """The course of figures since the view began, columns of equal length.
+    """Time series of figures since the view began, columns of equal length.
 
     Attributes:
         t: UTC [s since 1970].
         error_m: error on new pairs of the answering model [m], measurement noise included; null while there is none.
-        claimed_m: the distance to the truth that the learner claims where data is [m].
+        claimed_m: distance to the truth that the learner predicts in its support [m].
         pairs_per_s: accepted pairs.
-        predict_s: how long one prediction took, there and back [s]; null where none came.
+        predict_s: round-trip time of one prediction [s]; null without an answer.
     """
 
     t: list[float]
@@ -55,13 +55,13 @@ class SeriesDocument(msgspec.Struct, frozen=True):
 
 
 class Change(msgspec.Struct, frozen=True):
-    """A change of the tool, the camera or a joint's zero.
+    """Change of the tool, the camera or a joint offset.
 
     Attributes:
-        pairs: learnt before it.
-        t: when the view heard of it, UTC [s since 1970].
-        kind: as in the learner's status; null where learning began again from the prior.
-        told: whether it was told; else the learner found it.
+        pairs: number of pairs learnt before it.
+        t: when the view received it, UTC [s since 1970].
+        kind: as in the learner's status; null if learning restarted from the prior.
+        told: true if it was reported, false if the learner detected it.
     """
 
     pairs: int
@@ -71,15 +71,15 @@ class Change(msgspec.Struct, frozen=True):
 
 
 class Version(msgspec.Struct, frozen=True):
-    """A span of time in which the same kind of model answered.
+    """Span of time in which the same kind of model answered.
 
     Attributes:
         since: UTC [s since 1970].
         first_pairs, pairs: pairs learnt when it began, and at last.
-        answering: which model.
+        answering: name of the model.
         model: hash of the newest of them.
         error_m: its error on new pairs [m].
-        after_change: whether it began with a change of the tool.
+        after_change: true if it began with a change of the tool.
     """
 
     since: float
@@ -92,19 +92,21 @@ class Version(msgspec.Struct, frozen=True):
 
 
 class CourseDocument(msgspec.Struct, frozen=True):
-    """What changed while the view looked on: the newest last."""
+    """Changes and answering models since the view began, the newest last."""
 
     changes: list[Change]
     versions: list[Version]
 
 
 class Segment(msgspec.Struct, frozen=True):
-    """A run of pairs.
+    """Run of pairs.
 
     Attributes:
+        segment: its number.
+        pairs: their number.
         utc: when its first known pair was accepted, ISO 8601.
         lasted_s: from its first to its last pair.
-        complete: whether its first pair is known.
+        complete: true if its first pair is known.
     """
 
     segment: int
@@ -115,10 +117,10 @@ class Segment(msgspec.Struct, frozen=True):
 
 
 class CloudDocument(msgspec.Struct, frozen=True):
-    """Where the marker was, and how far from there the model has it: pairs that were learnt already.
+    """Measured marker positions and the model's residuals there, for learnt pairs.
 
     Attributes:
-        model: hash of the model that was asked; empty while none answers.
+        model: hash of the queried model; empty while none answers.
         x: measured positions [m], measurement frame.
         residual: measured - predicted [m].
         segment: of each row.
@@ -134,16 +136,16 @@ class CloudDocument(msgspec.Struct, frozen=True):
 
 
 class DiagnosisDocument(msgspec.Struct, frozen=True):
-    """The diagnosis that was asked for last.
+    """State of the last requested diagnosis.
 
     Attributes:
         number: of the diagnosis, from 1; 0 before any.
         state: idle, copying (pairs from the sampler), running, done, failed or stopped.
-        pairs: how many it has.
-        said: what it is doing, what it found, or what went wrong.
+        pairs: number of pairs.
+        said: current step, result, or error.
         started: UTC [s since 1970].
         verdict: of diagnosis.json; null unless it is done.
-        report: number of the diagnosis whose report there is to look at; null while there is none.
+        report: number of the diagnosis whose report is available; null if there is none.
     """
 
     number: int = 0

@@ -1,6 +1,6 @@
-"""Which requests are served: those that name this machine, and changes from this page alone.
+"""Filter of HTTP requests: they must name this machine, and changes must come from this page.
 
-A web page from elsewhere can make a browser ask, but it cannot choose the header Origin.
+A web page from elsewhere can make a browser send requests, but it cannot choose the header Origin.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _HEADERS = HEADERS | {
 
 
 class Guard:
-    """ASGI middleware that refuses what this page would not ask, and adds headers that bind the page to itself."""
+    """ASGI middleware that refuses requests that are not from this page, and adds headers that isolate the page."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -44,7 +44,7 @@ class Guard:
 
 
 def refusal(method: str, headers: Headers) -> str | None:
-    """Return what is wrong with a request, for a person; None when nothing is."""
+    """Return the problem of a request, in words; None if it is valid."""
     hosts = headers.getlist("host")
     if (said := host_refusal(hosts)) is not None:
         return said

@@ -1,4 +1,4 @@
-"""What one of the processes said of itself last."""
+"""Last status received from one of the processes."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from bodyschema.interfaces.protocols import Clock
 
 from .documents import ProcessDocument
 
-# A process says something every second; on a busy machine later.
+# A process publishes its status every second; less often on a busy machine.
 SILENT_AFTER_S = 5.0
 
 S = TypeVar("S", SamplerStatus, LearnerStatus)
 
 
 class Heard(Generic[S]):
-    """The newest state of one process; any thread may use it."""
+    """Newest status of one process; any thread may use it."""
 
     def __init__(self, kind: type[S], endpoint: str, clock: Clock) -> None:
         self._kind, self._endpoint, self._clock = kind, endpoint, clock
@@ -33,18 +33,18 @@ class Heard(Generic[S]):
 
     @property
     def status(self) -> S | None:
-        """What it said last, whether it is there now or not."""
+        """Last status, even if the process has gone."""
         with self._lock:
             return self._status
 
     @property
     def answers(self) -> bool:
-        """Whether it is there now."""
+        """True if the process is alive now."""
         with self._lock:
             return self._is_there()
 
     def take(self, payload: bytes, utc: float) -> None:
-        """A publication of its state, received at this time [s since 1970]."""
+        """Take a published status, received at this time [s since 1970]."""
         try:
             status, fields, problem = decode(payload, self._kind), decode(payload, dict[str, Any]), None
         except RequestError as error:
@@ -55,13 +55,13 @@ class Heard(Generic[S]):
                 self._status, self._fields = status, fields
 
     def note_alive(self, alive: bool) -> None:
-        """Its liveliness token came, or is gone."""
+        """Record that its liveliness token came, or is gone."""
         with self._lock:
             self._alive = alive
 
     @property
     def document(self) -> ProcessDocument:
-        """For the page."""
+        """State for the page."""
         with self._lock:
             return ProcessDocument(self._is_there(), self._endpoint, self._heard_utc, self._problem, self._fields)
 

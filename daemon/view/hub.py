@@ -1,4 +1,4 @@
-"""What the page shows, as named documents, and the browsers that follow them."""
+"""Named documents of the page, and the browsers that follow them."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ MOST_FOLLOWERS = 32
 
 
 class HubFullError(BodyschemaError):
-    """So many browsers follow already."""
+    """Too many browsers follow already."""
 
     def __init__(self) -> None:
         super().__init__(f"{MOST_FOLLOWERS} pages are open already. Close one")
 
 
 class Follower:
-    """One browser: the documents that it has not got yet, each as it is now. Who is slow misses what was between."""
+    """One browser: its pending documents, each in its newest version. A slow browser misses the versions between."""
 
     def __init__(self, documents: dict[str, bytes]) -> None:
-        """For the event loop that runs now; `documents` are the first to take."""
+        """Initialise for the running event loop; `documents` are the first to take."""
         self._loop, self._news = asyncio.get_running_loop(), asyncio.Event()
         self._lock = threading.Lock()
         self._pending = dict(documents)
         self._news.set()
 
     def offer(self, topic: str, document: bytes) -> None:
-        """A document is new; from any thread."""
+        """Queue a new document; from any thread."""
         with self._lock:
             self._pending[topic] = document
         self.wake()
@@ -40,7 +40,7 @@ class Follower:
         self._loop.call_soon_threadsafe(self._news.set)
 
     async def take(self, timeout_s: float) -> dict[str, bytes]:
-        """What is new; nothing when nothing is for so long [s]."""
+        """Return new documents; empty after a timeout [s] without any."""
         try:
             await asyncio.wait_for(self._news.wait(), timeout_s)
         except TimeoutError:
@@ -52,7 +52,7 @@ class Follower:
 
 
 class Hub:
-    """Documents as JSON, each replaced as a whole; from any thread."""
+    """Documents as JSON, each replaced as a whole; usable from any thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -62,11 +62,11 @@ class Hub:
 
     @property
     def closed(self) -> bool:
-        """Whether nothing comes any more."""
+        """True after `close`."""
         return self._closed
 
     def put(self, topic: str, document: object) -> None:
-        """Replace a document; followers hear of it when it differs."""
+        """Replace a document; followers get it if it differs."""
         encoded = msgspec.json.encode(document)
         with self._lock:
             if self._documents.get(topic) == encoded:
@@ -76,12 +76,12 @@ class Hub:
                 follower.offer(topic, encoded)
 
     def all(self) -> bytes:
-        """All documents as one JSON object."""
+        """Return all documents as one JSON object."""
         with self._lock:
             return msgspec.json.encode({topic: msgspec.Raw(document) for topic, document in self._documents.items()})
 
     def follow(self) -> Follower:
-        """Return a follower, to be given to `leave` in the end; it begins with all documents.
+        """Return a follower, to be passed to `leave` in the end; it starts with all documents.
 
         Raises:
             HubFullError: too many follow.
@@ -94,12 +94,12 @@ class Hub:
         return follower
 
     def leave(self, follower: Follower) -> None:
-        """End what `follow` began."""
+        """Remove a follower."""
         with self._lock:
             self._followers.discard(follower)
 
     def close(self) -> None:
-        """Nothing comes any more: let every follower end."""
+        """Close the hub: let every follower end."""
         with self._lock:
             self._closed = True
             for follower in self._followers:

@@ -1,4 +1,4 @@
-"""The sampler's newest pairs: their segments, and how the model misses them."""
+"""Newest pairs of the sampler: their segments, and the model's residuals at them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .documents import CloudDocument, Segment
 KEPT = 3000
 LARGEST_CLOUD = 800
 SHOWN_SEGMENTS = 40
-# Of a coordinate that is sent to the page: a micrometre.
+# Decimals of a coordinate [m] that is sent to the page: a micrometre.
 DECIMALS = 6
 
 NOTHING = CloudDocument("", [], [], [], None, None)
@@ -33,15 +33,15 @@ class RecentPairs:
 
     @property
     def newest(self) -> Pair | None:
-        """The last of them."""
+        """Newest pair."""
         return self._pairs[-1] if self._pairs else None
 
     def add(self, pairs: Iterable[Pair]) -> None:
-        """Pairs that follow."""
+        """Append pairs."""
         self._pairs.extend(pairs)
 
     def segments(self) -> list[Segment]:
-        """The newest segments, the newest last."""
+        """Return the newest segments, the newest last."""
         runs: list[list[Pair]] = []
         for pair in self._pairs:
             if runs and runs[-1][0].segment == pair.segment:
@@ -61,7 +61,7 @@ class RecentPairs:
         ]
 
     def chosen(self, after_seq: int, upto_seq: int) -> list[Pair]:
-        """At most `LARGEST_CLOUD` pairs behind one sequence number and up to another, evenly spread."""
+        """Return at most `LARGEST_CLOUD` pairs after one sequence number and up to another, evenly spread."""
         wanted = [pair for pair in self._pairs if after_seq < pair.seq <= upto_seq]
         if len(wanted) <= LARGEST_CLOUD:
             return wanted
@@ -69,10 +69,11 @@ class RecentPairs:
 
 
 def cloud(pairs: list[Pair], predict: Callable[[list[list[float]]], PredictReply]) -> CloudDocument:
-    """How the model misses pairs.
+    """Return the model's residuals at pairs.
 
     Args:
-        predict: asks the learner; RequestError while it has no model.
+        pairs: the pairs.
+        predict: queries the learner; RequestError while it has no model.
 
     Raises:
         BusError: the learner does not answer.

@@ -1,4 +1,4 @@
-"""The page on loopback, until it is told to stop."""
+"""HTTP server of the page on loopback."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ END_LIMIT_S = 3
 
 
 class _Server(uvicorn.Server):
-    """Ends the streams first: a browser holds them open for ever."""
+    """Ends the event streams first: a browser holds them open for ever."""
 
     def __init__(self, config: uvicorn.Config, hub: Hub) -> None:
         super().__init__(config)
         self._hub = hub
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Come to an orderly end."""
+        """Close the hub, then shut down."""
         self._hub.close()
         await super().shutdown(sockets)
 
     def stop(self) -> None:
-        """Let `serve` come to its end. Only sets a flag: a signal handler may call it."""
+        """Let `serve` end. Only sets a flag: a signal handler may call it."""
         self.should_exit = True
 
 
@@ -44,8 +44,9 @@ def serve(config: Config, port: int, ready: Callable[[str], None]) -> None:
     """Serve the page of one robot until SIGTERM or Ctrl-C.
 
     Args:
+        config: the robot's configuration.
         port: on loopback; 0 takes one that is free.
-        ready: given the page's address when a browser may ask for it.
+        ready: called with the page's address when a browser may request it.
 
     Raises:
         ConfigError: the port cannot be used.
@@ -78,7 +79,7 @@ def serve(config: Config, port: int, ready: Callable[[str], None]) -> None:
 
 
 def listening(port: int) -> socket.socket:
-    """A socket on loopback; ConfigError when the port cannot be used."""
+    """Return a socket on loopback; ConfigError if the port cannot be used."""
     try:
         return socket.create_server((LOOPBACK, port))
     except OSError as error:

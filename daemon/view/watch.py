@@ -1,4 +1,4 @@
-"""Looks on over zenoh, and keeps the hub's documents as they are."""
+"""Follows both processes over zenoh, and keeps the hub's documents up to date."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 EVERY_S = 1.0
 CLOUD_EVERY_S = 2.0
 PREDICT_LIMIT_S = 2.0
-# A tool is told to be another one, or torque is to come on: longer than that takes.
+# Longer than a tool change or switching torque on takes.
 COMMAND_LIMIT_S = 10.0
 
 
@@ -42,7 +42,7 @@ class Watch:
     """Follows both processes while the with statement lasts; they may come and go."""
 
     def __init__(self, config: Config, hub: Hub, clock: Clock | None = None) -> None:
-        """Nothing is open yet; documents go to `hub`."""
+        """Initialise without opening anything; documents go to `hub`."""
         self._config, self._hub = config, hub
         self._clock = SystemClock() if clock is None else clock
         self._keys = Keys(config.robot.name)
@@ -78,7 +78,7 @@ class Watch:
             self._open.close()
 
     def command(self, process: Process, name: CommandName) -> str:
-        """Tell a process to do something; its words.
+        """Send a command to a process and return its reply.
 
         Raises:
             BusError: it does not answer.
@@ -89,7 +89,7 @@ class Watch:
         return decode(reply, CommandReply).message
 
     def history(self, newest: int) -> History:
-        """So many of the sampler's newest pairs, to be read page by page.
+        """Return the sampler's newest pairs, `newest` of them, to be read page by page.
 
         Raises:
             BusError: the sampler does not answer.
@@ -115,7 +115,7 @@ class Watch:
             try:
                 self._look()
             except (BusError, RequestError, RecordingError) as error:
-                log.debug("%s", error)  # the page says who does not answer
+                log.debug("%s", error)  # the page shows which process does not answer
             except Exception:
                 log.exception("the page is not up to date")
             if self._stopping.wait(EVERY_S):
@@ -148,7 +148,7 @@ class Watch:
         self._hub.put("series", self._series.document)
 
     def _predict_time(self) -> float | None:
-        """How long one prediction takes [s], there and back, as any program would see it."""
+        """Return the time of one prediction [s], round trip, as any program would see it."""
         newest, robot = self._recent.newest, self._config.robot
         q = (0.5 * (robot.lower + robot.upper) if newest is None else newest.q).tolist()
         begin = time.perf_counter()

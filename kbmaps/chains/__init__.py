@@ -1,1 +1,1 @@
-"""Rigid chains as products of exponentials, what learns them, and a tool at the end of any model."""
+"""Rigid chains as products of exponentials, their learners, and a tool layer for any model."""

@@ -1,4 +1,4 @@
-"""Best rigid fit of a nominal chain to measurements: instrument pose, marker offset, or both."""
+"""Best rigid fit of a nominal chain to measurements: camera pose, marker offset, or both."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
 from kbmaps.robust import MEDIAN_NORM, ROUNDING_M
 from kbmaps.rotations import cross_matrix, exponentials, nearest_rotation
 
-# Pairs beyond this many σ are outliers. Far out, since the errors of an uncalibrated arm have long tails themselves
-# and must not be rejected.
+# Pairs beyond this many σ are outliers. The limit is wide because the errors of an uncalibrated arm have long tails,
+# which must not be rejected.
 _OUTLIER_SIGMAS = 15.0
 _ROUNDS = 60
 _START_PAIRS = 300
@@ -27,14 +27,14 @@ _RANK_TOLERANCE = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """A nominal chain fitted to measured pairs by rigid motion alone.
+    """Nominal chain fitted to measured pairs by rigid motion alone.
 
     Attributes:
-        chain: the nominal chain with what was fitted built in.
+        chain: the nominal chain with the fitted motion built in.
         T_measured_nominal: pose (4, 4) of the nominal measurement frame in the real one; identity if it was known.
-        marker_shift: move of the marker (3,) [m] in the marker frame; zero if it was known.
-        rms: RMS distance [m] between the fitted chain and the pairs that are no outliers.
-        inliers: which pairs (n,) are no outliers.
+        marker_shift: offset of the marker (3,) [m] in the marker frame; zero if it was known.
+        rms: RMS distance [m] between the fitted chain and the inliers.
+        inliers: True for each pair (n,) that is not an outlier.
     """
 
     chain: RigidChain
@@ -46,7 +46,7 @@ class Alignment:
 
 @dataclass
 class _Fit:
-    """The present estimate for nominal poses: x ≈ rotation (p + R δ) + translation."""
+    """Current estimate for nominal poses: x ≈ rotation (p + R δ) + translation."""
 
     nominal_rotations: FloatArray
     nominal_positions: FloatArray
@@ -58,7 +58,7 @@ class _Fit:
     shift: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def markers(self) -> FloatArray:
-        """Marker positions (n, 3) in the nominal frame."""
+        """Return the marker positions (n, 3) in the nominal frame."""
         return self.nominal_positions + self.nominal_rotations @ self.shift
 
     def errors(self) -> FloatArray:
@@ -68,21 +68,22 @@ class _Fit:
         return np.linalg.norm(self.errors(), axis=1)
 
     def spread(self, least: float) -> float:
-        """Standard deviation [m] of one coordinate's error, from the middle distance, at least `least`.
+        """Return a robust standard deviation [m] of one coordinate's error, at least `least`.
 
-        The middle lies above the median by the pairs that what is fitted can explain whatever they are (Rousseeuw and
-        Leroy 1987, least median of squares): else a few pairs would look perfect and the others be outliers.
+        Taken from the middle distance. Its rank lies above the median by the number of pairs that the fitted parameters
+        can always explain (Rousseeuw and Leroy 1987, least median of squares). Otherwise a few pairs would fit
+        perfectly and the others would count as outliers.
         """
         free_pairs = 2 * self.fit_pose + self.fit_marker
         rank = min(len(self.x) // 2 + free_pairs, len(self.x) - 1)
         return max(float(np.partition(self.norms(), rank)[rank]) / MEDIAN_NORM, least)
 
     def place(self, weights: FloatArray) -> None:
-        """The best pose for the present marker."""
+        """Fit the best pose for the current marker offset."""
         self.rotation, self.translation = rigid_motion(self.markers(), self.x, weights)
 
     def improve(self, weights: FloatArray) -> float:
-        """One weighted Gauss-Newton step in all that is fitted; returns its size (rad and m added)."""
+        """Take one weighted Gauss-Newton step in all fitted parameters; return its size (rad and m added)."""
         turned = self.markers() @ self.rotation.T
         columns: list[FloatArray] = []
         if self.fit_pose:
@@ -112,11 +113,11 @@ def align(
     sigma: float | None = None,
     turns: ArrayLike | None = None,
 ) -> Alignment:
-    """Fits what is not known of the instrument's pose and the marker's place to measured pairs.
+    """Fit the unknown camera pose and marker offset to measured pairs.
 
-    Needs no first guess and withstands gross outliers. The final fit is plain least squares over the pairs that are
-    no outliers. Where pose and marker can make up for each other (a chain whose last frame hardly turns), the
-    combination that changes the nominal chain least is returned.
+    Needs no first guess and withstands gross outliers. The final fit is plain least squares over the inliers. Where
+    pose and marker offset can compensate for each other (a chain whose last frame hardly turns), the combination that
+    changes the nominal chain least is returned.
 
     Args:
         chain: the nominal chain.
@@ -165,7 +166,7 @@ def align(
 
 
 def rigid_motion(points: FloatArray, targets: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The proper rotation (3, 3) and translation (3,) that take points (n, 3) nearest to targets, in closed form.
+    """Return the proper rotation (3, 3) and translation (3,) that best map points (n, 3) to targets, in closed form.
 
     Kabsch 1976, "A solution for the best rotation to relate two sets of vectors".
     """
@@ -181,7 +182,8 @@ def rigid_motion(points: FloatArray, targets: FloatArray, weights: FloatArray) -
 def _start_shift(fit: _Fit, sigma: float, turns: FloatArray | None) -> FloatArray:
     """Marker shift (3,) whose fit explains a sample of the pairs best, of several starting points.
 
-    Pose and marker together have local minima, mostly with few joints or small ranges.
+    Several starting points are tried: pose and marker offset together have local minima, mostly with few joints or
+    small ranges.
     """
     chosen = np.unique(np.linspace(0, len(fit.x) - 1, _START_PAIRS).astype(np.intp))
     reach = float(np.linalg.norm(fit.x - np.median(fit.x, axis=0), axis=1).mean())
@@ -194,7 +196,7 @@ def _start_shift(fit: _Fit, sigma: float, turns: FloatArray | None) -> FloatArra
         trial.shift = start
         _fit_robustly(trial, sigma)
         spread = trial.spread(0.0)
-        # A better start must be clearly better, so that rounding does not choose among equals.
+        # A new start must be clearly better, so that rounding does not choose among equals.
         if spread < 0.9 * best_spread - ROUNDING_M:
             best, best_spread = trial.shift, spread
     return best
@@ -223,10 +225,11 @@ def _shift_by_turns(fit: _Fit, turns: FloatArray) -> FloatArray:
 
 
 def _fit_robustly(fit: _Fit, sigma: float) -> BoolArray:
-    """Improves `fit` by graduated non-convexity, then by least squares on the inliers, which it returns (n,).
+    """Fit robustly by graduated non-convexity, then by least squares on the inliers; return the inliers (n,).
 
-    Geman-McClure weights whose scale shrinks from the largest residual to the bulk's (Yang et al. 2020, "Graduated
-    Non-Convexity for Robust Spatial Perception"): the first fits are nearly least squares and need no good guess.
+    Geman-McClure weights whose scale shrinks from the largest residual to that of the bulk (Yang et al. 2020,
+    "Graduated Non-Convexity for Robust Spatial Perception"). The first fits are nearly least squares and need no good
+    guess. `fit` is changed in place.
     """
     weights = np.ones(len(fit.x))
     if fit.fit_pose:

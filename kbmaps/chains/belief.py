@@ -1,4 +1,4 @@
-"""What is believed of a rigid chain: a Gaussian over the changes of a reference chain."""
+"""Gaussian posterior over the parameters of a rigid chain."""
 
 from __future__ import annotations
 
@@ -26,11 +26,10 @@ class ChainBelief:
     """Mean and covariance of the parameters of a chain.
 
     Attributes:
-        parameters: what they are, and the reference chain that they change.
+        parameters: the parametrisation, with its reference chain.
         mean: (size,) [rad, m].
         root: matrix W (size, k) with the covariance W Wᵀ; a row of zeros holds its parameter.
-        noise: 1-sigma of a coordinate of what was measured around the chain [m], as the pairs showed it; 0 where none
-            did.
+        noise: 1-sigma of a measured coordinate about the chain [m], estimated from pairs; 0 without pairs.
 
     Raises:
         ShapeError, NonFiniteError
@@ -57,15 +56,16 @@ class ChainBelief:
 
     @classmethod
     def from_tolerances(cls, parameters: ChainParameters, tolerances: ChainTolerances) -> Self:
-        """The reference chain, as far as its tolerances let believe in it."""
+        """Return the reference chain with its tolerances as the prior."""
         std = np.minimum(parameters.standard_deviations(tolerances), WIDE)
         return cls(parameters, np.zeros(parameters.size), np.diag(std))
 
     @classmethod
     def from_covariance(cls, parameters: ChainParameters, mean: FloatArray, covariance: FloatArray) -> Self:
-        """A Gaussian with this covariance (size, size); a row of zeros holds its parameter.
+        """Return a Gaussian with this covariance (size, size); a row of zeros holds its parameter.
 
-        Scaled to correlations first: lengths and angles, known and unknown ones, differ by many orders of magnitude.
+        The covariance is first scaled to correlations: lengths and angles, known and unknown ones, differ by many
+        orders of magnitude.
         """
         std = np.sqrt(np.diag(covariance))
         free = np.flatnonzero(std > 0.0)
@@ -76,7 +76,7 @@ class ChainBelief:
 
     @property
     def chain(self) -> RigidChain:
-        """The most probable chain."""
+        """Most probable chain."""
         return self.parameters.chain(self.mean)
 
     @property
@@ -85,7 +85,7 @@ class ChainBelief:
         return self.root @ self.root.T
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Positions (n, 3) [m] of the most probable chain at q (n, d), or (3,) at q (d,).
+        """Return the positions (n, 3) [m] of the most probable chain at q (n, d), or (3,) at q (d,).
 
         Raises:
             ShapeError, NonFiniteError
@@ -93,7 +93,7 @@ class ChainBelief:
         return self.parameters.positions(self.mean, rows_or_vector("q", q, self.parameters.reference.joints))
 
     def predict_with_variance(self, q: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Positions at q (n, d) and the variance of each coordinate to first order, both (n, 3) [m, m²].
+        """Return positions at q (n, d) and the first-order variance of each coordinate, both (n, 3) [m, m²].
 
         Raises:
             ShapeError, NonFiniteError
@@ -107,13 +107,13 @@ class ChainBelief:
         return x, variance
 
     def to_bytes(self) -> bytes:
-        """The belief and its reference chain, as one self-describing byte string."""
+        """Return the belief and its reference chain as one self-describing byte string."""
         arrays = chain_arrays(self.parameters.reference) | {"mean": self.mean, "root": self.root}
         return pack(_KIND, {"noise": self.noise}, arrays)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """The belief in `data`. Raises ModelFormatError: it is none, or damaged."""
+        """Return the belief in `data`. Raises ModelFormatError: wrong type of model, or damaged."""
         fields, arrays = unpack(data, _KIND)
         with restoring("a belief in a chain"):
             complete(arrays, (*CHAIN, "mean", "root"))
@@ -121,20 +121,20 @@ class ChainBelief:
             return cls(ChainParameters(chain_from_arrays(arrays)), arrays["mean"], arrays["root"], noise)
 
     def tightened(self, before: ChainTolerances, after: ChainTolerances) -> tuple[Self, float]:
-        """The same pairs' belief had it begun with narrower tolerances, and its evidence.
+        """Return the posterior that narrower tolerances would have given for the same pairs, and its evidence.
 
-        Only what is narrower is exchanged; so what is believed may come from several tools, if that of the tool is not.
-        Both are exact where positions are linear in the parameters.
+        Only the tolerances that change are exchanged. So the posterior may combine pairs of several tools, provided
+        that the tool's tolerance does not change. Both results are exact where positions are linear in the parameters.
 
         Args:
-            before: the tolerances that the belief began with.
-            after: those that it shall have begun with, none of them wider.
+            before: the tolerances of the original prior.
+            after: the tolerances to use instead, none of them wider.
 
         Returns:
-            The belief, and the logarithm of how many times as probable the narrower tolerances make the pairs.
+            The posterior, and the log Bayes factor of the narrower tolerances against the original ones.
 
         Raises:
-            SettingError: a tolerance would be wider than it was, or held.
+            SettingError: a tolerance would become wider, or 0.
         """
         wide, narrow = (np.minimum(self.parameters.standard_deviations(each), WIDE) for each in (before, after))
         if (narrow > wide).any() or ((narrow == 0.0) & (wide > 0.0)).any():
@@ -150,11 +150,11 @@ class ChainBelief:
         return type(self)(self.parameters, mean, root, self.noise), evidence - 0.5 * float(self.mean @ (added * mean))
 
     def among(self, beliefs: Sequence[ChainBelief], shares: ArrayLike) -> Self:
-        """This chain, as far as it may be any of several others: the mixture's second moment about this mean.
+        """Return this chain with the uncertainty of a mixture: the mixture's second moment about this mean.
 
         Args:
-            beliefs: in the same parameters; this one among them.
-            shares: how probable each is (m,); they add up to 1.
+            beliefs: the components, in the same parameters; this one among them.
+            shares: their probabilities (m,), which add up to 1.
         """
         weights = np.sqrt(np.asarray(shares, dtype=np.float64))
         apart = np.array([belief.mean - self.mean for belief in beliefs]).T * weights
@@ -165,7 +165,7 @@ class ChainBelief:
         return type(self)(self.parameters, self.mean, root, self.noise)
 
     def with_other_tool(self, tolerance: float) -> Self:
-        """The same arm with a marker that was moved, by `tolerance` (1-sigma of each component [m]).
+        """Return the same arm with a marker displaced by `tolerance` (1-sigma of each component [m]).
 
         Raises:
             SettingError: the tolerance is not positive.
@@ -176,10 +176,11 @@ class ChainBelief:
         return self.widened(np.arange(size)[self.parameters.tool], np.full(3, tolerance))
 
     def widened(self, columns: IntArray, std: FloatArray) -> Self:
-        """The same chain but for some parameters that were changed, by `std` (k,) [rad, m] (1-sigma of each).
+        """Return the same chain with the uncertainty of some parameters increased by `std` (k,) [rad, m] (1-sigma).
 
         Args:
-            columns: which (k,).
+            columns: indices (k,) of these parameters.
+            std: 1-sigma of each change (k,) [rad, m].
         """
         changed = np.zeros((self.parameters.size, len(columns)))
         changed[columns, np.arange(len(columns))] = std
@@ -190,7 +191,7 @@ class ChainBelief:
 
 
 def squared(root: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Which rows of a root (size, k) are free, as indices (f,), and their lower triangular root (f, f)."""
+    """Return the indices (f,) of the free rows of a root (size, k), and their lower triangular root (f, f)."""
     free = np.flatnonzero(root.any(axis=1))
     held = root[free]
     if held.shape[1] < len(free):

@@ -1,4 +1,4 @@
-"""Models that stand behind another one, and travel inside its bytes where they can."""
+"""Serialisation of a model that serves as the prior of another one."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from kbmaps.packed import count
 
 
 class Predictor(Protocol):
-    """Anything that gives positions."""
+    """Model that predicts positions."""
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Positions (n, 3) [m] at q (n, d) [rad, m], or (3,) at q (d,)."""
+        """Return positions (n, 3) [m] at q (n, d) [rad, m], or (3,) at q (d,)."""
         ...
 
 
 class Origin:
-    """Predicts the origin of the measurement frame everywhere: the prior of who knows nothing."""
+    """Predictor of the origin of the measurement frame everywhere: the prior without any knowledge."""
 
     def __init__(self, joints: int) -> None:
         self.joints = joints
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Zeros (n, 3), or (3,) at q (d,)."""
+        """Return zeros (n, 3), or (3,) at q (d,)."""
         return np.zeros((*rows_or_vector("q", q, self.joints).shape[:-1], 3))
 
 
 def packable(model: object) -> tuple[dict[str, Any], dict[str, FloatArray]]:
-    """Fields and arrays for `kbmaps.packed` from which `unpacked` makes the model again.
+    """Return fields and arrays for `kbmaps.packed` from which `unpacked` restores the model.
 
-    Of a model that is no `KBMap`, `RigidChain` or `Origin`, its type's name only.
+    For any other type than `KBMap`, `RigidChain` or `Origin`, only the type's name is stored.
     """
     if isinstance(model, KBMap):
         bases = describe_bases(model.bases)
@@ -52,10 +52,10 @@ def packable(model: object) -> tuple[dict[str, Any], dict[str, FloatArray]]:
 
 
 def unpacked(fields: Any, arrays: Mapping[str, FloatArray], given: object | None) -> Any:
-    """The model that `packable` described, or the one `given`, where it is of a type that does not travel.
+    """Return the model that `packable` described, or the one `given` if its type is not stored in bytes.
 
     Raises:
-        ModelFormatError: it does not travel, and none or one of another type was given.
+        ModelFormatError: the type is not stored, and no model or one of another type was given.
         KeyError, TypeError, ValueError, KBMapsError: the description is damaged.
     """
     described = cast(dict[str, Any], fields) if isinstance(fields, dict) else {}

@@ -20,7 +20,7 @@ _RIGID_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class RigidChain:
-    """A serial chain from the measurement frame to the marker frame.
+    """Serial chain from the measurement frame to the marker frame.
 
     T(q) = F_0 · J_1(q_1) · F_1 · J_2(q_2) · … · J_d(q_d) · F_d, where J_k turns about (or, prismatic, slides along)
     its axis. The marker is the origin of the last frame.
@@ -28,7 +28,7 @@ class RigidChain:
     Attributes:
         fixed: the constant transforms F_0 ... F_d (d+1, 4, 4), lengths [m].
         axes: unit axes (d, 3) in each joint's own frame, the frame after F_{k-1}.
-        prismatic: which joints slide (d,).
+        prismatic: True for each joint (d,) that slides.
 
     Raises:
         ShapeError, NonFiniteError
@@ -77,7 +77,9 @@ class RigidChain:
         return len(self.axes)
 
     def poses(self, q: ArrayLike) -> FloatArray:
-        """Pose of the marker frame (4, 4) in the measurement frame for q (d,) [rad, m]; (n, 4, 4) for (n, d).
+        """Return the pose of the marker frame (4, 4) for q (d,) [rad, m]; (n, 4, 4) for (n, d).
+
+        In the measurement frame.
 
         Raises:
             ShapeError, NonFiniteError
@@ -86,7 +88,7 @@ class RigidChain:
         return self._frames(checked)[-1]
 
     def positions(self, q: ArrayLike) -> FloatArray:
-        """Marker position (3,) [m] for q (d,), or (n, 3) for (n, d).
+        """Return the marker position (3,) [m] for q (d,), or (n, 3) for (n, d).
 
         Raises:
             ShapeError, NonFiniteError
@@ -94,14 +96,15 @@ class RigidChain:
         return self.poses(q)[..., :3, 3]
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """`positions`, by the name that models have for it."""
+        """Return `positions(q)`, under the name that all models share."""
         return self.positions(q)
 
     def orientation(self, q: ArrayLike, *, orthonormal: bool = False) -> FloatArray:
-        """Rotation (3, 3) of the marker frame in the measurement frame for q (d,), or (n, 3, 3) for (n, d).
+        """Return the rotation (3, 3) of the marker frame in the measurement frame for q (d,), or (n, 3, 3) for (n, d).
 
         Args:
-            orthonormal: mends what rounding has left of the fixed transforms' errors, at most 1e-6 each.
+            q: joint values (d,) or (n, d) [rad, m].
+            orthonormal: remove the rounding errors of the fixed transforms, at most 1e-6 each.
 
         Raises:
             ShapeError, NonFiniteError
@@ -110,9 +113,9 @@ class RigidChain:
         return nearest_rotation(rotations) if orthonormal else rotations
 
     def frames(self, q: ArrayLike) -> FloatArray:
-        """Poses in the measurement frame of joints 1..d before they move and of the marker: (d+1, 4, 4) for q (d,).
+        """Return the poses of joints 1..d before they move and of the marker: (d+1, 4, 4) for q (d,).
 
-        For q (n, d): (n, d+1, 4, 4).
+        All are in the measurement frame. For q (n, d): (n, d+1, 4, 4).
 
         Raises:
             ShapeError, NonFiniteError
@@ -121,7 +124,7 @@ class RigidChain:
         return self._frames_of_rows(checked) if checked.ndim == 2 else np.stack(self._frames(checked), axis=-3)
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d).
+        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d).
 
         Raises:
             ShapeError, NonFiniteError
@@ -137,7 +140,7 @@ class RigidChain:
         return columns
 
     def angular_jacobian(self, q: ArrayLike) -> FloatArray:
-        """Angular velocity (3, d) of the marker frame [rad/rad, or rad/m], or (n, 3, d) for q (n, d).
+        """Return the angular velocity (3, d) of the marker frame [rad/rad, or rad/m], or (n, 3, d) for q (n, d).
 
         In the measurement frame: dR/dq_k = [column k]× R.
 
@@ -152,37 +155,37 @@ class RigidChain:
         return columns
 
     def to_kbmap(self, bases: Sequence[JointBasis], *, orientation: bool = False) -> KBMap:
-        """The chain as a KB-Map, exact up to rounding, without any sampling.
+        """Convert the chain to a KB-Map, exact up to rounding, without any sampling.
 
-        Each joint's 4x4 matrix is affine in its basis functions, so the product of the chain is a tensor product of
-        them and its last column is the control net.
+        Each joint's 4x4 matrix is affine in its basis functions. The product of the chain is therefore a tensor product
+        of them, and its last column is the control net.
 
         Args:
-            bases: one a joint.
-            orientation: also the nine planes of the rotation matrix.
+            bases: one per joint.
+            orientation: add the nine planes of the rotation matrix.
 
         Raises:
-            BasisError: another number of bases, or a revolute basis for a prismatic joint; NetSizeError: more than
-                3^13 control points.
+            BasisError: wrong number of bases, or a revolute basis for a prismatic joint.
+            NetSizeError: more than 3^13 control points.
         """
         check_net_size(bases, POSE_OUTPUTS if orientation else POSITION_OUTPUTS)
         net = self._net(bases, 3)
         return KBMap(tuple(bases), np.concatenate([net, self.orientation_maps(bases)]) if orientation else net)
 
     def orientation_maps(self, bases: Sequence[JointBasis]) -> FloatArray:
-        """Planes (9, m1, ..., md) of the unit vectors e1, e2, e3 of the marker frame (three planes each).
+        """Return the planes (9, m1, ..., md) of the unit vectors e1, e2, e3 of the marker frame (three planes each).
 
-        A tool moved by δ [m] in the marker frame is G + E1 δ1 + E2 δ2 + E3 δ3 exactly.
+        A tool displaced by δ [m] in the marker frame is exactly G + E1 δ1 + E2 δ2 + E3 δ3.
 
         Raises:
-            BasisError: another number of bases, or a revolute basis for a prismatic joint; NetSizeError: more than
-                3^13 control points.
+            BasisError: wrong number of bases, or a revolute basis for a prismatic joint.
+            NetSizeError: more than 3^13 control points.
         """
         check_net_size(bases, POSE_OUTPUTS - POSITION_OUTPUTS)
         return np.concatenate([self._net(bases, column) for column in range(3)])
 
     def with_tool(self, marker_shift: ArrayLike) -> RigidChain:
-        """The chain with its marker moved by a vector (3,) [m] given in the marker frame.
+        """Return the chain with its marker displaced by a vector (3,) [m] given in the marker frame.
 
         Raises:
             ShapeError, NonFiniteError
@@ -192,10 +195,11 @@ class RigidChain:
         return RigidChain(fixed, self.axes, self.prismatic)
 
     def transformed(self, T_new_old: ArrayLike) -> RigidChain:
-        """The chain as seen from another measurement frame, in which the old one has the pose T_new_old (4, 4).
+        """Return the chain in another measurement frame, in which the old one has the pose T_new_old (4, 4).
 
         Raises:
-            ShapeError, ChainError: not a rigid transform.
+            ShapeError
+            ChainError: not a rigid transform.
         """
         transform = numbers("T_new_old", T_new_old)
         check_rigid("T_new_old", transform)
@@ -204,7 +208,7 @@ class RigidChain:
         return RigidChain(fixed, self.axes, self.prismatic)
 
     def _frames(self, q: FloatArray) -> list[FloatArray]:
-        """Frames of joints 1..d (before they move), then the marker frame, each (..., 4, 4)."""
+        """Return the frames of joints 1..d (before they move), then the marker frame, each (..., 4, 4)."""
         constant, first, second = self._moved_links
         pose = np.broadcast_to(self.fixed[0], (*q.shape[:-1], 4, 4))
         cosines = np.where(self.prismatic, q, np.cos(q))[..., None, None]
@@ -216,7 +220,7 @@ class RigidChain:
         return frames
 
     def _frames_of_rows(self, q: FloatArray) -> FloatArray:
-        """`_frames` (n, d+1, 4, 4) of many q (n, d): number by number over all rows, which is several times as fast."""
+        """Return `_frames` (n, d+1, 4, 4) for many q (n, d), several times as fast: one operation per matrix entry."""
         constant, first, second = self._moved_links[..., None]
         cosines, sines = np.where(self.prismatic, q, np.cos(q)).T.copy(), np.sin(q).T.copy()
         frames = np.zeros((self.joints + 1, 4, 4, len(q)))
@@ -234,7 +238,7 @@ class RigidChain:
         return frozen(terms @ self.fixed[1:])
 
     def _joint_terms(self, k: int) -> FloatArray:
-        """Matrices A (3, 4, 4): J_k(q) = A0 + cos q·A1 + sin q·A2 (Rodrigues), or A0 + q·A1 for a prismatic joint."""
+        """Return matrices A (3, 4, 4): J_k(q) = A0 + cos q·A1 + sin q·A2 (Rodrigues), or A0 + q·A1 if prismatic."""
         axis = self.axes[k]
         terms = np.zeros((3, 4, 4))
         if self.prismatic[k]:
@@ -248,7 +252,7 @@ class RigidChain:
         return terms
 
     def _net(self, bases: Sequence[JointBasis], column: int) -> FloatArray:
-        """Coefficients (3, m1, ..., md) of the upper part of one column of T(q)."""
+        """Return the coefficients (3, m1, ..., md) of the upper part of one column of T(q)."""
         check_bases(bases, self.prismatic.tolist())
         tensor: FloatArray = self.fixed[-1][:, column]
         for k in range(self.joints - 1, -1, -1):
@@ -261,7 +265,7 @@ class RigidChain:
 
 
 def check_rigid(name: str, transform: FloatArray) -> None:
-    """Raises ShapeError or ChainError unless `transform` (4, 4) is a proper rigid transform."""
+    """Raise ShapeError or ChainError unless `transform` (4, 4) is a proper rigid transform."""
     if transform.shape != (4, 4):
         raise ShapeError(name, "(4, 4)", transform.shape)
     rotation = transform[:3, :3]

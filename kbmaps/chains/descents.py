@@ -1,4 +1,4 @@
-"""Several chains that descend side by side to where they fit the same pairs, in arrays."""
+"""Vectorised Levenberg-Marquardt fits of several chains to the same pairs."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from kbmaps.rotations import cross_matrix
 
 _STEPS = 150
 _FIRST_DAMPING, _LEAST_DAMPING, _LEAST_RAISED_DAMPING, _MOST_DAMPING = 1e-2, 1e-14, 1e-8, 1e6
-# A start whose residual [m] is this small has found the chain to the last digits.
+# A start with a residual [m] this small has found the chain to the last digits.
 _EXACT_M = 1e-12
-# A step that mends less than this share of the squared residual ends a start, once it has happened a few times.
+# A start ends after this many steps that each reduce the squared residual by less than this share.
 _STALLED, _STALLED_STEPS = 1e-4, 8
 
 
 @dataclass(frozen=True, eq=False)
 class ScrewArms:
-    """Chains given by where their joints' axes lie when all joints are at zero (Brockett 1984).
+    """Chains given by the location of their joint axes with all joints at zero (Brockett 1984).
 
     Attributes:
         axes: unit axes (s, d, 3).
-        points: a point of each axis (s, d, 3), and the marker's place (s, d+1, 3) as the last one [m].
+        points: a point of each axis (s, d, 3), then the marker position (s, d+1, 3) [m].
     """
 
     axes: FloatArray
@@ -35,14 +35,17 @@ class ScrewArms:
         return ScrewArms(self.axes[chosen], self.points[chosen])
 
     def chain(self, index: int, slides: BoolArray) -> RigidChain:
-        """One of them; all its frames are parallel to the measurement frame when the joints are at zero."""
+        """Return one chain; with the joints at zero, all its frames are parallel to the measurement frame."""
         fixed = np.tile(np.eye(4), (len(slides) + 1, 1, 1))
         fixed[:, :3, 3] = np.diff(self.points[index], axis=0, prepend=np.zeros((1, 3)))
         return RigidChain(fixed, self.axes[index], slides)
 
     def changed(self, steps: FloatArray) -> ScrewArms:
-        """After steps (s, 4 d + 3): tilts of the axes across two `tangents` [rad], their shifts along these and the
-        marker's move [m]."""
+        """Return the chains after steps (s, 4 d + 3).
+
+        A step holds tilts of the axes about two `tangents` [rad], their shifts along these [m] and the marker's
+        displacement [m].
+        """
         count, d = self.axes.shape[:2]
         across = tangents(self.axes.reshape(-1, 3)).reshape(count, d, 3, 2)
         tilts = steps[:, : 2 * d].reshape(count, d, 2, 1)
@@ -59,12 +62,13 @@ class ScrewArms:
 
 @dataclass(frozen=True, eq=False)
 class _Reached:
-    """Where the markers come to, pairs last, so that all of them are one vector operation.
+    """Marker positions of each chain; pairs come last so that all of them are one vector operation.
 
     Attributes:
         turned: R_kᵀ (d+1, s, 3, 3, n), R_k the rotation before joint k, and of the marker.
         levers: from each joint's point to the marker (d, s, 3, n) [m].
-        residuals: (s, 3, n) [m]; squares: their sums of squares (s,) [m²].
+        residuals: (s, 3, n) [m].
+        squares: their sums of squares (s,) [m²].
     """
 
     turned: FloatArray
@@ -77,12 +81,13 @@ class _Reached:
 
 
 class Descents:
-    """Levenberg-Marquardt from several chains at once.
+    """Levenberg-Marquardt from several starting chains at once.
 
     Args:
-        q: joint angles (n, d) [rad, m]; x: marker positions (n, 3) [m].
-        slides: which joints slide (d,).
-        size: how far the positions spread [m].
+        q: joint angles (n, d) [rad, m].
+        x: marker positions (n, 3) [m].
+        slides: True for each joint (d,) that slides.
+        size: spread of the positions [m].
     """
 
     def __init__(self, q: FloatArray, x: FloatArray, slides: BoolArray, size: float) -> None:
@@ -96,7 +101,7 @@ class Descents:
         self._held = 1e-3 * size**2
 
     def run(self, starts: ScrewArms, enough: float) -> tuple[ScrewArms, FloatArray]:
-        """Where they come to, and the RMS residuals there [m]. All end with the first that ends at `enough`."""
+        """Return the fitted chains and their RMS residuals [m]. All stop as soon as one ends at `enough` or below."""
         arms, count = ScrewArms(starts.axes.copy(), starts.points.copy()), len(starts.axes)
         pairs = self._x.shape[1]
         reached = self._reach(arms)
@@ -149,7 +154,7 @@ class Descents:
         return _Reached(turned, levers, residuals, np.einsum("sin,sin->s", residuals, residuals))
 
     def _normal(self, arms: ScrewArms, reached: _Reached) -> tuple[FloatArray, FloatArray]:
-        """Gram matrices (s, f, f) of the Jacobians and their products with the residuals (s, f).
+        """Return the Gram matrices (s, f, f) of the Jacobians and their products with the residuals (s, f).
 
         A tilt of an axis about u moves the marker by (R_k u − R_{k+1} u) × lever, a shift by v moves it by
         R_k v − R_{k+1} v.

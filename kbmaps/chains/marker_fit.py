@@ -1,4 +1,4 @@
-"""Where a marker sits on the last link, in closed form: x = f(q) + R(q) δ is linear in δ."""
+"""Position of a marker on the last link, in closed form: x = f(q) + R(q) δ is linear in δ."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _ROUNDS = 20
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """What a model leaves to explain at n configurations.
+    """Residuals of a model at n configurations.
 
     Attributes:
-        rotations: R(q) (n, 3, 3), as the model has them.
+        rotations: R(q) (n, 3, 3) of the model.
         errors: x − f(q) (n, 3) [m].
-        sigma: 1-sigma of each (n,) [m], NaN where it was not told.
+        sigma: 1-sigma of each (n,) [m], NaN where unknown.
     """
 
     rotations: FloatArray
@@ -36,8 +36,8 @@ class Residuals:
         return Residuals(self.rotations[chosen], self.errors[chosen], self.sigma[chosen])
 
     def joined(self, more: Residuals) -> Residuals:
-        """These and then more."""
-        # In C order, whatever the model's: sums must not depend on a layout that is lost in bytes.
+        """Return these residuals followed by `more`."""
+        # C order, whatever the model's: sums must not depend on a memory layout that is lost in bytes.
         return Residuals(
             np.ascontiguousarray(np.concatenate([self.rotations, more.rotations])),
             np.concatenate([self.errors, more.errors]),
@@ -45,21 +45,20 @@ class Residuals:
         )
 
     def norms(self, shift: FloatArray) -> FloatArray:
-        """Distances (n,) [m] that a shift (3,) leaves."""
+        """Return the distances (n,) [m] that remain with a marker offset (3,)."""
         return np.linalg.norm(self.errors - self.rotations @ shift, axis=1)
 
 
 @dataclass(frozen=True, eq=False)
 class MarkerKnowledge:
-    """All that pairs and a prior say about δ and the noise, as sums: the order of the pairs does not matter.
+    """Sufficient statistics of δ and the noise; the order of the pairs does not matter.
 
     Attributes:
         information, pull: Λ (3, 3) [1/m²] and Λ m (3,) [1/m] of a Gaussian N(m, Λ⁻¹) of δ: the prior, and the pairs
-            whose sigma was told.
-        square, inner, count: of the pairs whose noise is not known, Σ Rᵀ R (3, 3), Σ Rᵀ e (3,) and their number.
+            with a given sigma.
+        square, inner, count: of the pairs of unknown noise, Σ Rᵀ R (3, 3), Σ Rᵀ e (3,) and their number.
         errors: Σ eᵀ e of these [m²].
-        noise_count, noise_square: what is known of their noise beforehand, as so many coordinates and the sum of
-            their squares.
+        noise_count, noise_square: prior of their noise, as a number of coordinates and the sum of their squares.
     """
 
     information: FloatArray
@@ -73,7 +72,14 @@ class MarkerKnowledge:
 
     @classmethod
     def before(cls, shift: FloatArray, covariance: FloatArray, noise: float, noise_count: float) -> Self:
-        """A prior: shift (3,) [m], its covariance (3, 3), and the noise [m] as if found from so many coordinates."""
+        """Return the prior of an offset and the noise.
+
+        Args:
+            shift: mean of the offset (3,) [m].
+            covariance: of the offset (3, 3) [m²].
+            noise: 1-sigma of a coordinate [m].
+            noise_count: number of coordinates that the noise counts for.
+        """
         information: FloatArray = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
         return cls(
             information,
@@ -87,7 +93,7 @@ class MarkerKnowledge:
         )
 
     def given(self, pairs: Residuals) -> MarkerKnowledge:
-        """What is known after these pairs too."""
+        """Return the statistics updated with these pairs."""
         told = ~np.isnan(pairs.sigma)
         known, other = pairs[told], pairs[~told]
         weights = 1.0 / np.square(known.sigma)
@@ -102,7 +108,7 @@ class MarkerKnowledge:
         )
 
     def posterior(self) -> MarkerPosterior:
-        """The shift and the noise that the evidence speaks for."""
+        """Return the posterior of the offset, with the noise that maximises the evidence."""
         covariance = np.linalg.inv(self.information)
         centre = covariance @ self.pull
         root = np.linalg.cholesky(0.5 * (covariance + covariance.T))
@@ -129,7 +135,7 @@ class MarkerKnowledge:
 
 @dataclass(frozen=True, eq=False)
 class MarkerPosterior:
-    """δ (3,) [m], its covariance (3, 3) [m²], and the noise of a coordinate [m] where it was not told."""
+    """Posterior of δ (3,) [m]: mean, covariance (3, 3) [m²], and noise of a coordinate [m] where it was not given."""
 
     shift: FloatArray
     covariance: FloatArray
@@ -139,10 +145,10 @@ class MarkerPosterior:
 def fit_marker(
     before: MarkerKnowledge, pairs: Residuals, outlier_sigmas: float
 ) -> tuple[MarkerKnowledge, MarkerPosterior, BoolArray]:
-    """Least squares over the pairs that are no outliers: what is then known, the posterior, and which pairs (n,).
+    """Fit by least squares over the inliers; return the statistics, the posterior, and the inliers (n,).
 
-    Begins from the median of what single pairs say, so that up to half of them may be anything. With fewer than five
-    pairs there is no majority, and all count.
+    Starts from the median of the single pairs' estimates, so that up to half of them may be arbitrary. Fewer than five
+    pairs have no majority, and all count.
     """
     inliers = np.ones(len(pairs), dtype=np.bool_)
     if len(pairs):
@@ -162,7 +168,10 @@ def fit_marker(
 
 
 def _near(pairs: Residuals, shift: FloatArray, outlier_sigmas: float) -> BoolArray:
-    """Which pairs (n,) lie within so many robust standard deviations, and no fewer than their sigma says."""
+    """Return True for each pair (n,) within `outlier_sigmas` robust standard deviations.
+
+    The robust standard deviation is at least the given sigma.
+    """
     norms = pairs.norms(shift)
     told = ~np.isnan(pairs.sigma)
     limits = np.full(len(norms), ROUNDING_M)
@@ -175,10 +184,10 @@ def _near(pairs: Residuals, shift: FloatArray, outlier_sigmas: float) -> BoolArr
 
 
 def _spread(norms: FloatArray) -> float:
-    """Standard deviation of a coordinate from the middle norm.
+    """Return the standard deviation of a coordinate from the middle norm.
 
-    The middle lies above the median by one pair, which a shift can explain whatever it is (Rousseeuw and Leroy 1987,
-    least median of squares): else a few pairs would look perfect and the others be outliers.
+    Its rank lies above the median by the one pair that an offset can always explain (Rousseeuw and Leroy 1987, least
+    median of squares). Otherwise a few pairs would fit perfectly and the others would count as outliers.
     """
     rank = min(len(norms) // 2 + 1, len(norms) - 1)
     return float(np.partition(norms, rank)[rank]) / MEDIAN_NORM

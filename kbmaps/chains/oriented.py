@@ -1,4 +1,4 @@
-"""A rigid chain whose marker is seen turned: what orientations say of it, beside what positions said."""
+"""Rigid chain fitted to marker orientations, in addition to positions."""
 
 from __future__ import annotations
 
@@ -21,29 +21,30 @@ from kbmaps.robust import MEDIAN_NORM
 from kbmaps.rotations import exponentials, nearest_rotation, rotation_matrices, rotation_vectors
 
 _KIND = "oriented chain, 1"
-# Turns of the marker on the hand that are tried as a beginning.
+# Number of candidate rotations of the marker on the hand to start from.
 _CANDIDATES = 64
 _STEPS = 8
-# Student's t: a turn many sigmas away counts little, one within them nearly as in least squares.
+# Degrees of freedom of Student's t: a residual of many sigmas counts little, one within them nearly as in least
+# squares.
 _FREEDOM = 6.0
-# No measured orientation is better than this [rad]: below is rounding.
+# Lower bound of the noise of a measured orientation [rad]: below is rounding.
 _ROUNDING_RAD = 1e-8
 _BLOCK = 2048
 
 
 @dataclass(frozen=True, eq=False)
 class OrientedChain:
-    """What is believed of a chain, and of how the marker's own frame is turned in the chain's marker frame.
+    """Posterior of a chain, and of the rotation of the marker's own frame in the chain's marker frame.
 
     The marker is measured as R(q) · turn, with R(q) the rotation of the chain's last frame.
 
     Attributes:
-        parameters: what may be wrong of the chain, and the reference chain.
+        parameters: the parametrisation, with the reference chain.
         mean: their values (size,) [rad, m].
-        turn: rotation (3, 3) of the marker in the chain's last frame; constant, and unknown before it was seen.
+        turn: rotation (3, 3) of the marker in the chain's last frame; constant, and unknown before the fit.
         root: matrix W (size + 3, k), the covariance W Wᵀ of the parameters and of a small turn τ of the marker,
             exp([τ]×) · turn [rad].
-        noise: 1-sigma of a measured orientation about one axis around the chain [rad].
+        noise: 1-sigma of a measured orientation about one axis [rad].
 
     Raises:
         ShapeError, NonFiniteError
@@ -71,14 +72,14 @@ class OrientedChain:
 
     @property
     def chain(self) -> RigidChain:
-        """The most probable chain, its last frame turned as the marker is."""
+        """Most probable chain, its last frame turned as the marker is."""
         chain = self.parameters.chain(self.mean)
         fixed = chain.fixed.copy()
         fixed[-1, :3, :3] = nearest_rotation(fixed[-1, :3, :3] @ self.turn)
         return RigidChain(fixed, chain.axes, chain.prismatic)
 
     def orientation(self, q: ArrayLike) -> FloatArray:
-        """Rotations of the marker (n, 3, 3) at q (n, d).
+        """Return rotations of the marker (n, 3, 3) at q (n, d).
 
         Raises:
             ShapeError, NonFiniteError
@@ -86,8 +87,9 @@ class OrientedChain:
         return self.orientation_with_variance(q)[0]
 
     def orientation_with_variance(self, q: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Rotations (n, 3, 3) at q (n, d), and the variance (n, 3) [rad²] of a small turn of them about each axis of
-        the measurement frame, to first order.
+        """Return rotations (n, 3, 3) at q (n, d) and their first-order variance (n, 3) [rad²].
+
+        The variance is that of a small turn about each axis of the measurement frame.
 
         Raises:
             ShapeError, NonFiniteError
@@ -103,13 +105,13 @@ class OrientedChain:
         return rotations, variance
 
     def to_bytes(self) -> bytes:
-        """The chain and what is believed of it, as one self-describing byte string."""
+        """Return the chain and its posterior as one self-describing byte string."""
         arrays = {"mean": self.mean, "turn": self.turn, "root": self.root}
         return pack(_KIND, {"noise": self.noise}, chain_arrays(self.parameters.reference) | arrays)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """What `to_bytes` wrote. Raises ModelFormatError: it is something else, or damaged."""
+        """Restore the bytes of `to_bytes`. Raises ModelFormatError: wrong type of model, or damaged."""
         fields, arrays = unpack(data, _KIND)
         with restoring("an oriented chain"):
             complete(arrays, (*CHAIN, "mean", "turn", "root"))
@@ -119,19 +121,19 @@ class OrientedChain:
 
 
 def fitted_orientation(belief: ChainBelief, q: ArrayLike, rotation: ArrayLike) -> OrientedChain:
-    """The most probable chain and turn of the marker for measured orientations, robustly.
+    """Fit the most probable chain and rotation of the marker to measured orientations, robustly.
 
-    Maximum a posteriori by Gauss-Newton steps on the rotation vectors of R_measured · (R(q) turn)ᵀ, each weighted as
-    Student's t would (Lange, Little, Taylor 1989), with the noise from their median length. On a path neighbours share
-    their errors; so many count as one as do so (`shared_by`).
+    Maximum a posteriori by Gauss-Newton steps on the rotation vectors of R_measured · (R(q) turn)ᵀ. Each is weighted
+    as under Student's t (Lange, Little, Taylor 1989), with the noise from their median length. Along a path,
+    neighbours share their errors; the weights are divided by the number that do (`shared_by`).
 
     Args:
-        belief: what positions let believe of the chain. Where it holds a parameter, that stays.
+        belief: posterior of the chain from positions. Parameters that it holds stay held.
         q: joint values (n, d) [rad, m], in the order in which they were measured.
         rotation: orientations, (n, 3, 3) or quaternions x, y, z, w (n, 4).
 
     Raises:
-        DegenerateDataError: there are none.
+        DegenerateDataError: no orientations.
         ShapeError, NonFiniteError, RotationError
 
     Example:
@@ -168,7 +170,7 @@ class _Fit:
         self._mean = belief.mean
         hand, _ = belief.parameters.turned(self._mean, q)
         self._turn = _likely_turn(hand, measured)
-        self._freedom = 3.0  # numbers that the data have used up so far
+        self._freedom = 3.0  # degrees of freedom that the parameters have used up so far
 
     def step(self) -> None:
         """Linearise, weight and solve once."""
@@ -179,8 +181,8 @@ class _Fit:
         shared = shared_by(errors[lengths <= 3.0 * MEDIAN_NORM * noise])
         scale = np.sqrt(weights / shared)[:, None] / noise
         free = len(self._chosen)
-        # The square root of the normal equations, a priori rows first: what is hardly known and what is known well
-        # differ by more orders of magnitude than their squares leave digits.
+        # Square root of the normal equations, prior rows first: poorly and well known directions differ by more orders
+        # of magnitude than their squares leave digits.
         stacked = np.zeros((free + errors.size, free + 4))
         stacked[:free, :free], stacked[:free, -1] = np.eye(free), -self._chosen
         stacked[free:, :-1] = (columns * scale[..., None]).reshape(errors.size, -1)
@@ -194,7 +196,7 @@ class _Fit:
         self._turn = exponentials(change[None, free:])[0][0] @ self._turn
 
     def result(self) -> OrientedChain:
-        """The chain as it is now."""
+        """Return the chain at the current estimate."""
         size = self._belief.parameters.size
         outward = np.zeros((size + 3, len(self._chosen) + 3))
         outward[:size, : len(self._chosen)] = self._belief.root
@@ -204,7 +206,7 @@ class _Fit:
         return OrientedChain(self._belief.parameters, self._mean, turn, outward @ self._root, noise)
 
     def _linearised(self) -> tuple[FloatArray, FloatArray]:
-        """Errors (n, 3) [rad], and what the unknowns turn (n, 3, k + 3)."""
+        """Return the errors (n, 3) [rad] and their derivatives by the unknowns (n, 3, k + 3)."""
         hand, omega = self._belief.parameters.turned(self._mean, self._q)
         errors = rotation_vectors(self._measured @ (hand @ self._turn).swapaxes(1, 2))
         return errors, np.concatenate([omega @ self._belief.root, hand], axis=2)
@@ -215,7 +217,7 @@ class _Fit:
 
 
 def _likely_turn(hand: FloatArray, measured: FloatArray) -> FloatArray:
-    """Of the turns that single orientations tell, the one from which the others are least far, by the median."""
+    """Return the rotation, among those of single orientations, with the smallest median distance to the others."""
     turns = hand.swapaxes(1, 2) @ measured
     tried = turns[np.linspace(0, len(turns) - 1, min(len(turns), _CANDIDATES)).round().astype(np.intp)]
     # tr(AᵀB) = 1 + 2 cos of the angle between them.

@@ -1,4 +1,4 @@
-"""A rigid chain as arrays of a stored model."""
+"""Conversion of a rigid chain to and from the arrays of a stored model."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ CHAIN = ("fixed", "axes", "prismatic")
 
 
 def chain_arrays(chain: RigidChain) -> dict[str, FloatArray]:
-    """A chain as arrays to pack."""
+    """Return a chain as arrays to pack."""
     return {"fixed": chain.fixed, "axes": chain.axes, "prismatic": chain.prismatic.astype(np.float64)}
 
 
 def chain_from_arrays(arrays: Mapping[str, FloatArray]) -> RigidChain:
-    """The chain in unpacked arrays.
+    """Return the chain in unpacked arrays.
 
     Raises:
-        KeyError (one is missing), ModelFormatError, ChainError, ShapeError, NonFiniteError.
+        KeyError (an array is missing), ModelFormatError, ChainError, ShapeError, NonFiniteError.
     """
     if not np.isin(arrays["prismatic"], (0.0, 1.0)).all():
         raise ModelFormatError("it is not said of every joint whether it slides")
@@ -34,12 +34,12 @@ def chain_from_arrays(arrays: Mapping[str, FloatArray]) -> RigidChain:
 
 
 def describe_tolerances(tolerances: ChainTolerances) -> dict[str, float | None]:
-    """Tolerances as JSON holds them: None where one is infinite."""
+    """Return tolerances as JSON holds them: None for an infinite one."""
     return {name: unless_infinite(value) for name, value in asdict(tolerances).items()}
 
 
 def parse_tolerances(value: Any) -> ChainTolerances:
-    """The tolerances that `describe_tolerances` gave. Raises ModelFormatError, SettingError."""
+    """Return the tolerances from `describe_tolerances`. Raises ModelFormatError, SettingError."""
     names = [field.name for field in fields(ChainTolerances)]
     described = named(value, "the tolerances", names)
     return ChainTolerances(*(or_infinite(described[name], f"the tolerance {name}") for name in names))

@@ -1,4 +1,4 @@
-"""What may be wrong about a rigid chain, as one vector of small changes, and what each change does to the marker."""
+"""Deviations of a rigid chain from its nominal form as one vector, and their effect on the marker."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from kbmaps.chains.chain import RigidChain
 from kbmaps.errors import SettingError
 from kbmaps.rotations import cross_matrix, exponentials
 
-# What an infinite tolerance is taken for [rad, m]: far beyond anything real, and still a proper prior.
+# Finite stand-in for an infinite tolerance [rad, m]: far beyond anything real, and still a proper prior.
 WIDE = 10.0
 _FIXED_PARAMETERS = 9
 _JOINT_PARAMETERS = 5
@@ -21,16 +21,16 @@ _EYE = np.eye(3)
 
 @dataclass(frozen=True, eq=False)
 class ChainTolerances:
-    """How far a real arm may be from its nominal chain: standard deviations of each component.
+    """Standard deviations of each component of a real arm about its nominal chain.
 
     Zero holds a parameter at its nominal value; infinity leaves it to the data alone.
 
     Attributes:
         axes: tilt of a joint's axis [rad].
         points: shift of a joint's axis across itself [m].
-        zeros: zero position of a revolute joint [rad].
-        slide_zeros: zero position of a prismatic joint [m].
-        tool: place of the marker [m].
+        zeros: joint offset of a revolute joint [rad].
+        slide_zeros: joint offset of a prismatic joint [m].
+        tool: position of the marker [m].
         base_rotation: turn of the whole arm about the origin of the measurement frame [rad].
         base_translation: shift of the whole arm in the measurement frame [m].
 
@@ -39,7 +39,7 @@ class ChainTolerances:
 
     Example:
         >>> from kbmaps import ChainTolerances
-        >>> ChainTolerances(zeros=0.05, tool=0.03).axes  # what is not named is held as drawn
+        >>> ChainTolerances(zeros=0.05, tool=0.03).axes  # unnamed components are held at nominal
         0.0
     """
 
@@ -61,7 +61,7 @@ class ChainTolerances:
 
 @dataclass(frozen=True, eq=False)
 class _Geometry:
-    """The chain after a change, at q = 0 and before the base has moved."""
+    """Chain after a change, at q = 0 and before the base motion."""
 
     base: FloatArray
     base_turns: FloatArray
@@ -76,18 +76,18 @@ class _Geometry:
 class ChainParameters:
     """Small changes of a reference chain, as vectors (size,), and the marker positions that result.
 
-    The product of exponentials of screws that are given where all joints are at zero (Brockett 1984): a change of one
-    axis leaves the others where they are. In this order, with d joints:
+    The product of exponentials of screws given with all joints at zero (Brockett 1984): a change of one axis leaves the
+    others where they are. In this order, with d joints:
 
-        base turn (3) [rad]    rotation vector of the arm about the origin of the measurement frame
-        base shift (3) [m]     move of the arm in the measurement frame, after the turn
-        tilts (2 d) [rad]      of each axis, about two directions across it
-        shifts (2 d) [m]       of each axis, along the same two directions; without effect for a prismatic joint
-        zeros (d) [rad, m]     added to the joint's reading
-        tool (3) [m]           move of the marker in the marker frame
+        base turn (3) [rad]  rotation vector of the arm about the origin of the measurement frame
+        base shift (3) [m]   move of the arm in the measurement frame, after the turn
+        tilts (2 d) [rad]    of each axis, about two directions across it
+        shifts (2 d) [m]     of each axis, along the same two directions; without effect for a prismatic joint
+        zeros (d) [rad, m]   joint offsets, added to the joints' readings
+        tool (3) [m]         move of the marker in the marker frame
 
-    Turns of an axis about itself and shifts along itself would change nothing and are left out. What remains is
-    over-complete on purpose: base and zeros can be made up for by axes and tool, and only a prior tells them apart.
+    Turns of an axis about itself and shifts along itself would change nothing and are left out. The rest is
+    over-complete on purpose: axes and tool can compensate for base and joint offsets, and only a prior separates them.
 
     Example:
         >>> import numpy as np
@@ -120,13 +120,19 @@ class ChainParameters:
 
     @property
     def tables(self) -> tuple[FloatArray, ...]:
-        """What `linearised` computes with: axes and points of the reference at q = 0 (d, 3), the tangents (d, 3, 2),
-        1 where prismatic (d,), and the marker's frame (4, 4)."""
+        """Constant inputs of `linearised`.
+
+        Axes and points of the reference at q = 0 (d, 3), the tangents (d, 3, 2), 1 where prismatic (d,), and the
+        marker's frame (4, 4).
+        """
         return self._axes, self._points, self._tangents, self.reference.prismatic.astype(np.float64), self._frames[-1]
 
     @property
     def turning(self) -> BoolArray:
-        """Which parameters (size,) are angles, and so bend the marker's way; the others are lengths."""
+        """True for each parameter (size,) that is an angle, and so curves the marker's path.
+
+        The others are lengths.
+        """
         turning = np.zeros(self.size, dtype=np.bool_)
         turning[self.base_turn] = turning[self.tilts] = True
         turning[self.zeros] = ~self.reference.prismatic
@@ -134,11 +140,11 @@ class ChainParameters:
 
     @property
     def reach(self) -> float:
-        """How far the marker usually is from what turns it [m]: half the length of all links."""
+        """Typical distance of the marker from the joint axes [m]: half the length of all links."""
         return max(float(np.linalg.norm(self.reference.fixed[1:, :3, 3], axis=1).sum()) / 2.0, 1e-3)
 
     def standard_deviations(self, tolerances: ChainTolerances) -> FloatArray:
-        """Standard deviation (size,) of each parameter; 0 where it is held."""
+        """Return the standard deviation (size,) of each parameter; 0 where it is held."""
         prismatic = self.reference.prismatic
         std = np.empty(self.size)
         std[self.base_turn], std[self.base_shift] = tolerances.base_rotation, tolerances.base_translation
@@ -148,7 +154,7 @@ class ChainParameters:
         return std
 
     def names(self) -> tuple[str, ...]:
-        """What each parameter is, in words; joints are counted from 1."""
+        """Return the name of each parameter; joints are counted from 1."""
         joints = range(1, self.reference.joints + 1)
         return (
             *(f"base turn {axis}" for axis in "xyz"),
@@ -160,14 +166,14 @@ class ChainParameters:
         )
 
     def base_pose(self, change: FloatArray) -> FloatArray:
-        """T_measured_nominal (4, 4) of a change (size,)."""
+        """Return T_measured_nominal (4, 4) of a change (size,)."""
         pose = np.eye(4)
         pose[:3, :3] = exponentials(change[None, self.base_turn])[0][0]
         pose[:3, 3] = change[self.base_shift]
         return pose
 
     def chain(self, change: ArrayLike) -> RigidChain:
-        """The reference chain with a change (size,) built in; the axes stay what they are in their own frames.
+        """Return the reference chain with a change (size,) built in; axes keep their values in their own frames.
 
         Raises:
             ShapeError, NonFiniteError
@@ -185,7 +191,7 @@ class ChainParameters:
         return RigidChain(_reorthonormalised(fixed), self.reference.axes, self.reference.prismatic)
 
     def positions(self, change: ArrayLike, q: ArrayLike) -> FloatArray:
-        """Marker positions [m] (3,) at q (d,), or (n, 3) at (n, d).
+        """Return marker positions [m] (3,) at q (d,), or (n, 3) at (n, d).
 
         Raises:
             ShapeError, NonFiniteError
@@ -197,23 +203,25 @@ class ChainParameters:
         return x[0] if angles.ndim == 1 else x
 
     def jacobian(self, change: ArrayLike, q: ArrayLike) -> FloatArray:
-        """Derivative of the positions by the joints [m/rad, or m/m] (3, d) at q (d,), or (n, 3, d) at (n, d).
+        """Return the derivative of the positions by the joints (3, d) at q (d,), or (n, 3, d) at (n, d).
+
+        Units: m/rad, or m/m.
 
         Raises:
             ShapeError, NonFiniteError
         """
         angles = rows_or_vector("q", q, self.reference.joints)
-        # A zero is added to its joint's reading, so that the derivatives by both are the same.
+        # A joint offset is added to the reading, so the derivatives by both are the same.
         _, jacobian = self.linearised(vector("change", change, self.size), np.atleast_2d(angles))
         columns = jacobian[:, :, self.zeros]
         return columns[0] if angles.ndim == 1 else columns
 
     def linearised(self, change: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Positions (n, 3) and their derivatives (n, 3, size) by the change, at q (n, d); the inputs are trusted.
+        """Return positions (n, 3) and their derivatives (n, 3, size) by the change, at q (n, d).
 
-        With R_k the rotation before and R_{k+1} the one after joint k, and r the lever from its axis to the marker, a
-        tilt of the axis about u moves the marker by (R_k u − R_{k+1} u) × r, a shift by v moves it by
-        R_k v − R_{k+1} v.
+        Inputs are not checked. With R_k the rotation before and R_{k+1} the one after joint k, and r the lever from its
+        axis to the marker, a tilt of the axis about u moves the marker by (R_k u − R_{k+1} u) × r, a shift by v moves
+        it by R_k v − R_{k+1} v.
         """
         geometry = self._geometry(change)
         angles = q + geometry.zeros
@@ -241,10 +249,10 @@ class ChainParameters:
         return x, jacobian
 
     def turned(self, change: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Rotations R (n, 3, 3) of the marker frame at q (n, d), and Ω (n, 3, size); the inputs are trusted.
+        """Return rotations R (n, 3, 3) of the marker frame at q (n, d), and Ω (n, 3, size); inputs are not checked.
 
-        A small change δ turns them by dR = [Ω δ]× R. What turns them is what moves the marker by a lever in
-        `linearised`; shifts, tool and sliding joints turn nothing.
+        A small change δ turns them by dR = [Ω δ]× R. The parameters that turn them are those that act through a lever
+        in `linearised`; shifts, tool and prismatic joints do not turn them.
         """
         geometry = self._geometry(change)
         rotations = self._placed(geometry, q + geometry.zeros)[..., :3, :3]
@@ -276,7 +284,7 @@ class ChainParameters:
         )
 
     def _motions(self, geometry: _Geometry, angles: FloatArray) -> FloatArray:
-        """What each joint alone does (d, n, 4, 4) at its angles (n, d), in the frame of q = 0."""
+        """Return the motion of each joint alone (d, n, 4, 4) at its angles (n, d), in the frame of q = 0."""
         axes = geometry.axes
         along = axes[:, :, None] * axes[:, None, :]
         values = angles.T[..., None, None]
@@ -294,7 +302,7 @@ class ChainParameters:
         return motions
 
     def _placed(self, geometry: _Geometry, angles: FloatArray) -> FloatArray:
-        """Motion (d+1, n, 4, 4) of everything before joint k, the base first, and of the marker last."""
+        """Return the motion (d+1, n, 4, 4) of everything before joint k, the base first, and of the marker last."""
         motions = self._motions(geometry, angles)
         placed = np.empty((len(motions) + 1, *motions.shape[1:]))
         placed[0] = geometry.base
@@ -304,10 +312,10 @@ class ChainParameters:
 
 
 def tangents(axes: FloatArray) -> FloatArray:
-    """Two unit vectors across each axis and each other, as columns (d, 3, 2)."""
+    """Return two unit vectors across each axis and each other, as columns (d, 3, 2)."""
     cross = cross_matrix(axes)
     columns = np.empty((len(axes), 3, 2))
-    # The axis × e_i with the axis's smallest component i.
+    # axis × e_i, with i the smallest component of the axis
     first = cross[np.arange(len(axes)), :, np.abs(axes).argmin(axis=1)]
     columns[..., 0] = first / np.linalg.norm(first, axis=1, keepdims=True)
     columns[..., 1] = (cross @ columns[..., :1])[..., 0]
@@ -315,7 +323,7 @@ def tangents(axes: FloatArray) -> FloatArray:
 
 
 def _reorthonormalised(transforms: FloatArray) -> FloatArray:
-    """The nearest proper rotations in place of products that have gathered rounding errors."""
+    """Replace products that have gathered rounding errors by the nearest proper rotations."""
     u, _, vt = np.linalg.svd(transforms[:, :3, :3])
     transforms[:, :3, :3] = u @ vt
     return transforms

@@ -1,4 +1,4 @@
-"""Where a fit starts from when the place of the arm is anyone's guess."""
+"""Starting point of a fit when the pose of the arm is unknown."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from kbmaps.chains.parameters import ChainParameters, ChainTolerances
 from kbmaps.errors import DegenerateDataError
 from kbmaps.rotations import rotation_vector
 
-# So many pairs, evenly spread, show where an arm stands.
+# This many evenly spread pairs suffice to place the arm.
 _PLACED = 64
 
 
 class PlacedStart:
-    """The nominal chain, placed where it fits best; looked for only when the pairs have doubled.
+    """Nominal chain at its best-fitting pose; refitted only when the number of pairs has doubled.
 
-    The place follows from the first 2^k pairs, so that it does not depend on when it was asked for.
+    The pose follows from the first 2^k pairs, so that it does not depend on when it was requested.
     """
 
     def __init__(self, parameters: ChainParameters, tolerances: ChainTolerances) -> None:
@@ -30,7 +30,12 @@ class PlacedStart:
         self._placed_at = 0
 
     def change(self, q: FloatArray, x: FloatArray) -> FloatArray:
-        """The change (size,) to start a fit to at least one pair from; 0 while they do not show a place."""
+        """Return the change (size,) to start a fit from; 0 while the pairs do not determine a pose.
+
+        Args:
+            q: joint values of at least one pair (n, d) [rad, m].
+            x: marker positions (n, 3) [m].
+        """
         first = 1 << (len(q).bit_length() - 1)
         if self.needed and first != self._placed_at:
             chosen = np.linspace(0, first - 1, min(first, _PLACED)).round().astype(np.intp)

@@ -1,4 +1,4 @@
-"""Where a chain stands by its pairs, and its joints' zeros: fitted for several readings of the pairs side by side."""
+"""Pose and joint offsets of a chain, fitted to several readings of the same pairs side by side."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from kbmaps.robust import MEDIAN_NORM, ROUNDING_M
 from kbmaps.rotations import cross_matrix, exponentials
 
 _STEPS = 30
-# Weights are nearly those of least squares at first, and halve their reach with each step down to so many sigma.
+# Weights start nearly as in least squares; their scale halves with each step down to this many sigma.
 _FIRST_REACH, _LEAST_REACH = 32.0, 4.0
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-9, 1e6
-# A step that lowers the cost by less than this share is the last, once the weights have settled.
+# Once the weights have settled, a step that lowers the cost by less than this share is the last.
 _SMALL_GAIN, _SETTLING = 1e-3, 4
-# Holds directions that nothing shows; as a share of the largest diagonal entry.
+# Holds undetermined directions; as a share of the largest diagonal entry.
 _RIDGE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Placements:
-    """A nominal chain placed to s readings of the same n pairs.
+    """Nominal chain placed to s readings of the same n pairs.
 
     Attributes:
         rotations, shifts: the pose of the nominal measurement frame in the real one (s, 3, 3) and (s, 3) [m].
-        zeros: added to the joints' readings (s, d) [rad, m].
-        tools: moves of the marker in the marker frame (s, 3) [m].
+        zeros: joint offsets, added to the joints' readings (s, d) [rad, m].
+        tools: offsets of the marker in the marker frame (s, 3) [m].
         distances: of the pairs from the chain (s, n) [m].
     """
 
@@ -40,7 +40,7 @@ class Placements:
     distances: FloatArray
 
     def errors(self, share: float) -> FloatArray:
-        """RMS distance (s,) [m] of this share of the pairs, the nearest ones."""
+        """Return the RMS distance (s,) [m] of this share of the pairs, the nearest ones."""
         nearest = np.sort(np.square(self.distances), axis=1)[:, : int(np.ceil(share * self.distances.shape[1]))]
         return np.sqrt(nearest.mean(axis=1))
 
@@ -74,28 +74,28 @@ def place(
     tool_std: float,
     tools: FloatArray | None = None,
 ) -> Placements:
-    """Fit the pose of the measurement frame, the marker and the joint zeros to each reading; the links are as drawn.
+    """Fit the pose of the measurement frame, the marker and the joint offsets to each reading; links stay nominal.
 
-    Levenberg-Marquardt from where the drawn chain fits best (Kabsch 1976), with Geman-McClure weights. The inputs are
-    trusted.
+    Levenberg-Marquardt from the best placement of the nominal chain (Kabsch 1976), with Geman-McClure weights. Inputs
+    are not checked.
 
     Args:
         chain: the nominal chain.
         q: joint angles (s, n, d) [rad, m].
         x: marker positions (s, n, 3) [m].
-        zeros_std: how far each zero may be off (d,) [rad, m]; 1-sigma.
-        tool_std: how far the marker may be from where it is drawn [m]; 1-sigma of a coordinate.
-        tools: moves of the marker (s, 3) [m] to start from; none by default.
+        zeros_std: 1-sigma of each joint offset (d,) [rad, m].
+        tool_std: 1-sigma of each coordinate of the marker about its nominal position [m].
+        tools: marker offsets (s, 3) [m] to start from; none by default.
     """
     return _Fitter(chain, q, x, np.concatenate([np.zeros(6), zeros_std**-2.0, np.full(3, tool_std**-2.0)])).run(tools)
 
 
 class _Fitter:
-    """What is minimised is the weighted sum of squares over sigma² plus what the prior says of zeros and marker."""
+    """Minimiser of the weighted sum of squares over sigma² plus the prior's term for joint offsets and marker."""
 
     def __init__(self, chain: RigidChain, q: FloatArray, x: FloatArray, information: FloatArray) -> None:
         self._chain, self._q, self._x, self._information = chain, q, x, information
-        # The middle lies above the median by the pairs that the parameters can explain whatever they are.
+        # The rank lies above the median by the number of pairs that the parameters can always explain.
         self._middle = min(q.shape[1] // 2 + len(information) // 6, q.shape[1] - 1)
 
     def run(self, tools: FloatArray | None) -> Placements:

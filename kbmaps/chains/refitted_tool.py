@@ -1,4 +1,4 @@
-"""A marker that was moved on the hand: three numbers instead of a whole net."""
+"""Refit of a marker that was moved on the hand: three numbers instead of a whole net."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from kbmaps.chains.tool_layer import ToolLayer
 from kbmaps.errors import DegenerateDataError
 from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap
 
-# Far out, since the errors of an uncalibrated arm have long tails themselves and must not be rejected.
+# The limit is wide because the errors of an uncalibrated arm have long tails, which must not be rejected.
 _OUTLIER_SIGMAS = 15.0
 
 
 def with_refitted_tool(
     kbmap: KBMap, chain: RigidChain, q: ArrayLike, x: ArrayLike, sigma: float | None = None
 ) -> KBMap:
-    """The map after its marker was moved to another place on the last link, or the tool was changed.
+    """Return the map after its marker was moved to another place on the last link, or the tool was changed.
 
-    The move δ is fitted, robustly, to pairs seen since: x ≈ f(q) + R(q) δ with the orientation R of the nominal
-    chain (`ToolLayer`). With E the nets of R it is built in exactly, G ← G + E δ. What R's own errors leave is for a
+    The offset δ is fitted, robustly, to pairs seen since: x ≈ f(q) + R(q) δ with the orientation R of the nominal
+    chain (`ToolLayer`). With E the nets of R it is built in exactly, G ← G + E δ. Errors of R itself are left to a
     learner.
 
     Args:
         kbmap: the map as learnt before the change; of its outputs only the position moves.
-        chain: the nominal chain, whose orientations are used.
+        chain: the nominal chain, which supplies the orientations.
         q, x: pairs since the change, (n, d) [rad, m] and (n, 3) [m].
         sigma: noise of one coordinate [m], if known.
 

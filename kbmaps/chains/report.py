@@ -1,4 +1,4 @@
-"""What calibration is done for: where the camera stands, where the tool is, where the joints have their zeros."""
+"""Results of a calibration: camera pose, tool offset and joint offsets, with 95 % intervals."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from kbmaps.arrays import BoolArray, FloatArray, frozen
 from kbmaps.chains.parameters import ChainParameters
 from kbmaps.chains.report_text import report_text
 
-# Of the standard deviation; Gaussian.
+# In standard deviations of a Gaussian.
 _HALF_WIDTH_95 = 1.959964
 
 
 @dataclass(frozen=True, eq=False)
 class Interval:
-    """The most probable values (k,) with the half width (k,) of their 95 % intervals."""
+    """Most probable values (k,) with the half widths (k,) of their 95 % intervals."""
 
     value: FloatArray
     half_width: FloatArray
@@ -32,12 +32,13 @@ class Interval:
 
 @dataclass(frozen=True)
 class Scatter:
-    """How pairs lie around a chain.
+    """Scatter of pairs about a chain.
 
     Attributes:
-        noise: 1-sigma of a measured coordinate [m], estimated or told (their RMS).
-        misfit: residual over what the noise explains; about 1 for a rigid chain, 1 where the noise was not told.
-        freedom: residual coordinates minus those that the parameters have used up; few make `noise` uncertain.
+        noise: 1-sigma of a measured coordinate [m], estimated or given (their RMS).
+        misfit: residual over what the noise explains; about 1 for a rigid chain, 1 where the noise was not given.
+        freedom: degrees of freedom: residual coordinates minus those that the parameters have used up. If they are few,
+            `noise` is uncertain.
     """
 
     noise: float
@@ -47,24 +48,26 @@ class Scatter:
 
 @dataclass(frozen=True, eq=False)
 class ChainReport:
-    """The learnt chain relative to the nominal one, in the numbers that have names.
+    """Learnt chain relative to the nominal one, in quantities that have names.
 
     Attributes:
         T_measured_nominal: pose (4, 4) of the nominal measurement frame in the real one (hand-eye, camera pose).
         base_rotation: its rotation vector (3) [rad].
         base_translation: its translation (3) [m].
-        tool_shift: move of the tool centre point (3) in the nominal marker frame [m].
-        zeros: what has to be added to each joint's reading (d) [rad, m].
-        widening: by what the intervals are wider since the noise was estimated from few pairs (Student's); 1 if told.
-        noise: 1-sigma of a measured coordinate [m], estimated or told (their RMS).
-        misfit: residual over what the noise explains; about 1 for a rigid chain, 1 where the noise was not told.
-        freedom: residual coordinates minus those that the parameters have used up; few make `noise` uncertain.
-        outliers: how many pairs were left out.
-        determined: how many independent directions of the free parameters the pairs show.
-        undetermined: names of the free parameters that these pairs did not show, though they matter: more than half of
-            what was left open before is still (1-sigma), and it was more than the noise at the arm's reach. They make
-            up for each other or were never moved; their values rest on the tolerances.
-        prismatic: which joints slide (d,).
+        tool_shift: offset of the tool centre point (3) in the nominal marker frame [m].
+        zeros: joint offsets to add to each joint's reading (d) [rad, m].
+        widening: factor by which the intervals are wider because the noise was estimated from few pairs (Student's t);
+            1 if it was given.
+        noise: 1-sigma of a measured coordinate [m], estimated or given (their RMS).
+        misfit: residual over what the noise explains; about 1 for a rigid chain, 1 where the noise was not given.
+        freedom: degrees of freedom: residual coordinates minus those that the parameters have used up. If they are few,
+            `noise` is uncertain.
+        outliers: number of pairs left out.
+        determined: number of independent directions of the free parameters that the pairs determine.
+        undetermined: names of the free parameters that these pairs did not determine, though they matter: more than
+            half of the prior's 1-sigma remains, and it exceeded the noise at the arm's reach. They compensate for each
+            other or were never moved; their values rest on the tolerances.
+        prismatic: True for each joint (d,) that slides.
     """
 
     T_measured_nominal: FloatArray
@@ -96,9 +99,9 @@ def chain_report(
     outliers: int,
     determined: int,
 ) -> ChainReport:
-    """The report on a change (size,) with the RMS deviations of the truth from it (size,).
+    """Return the report on a change (size,) with the RMS deviations of the truth from it (size,).
 
-    What is `hidden` (size,) is undetermined.
+    Parameters in `hidden` (size,) are reported as undetermined.
     """
 
     def interval(part: slice) -> Interval:

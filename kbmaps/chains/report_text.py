@@ -14,7 +14,7 @@ _AXES = ("x", "y", "z")
 
 
 def report_text(report: ChainReport) -> str:
-    """The figures with their 95 % intervals, one a line, then what they rest on."""
+    """Return the figures with their 95 % intervals, one per line, then the data they rest on."""
     lines = [f"{'':<14}{'change':>10}   95 %"]
     lines += _of_axes("base shift", report.base_translation, "mm", _MM)
     lines += _of_axes("base turn", report.base_rotation, "deg", _DEG)
@@ -35,5 +35,5 @@ def _of_axes(name: str, interval: Interval, unit: str, scale: float) -> list[str
 
 def _line(name: str, unit: str, scale: float, interval: Interval, k: int) -> str:
     value, half = scale * float(interval.value[k]), scale * float(interval.half_width[k])
-    # 0.0 is added lest a rounded zero has a sign.
+    # Adding 0.0 removes the sign of a rounded zero.
     return f"{name:<14}{round(value, 3) + 0.0:>10.3f} ± {half:.3f} {unit}"

@@ -17,14 +17,14 @@ from kbmaps.errors import NonFiniteError, SettingError, ShapeError
 from kbmaps.maps.kernels import FilterKernel, filter_kernel
 from kbmaps.rotations import SMALL_ANGLE
 
-# Unit of the marker's place where its tolerance is 0, so that a tool change can loosen it [m].
+# Scale of the marker's position where its tolerance is 0, so that a tool change can loosen it [m].
 _TOOL_UNIT = 0.1
 _ITERATIONS = 5
-# Linearise anew when the curvature of the last step may have moved the marker by this share of the noise.
+# Relinearise when the curvature of the last step may have moved the marker by this share of the noise.
 _SMALL_BEND = 0.1
-# Squared Mahalanobis distance of an innovation beyond which a pair counts for less (chi², 3 degrees: 1 in 10,000).
+# Squared Mahalanobis distance of an innovation beyond which a pair is down-weighted (chi², 3 degrees: 1 in 10,000).
 _GATE = 21.0
-# The estimate of the noise starts as if it had seen this many coordinates, and forgets those before the last ones.
+# The noise estimate starts with the weight of this many coordinates, and forgets all but this many of the last ones.
 NOISE_COORDINATES, NOISE_MEMORY = 6.0, 900.0
 LEAST_NOISE_M = 1e-6
 _EYE = np.eye(3)
@@ -32,10 +32,10 @@ _EYE = np.eye(3)
 
 @dataclass(frozen=True, eq=False)
 class _Update:
-    """A step of the filter (p,), its gains P Jᵀ (p, 3) and the innovation's inverse covariance (3, 3).
+    """Step of the filter (p,), its gains P Jᵀ (p, 3) and the innovation's inverse covariance (3, 3).
 
-    `distance` is the squared Mahalanobis length of the innovation, `bend` how far [m] the step's curvature may have
-    moved the marker at most.
+    `distance` is the squared Mahalanobis length of the innovation. `bend` bounds how far [m] the step's curvature may
+    have moved the marker.
     """
 
     step: FloatArray
@@ -47,19 +47,19 @@ class _Update:
 
 
 class RigidFilter:
-    """Takes one pair after the other into a chain's change and its covariance, at a constant cost.
+    """Sequential estimator of a chain's change and its covariance, at a constant cost per pair.
 
-    Each pair is linearised once: where the last fit left the chain, or, before any, where it is when the pair comes.
-    The curvature left out is taken for noise, so that early pairs do not make it too sure.
+    Each pair is linearised once: at the last fit, or, before any fit, at the current estimate. The curvature left out
+    counts as noise, so that early pairs do not make the estimate overconfident.
 
     Attributes:
         change: the parameters (size,) as in `ChainParameters`.
-        origin: where pairs are linearised (size,); None: at `change`. Many directions of a chain show in no position,
-            and others hardly. With one origin for all pairs they are the same directions for each of them; linearised
-            here and there, pairs seem to tell of them, and the chain moves along them for no reason (Huang, Mourikis
-            and Roumeliotis 2010).
+        origin: linearisation point (size,); None: at `change`. Many directions of a chain have no effect on positions,
+            and others hardly any. With one origin for all pairs, these directions are the same for each pair. With
+            several, pairs seem to carry information about them, and the chain drifts along them (Huang, Mourikis and
+            Roumeliotis 2010).
         noise_square: the estimated variance [m²] of a coordinate of the pairs that came without their sigma.
-        noise_coordinates: how many coordinates that rests on.
+        noise_coordinates: number of coordinates that this estimate rests on.
     """
 
     STORED = ("change", "covariance", "noise", "origin")
@@ -88,7 +88,7 @@ class RigidFilter:
         return covariance
 
     def learn(self, q: FloatArray, x: FloatArray, sigma: FloatArray) -> None:
-        """Trusted pairs q (n, d), x (n, 3) and sigma (n,), NaN where it is to be estimated."""
+        """Learn checked pairs q (n, d), x (n, 3) and sigma (n,), NaN where it is to be estimated."""
         if self._kernel is not None:
             self._learn_compiled(self._kernel, q, x, sigma)
             return
@@ -96,9 +96,9 @@ class RigidFilter:
             self._learn_one(q[k : k + 1], x[k], float(sigma[k]))
 
     def learn_plain(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None, row: FloatArray) -> bool:
-        """Learns one pair and writes q, x and sigma to `row` (d + 4), if the kernel can take them as they are.
+        """Learn one pair and write q, x and sigma to `row` (d + 4), if the kernel can take them as they are.
 
-        False, and nothing has changed, where there is no kernel, or anything has to be converted or complained of.
+        Returns False, and changes nothing, if there is no kernel or the input needs conversion or is invalid.
         """
         if self._kernel is None:
             return False
@@ -119,10 +119,11 @@ class RigidFilter:
         return True
 
     def go_on_from(self, belief: ChainBelief, *, fitted: bool) -> None:
-        """Takes what is believed of the same chain for what the pairs so far say.
+        """Replace the estimate by a posterior of the same chain.
 
         Args:
-            fitted: whether its mean is where those pairs are linearised, and near enough for those that come.
+            belief: the posterior that replaces the information of all pairs so far.
+            fitted: True if its mean is the linearisation point of those pairs, and near enough for those to come.
         """
         active = self._active
         self.change = np.array(belief.mean)
@@ -130,19 +131,19 @@ class RigidFilter:
         self._covariance = belief.covariance[np.ix_(active, active)] / np.outer(self._scales, self._scales)
 
     def with_variance(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Positions at q (n, d) and the variance of each coordinate to first order, both (n, 3) [m, m²]."""
+        """Return positions at q (n, d) and the first-order variance of each coordinate, both (n, 3) [m, m²]."""
         x, jacobian = self._linearised(self.change, q)
         variance = np.einsum("nip,pr,nir->ni", jacobian, self._covariance, jacobian, optimize=True)
         return x, np.maximum(variance, 0.0)
 
     def arrays(self) -> dict[str, FloatArray]:
-        """For `kbmaps.packed`."""
+        """Return the state as arrays for `kbmaps.packed`."""
         noise = np.array([self.noise_square, self.noise_coordinates])
         origin = np.empty(0) if self.origin is None else self.origin
         return {"change": self.change, "covariance": self._covariance, "noise": noise, "origin": origin}
 
     def restore(self, arrays: Mapping[str, FloatArray]) -> None:
-        """The state that `arrays` gave. Raises KeyError, ShapeError, NonFiniteError, SettingError."""
+        """Restore the state from `arrays`. Raises KeyError, ShapeError, NonFiniteError, SettingError."""
         shapes = {name: array.shape for name, array in self.arrays().items()}
         linearised = arrays["origin"].size > 0
         shapes["origin"] = self.change.shape if linearised else (0,)
@@ -166,7 +167,7 @@ class RigidFilter:
         )
 
     def _learn_compiled(self, kernel: FilterKernel, q: FloatArray, x: FloatArray, sigma: FloatArray) -> None:
-        """What `_learn_one` does with each pair."""
+        """Run `_learn_one` on each pair, compiled."""
         taken, self.noise_square, self.noise_coordinates = kernel.learn(
             self.change,
             self._covariance,
@@ -181,18 +182,18 @@ class RigidFilter:
             raise np.linalg.LinAlgError("Singular matrix")
 
     def _linearised(self, change: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Positions (n, 3) of the chain at `change`, and their derivatives (n, 3, p) at the origin."""
+        """Return positions (n, 3) of the chain at `change`, and their derivatives (n, 3, p) at the origin."""
         x, jacobian = self.parameters.linearised(change if self.origin is None else self.origin, q)
         if self.origin is not None:
             x = self.parameters.positions(change, q)
         return x, jacobian[:, :, self._active] * self._scales
 
     def _learn_one(self, q: FloatArray, x: FloatArray, sigma: float) -> None:
-        """An iterated update (Bell and Cathey 1993): the gain is that of the point it leads to."""
+        """Update with one pair, iterated (Bell and Cathey 1993): the gain is that of the point it leads to."""
         told = not math.isnan(sigma)
         noise_square = sigma**2 if told else self.noise_square
         update = self._update(self.change, np.zeros(len(self._scales)), q, x, noise_square, 1.0)
-        # An outlier gets the weight with which it would be at the gate (Huber's influence).
+        # An outlier gets the weight that places it at the gate (Huber's influence).
         distance = min(update.distance, _GATE)
         weight = distance / update.distance if distance > 0.0 else 1.0
         if weight < 1.0:
@@ -209,7 +210,7 @@ class RigidFilter:
     def _update(
         self, change: FloatArray, present: FloatArray, q: FloatArray, x: FloatArray, noise_square: float, weight: float
     ) -> _Update:
-        """The step (p,) from where the filter is, with the measurement linearised at the step `present` (p,)."""
+        """Return the step (p,) from the filter's state, with the measurement linearised at the step `present` (p,)."""
         positions, jacobians = self._linearised(change, q)
         jacobian, innovation = jacobians[0], x - positions[0] + jacobians[0] @ present
         gains = self._covariance @ jacobian.T
@@ -228,18 +229,19 @@ class RigidFilter:
         return change
 
     def _curvature(self, jacobian: FloatArray) -> float:
-        """Variance [m²] that the linearisation leaves out.
+        """Return the variance [m²] that the linearisation leaves out.
 
-        An uncertainty s of the position from angles alone, at the reach L, bends the marker's way by s² / (2 L).
+        An uncertainty s of the position from angles alone, at the reach L, curves the marker's path by s² / (2 L).
         """
         turning = jacobian * self._bends
         square = float(np.vdot(turning @ self._covariance, turning)) / 3.0
         return 0.25 * (square / self._reach) ** 2
 
     def _reestimate(self, distance: float, precision: FloatArray) -> None:
-        """Noise² from the squared Mahalanobis distance of an innovation, which is 3 on average when it is right.
+        """Update noise² from the squared Mahalanobis distance of an innovation.
 
-        Fisher scoring: an innovation tells of the noise by the share that noise has in its variance.
+        The distance is 3 on average if noise² is right. Fisher scoring: an innovation carries information about the
+        noise by the noise's share of its variance.
         """
         share = self.noise_square * float(np.trace(precision)) / 3.0
         total = self.noise_coordinates + 3.0 * share**2

@@ -14,23 +14,23 @@ from kbmaps.chains.belief import ChainBelief, squared
 from kbmaps.pairs import Pairs
 from kbmaps.robust import MEDIAN_NORM, OUTLIER_SIGMAS, ROUNDING_M
 
-# A residual's variance is never taken for less than this share of the noise: below, the pair explains itself.
+# Lower bound of a residual's variance as a share of the noise: below, the pair explains itself.
 _LEAST_SHARE = 1e-4
 _SCALES_PER_SIGMA = 3.0
-# Told noise explains a sum of squared residuals that is not less probable than this (χ²).
+# A given noise explains a sum of squared residuals unless its probability is below this (χ²).
 _MISFIT_CHANCE = 1e-3
 _ROUNDS = 80
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-12, 1e8
-# A step that changes the fit by less than this share of what the noise leaves open is the last.
+# A step that changes the fit by less than this share of the posterior's standard deviation is the last.
 _SMALL_STEP = 1e-4
 
 
 @dataclass(frozen=True)
 class NoiseKnowledge:
-    """What is known beforehand of a noise that is not told: as if found from so many coordinates.
+    """Prior of an unknown noise, with the weight of a number of coordinates.
 
     Attributes:
-        coordinates: how many, 0 where nothing is known.
+        coordinates: that number, 0 without a prior.
         square: their mean square [m²].
     """
 
@@ -38,7 +38,7 @@ class NoiseKnowledge:
     square: float = 0.0
 
     def found(self, square: float, freedom: float) -> float:
-        """Variance after residuals with a sum of squares [m²] and so many degrees of freedom, above 0 in all."""
+        """Return the variance from a sum of squared residuals [m²]; `freedom + coordinates` must exceed 0."""
         return (square + self.coordinates * self.square) / (freedom + self.coordinates)
 
 
@@ -47,14 +47,14 @@ NOTHING_KNOWN = NoiseKnowledge()
 
 @dataclass(frozen=True, eq=False)
 class RigidFit:
-    """A change of the chain and how sure it is.
+    """Change of the chain with its uncertainty.
 
     Attributes:
         belief: the posterior of the parameters.
         noise: estimated noise over unit; at least 1 where the units are the noise (more: the chain does not fit).
         freedom: residual coordinates minus those that the parameters have used up.
-        inliers: which pairs (n,) are no outliers.
-        rank: how many independent directions of the parameters the data determine.
+        inliers: True for each pair (n,) that is not an outlier.
+        rank: number of independent directions of the parameters that the data determine.
         log_evidence: log marginal likelihood of the inliers (Laplace's approximation).
     """
 
@@ -70,7 +70,8 @@ class RigidFit:
 class _Point:
     """Residuals (n, 3) and Jacobian (n, 3, f), as sure in all directions, and norms in units (n,) at a change (size,).
 
-    The f free parameters are counted from the prior's mean in columns of its root; `offset` (f,) is where they are.
+    The f free parameters are counted from the prior's mean in columns of its root; `offset` (f,) is their current
+    value.
     """
 
     change: FloatArray
@@ -80,15 +81,15 @@ class _Point:
     offset: FloatArray
 
     def reduced(self, roots: FloatArray) -> FloatArray:
-        """Triangular factor (f+1, f+1) of the rows [J, residual], each pair's multiplied by its root (n,)."""
+        """Return the triangular factor (f+1, f+1) of the rows [J, residual], each pair's times its root (n,)."""
         rows = np.concatenate([self.jacobian, self.residuals[:, :, None]], axis=2) * roots[:, None, None]
         return cast(FloatArray, np.linalg.qr(rows.reshape(-1, rows.shape[2]), mode="r"))
 
     def deletion_distances(self, inliers: BoolArray, sigma: FloatArray) -> FloatArray:
-        """How far (n,) each pair lies from where the other inliers predict it, in standard deviations of that.
+        """Return the distance (n,) of each pair from its prediction by the other inliers, in standard deviations.
 
-        Mahalanobis lengths: an inlier's residual has the covariance σ² − J P Jᵀ, another's σ² + J P Jᵀ (Cook and
-        Weisberg 1982, section 2.2). Whether a pair takes part does not change what is said of it.
+        Mahalanobis lengths: an inlier's residual has the covariance σ² − J P Jᵀ, an outlier's σ² + J P Jᵀ (Cook and
+        Weisberg 1982, section 2.2). A pair's distance does not depend on whether it takes part in the fit.
         """
         factor = self.reduced(inliers / sigma)
         _, singular, vt = np.linalg.svd(factor[:, :-1])
@@ -105,7 +106,7 @@ class _Point:
 
 
 class _Fitter:
-    """One fit on its way: what is minimised is Σ (root ‖residual‖)² + ‖offset‖² with the roots of the present noise."""
+    """State of one fit that minimises Σ (root ‖residual‖)² + ‖offset‖² with the roots of the current noise."""
 
     def __init__(self, prior: ChainBelief, pairs: Pairs, start: FloatArray) -> None:
         self.prior, self.pairs = prior, pairs
@@ -117,16 +118,16 @@ class _Fitter:
         self.used = float(min(len(self.free), 3 * len(pairs)))
 
     def typical(self) -> float:
-        """Noise over unit as the middle residual shows it (Rousseeuw and Leroy 1987, least median of squares).
+        """Return noise over unit from the middle residual (Rousseeuw and Leroy 1987, least median of squares).
 
-        The middle lies above the median by the pairs that the parameters can explain whatever they are.
+        Its rank lies above the median by the number of pairs that the parameters can always explain.
         """
         norms = self.point.norms
         rank = min(int(0.5 * (len(norms) + self.used / 3.0)), len(norms) - 1)
         return max(float(np.partition(norms, rank)[rank]) / MEDIAN_NORM, self.least_noise)
 
     def improve(self, weights: FloatArray, noise: float) -> float:
-        """A Levenberg-Marquardt step; returns its length in units of what is left open (0: none was found)."""
+        """Take a Levenberg-Marquardt step; return its length in posterior sigmas (0: no better step found)."""
         point, roots = self.point, np.sqrt(weights) / (self.pairs.unit * noise)
         factor = point.reduced(roots)
         design, target = factor[:, :-1], factor[:, -1]
@@ -166,15 +167,18 @@ def fit_chain(
     near: bool = False,
     noise: NoiseKnowledge = NOTHING_KNOWN,
 ) -> RigidFit:
-    """The most probable change for at least one pair, on the way from `start` (size,).
+    """Fit the most probable change to at least one pair, starting from `start` (size,).
 
-    Graduated non-convexity (Yang et al. 2020): Geman-McClure weights, and with them the noise that weighs data against
-    prior, shrink from the largest residual to what is typical, so that neither outliers nor a marker far from its
-    place stop the way. Then least squares on all pairs that are no outliers, with the noise estimated from them.
+    First graduated non-convexity (Yang et al. 2020): Geman-McClure weights, and with them the noise that weighs data
+    against prior, shrink from the largest residual to the typical one. So neither outliers nor a marker far from its
+    nominal position stop the fit. Then least squares on all inliers, with the noise estimated from them.
 
     Args:
+        prior: Gaussian over the parameters before these pairs.
+        pairs: the pairs, at least one.
+        start: change (size,) to start from.
         near: the start is a fit to most of these pairs, so that least squares will do.
-        noise: what is known beforehand of a noise that is not told.
+        noise: prior of a noise that is not given.
     """
     fitter = _Fitter(prior, pairs, start)
     if not near:
@@ -183,9 +187,12 @@ def fit_chain(
 
 
 def folded(prior: ChainBelief, pairs: Pairs, change: FloatArray, noise: float) -> ChainBelief:
-    """What is believed after pairs, all good, that are linearised at a change (size,).
+    """Return the posterior after inlier pairs, linearised at a change (size,).
 
     Args:
+        prior: Gaussian over the parameters before these pairs.
+        pairs: the pairs, without outliers.
+        change: linearisation point (size,).
         noise: over the pairs' unit.
     """
     point = _Fitter(prior, pairs, change).point
@@ -215,7 +222,7 @@ def _polish(fitter: _Fitter, before: NoiseKnowledge) -> RigidFit:
     pairs = fitter.pairs
     typical = fitter.typical()
     inliers = fitter.point.norms <= OUTLIER_SIGMAS * typical
-    # Few pairs can be fitted with much noise or with little; what was told has the first say.
+    # Few pairs can be fitted with much noise or with little; a given noise is tried first.
     noise = 1.0 if pairs.known else typical
     freedom = 0.0
     for _ in range(_ROUNDS):
@@ -239,7 +246,7 @@ def _found_noise(square: float, freedom: float, before: NoiseKnowledge, fitter: 
 
 
 def _told_noise(square: float, freedom: float) -> float:
-    """1 unless the residuals are more than chance makes them: then the chain does not fit."""
+    """Return 1, or more if the residuals exceed chance: then the chain does not fit."""
     if freedom == 0.0 or chdtrc(freedom, square) >= _MISFIT_CHANCE:
         return 1.0
     return max(math.sqrt(square / freedom), 1.0)
@@ -264,7 +271,7 @@ def _summary(fitter: _Fitter, inliers: BoolArray, noise: float, freedom: float) 
 
 
 def _rank(design: FloatArray) -> int:
-    """How many directions of the parameters the rows show."""
+    """Return the number of parameter directions that the rows determine."""
     lengths = np.linalg.norm(design, axis=0)
     seen = lengths > 1e-12 * max(float(lengths.max(initial=0.0)), 1e-300)
     singular = np.linalg.svd(design[:, seen] / lengths[seen], compute_uv=False)

@@ -1,4 +1,4 @@
-"""Learning a rigid chain from all pairs at once: the most probable chain and how sure it is."""
+"""Batch learner of a rigid chain: the most probable chain, and its uncertainty."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ from kbmaps.pairs import Pairs, checked_pairs, of_covariances, stored_pairs, wit
 from kbmaps.robust import claimed_sigma, student
 
 _KIND = "rigid chain, batch, 2"
-# About so many pairs, evenly spread, stand for all where the bend of their valley is looked for.
+# The curvature of the posterior is estimated from about this many evenly spread pairs.
 _FOLLOWED = 100
-# A parameter whose standard deviation the pairs left above this share of the one before was not shown by them.
+# A parameter counts as undetermined if its standard deviation stayed above this share of the prior's.
 _HARDLY_NARROWER = 0.5
 
 
 class RigidLearner:
     """Fits a rigid chain to all pairs, around a nominal one whose tolerances are the prior.
 
-    The result depends on the pairs only, not on their order or how they came in. It is fitted when first asked for
-    after `learn` (7 joints: 10 ms at 30 pairs, 0.1 s at 2,200). Outliers are left out.
+    The result depends on the pairs only, not on their order or grouping. The fit runs on first use after `learn`
+    (7 joints: 10 ms at 30 pairs, 0.1 s at 2,200). Outliers are left out.
 
     Args:
-        nominal: the chain as drawn, or as `find_chain` found it.
-        tolerances: how far the real one may be from it.
-        prior: what is believed before the first pair, where more is known than the tolerances; it changes the same
-            nominal chain. So an arm that got another tool is learnt on: `learner.belief.with_other_tool(0.2)`.
+        nominal: the nominal chain, or one found by `find_chain`.
+        tolerances: standard deviations of the real chain about it.
+        prior: Gaussian prior, where more is known than the tolerances; it changes the same nominal chain. Use it to
+            continue with another tool: `learner.belief.with_other_tool(0.2)`.
 
     Raises:
         ShapeError: the prior is one of another chain.
@@ -74,7 +74,7 @@ class RigidLearner:
         self._twin: RigidLearner | None = None
 
     def twin(self) -> RigidLearner:
-        """A learner of the same arm without pairs. While it gets the same pairs, it takes this one's fit over."""
+        """Return a learner of the same arm without pairs. While it gets the same pairs, it reuses this one's fit."""
         twin = RigidLearner(self.nominal, self._tolerances, self._prior if self._told_prior else None)
         twin._twin = self
         return twin
@@ -86,38 +86,38 @@ class RigidLearner:
 
     @property
     def pairs(self) -> int:
-        """How many pairs have been learnt."""
+        """Number of learnt pairs."""
         return len(self._q)
 
     @property
     def nominal(self) -> RigidChain:
-        """The chain that learning started from."""
+        """Chain that learning started from."""
         return self._parameters.reference
 
     @property
     def chain(self) -> RigidChain:
-        """The most probable chain."""
+        """Most probable chain."""
         return self.belief.chain
 
     @property
     def tolerances(self) -> ChainTolerances:
-        """How far the real chain may be from the nominal one."""
+        """Standard deviations of the real chain about the nominal one."""
         return self._tolerances
 
     @property
     def prior(self) -> ChainBelief:
-        """What was believed before the first pair."""
+        """Gaussian over the parameters before the first pair."""
         return self._prior
 
     @property
     def belief(self) -> ChainBelief:
-        """What the pairs let believe of the chain; the prior without pairs."""
+        """Posterior of the chain; the prior without pairs."""
         fit = self._fitted()
         return self._prior if fit is None else fit.belief
 
     @property
     def change(self) -> FloatArray:
-        """The most probable parameters (size,) as in `ChainParameters` (read-only)."""
+        """Most probable parameters (size,) as in `ChainParameters` (read-only)."""
         return self.belief.mean
 
     @property
@@ -127,13 +127,13 @@ class RigidLearner:
 
     @property
     def inliers(self) -> BoolArray:
-        """Which pairs (n,), as they came, are no outliers."""
+        """True for each pair (n,), in the order of learning, that is not an outlier."""
         fit = self._fitted()
         return np.zeros(0, dtype=np.bool_) if fit is None else fit.inliers.copy()
 
     @property
     def scatter(self) -> Scatter:
-        """How the pairs lie around the chain. Raises DegenerateDataError: no pair has been learnt."""
+        """Scatter of the pairs about the chain. Raises DegenerateDataError: no pair has been learnt."""
         fit = self._fitted()
         if fit is None:
             raise DegenerateDataError("nothing lies around the chain before the first pair was learnt")
@@ -141,7 +141,7 @@ class RigidLearner:
 
     @property
     def least_sure(self) -> FloatArray:
-        """The configuration (1, d) of the pair that the chain is least sure of, outliers left out; (0, d) without."""
+        """Configuration (1, d) of the inlier with the largest predicted uncertainty; (0, d) without pairs."""
         fit = self._fitted()
         q = self._q if fit is None else self._q[fit.inliers]
         _, variance = self.belief.predict_with_variance(q)
@@ -159,6 +159,8 @@ class RigidLearner:
         """Pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
 
         Args:
+            q: joint values.
+            x: measured positions.
             sigma: 1-sigma of the positions [m], () or (n,); None where it is to be estimated. Once one pair came
                 without, the noise is estimated for all, and those told count relative to their median.
             cov: in its place their covariances [m²], (3, 3) or (n, 3, 3), where some directions are surer than others:
@@ -180,7 +182,7 @@ class RigidLearner:
         self._fit = None
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
+        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
 
         Raises:
             ShapeError, NonFiniteError
@@ -189,7 +191,7 @@ class RigidLearner:
         return self._parameters.positions(self.belief.mean, angles)
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d); exact.
+        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d); exact.
 
         Raises:
             ShapeError, NonFiniteError
@@ -197,9 +199,9 @@ class RigidLearner:
         return self._parameters.jacobian(self.belief.mean, q)
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and whether data was there.
+        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and True where data is near.
 
-        Where the told noise does not explain the residuals, what is left over adds to sigma everywhere.
+        Where the given noise does not explain the residuals, the excess is added to sigma everywhere.
 
         Raises:
             ShapeError, NonFiniteError
@@ -213,7 +215,7 @@ class RigidLearner:
         return Estimate(x, sigma, near_data(variance, self._widest)).like(angles)
 
     def report(self) -> ChainReport:
-        """Hand-eye, tool centre point and joint zeros with 95 % intervals.
+        """Return hand-eye, tool centre point and joint offsets with 95 % intervals.
 
         Raises:
             DegenerateDataError: no pairs have been learnt.
@@ -241,13 +243,13 @@ class RigidLearner:
         return Scatter(noise, misfit, fit.freedom)
 
     def _hidden(self, fit: RigidFit, noise: float) -> BoolArray:
-        """Which parameters (size,) matter and were not shown; noise of a coordinate [m]."""
+        """Return True for each parameter (size,) that matters and was not determined; noise of a coordinate [m]."""
         before, after = (np.sqrt(np.square(belief.root).sum(axis=1)) for belief in (self._prior, fit.belief))
         lever = np.where(self._parameters.turning, self._parameters.reach, 1.0)
         return (after > _HARDLY_NARROWER * before) & (before * lever > noise)
 
     def to_bytes(self) -> bytes:
-        """The learner with all its pairs; `from_bytes` gives the same predictions to the last bit."""
+        """Return the learner with all its pairs; `from_bytes` restores the same predictions to the last bit."""
         arrays = chain_arrays(self.nominal) | {
             "q": self._q,
             "x": self._x,
@@ -261,7 +263,7 @@ class RigidLearner:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """The learner in `data`. Raises ModelFormatError: it is none of this kind, or damaged."""
+        """Return the learner in `data`. Raises ModelFormatError: wrong type of model, or damaged."""
         fields, arrays = unpack(data, _KIND)
         with restoring("a rigid learner"):
             tolerances = parse_tolerances(named(fields, "the fields", ("tolerances",))["tolerances"])

@@ -1,4 +1,4 @@
-"""Learning a rigid chain pair by pair: a filter, set right by refits of the last pairs."""
+"""Recursive learner of a rigid chain: a filter for each pair, corrected by refits of the last pairs."""
 
 from __future__ import annotations
 
@@ -26,27 +26,27 @@ _KIND = "rigid chain, recursive, 5"
 _COUNTS = ("pairs", "window", "due")
 # The first refit comes with this pair, the next when the kept pairs have grown by this factor, or the window is full.
 _FIRST, _GROWTH = 8, 1.5
-# A noise found from fewer degrees of freedom is a guess: the next refit comes with the next pair.
+# A noise estimated from fewer degrees of freedom is a guess: the next refit comes with the next pair.
 _SURE_FREEDOM = 12.0
 
 
 class RecursiveRigidLearner:
-    """Corrects a rigid chain with each pair at once, and keeps a bounded number of pairs to look back on.
+    """Corrects a rigid chain with each pair at once, and keeps a bounded number of pairs for refits.
 
     The parameters and the prior are those of `RigidLearner`. A filter takes each pair as it comes. At growing intervals
-    the kept pairs are fitted anew, as `RigidLearner` fits them: outliers and noise are judged in hindsight, and what
-    was linearised early is linearised where the chain has turned out to be. When the window is full, the older half of
-    it is folded into a Gaussian. With 7 joints a pair costs 5 µs compiled, 0.27 ms in NumPy, and its share of the
-    refits 0.1 ms once the window has filled; a refit takes 5 to 50 ms. Lists, other types than float64 and rows of one
-    pair take 10 µs more.
+    the kept pairs are refitted as in `RigidLearner`. A refit judges outliers and noise in hindsight, and linearises all
+    pairs at the chain found. When the window is full, its older half is folded into a Gaussian.
+
+    Cost with 7 joints: a pair takes 5 µs compiled, 0.27 ms in NumPy, and its share of the refits 0.1 ms once the window
+    has filled. A refit takes 5 to 50 ms. Lists, other types than float64 and rows of one pair take 10 µs more.
 
     Args:
-        nominal: the chain as drawn.
-        tolerances: how far the real one may be from it.
-        noise: 1-sigma of a coordinate to start from where pairs come without their sigma [m]. From the eighth pair
-            on it is estimated from the pairs alone.
-        window: how many pairs are kept at most. Where the arm is vague for long, as on a guided path that shows one
-            joint after the other, a long window is worth its memory (8 (d + 4) bytes a pair).
+        nominal: the nominal chain.
+        tolerances: standard deviations of the real chain about it.
+        noise: initial 1-sigma of a coordinate where pairs come without their sigma [m]. From the eighth pair on it is
+            estimated from the pairs alone.
+        window: maximum number of kept pairs. Where the arm stays poorly determined for long, as on a guided path that
+            moves one joint after the other, a long window is worth its memory (8 (d + 4) bytes a pair).
 
     Raises:
         SettingError: noise is not positive, or window below 16.
@@ -58,7 +58,7 @@ class RecursiveRigidLearner:
         >>> fixed[1:, 0, 3] = 0.3, 0.2  # links [m]
         >>> arm = RigidChain(fixed, axes=[[0, 0, 1], [0, 1, 0]], prismatic=[False, False])
         >>> learner = RecursiveRigidLearner(arm, ChainTolerances(tool=0.1), noise=1e-6)
-        >>> learner.learn([0.0, 0.0], [0.5, 0.0, 0.1])  # 100 mm above where it was drawn
+        >>> learner.learn([0.0, 0.0], [0.5, 0.0, 0.1])  # 100 mm above its nominal position
         >>> learner.predict([0.0, -np.pi / 2]).round(6)
         array([0.2, 0. , 0.2])
     """
@@ -78,10 +78,11 @@ class RecursiveRigidLearner:
 
     @classmethod
     def continuing(cls, batch: RigidLearner, *, window: int = 1000) -> Self:
-        """A learner that goes on from what a batch has found.
+        """Return a learner that continues from the result of a batch learner.
 
         Raises:
-            DegenerateDataError: the batch has learnt no pair. SettingError: window below 16.
+            DegenerateDataError: the batch has learnt no pair.
+            SettingError: window below 16.
         """
         scatter = batch.scatter
         learner = cls(batch.nominal, batch.tolerances, noise=max(scatter.noise, LEAST_NOISE_M), window=window)
@@ -98,22 +99,22 @@ class RecursiveRigidLearner:
 
     @property
     def pairs(self) -> int:
-        """How many pairs have been learnt."""
+        """Number of learnt pairs."""
         return self._pairs
 
     @property
     def kept(self) -> int:
-        """How many of the last pairs are kept."""
+        """Number of kept pairs."""
         return len(self._window)
 
     @property
     def nominal(self) -> RigidChain:
-        """The chain that learning started from."""
+        """Chain that learning started from."""
         return self._parameters.reference
 
     @property
     def chain(self) -> RigidChain:
-        """The chain as learnt."""
+        """Chain as learnt."""
         return self._parameters.chain(self._filter.change)
 
     @property
@@ -123,28 +124,30 @@ class RecursiveRigidLearner:
 
     @property
     def change(self) -> FloatArray:
-        """The parameters (size,) as in `ChainParameters` (a read-only copy)."""
+        """Parameters (size,) as in `ChainParameters` (a read-only copy)."""
         return frozen(self._filter.change)
 
     @property
     def origin(self) -> FloatArray:
-        """The change (size,) at which the pairs are linearised (a read-only copy): that of the last refit."""
+        """Change (size,) at which the pairs are linearised (a read-only copy): that of the last refit."""
         return frozen(self._filter.change if self._filter.origin is None else self._filter.origin)
 
     @property
     def covariance(self) -> FloatArray:
         """Covariance (size, size) of the parameters [rad², m²] (a read-only copy).
 
-        What it says of a position holds with the derivatives at `origin`.
+        To propagate it to a position, use the derivatives at `origin`.
         """
         return frozen(self._filter.covariance)
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
-        """Pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,), one after the other.
+        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,), one after the other.
 
         Args:
+            q: joint values.
+            x: measured positions.
             sigma: 1-sigma of the positions [m], () or (n,); None where it is to be estimated. In a refit of pairs of
-                both kinds those told count relative to their median.
+                both kinds, given sigmas count relative to their median.
 
         Raises:
             ShapeError, NonFiniteError, SettingError (a sigma that is not positive): nothing has changed.
@@ -168,7 +171,7 @@ class RecursiveRigidLearner:
                 self._refit()
 
     def tool_changed(self, tolerance: float) -> None:
-        """Tells that the marker was moved, by `tolerance` (1-sigma of each component [m]); the arm stays known.
+        """Allow for a marker that was moved, by `tolerance` (1-sigma of each component [m]); keep the arm's estimate.
 
         Raises:
             SettingError: the tolerance is not positive.
@@ -181,7 +184,7 @@ class RecursiveRigidLearner:
         self._go_on_from(belief.with_other_tool(tolerance), fitted=False)
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
+        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
 
         Raises:
             ShapeError, NonFiniteError
@@ -189,7 +192,7 @@ class RecursiveRigidLearner:
         return self._parameters.positions(self._filter.change, rows_or_vector("q", q, self.joints))
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d); exact.
+        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d); exact.
 
         Raises:
             ShapeError, NonFiniteError
@@ -197,11 +200,11 @@ class RecursiveRigidLearner:
         return self._parameters.jacobian(self._filter.change, q)
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and whether data was there.
+        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and True where data is near.
 
-        Where the told noise does not explain the residuals of a refit, what is left over adds to sigma everywhere. The
-        pairs that support goes by are those that are kept, and of those before them the one that was least sure;
-        they are gone through once after each `learn` (5 ms at 1,000 kept pairs of 7 joints).
+        Where the given noise does not explain the residuals of a refit, the excess is added to sigma everywhere.
+        Support is judged by the kept pairs, and by the most uncertain one of those before them. They are evaluated once
+        after each `learn` (5 ms at 1,000 kept pairs of 7 joints).
 
         Raises:
             ShapeError, NonFiniteError
@@ -213,14 +216,14 @@ class RecursiveRigidLearner:
         return Estimate(x, np.sqrt(variance + self._window.excess), near_data(variance, self._widest)).like(angles)
 
     def to_bytes(self) -> bytes:
-        """The learner as it is; `from_bytes` learns on to the last bit as this one would."""
+        """Return the learner's state; a learner restored by `from_bytes` continues to the last bit as this one."""
         counts = {"pairs": self._pairs, "window": self._window.size, "due": self._due}
         arrays = chain_arrays(self.nominal) | self._filter.arrays() | self._window.arrays()
         return pack(_KIND, {"tolerances": describe_tolerances(self._tolerances), **counts}, arrays)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """The learner in `data`. Raises ModelFormatError: it is none of this kind, or damaged."""
+        """Return the learner in `data`. Raises ModelFormatError: wrong type of model, or damaged."""
         fields, arrays = unpack(data, _KIND)
         with restoring("a recursive rigid learner"):
             settings = named(fields, "the fields", ("tolerances", *_COUNTS))
@@ -245,7 +248,7 @@ class RecursiveRigidLearner:
             self._due = min(math.ceil(_GROWTH * self.kept), self._window.size)
 
     def _set_right(self) -> RigidFit:
-        """Sets the filter where a fit to the kept pairs is."""
+        """Set the filter to a fit of the kept pairs, and return the fit."""
         fit = self._window.fitted(self._filter.change)
         self._filter.go_on_from(fit.belief, fitted=True)
         if self._window.finds_noise:

@@ -1,4 +1,4 @@
-"""The last pairs of a rigid chain, refitted together, and what those before them let believe."""
+"""Window of the last pairs of a rigid chain, refitted together, and the posterior from the pairs before it."""
 
 from __future__ import annotations
 
@@ -16,21 +16,20 @@ from kbmaps.errors import ModelFormatError, SettingError
 from kbmaps.pairs import stored_pairs, with_units
 
 LEAST_WINDOW = 16
-# With so few pairs, and nothing before them, an earlier fit may be far off: look from the drawing on.
+# With few pairs and no prior, an earlier fit may be far off: start from the nominal chain.
 _FRESH = 200
-# What older pairs tell of the noise counts for no more coordinates than this.
+# Upper bound of the number of coordinates that older pairs contribute to the noise estimate.
 _NOISE_MEMORY = 900.0
 
 
 class RigidWindow:
-    """Keeps at most `size` pairs. Older ones are folded: linearised at the fit that knew those after them too.
+    """Keeps at most `size` pairs. Older ones are folded: linearised at a fit that also used the pairs after them.
 
     Attributes:
-        belief: of the chain before the pairs that are kept.
-        noise: what is known of the noise before them, of pairs that come without their sigma.
-        farthest: of the pairs that were folded, the configuration (1, d) that the chain was least sure of; (0, d)
-            without any.
-        excess: variance [m²] of a coordinate that the chain did not explain at the last fit, the noise being told.
+        belief: posterior of the chain before the kept pairs.
+        noise: noise estimated before them, from pairs that came without their sigma.
+        farthest: configuration (1, d) of the folded pair with the largest predicted uncertainty; (0, d) without any.
+        excess: variance [m²] of a coordinate that the chain did not explain at the last fit, with the noise given.
 
     Raises:
         SettingError: size below 16.
@@ -50,7 +49,7 @@ class RigidWindow:
         self.farthest = np.empty((0, parameters.reference.joints))
         self._place = PlacedStart(parameters, tolerances)
         self._joints, self._count = parameters.reference.joints, 0
-        # q, x and sigma side by side.
+        # q, x and sigma side by side
         self._rows = np.empty((size, self._joints + 4))
 
     def __len__(self) -> int:
@@ -58,31 +57,31 @@ class RigidWindow:
 
     @property
     def configurations(self) -> FloatArray:
-        """Those (n, d) of the pairs that are kept, and the farthest of those that were folded."""
+        """Configurations (n, d) of the kept pairs, and the most uncertain one of the folded pairs."""
         return np.concatenate([self._rows[: self._count, : self._joints], self.farthest])
 
     @property
     def finds_noise(self) -> bool:
-        """Whether a pair came without its sigma."""
+        """True if a pair came without its sigma."""
         return bool(np.isnan(self._rows[: self._count, -1]).any())
 
     def add(self, q: FloatArray, x: FloatArray, sigma: FloatArray) -> None:
-        """Trusted pairs q (n, d), x (n, 3) and sigma (n,), NaN where it was not told; no more than there is room."""
+        """Add checked pairs q (n, d), x (n, 3) and sigma (n,), NaN where unknown; they must fit into the window."""
         rows = self._rows[self._count : self._count + len(q)]
         rows[:, : self._joints], rows[:, self._joints : -1], rows[:, -1] = q, x, sigma
         self._count += len(q)
 
     @property
     def next_row(self) -> FloatArray:
-        """Where the next pair goes: q, x and sigma side by side (d + 4)."""
+        """Row of the next pair: q, x and sigma side by side (d + 4)."""
         return self._rows[self._count]
 
     def next_row_filled(self) -> None:
-        """Counts the pair that was written to `next_row`."""
+        """Count the pair that was written to `next_row`."""
         self._count += 1
 
     def fitted(self, near: FloatArray) -> RigidFit:
-        """The fit to at least one pair; `near` (size,) is where the chain is supposed to be."""
+        """Return the fit to at least one pair; `near` (size,) is the expected change of the chain."""
         q, x, sigma = self._pairs()
         pairs = with_units(q, x, sigma)
         if self._count > _FRESH:
@@ -94,7 +93,7 @@ class RigidWindow:
         return fit
 
     def fold(self, fit: RigidFit, count: int) -> None:
-        """Lets go of the oldest pairs, so many, after a fit to all that are kept."""
+        """Fold the oldest `count` pairs into the belief, after a fit to all kept pairs."""
         q, x, sigma = self._pairs()
         # The units are those of the fit, hence of all pairs.
         pairs = with_units(q, x, sigma)
@@ -111,22 +110,22 @@ class RigidWindow:
         self._rows[: self._count] = self._rows[count : count + self._count].copy()
 
     def begin_with(self, belief: ChainBelief) -> None:
-        """Lets go of all pairs; `belief` is what is believed of the chain from now on."""
+        """Drop all pairs and start from `belief`."""
         self.belief, self._begun, self._count = belief, True, 0
         self.farthest = self.farthest[:0]
 
     def arrays(self) -> dict[str, FloatArray]:
-        """For `kbmaps.packed`."""
+        """Return the state as arrays for `kbmaps.packed`."""
         q, x, sigma = self._pairs()
         known = np.array([self.noise.coordinates, self.noise.square, self.excess])
         arrays = {"q": q, "x": x, "sigma": sigma, "known": known, "farthest": self._stored_farthest()}
         return arrays | ({"before_mean": self.belief.mean, "before_root": self.belief.root} if self._begun else {})
 
     def restore(self, arrays: Mapping[str, FloatArray]) -> None:
-        """The state that `arrays` gave.
+        """Restore the state from `arrays`.
 
         Raises:
-            ModelFormatError, KeyError, ValueError, ShapeError, NonFiniteError, SettingError: it is none.
+            ModelFormatError, KeyError, ValueError, ShapeError, NonFiniteError, SettingError: invalid state.
         """
         q, x, sigma = stored_pairs(arrays, self._joints)
         coordinates, square, excess = (float(number) for number in vector("known", arrays["known"], 3))
@@ -140,17 +139,17 @@ class RigidWindow:
         self.add(q, x, sigma)
 
     def _stored_farthest(self) -> FloatArray:
-        """`farthest` as a vector (d,); NaN for none."""
+        """Return `farthest` as a vector (d,); NaN if there is none."""
         return self.farthest[0] if len(self.farthest) else np.full(self._joints, np.nan)
 
     def _farthest(self, stored: FloatArray) -> FloatArray:
-        """What `_stored_farthest` gave. Raises ShapeError, NonFiniteError."""
+        """Restore the result of `_stored_farthest`. Raises ShapeError, NonFiniteError."""
         if stored.shape == (self._joints,) and np.isnan(stored).all():
             return np.empty((0, self._joints))
         return vector("farthest", stored, self._joints)[None]
 
     def _pairs(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         rows = self._rows[: self._count]
-        # In C order, as it comes back from bytes: sums must not depend on the layout.
+        # C order, as it comes back from bytes: sums must not depend on the layout.
         q, x, sigma = rows[:, : self._joints], rows[:, self._joints : -1], rows[:, -1]
         return np.ascontiguousarray(q), np.ascontiguousarray(x), np.ascontiguousarray(sigma)

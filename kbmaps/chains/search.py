@@ -1,4 +1,4 @@
-"""Finding a rigid chain from pairs alone, without any drawing."""
+"""Search for a rigid chain from pairs alone, without a nominal model."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from kbmaps.chains.descents import Descents, ScrewArms
 from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
 from kbmaps.robust import ROUNDING_M
 
-# A start that leaves less than this times the noise has found the chain.
+# A start whose residual is below this multiple of the noise has found the chain.
 _EXPLAINED = 1.2
 
 
@@ -27,18 +27,19 @@ def find_chain(
     starts: int = 20,
     sigma: float | None = None,
 ) -> RigidChain:
-    """The chain that fits pairs best, of those reached from random chains; pairs must be without gross outliers.
+    """Return the chain that fits the pairs best, of those reached from random chains.
 
-    Ends early when a start explains the pairs, exactly or, with `sigma`, up to the noise. Without sigma noisy pairs
-    take all the starts: local minima recur, so that reaching one twice says nothing. What positions cannot show (base
-    and zeros apart from axes, the orientation of the marker) is arbitrary in the result, which is meant as the nominal
-    chain of a learner.
+    The pairs must be free of gross outliers. The search ends early when a start explains the pairs, exactly or, with
+    `sigma`, up to the noise. Without sigma, noisy pairs use all the starts: local minima recur, so reaching one twice
+    proves nothing. What positions cannot determine (base and joint offsets apart from axes, the orientation of the
+    marker) is arbitrary in the result. Use it as the nominal chain of a learner.
 
     Args:
-        q: joint angles (n, d) [rad, m]; x: marker positions (n, 3) [m].
-        prismatic: which joints slide (d); None: all turn.
-        rng: draws the starts.
-        starts: how many random chains at most.
+        q: joint angles (n, d) [rad, m].
+        x: marker positions (n, 3) [m].
+        prismatic: True for each joint (d) that slides; None: all turn.
+        rng: random generator of the starts.
+        starts: maximum number of random chains.
         sigma: noise of a coordinate [m], if known.
 
     Raises:
@@ -84,12 +85,12 @@ def find_chain(
 def _best_of(
     q: FloatArray, x: FloatArray, slides: BoolArray, size: float, rng: np.random.Generator, starts: int, enough: float
 ) -> RigidChain:
-    """The best of at most `starts` descents; the first whose RMS residual is `enough` [m] ends the search."""
+    """Return the best of at most `starts` descents; the first with an RMS residual of `enough` [m] ends the search."""
     descents = Descents(q, x, slides, size)
     best, best_rms = None, math.inf
     side_by_side = 1
     while best is None or (starts > 0 and best_rms > enough):
-        # Often the first does. Each that does not makes it likelier that many are needed.
+        # Often the first start succeeds. Each failure makes it likelier that many are needed.
         count = min(side_by_side, starts)
         arms, rms = descents.run(_random_arms(count, len(slides), x.mean(axis=0), size, rng), enough)
         winner = int(rms.argmin())
@@ -101,7 +102,7 @@ def _best_of(
 
 
 def _random_arms(count: int, joints: int, centre: FloatArray, size: float, rng: np.random.Generator) -> ScrewArms:
-    """Arms whose axes at zero have any direction and pass where the positions are."""
+    """Return arms whose axes at zero have random directions and pass near the positions."""
     axes, points = np.empty((count, joints, 3)), np.empty((count, joints + 1, 3))
     for arm in range(count):
         axes[arm] = rng.normal(size=(joints, 3))

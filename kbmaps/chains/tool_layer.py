@@ -1,4 +1,4 @@
-"""A tool or marker on a known arm: three numbers that are learnt from single pairs."""
+"""Tool or marker offset on a known arm: three numbers, learnt from single pairs."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from kbmaps.pairs import checked_pairs
 
 _KIND = "tool layer, 1"
 DEFAULT_OUTLIER_SIGMAS = 6.0
-# What an infinite spread is taken for [m].
+# Finite stand-in for an infinite spread [m].
 _WIDE = 1e6
-# The noise is guessed as if it had been found from this many coordinates.
+# The initial noise has the weight of this many coordinates.
 _NOISE_COORDINATES = 6.0
-# So many pairs are kept to judge outliers among; older ones live on in sums.
+# Number of pairs kept to judge outliers; older ones remain in sums.
 _RECENT = 128
 _RESIDUALS = ("rotations", "residuals", "sigma")
 _SUMS = ("information", "pull", "square", "inner")
@@ -35,29 +35,30 @@ _NUMBERS = ("errors", "count", "noise_count", "noise_square")
 
 @runtime_checkable
 class _Estimating(Protocol):
-    """A model that says how sure it is."""
+    """Model with an uncertainty."""
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Positions at q (n, d) with their uncertainty."""
+        """Return positions at q (n, d) with their uncertainty."""
         ...
 
 
 class ToolLayer:
-    """f(q) + R(q) δ on a model that is taken as it is, with δ in the marker's frame learnt by least squares. A `Model`.
+    """Adds a marker offset to a fixed model: f(q) + R(q) δ, with δ in the marker's frame. A `Model`.
 
-    The pairs enter through sums, at a constant cost and memory; outliers are judged among the last 128 or more. What is
-    learnt is the posterior of a Gaussian δ, with the most evident noise where none was told. The order of the pairs
-    does not matter, but for outliers older than that.
+    δ is learnt by least squares. The pairs enter through sums, at a constant cost and memory; outliers are judged among
+    the last 128 or more. The result is the posterior of a Gaussian δ, with the noise that maximises the evidence where
+    none was given. The order of the pairs does not matter, except for the outliers among the older ones.
 
     Args:
         model: an arm with orientations: a `RigidChain`, a `KBMap` that has them, or any `PoseModel`; it must not
             change.
         spread: 1-sigma of each component of δ before the first pair [m]; infinity leaves it to the pairs alone.
-        noise: 1-sigma of a coordinate to start from where pairs come without [m].
-        outlier_sigmas: pairs farther off than so many robust standard deviations do not count.
+        noise: initial 1-sigma of a coordinate where pairs come without their sigma [m].
+        outlier_sigmas: pairs farther off than this many robust standard deviations do not count.
 
     Raises:
-        SettingError: one of these is not positive. ShapeError: a `KBMap` without orientation.
+        SettingError: one of these is not positive.
+        ShapeError: a `KBMap` without orientation.
     """
 
     def __init__(
@@ -88,7 +89,7 @@ class ToolLayer:
 
     @property
     def pairs(self) -> int:
-        """How many pairs have been learnt, those before a tool change included."""
+        """Number of learnt pairs, those before a tool change included."""
         return self._pairs
 
     @property
@@ -108,13 +109,15 @@ class ToolLayer:
 
     @property
     def inliers(self) -> BoolArray:
-        """Which of the recent pairs (n,) are no outliers."""
+        """True for each recent pair (n,) that is not an outlier."""
         return self._fitted()[2].copy()
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
-        """Pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
+        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
 
         Args:
+            q: joint values.
+            x: measured positions.
             sigma: 1-sigma of the positions [m], () or (n,); None where it is to be estimated.
 
         Raises:
@@ -128,7 +131,7 @@ class ToolLayer:
             self._sum_up()
 
     def tool_changed(self, tolerance: float) -> None:
-        """Tells that the marker was moved, by `tolerance` (1-sigma of each component [m]); the noise stays known.
+        """Allow for a marker that was moved, by `tolerance` (1-sigma of each component [m]); keep the noise estimate.
 
         Raises:
             SettingError: the tolerance is not positive.
@@ -142,7 +145,7 @@ class ToolLayer:
         self._recent, self._fit = self._recent[:0], None
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
+        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
 
         Raises:
             ShapeError, NonFiniteError
@@ -151,7 +154,7 @@ class ToolLayer:
         return self._model.predict(angles) + self._model.orientation(angles) @ self._posterior().shift
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d).
+        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d).
 
         Exact on a `KBMap` or a `RigidChain`, and on any model whose orientations are rotations.
 
@@ -168,19 +171,19 @@ class ToolLayer:
         return self._model.jacobian(q) + np.cross(turning, lever[..., None, :]).swapaxes(-1, -2)
 
     def orientation(self, q: ArrayLike, *, orthonormal: bool = False) -> FloatArray:
-        """The model's orientations (n, 3, 3), or (3, 3) at q (d,): a tool does not turn the marker's frame."""
+        """Return the model's orientations (n, 3, 3), or (3, 3) at q (d,): a tool does not turn the marker's frame."""
         return self._model.orientation(q, orthonormal=orthonormal)
 
     def angular_jacobian(self, q: ArrayLike) -> FloatArray:
-        """The model's angular velocities (n, 3, d), or (3, d) at q (d,), of the orthonormal orientation."""
+        """Return the model's angular velocities (n, 3, d), or (3, d) at q (d,), of the orthonormal orientation."""
         return self._model.angular_jacobian(q)
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and whether data was there.
+        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and True where data is near.
 
-        What the model itself claims adds to what is open about δ. Every pair shows all of δ, which then is as sure at
-        one configuration as at any other: once there is a pair of the present tool, support is that of the model
-        itself, or everywhere where it claims none.
+        The model's own variance adds to that of δ. Every pair determines all of δ, so δ is equally certain at all
+        configurations. Once there is a pair of the current tool, support is that of the model, or everywhere if the
+        model has none.
 
         Raises:
             ShapeError, NonFiniteError
@@ -196,7 +199,7 @@ class ToolLayer:
         return Estimate(self.predict(batch), np.sqrt(variance), inside).like(angles)
 
     def baked(self) -> KBMap | RigidChain:
-        """The model with the marker moved for good, exactly: of a KB-Map G + E1 δ1 + E2 δ2 + E3 δ3.
+        """Return the model with the offset built in, exactly: for a KB-Map G + E1 δ1 + E2 δ2 + E3 δ3.
 
         Raises:
             SettingError: the model is neither a `KBMap` nor a `RigidChain`.
@@ -206,9 +209,9 @@ class ToolLayer:
         raise SettingError(f"a {type(self._model).__name__} cannot take in a tool; only a KBMap or a RigidChain can")
 
     def to_bytes(self) -> bytes:
-        """The layer as it is; `from_bytes` gives the same predictions to the last bit.
+        """Return the layer's state; `from_bytes` restores the same predictions to the last bit.
 
-        A model that is neither a `KBMap` nor a `RigidChain` stays behind.
+        A model that is neither a `KBMap` nor a `RigidChain` is not stored.
         """
         behind, arrays = packable(self._model)
         fields: dict[str, Any] = {
@@ -222,13 +225,14 @@ class ToolLayer:
 
     @classmethod
     def from_bytes(cls, data: bytes, model: PoseModel | None = None) -> Self:
-        """The layer in `data`.
+        """Return the layer in `data`.
 
         Args:
-            model: the one it had, where that does not travel.
+            data: the result of `to_bytes`.
+            model: the layer's model, if it is not stored.
 
         Raises:
-            ModelFormatError: it is none of this kind, or damaged, or its model is missing.
+            ModelFormatError: wrong type of model, or damaged, or the layer's model is missing.
         """
         fields, arrays = unpack(data, _KIND)
         with restoring("a tool layer"):
@@ -249,7 +253,7 @@ class ToolLayer:
         return Residuals(self._model.orientation(q), x - self._model.predict(q), sigma)
 
     def _sum_up(self) -> None:
-        """Lets all but the last pairs live on in sums only, without those that were outliers."""
+        """Reduce all but the last pairs to sums, without their outliers."""
         _, _, inliers = self._fitted()
         old = len(self._recent) - _RECENT
         self._before = self._before.given(self._recent[:old][inliers[:old]])
@@ -272,7 +276,7 @@ def _checked_spread(name: str, spread: float) -> float:
 
 
 def _residuals(arrays: Mapping[str, FloatArray]) -> Residuals:
-    """What `to_bytes` stored of the recent pairs. Raises ModelFormatError, KeyError."""
+    """Return the stored recent pairs. Raises ModelFormatError, KeyError."""
     rotations, errors, sigma = (arrays[name] for name in _RESIDUALS)
     if sigma.ndim != 1 or (sigma <= 0.0).any():
         raise ModelFormatError("the sigmas of a stored layer are not positive numbers, one a pair")
@@ -281,7 +285,7 @@ def _residuals(arrays: Mapping[str, FloatArray]) -> Residuals:
 
 
 def _shaped(array: FloatArray, like: FloatArray) -> FloatArray:
-    """The array if it is finite and of this shape. Raises ModelFormatError."""
+    """Return the array if it is finite and of this shape. Raises ModelFormatError."""
     if array.shape != like.shape or not np.isfinite(array).all():
         raise ModelFormatError(f"an array of finite numbers of shape {like.shape} was expected, got {array.shape}")
     return array

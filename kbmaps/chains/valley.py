@@ -1,4 +1,4 @@
-"""How far the parameters of a chain may be off where what fits the pairs equally well lies along a curve."""
+"""Deviation of chain parameters whose posterior is curved."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from kbmaps.arrays import FloatArray
 from kbmaps.chains.belief import ChainBelief, squared
 from kbmaps.pairs import Pairs
 
-# Of a direction that is open the pairs have left at least this share of the prior's variance.
+# A direction is open if at least this share of the prior's variance remains.
 _OPEN = 0.5
-# No step along a direction changes a parameter by more than this [rad, m]: beyond, two orders say nothing.
+# No step along a direction changes a parameter by more than this [rad, m]: beyond, the second order does not hold.
 _LONGEST_STEP = 0.1
 
 
 def deviations(belief: ChainBelief, pairs: Pairs, sigma: FloatArray) -> FloatArray:
     """Root mean square deviation (size,) [rad, m] of each parameter's true value from the mean, to second order.
 
-    What the pairs do not tell apart lies along a curved valley, not along its tangent: another zero of the last joint,
-    made up for by the marker, takes the marker round the joint's axis. With y standard normal along the open
-    directions W_o, the closed ones W_c follow, so that the pairs stay as well explained (our derivation):
+    Changes that the pairs cannot separate lie along a curve, not along its tangent. An example is another offset of the
+    last joint, compensated for by the marker: it takes the marker round the joint's axis. With y standard normal along
+    the open directions W_o, the closed ones W_c follow, so that the pairs stay as well explained (our derivation):
 
         θ = m + W_o y + W_c (z + ½ Σ B_kl y_k y_l)    B_kl = −(J W_c)⁺ ∂²x(W_o e_k, W_o e_l)
 
@@ -47,7 +47,7 @@ def deviations(belief: ChainBelief, pairs: Pairs, sigma: FloatArray) -> FloatArr
 def _sides(belief: ChainBelief, pairs: Pairs, sigma: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """A root of the belief in two parts, open (size, k) and closed (size, c), and (J W_c)⁺ (c, 3 n) of the latter.
 
-    In units of the posterior the square of J W is what the pairs have taken of the prior's variance.
+    In units of the posterior, the eigenvalues of (J W)ᵀ J W are the removed shares of the prior's variance.
     """
     free, triangle = squared(belief.root)
     root = np.zeros((len(belief.mean), len(free)))

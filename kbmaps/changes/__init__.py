@@ -1,1 +1,1 @@
-"""Noticing that an arm, its tool or its camera changed, and telling which."""
+"""Detection of a changed arm, tool or camera, and identification of the part that changed."""

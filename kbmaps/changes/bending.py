@@ -1,4 +1,4 @@
-"""What is left of a change if the arm may bend: what a smooth function of the joint values explains is none."""
+"""Evidence for a change if the arm may bend: a smooth function of the joint values is not a change."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from kbmaps.arrays import FloatArray, IntArray
 from kbmaps.changes.bends import Runs, log_evidence, probable_bends
 from kbmaps.changes.mixture import log_ratios
 
-# Runs of neighbours count by their means; a run is as long as this share of its age, at most so many pairs.
+# Runs of neighbours count by their means; a run's length is this share of its age, at most this many pairs.
 _RUN_SHARE, _LONGEST_RUN = 0.04, 6
-# A change may begin with each of so many runs, of older ones with those that lie so far apart, as a share of their age:
-# it is best seen soon, where a pair that counts wrongly costs most.
+# Any of this many newest runs may be the onset of a change; older onsets are spaced by this share of their age. A
+# change is best seen soon after it, when a wrongly counted pair costs most.
 _EACH, _SPACING = 30, 0.1
-# A pair farther than so many sigmas from the middle of so many neighbours counts as that far: it may be an outlier.
-# Where more than half of them moved together, the middle moved as well.
+# A pair farther than this many sigmas from the median of its neighbours is clipped: it may be an outlier. Where more
+# than half of them moved together, the median moved as well.
 _CLIPPED_SIGMAS, _NEIGHBOURS = 4.0, 5
-# So many of the newest pairs are looked at.
+# Maximum number of pairs, the newest ones, that are evaluated.
 MOST_PAIRS = 1200
 
 
@@ -33,26 +33,26 @@ def log_ratios_if_it_bends(
     suspected: int,
     before: Sequence[FloatArray | float],
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Log of the likelihood ratio of each kind of change to none, where the arm bends before and after.
+    """Return the log likelihood ratio of each kind of change to none, for an arm that bends before and after.
 
-    The errors of all pairs are those of what was not known of the chain, a change from some pair on, noise, a smooth
-    function of the joint values, which is a Gaussian process with variance a² exp(−Σ_j (1 − cos Δ_j) / ℓ²) on each
-    coordinate, and an error of each joint that is a smooth function of its own value. Their a and ℓ and the noise are
-    as probable as all pairs make them without a change.
+    The errors of all pairs are the sum of these terms: the unknown part of the chain, a change from some pair on,
+    noise, a smooth function of the joint values, and an error of each joint that is a smooth function of its own value.
+    The smooth function is a Gaussian process with variance a² exp(−Σ_j (1 − cos Δ_j) / ℓ²) on each coordinate. Its a
+    and ℓ and the noise are weighted by their probability given all pairs without a change.
 
     Args:
-        angles: where (n, d) [rad, or for a sliding joint what moves the marker as far], n at most `MOST_PAIRS`.
+        angles: configurations (n, d) [rad, or for a prismatic joint the equivalent], n at most `MOST_PAIRS`.
         errors: of a model that knows none of the pairs, in units of their noise (n, 3).
-        known: their derivatives by what is known, whose prior is of variance 1 (n, 3, k).
+        known: their derivatives by the known parameters, whose prior is of variance 1 (n, 3, k).
         turning: by each joint, such that 1 moves the marker by about the noise (n, 3, d).
-        changed: by what may change (n, 3, c).
-        places: which of these each kind of change has.
+        changed: by the parameters that may change (n, 3, c).
+        places: the columns of `changed` of each kind of change.
         sizes: of a change, 1-sigma of each number.
-        suspected: the pair with which it most probably began if the arm is rigid.
-        before: what other pairs say of bends, as `log_evidence_of_bends`.
+        suspected: the most probable onset if the arm is rigid.
+        before: evidence of other pairs about bends, from `log_evidence_of_bends`.
 
     Returns:
-        Pairs (t,), ascending, with which the change may begin, for how many each stands, and the ratios (t, kinds).
+        Onsets (t,), ascending, the number of pairs that each stands for, and the ratios (t, kinds).
     """
     pairs, errors = len(angles), _without_outliers(errors)
     starts = np.array(sorted({suspected, *(pairs - age for age in _ages(pairs, _RUN_SHARE, _LONGEST_RUN))}))
@@ -73,23 +73,28 @@ def log_ratios_if_it_bends(
 def log_evidence_of_bends(
     angles: FloatArray, errors: FloatArray, known: FloatArray, turning: FloatArray
 ) -> list[FloatArray]:
-    """What pairs to which the belief was fitted say of bends; arguments as of `log_ratios_if_it_bends`."""
+    """Return the evidence about bends in pairs to which the belief was fitted.
+
+    Arguments as in `log_ratios_if_it_bends`.
+    """
     starts = np.arange(0, len(angles), _LONGEST_RUN)
     return log_evidence(Runs.of(angles, known, turning, _without_outliers(errors), starts, fitted=True))
 
 
 def _compared(sums: FloatArray, places: Sequence[slice], sizes: FloatArray) -> FloatArray:
-    """Log ratios (h, kinds) of each kind of change to none.
+    """Return the log ratios (h, kinds) of each kind of change to none.
 
     Args:
         sums: of products of the derivatives by changes, and of the errors (h, p, p).
+        places: the columns of each kind of change.
+        sizes: of a change, 1-sigma of each number.
     """
     information, score = sums[:, :-1, :-1], sums[:, :-1, -1]
     return np.stack([log_ratios(information[:, at, at], score[:, at], sizes) for at in places], axis=1)
 
 
 def _without_outliers(errors: FloatArray) -> FloatArray:
-    """Errors (n, 3) in units of their noise, in their order, none of them far from its neighbours."""
+    """Return errors (n, 3) in units of their noise, clipped to lie near their neighbours."""
     if len(errors) < _NEIGHBOURS:
         return errors
     middles = np.median(np.lib.stride_tricks.sliding_window_view(errors, _NEIGHBOURS, axis=0), axis=2)
@@ -101,7 +106,7 @@ def _without_outliers(errors: FloatArray) -> FloatArray:
 
 
 def _ages(pairs: int, share: float, longest: int) -> list[int]:
-    """Ever larger ages, 1 to `pairs`, the last one included."""
+    """Return ever larger ages, 1 to `pairs`, the last one included."""
     ages = [min(1, pairs)]
     while ages[-1] < pairs:
         ages.append(min(ages[-1] + max(1, min(int(share * ages[-1]), longest)), pairs))
@@ -109,7 +114,7 @@ def _ages(pairs: int, share: float, longest: int) -> list[int]:
 
 
 def _apart(starts: IntArray, pairs: int, suspected: int) -> IntArray:
-    """Those of the starts (m,) that are far enough apart for their age, with the newest, the first and this one."""
+    """Return starts (m,) that are far enough apart for their age, with the newest, the first and the suspected one."""
     kept = [int(starts[-1])]
     for start in starts[-2::-1].tolist():
         age = pairs - start

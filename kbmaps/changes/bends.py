@@ -1,4 +1,4 @@
-"""How an arm may bend that is no chain, and how probable that is by pairs between which nothing changed."""
+"""Bends of an arm that no rigid chain has, and their evidence in pairs without a change."""
 
 from __future__ import annotations
 
@@ -12,41 +12,42 @@ from scipy.special import ive  # pyright: ignore[reportMissingTypeStubs, reportU
 
 from kbmaps.arrays import FloatArray, IntArray
 
-# Over how far a bend is much the same [rad of all joints together], how large it is over the noise of a pair, how far a
-# joint's own error moves the marker over that noise, and the noise over what it was thought to be: equally probable,
-# but for an arm that has neither bends nor such errors, which is as probable as all others together.
+# Correlation length of a bend [rad of all joints together], its size over the noise of a pair, the marker's motion from
+# a joint's own error over that noise, and the noise over its nominal value. All are equally probable, except an arm
+# without bends and such errors, which is as probable as all others together.
 LENGTHS = (0.7, 1.4)
 BENDS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 TURNS = (0.0, 0.5, 2.0, 8.0)
 NOISES = (0.5, 0.7, 1.0, 1.4)
-# What other pairs say of bends of each length where there are none.
+# Log evidence of other pairs about bends of each length, without any such pairs.
 NOTHING_SEEN = (0.0,) * len(LENGTHS)
-# A joint's own error, as a function of its value alone, is much the same over so far [rad]. So many waves of a turn
-# describe it; constant, it is a zero that the belief has.
+# Correlation length of a joint's own error over its value [rad], and the number of harmonics that describe it. A
+# constant error is a joint offset, which the belief includes.
 _OWN_LENGTH, _HARMONICS = 0.7, 3
-# Of what is none, the 1-sigma.
+# 1-sigma that stands for an absent error.
 _NONE = 1e-3
-# As far as pairs tell to which it was fitted, what is known may be off by so many times what the belief leaves open.
+# For pairs to which the belief was fitted, the known parameters may be off by this multiple of the belief's
+# uncertainty.
 _OPEN = 1e3
-# A chain that was fitted to an arm that bends took part of it for its own: the variance of what the belief leaves open
-# is more by so many times the square of the bend over the noise.
+# A chain fitted to a bending arm has absorbed part of the bend: the belief's variance grows by this factor times the
+# square of the bend over the noise.
 _TAKEN_ALONG = 3.0
-# Those less probable than this by all pairs, were there no change, are left out: even with one they hardly count.
+# Hypotheses less probable than this without a change are left out: even with one they hardly count.
 _LEAST = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """Runs of neighbours, which count by their means.
+    """Runs of neighbours, represented by their means.
 
     Attributes:
-        angles: of all pairs (n, d) [rad, or for a sliding joint what moves the marker as far].
+        angles: of all pairs (n, d) [rad, or for a prismatic joint the equivalent].
         starts: the first pair of each run (m,).
-        rows: means of the derivatives by what is known, then by joints' own errors, and of errors, times the square
-            root of the run's length (m, 3, p).
-        known: how many of these are known, with a prior of variance 1.
+        rows: means of the derivatives by the known parameters, then by joints' own errors, and of errors, times the
+            square root of the run's length (m, 3, p).
+        known: number of the known parameters, with a prior of variance 1.
         within: sum of the squares of errors around their means.
-        fitted: whether what is known was fitted to these pairs, which then say nothing of it.
+        fitted: True if the known parameters were fitted to these pairs, which then carry no information about them.
     """
 
     angles: FloatArray
@@ -67,12 +68,15 @@ class Runs:
         *,
         fitted: bool,
     ) -> Runs:
-        """Runs of pairs, which begin with these.
+        """Return runs of pairs with these starts.
 
         Args:
-            known: derivatives by what is known (n, 3, k).
-            turning: derivatives by each joint, a joint's own error of 1 (n, 3, d).
+            angles: of all pairs (n, d).
+            known: derivatives by the known parameters (n, 3, k).
+            turning: derivatives by each joint, for a joint's own error of 1 (n, 3, d).
             errors: (n, 3).
+            starts: the first pair of each run (m,).
+            fitted: True if the known parameters were fitted to these pairs.
         """
         lengths = np.diff(np.append(starts, len(angles)))
         rows = np.concatenate([known, _own_errors(angles, turning), errors[..., None]], axis=2)
@@ -82,12 +86,12 @@ class Runs:
 
     @property
     def lengths(self) -> FloatArray:
-        """How many pairs each run has (m,)."""
+        """Number of pairs of each run (m,)."""
         return np.diff(np.append(self.starts, len(self.angles))).astype(np.float64)
 
     @cached_property
     def axes(self) -> tuple[tuple[FloatArray, FloatArray], ...]:
-        """Of bends of each length and of size 1 the variances (m,) along these axes of runs (m, m)."""
+        """Eigenvalues (m,) and eigenvectors (m, m) of the runs' covariance, for bends of each length and of size 1."""
         on_circles = np.concatenate([np.cos(self.angles), np.sin(self.angles)], axis=1)
         alike, lengths = on_circles @ on_circles.T - self.angles.shape[1], self.lengths
         found = list[tuple[FloatArray, FloatArray]]()
@@ -101,13 +105,13 @@ class Runs:
 
 @dataclass(frozen=True, eq=False)
 class Bends:
-    """Bends of one length, with many sizes, joints' own errors and noises, all of them probable.
+    """Probable hypotheses of one bend length: sizes, joints' own errors and noises.
 
     Attributes:
         axes: the coordinates of runs in which each bend is diagonal (m, m).
-        weights: over the variance of each coordinate (h, m).
-        known: what rows of runs have in common with what is known and joints' own errors (h, k, 3 m).
-        logs: how probable each is (h,).
+        weights: inverse variance of each coordinate (h, m).
+        known: projection of rows of runs onto the known parameters and joints' own errors (h, k, 3 m).
+        logs: log probability of each (h,).
     """
 
     axes: FloatArray
@@ -116,7 +120,7 @@ class Bends:
     logs: FloatArray
 
     def sums(self, rows: FloatArray) -> FloatArray:
-        """Of products of rows (m, 3, p) of runs, weighed, without what is explained by what is known (h, p, p)."""
+        """Return weighted products (h, p, p) of rows (m, 3, p) of runs, less the part of the known parameters."""
         turned = np.tensordot(self.axes.T, rows, axes=1)
         products = np.tensordot(self.weights, turned.transpose(0, 2, 1) @ turned, axes=1)
         common = self.known @ turned.reshape(-1, rows.shape[2])
@@ -124,9 +128,9 @@ class Bends:
 
 
 def log_evidence(runs: Runs) -> list[FloatArray]:
-    """How well bends explain pairs between which nothing changed, for each length (h,).
+    """Return the log evidence of bends in pairs between which nothing changed, for each length (h,).
 
-    The same bends for all runs: each joints' own error with each noise with each size.
+    Hypotheses are in the same order for all runs: each joints' own error with each noise with each size.
     """
     found: list[FloatArray] = []
     alone, known = 1.5 * (len(runs.angles) - len(runs.starts)), runs.rows.shape[2] - 1
@@ -148,7 +152,7 @@ def log_evidence(runs: Runs) -> list[FloatArray]:
 
 
 def probable_bends(runs: Runs, before: Sequence[FloatArray | float]) -> list[Bends]:
-    """What is probable by these pairs, if nothing changed, and by what others say (`log_evidence`)."""
+    """Return the hypotheses that are probable given these pairs without a change, and other pairs (`log_evidence`)."""
     evidence = zip(log_evidence(runs), before, strict=True)
     logs = [now + past + _log_prior(k) for k, (now, past) in enumerate(evidence)]
     total = np.logaddexp.reduce(np.concatenate(logs))
@@ -170,27 +174,27 @@ def _chosen(runs: Runs, k: int, logs: FloatArray) -> Bends:
 
 
 def _log_prior(k: int) -> FloatArray:
-    """How probable each is before any pair (h,), of those of the length number k; they need not add up to one."""
+    """Return the log prior of each hypothesis (h,) of the k-th length, not normalised."""
     sizes, turns = np.tile(_sizes(k), len(TURNS) * len(NOISES)), np.repeat(TURNS, len(NOISES) * len(_sizes(k)))
-    # A bend of no size has no length: it stands for as many as there are lengths.
+    # A bend of size zero has no length: it counts once for each length.
     shares = np.where(sizes == 0.0, float(len(LENGTHS)), 1.0)
     return np.log(np.where(sizes + turns == 0.0, shares * (len(BENDS) * len(TURNS) - 1.0), shares))
 
 
 def _sizes(k: int) -> FloatArray:
-    """Of bends of the length number k."""
+    """Return the sizes of bends of the k-th length."""
     return np.array(BENDS if k == 0 else BENDS[1:])
 
 
 def _weights(k: int, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Over the variances of runs (h, m) for each noise with each size of a bend, and the noises (h,), squared."""
+    """Return inverse variances of runs (h, m) for each noise with each size of a bend, and the noises squared (h,)."""
     noises = np.repeat(np.square(NOISES), len(_sizes(k)))
     sizes = np.tile(np.square(_sizes(k)), len(NOISES))
     return 1.0 / (noises[:, None] * (1.0 + sizes[:, None] * values)), noises
 
 
 def _prior(runs: Runs, k: int, turn: float) -> FloatArray:
-    """Over the variance (h, p) of what is known, and of joints' own errors of this size, with each noise and bend."""
+    """Return the prior precision (h, p) of the known parameters and joints' own errors, for each noise and bend."""
     squares = np.tile(np.square(_sizes(k)), len(NOISES)) + turn**2
     left_open = np.full(len(squares), _OPEN**2) if runs.fitted else 1.0 + _TAKEN_ALONG * squares
     known = np.repeat(1.0 / left_open[:, None], runs.known, axis=1)
@@ -199,9 +203,9 @@ def _prior(runs: Runs, k: int, turn: float) -> FloatArray:
 
 
 def _own_errors(angles: FloatArray, turning: FloatArray) -> FloatArray:
-    """Derivatives (n, 3, 2 d h) by the waves of each joint's own error, a Gaussian process of variance 1.
+    """Return derivatives (n, 3, 2 d h) by the harmonics of each joint's own error, a Gaussian process of variance 1.
 
-    Its kernel exp(−(1 − cos Δ) / ℓ²) has, for the wave n > 0, the share 2 exp(−1 / ℓ²) I_n(1 / ℓ²) with the Bessel
+    Its kernel exp(−(1 − cos Δ) / ℓ²) has, for the harmonic n > 0, the share 2 exp(−1 / ℓ²) I_n(1 / ℓ²) with the Bessel
     function I_n.
     """
     columns: list[FloatArray] = []

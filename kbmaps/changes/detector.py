@@ -1,4 +1,4 @@
-"""Noticing a change from the errors of a model that was learnt before it."""
+"""Detection of a change from the errors of a model that was learnt before it."""
 
 from __future__ import annotations
 
@@ -19,33 +19,33 @@ from kbmaps.changes.onsets import Onsets
 from kbmaps.changes.shared_noise import SharedNoise
 from kbmaps.changes.white_noise import inverse_roots
 
-# On average at least so many pairs lie between two false alarms, as far as the model's claims are true.
+# Minimum average number of pairs between two false alarms, if the model's uncertainty is correct.
 PAIRS_BETWEEN_FALSE_ALARMS = 75_000.0
-# When the statistic first exceeds its limit, it often does so by far, most of all for the large changes that it allows
-# for. So the limit may be lower than that number of pairs, by this factor (`python -m benchmarks.false_alarms`).
+# The statistic often exceeds its limit by far, most of all for the large changes that it allows for. So the limit may
+# be lower than that number of pairs, by this factor (`python -m benchmarks.false_alarms`).
 _OVERSHOOT = 0.33
-# No single pair counts for more than one that lies so many sigmas away: it may be an outlier.
+# No pair counts for more than one this many sigmas away: it may be an outlier.
 CLIPPED_SIGMAS = 4.0
-# So many of the newest pairs tell whether the noise has grown.
+# Number of the newest pairs that decide if the noise has grown.
 _RECENT = 50
 _CLEARLY = 3.0
-# While nothing is strange, it is enough to look every so many pairs: after a pair beyond so many sigmas, or when a
-# change is so probable, each pair counts.
+# Normally the statistic is evaluated once per this many pairs. After a pair beyond this many sigmas, or at log odds
+# above this, it is evaluated for each pair.
 LOOK_EVERY, STRANGE_SIGMAS, LOOK_CLOSELY = 5, 3.0, 4.0
-# So many of the newest errors are kept.
+# Number of the newest errors that are kept.
 MOST_SURPRISES = 3000
 
 
 @dataclass(frozen=True, eq=False)
 class Suspicion:
-    """How probable a change is.
+    """Probability of a change.
 
     Attributes:
         log_odds: logarithm of the Shiryaev-Roberts statistic: of all likelihood ratios together.
-        alarm: whether that is more than `PAIRS_BETWEEN_FALSE_ALARMS` allow without a change.
-        onsets: pairs (m,), counted from the detector's first, from which on the change may be.
-        shares: how probable each of them is (m,), if there was a change.
-        kinds: how probable each kind is (k,), in the order of the detector's kinds, if there was a change.
+        alarm: True if that exceeds the limit set by `PAIRS_BETWEEN_FALSE_ALARMS`.
+        onsets: candidate first pairs (m,) of the change, counted from the detector's first.
+        shares: probability of each onset (m,), given a change.
+        kinds: probability of each kind (k,), in the order of the detector's kinds, given a change.
     """
 
     log_odds: float
@@ -56,11 +56,11 @@ class Suspicion:
 
     @property
     def onset(self) -> int:
-        """The most probable first pair of the change."""
+        """Most probable first pair of the change."""
         return int(self.onsets[self.shares.argmax()])
 
     def interval(self, probability: float = 0.95) -> tuple[int, int]:
-        """Between which pairs the change began, with so much probability."""
+        """Return the first and last pair between which the change began, with this probability."""
         tail = 0.5 * (1.0 - probability)
         low, high = np.searchsorted(np.cumsum(self.shares), [tail, 1.0 - tail]).clip(max=len(self.onsets) - 1)
         # Onsets that are no longer kept lie before the next one that is.
@@ -70,23 +70,23 @@ class Suspicion:
 
 
 class ChangeDetector:
-    """Looks for a change of the tool, the camera or a joint's zero at an unknown pair, of an unknown size.
+    """Detects a change of the tool, the camera or a joint offset at an unknown pair, of an unknown size.
 
     The errors r of a model that knows none of the pairs are, with the derivatives J of its chain,
 
         r_i = J_i (c + θ [i ≥ t]) + e_i
 
-    with c what the model's own belief leaves open (known ever better from these errors), e the noise, partly shared by
-    neighbours, and θ the change from pair t on. For each t that is kept and each kind, θ has a likelihood ratio
-    (Willsky and Jones 1976, there maximised), averaged over sizes. Their sum over t is the statistic of
-    Shiryaev and Roberts: without a change its expectation after n pairs is n, so that the first time it exceeds A
-    comes after A pairs at least on average (Pollak 1987, "Average run lengths of an optimal method of detecting a
-    change in distribution"), and after more as it then exceeds A by far.
+    with c the model's own uncertainty (narrowed by these errors), e the noise, partly shared by neighbours, and θ the
+    change from pair t on. For each t that is kept and each kind, θ has a likelihood ratio (Willsky and Jones 1976,
+    there maximised), averaged over sizes. Their sum over t is the statistic of Shiryaev and Roberts: without a change
+    its expectation after n pairs is n. So it first exceeds A after at least A pairs on average (Pollak 1987, "Average
+    run lengths of an optimal method of detecting a change in distribution"), and after more because it then exceeds A
+    by far.
 
     Args:
-        belief: what is believed of the chain, by pairs before the first of these.
+        belief: posterior of the chain from pairs before the first of these.
         noise: of the whitened errors.
-        noise_m: 1-sigma of a coordinate of one measurement [m]: what small and large changes are.
+        noise_m: 1-sigma of a coordinate of one measurement [m]: the scale of small and large changes.
         distance_m: usual distance of the marker from the camera [m].
         pairs_between_false_alarms: on average, at least.
     """
@@ -111,7 +111,7 @@ class ChangeDetector:
         self._noise_m, self._sizes = noise_m, noise_m * np.array(SIZES)
         self._limit = self.log_limit(pairs_between_false_alarms)
         known = self._root.shape[1]
-        # A root of the covariance: a difference of covariances would be none after thousands of pairs.
+        # A root of the covariance: the difference of two covariances would lose all digits after thousands of pairs.
         self._posterior_root, self._mean = np.eye(known), np.zeros(known)
         self._onsets = Onsets(known, len(self._columns))
         self._differences: deque[float] = deque(maxlen=_RECENT)
@@ -123,54 +123,54 @@ class ChangeDetector:
 
     @staticmethod
     def log_limit(pairs_between_false_alarms: float) -> float:
-        """Beyond which log odds there is an alarm."""
+        """Return the log odds above which there is an alarm."""
         return math.log(_OVERSHOOT * pairs_between_false_alarms)
 
     @property
     def pairs(self) -> int:
-        """How many pairs it has seen."""
+        """Number of pairs seen."""
         return self._onsets.pairs
 
     @property
     def noise(self) -> SharedNoise:
-        """Of the whitened errors, as given."""
+        """Noise of the whitened errors, as given."""
         return self._noise
 
     @property
     def surprises(self) -> FloatArray:
         """Whitened errors (n, 3) of the newest pairs, n at most `MOST_SURPRISES`.
 
-        Each is against what was expected after the pairs before it. They are in units of the noise: what was not known
-        of the model is taken out.
+        Each is against the prediction from the pairs before it. They are in units of the noise: the model's own
+        uncertainty is taken out.
         """
         return np.array(self._surprises).reshape(-1, 3)
 
     def add(self, q: FloatArray, errors: FloatArray, covariances: FloatArray) -> None:
-        """Pairs that came after those that the model knows, in their order.
+        """Add pairs that came after those that the model knows, in their order.
 
         Args:
-            q: where (n, d) [rad, m].
+            q: configurations (n, d) [rad, m].
             errors: measured minus predicted (n, 3) [m].
-            covariances: of these: the measurement's, and what the model misses beyond its belief (n, 3, 3) [m²].
+            covariances: of these errors: the measurement's, and the model's error beyond its belief (n, 3, 3) [m²].
         """
         for row in zip(*self._whitened(q, errors, covariances), strict=True):
             self._rows.append(row)
             self._add(*row[1:])
 
     def recall(self, q: FloatArray, errors: FloatArray, covariances: FloatArray) -> None:
-        """Pairs to which the belief was fitted, in their order: they show how the arm bends, and nothing else.
+        """Set the pairs to which the belief was fitted, in their order: they show only how the arm bends.
 
         Args:
-            q: where (n, d) [rad, m].
+            q: configurations (n, d) [rad, m].
             errors: measured minus predicted by the believed chain (n, 3) [m].
-            covariances: as of `add`.
+            covariances: as in `add`.
         """
         self._fitted, self._bends_before = (q, errors, covariances), None
 
     def _whitened(
         self, q: FloatArray, errors: FloatArray, covariances: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Angles (n, d), derivatives by what is believed (n, 3, k) and by changes (n, 3, c), and errors (n, 3)."""
+        """Return angles (n, d), derivatives by the belief (n, 3, k) and by changes (n, 3, c), and errors (n, 3)."""
         _, jacobian = self._belief.parameters.linearised(self._belief.mean, q)
         weights = inverse_roots(covariances)
         known = weights @ (jacobian @ self._root)
@@ -179,7 +179,7 @@ class ChangeDetector:
         return np.where(prismatic, q / self._belief.parameters.reach, q), known, changed, np.matvec(weights, errors)
 
     def _add(self, known: FloatArray, changed: FloatArray, error: FloatArray) -> None:
-        """One pair's whitened derivatives by what is believed (3, k) and by changes (3, c), and its error (3,)."""
+        """Add one pair: whitened derivatives by the belief (3, k) and by changes (3, c), and its error (3,)."""
         expected, seen = known @ self._mean, known @ self._posterior_root
         covariance = seen @ seen.T
         spread = math.sqrt(self._noise.single + float(np.trace(covariance)) / 3.0)
@@ -200,12 +200,14 @@ class ChangeDetector:
 
     @property
     def due(self) -> bool:
-        """Whether `suspicion` may have grown enough to be asked for."""
+        """True if `suspicion` may have grown enough to be worth evaluating."""
         late = self.pairs - self._looked_at >= LOOK_EVERY
         return self.pairs > self._looked_at and (late or self._strange or self._log_odds > LOOK_CLOSELY)
 
     def sums(self) -> tuple[IntArray, FloatArray, FloatArray]:
-        """What the pairs since each onset (m,) say of all that may change, in metres of the marker's way.
+        """Return the information about all possible changes in the pairs since each onset (m,).
+
+        Changes are in metres of marker motion.
 
         Returns:
             The onsets, and the information (m, c, c) and score (m, c) of changes in the order of the kinds.
@@ -219,7 +221,7 @@ class ChangeDetector:
         return onsets, information, (score - np.matvec(crossed.transpose(0, 2, 1), self._mean)) / variances[:, None]
 
     def suspicion(self) -> Suspicion:
-        """How probable a change is after the pairs so far, at least one."""
+        """Return the probability of a change after the pairs so far, at least one."""
         onsets, information, score = self.sums()
         terms = np.stack([log_ratios(information[:, at, at], score[:, at], self._sizes) for at in self._places], axis=1)
         terms += self._log_shares + np.log(self._onsets.weights)[:, None]
@@ -228,9 +230,10 @@ class ChangeDetector:
         return suspicion
 
     def suspicion_if_it_bends(self) -> Suspicion:
-        """How probable a change is if the arm may bend, before and after, as its pairs let expect; at least one pair.
+        """Return the probability of a change if the arm may bend, before and after; at least one pair.
 
-        It costs some hundred times as much as `suspicion`: to be asked for when that is an alarm.
+        The bends are those that the pairs make probable. It costs some hundred times as much as `suspicion`: use it
+        when that is an alarm.
         """
         angles, known, changed, errors = (np.array(each) for each in zip(*self._rows, strict=True))
         scale = 1.0 / math.sqrt(self._noise.single)
@@ -250,7 +253,7 @@ class ChangeDetector:
         return self._suspected(onsets + first, terms)
 
     def _seen_of_bends(self) -> Sequence[FloatArray | float]:
-        """What the pairs that the belief was fitted to say of bends."""
+        """Return the evidence about bends in the pairs to which the belief was fitted."""
         if self._fitted is None:
             return NOTHING_SEEN
         if self._bends_before is None:
@@ -266,7 +269,7 @@ class ChangeDetector:
         return Suspicion(log_odds, log_odds > self._limit, onsets, shares.sum(axis=1), shares.sum(axis=0))
 
     def _grown_noise(self) -> SharedNoise:
-        """The noise, or more where the newest pairs scatter more: that is no change of the arm."""
+        """Return the noise, or more where the newest pairs scatter more: that is not a change of the arm."""
         if len(self._differences) < _RECENT:
             return self._noise
         chance = 1.0 + _CLEARLY * math.sqrt(1.0 / _RECENT)

@@ -1,4 +1,4 @@
-"""What may change while an arm is running, and how far that moves the marker."""
+"""Kinds of change of a running arm, and the marker motion that each causes."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from kbmaps.arrays import FloatArray, IntArray
 from kbmaps.chains.parameters import ChainParameters
 
 TOOL, CAMERA, JOINT, OTHER = "tool", "camera", "joint", "other"
-# What explains a change as well as one part does although everything may have changed, is seldom what happened.
+# A change of everything is seldom what happened if a change of one part explains the pairs as well.
 _OTHER_SHARE = 0.001
 
 
 @dataclass(frozen=True, eq=False)
 class ChangeKind:
-    """One part of the chain that may be another one from some pair on.
+    """Part of the chain that may change from some pair on.
 
     Attributes:
         name: `tool`, `camera`, `joint` or `other`.
-        joint: which one (from 0) where one joint's zero changed; else None.
+        joint: index of the joint (from 0) whose offset changed; else None.
         columns: the parameters (k,) that change, as in `ChainParameters`.
-        units: by how much each has to change to move the marker by about a metre (k,) [rad/m, m/m].
-        share: how probable this kind is before anything is known of a change.
+        units: change of each that moves the marker by about a metre (k,) [rad/m, m/m].
+        share: prior probability of this kind.
     """
 
     name: str
@@ -35,11 +35,11 @@ class ChangeKind:
 
 
 def change_kinds(parameters: ChainParameters, distance_m: float) -> tuple[ChangeKind, ...]:
-    """The tool, the camera, and each joint's zero, as probable as each other but for the joints, which share theirs.
+    """Return the kinds tool, camera, and each joint's offset, equally probable; the joints share one third.
 
     Args:
         parameters: of the chain.
-        distance_m: from the camera to the marker, usually [m].
+        distance_m: usual distance from the camera to the marker [m].
     """
     camera = np.r_[parameters.base_turn, parameters.base_shift]
     turned = np.r_[np.full(3, 1.0 / max(distance_m, 1e-3)), np.ones(3)] / math.sqrt(2.0)
@@ -55,6 +55,6 @@ def change_kinds(parameters: ChainParameters, distance_m: float) -> tuple[Change
 
 
 def any_change(parameters: ChainParameters) -> ChangeKind:
-    """Everything at once: what a change is that no single part explains."""
+    """Return the change of everything at once, for a change that no single part explains."""
     units = np.where(parameters.turning, 1.0 / parameters.reach, 1.0) / math.sqrt(parameters.size / 3.0)
     return ChangeKind(OTHER, None, np.arange(parameters.size), units, _OTHER_SHARE)

@@ -1,4 +1,4 @@
-"""The evidence for a change of unknown size: its likelihood ratio, averaged over sizes."""
+"""Evidence for a change of unknown size: its likelihood ratio, averaged over sizes."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import numpy as np
 
 from kbmaps.arrays import FloatArray
 
-# Sizes of a change over the noise of one measurement, equally probable: a fraction of it up to far beyond it.
+# Sizes of a change over the noise of one measurement, equally probable: from a fraction of it to far beyond it.
 SIZES = (0.5, 2.5, 12.0, 60.0)
 
 
 def log_ratios(information: FloatArray, score: FloatArray, sizes: FloatArray) -> FloatArray:
-    """Log of the likelihood ratio of a change θ ~ N(0, s² 1) to none, averaged over the sizes s, (m,).
+    """Return the log likelihood ratio of a change θ ~ N(0, s² 1) to none, averaged over the sizes s, (m,).
 
     With the information G and the score u = G θ̂ that a linear model has of θ, and in G's eigenvectors:
 

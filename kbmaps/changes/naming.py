@@ -1,4 +1,4 @@
-"""Which part of the chain changed, of all pairs since a change together."""
+"""Identification of the part of the chain that changed, from all pairs since the change together."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from kbmaps.changes.kinds import OTHER, ChangeKind
 from kbmaps.changes.mixture import SIZES
 from kbmaps.robust import OUTLIER_SIGMAS
 
-# Of more pairs so many are looked at, evenly spread. They stand for themselves alone: counted for the others too, their
-# noise would look like a change of everything.
+# Maximum number of pairs, evenly spread. They are not weighted up for the others: their noise would look like a change
+# of everything.
 MOST_PAIRS = 400
 _STEPS = 6
 
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """One kind of change, as far as the pairs since then speak for it.
+    """Evidence for one kind of change in the pairs since then.
 
     Attributes:
         kind: the part of the chain.
-        probability: that it is this one.
+        probability: of this kind.
         change: of the kind's parameters, most probable (k,) [rad, m].
-        moved_m: by how much that moves the marker at these pairs, root mean square [m].
+        moved_m: motion of the marker that this causes at these pairs, root mean square [m].
     """
 
     kind: ChangeKind
@@ -45,25 +45,26 @@ def explanations(
     noise_m: float,
     shared: float = 1.0,
 ) -> list[Explanation]:
-    """How probable each kind of change is, the most probable first.
+    """Return the probability of each kind of change, the most probable first.
 
-    For each kind the most probable change is found together with what was not known of the chain before. The evidence
-    for it is that of a Gaussian around it (Laplace), averaged over the sizes that a change may have. So one number that
-    does as well as three is more probable, and what these pairs cannot tell apart stays undecided.
+    For each kind, the most probable change is fitted together with the chain's prior uncertainty. Its evidence is that
+    of a Gaussian around it (Laplace), averaged over the possible sizes of a change. So one parameter that fits as well
+    as three is more probable, and kinds that these pairs cannot separate stay undecided.
 
     Args:
-        before: what is believed of the chain by the pairs before the change.
-        kinds: what may have changed.
+        before: posterior of the chain from the pairs before the change.
+        kinds: the kinds of change.
         q: pairs since then, joint values (n, d) [rad, m].
-        x: what of the measured positions (n, 3) [m] the chain shall explain.
+        x: the part of the measured positions (n, 3) [m] that the chain shall explain.
         noise_m: 1-sigma of a coordinate [m].
-        shared: how many neighbours say as much as one would.
+        shared: number of neighbours that carry as much information as one independent pair.
     """
     chosen = np.linspace(0, len(q) - 1, min(len(q), MOST_PAIRS)).round().astype(np.intp)
     q, x, counted = q[chosen], x[chosen], 1.0 / shared
     sizes = noise_m * np.array(SIZES)
     fits = [_fit(before, kind, q, x, noise_m, counted, float(sizes[-1])) for kind in kinds]
-    # A change of everything at once that is hardly seen is what was not known before, and no change.
+    # A barely visible change of everything is indistinguishable from the prior uncertainty, so small sizes are left
+    # out.
     logs = np.array(
         [
             np.log(kind.share) + fit.evidence(sizes[1:] if kind.name == OTHER else sizes)
@@ -80,11 +81,11 @@ def explanations(
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """A change that was fitted, in metres of the marker's way.
+    """Fitted change, in metres of marker motion.
 
     Attributes:
-        cost: minus the log likelihood there, with what the belief before says.
-        log_volume: of what was not known before, ½ log det of its precision.
+        cost: minus the log likelihood there, including the prior belief.
+        log_volume: of the prior uncertainty, ½ log det of its precision.
         information: of the change with the rest unknown (k, k).
         change: (k,) [m].
         moved_m: see `Explanation`.
@@ -107,7 +108,7 @@ class _Fit:
 def _fit(
     before: ChainBelief, kind: ChangeKind, q: FloatArray, x: FloatArray, noise_m: float, counted: float, widest: float
 ) -> _Fit:
-    """The most probable change of this kind; each pair counts as `counted`, a change is seldom larger than `widest`."""
+    """Fit the most probable change of this kind; each pair counts as `counted`, `widest` is the prior's 1-sigma."""
     root = before.root[:, np.square(before.root).any(axis=0)]
     known, size = root.shape[1], len(kind.columns)
     to_change = np.zeros((before.parameters.size, known + size))
@@ -121,7 +122,7 @@ def _fit(
         design = (jacobian @ to_change) / noise_m
         off = (x - predicted) / noise_m
         far = np.linalg.norm(off, axis=1)
-        # Beyond the limit less and less, at last not at all: at first it is wide, since nothing is fitted yet.
+        # The limit starts wide, since nothing is fitted yet, and ends as a hard cut.
         wide = limit if step >= _STEPS // 2 else max(limit, 3.0 * float(np.median(far)))
         weights = counted * (far <= wide)
         normal = _squared(design, weights) + np.diag(prior)
@@ -157,6 +158,6 @@ def _described(
 
 
 def _squared(design: FloatArray, weights: FloatArray) -> FloatArray:
-    """Σ_n w_n D_nᵀ D_n (k, k) of derivatives D (n, 3, k) and weights (n,)."""
+    """Return Σ_n w_n D_nᵀ D_n (k, k) of derivatives D (n, 3, k) and weights (n,)."""
     rows = design.reshape(-1, design.shape[2])
     return (rows * np.repeat(weights, design.shape[1])[:, None]).T @ rows

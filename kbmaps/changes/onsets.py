@@ -1,4 +1,4 @@
-"""What has been summed up since each of the pairs from which on there may be a change."""
+"""Sums over the pairs since each candidate onset of a change."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import numpy as np
 
 from kbmaps.arrays import FloatArray, IntArray
 
-# Every one of the newest pairs may be the first of a change; of older ones they thin out by this share of their age.
+# Each of the newest pairs may be the first of a change; older onsets are thinned to this share of their age.
 SPACING = 0.15
 _SLOTS = 96
 
 
 class Onsets:
-    """Sums over all pairs, and what they were before each onset that is kept.
+    """Sums over all pairs, and their values before each onset that is kept.
 
     Args:
-        known: numbers that are known, with an uncertainty.
-        changes: numbers that may change.
+        known: number of known parameters, with an uncertainty.
+        changes: number of parameters that may change.
     """
 
     def __init__(self, known: int, changes: int) -> None:
@@ -32,12 +32,12 @@ class Onsets:
 
     @property
     def weights(self) -> FloatArray:
-        """How many pairs each onset stands for (m,), itself and those after it that are no longer kept."""
+        """Number of pairs that each onset stands for (m,): itself and those after it that are no longer kept."""
         onsets = self._onset[self._slots]
         return np.diff(np.append(onsets, self.pairs)).astype(np.float64)
 
     def add(self, crossed: FloatArray, information: FloatArray, score: FloatArray) -> None:
-        """One more pair: D'C (k, c), C'C (c, c) and C'r (c,) of its derivatives D, C and its error r."""
+        """Add a pair: D'C (k, c), C'C (c, c) and C'r (c,) of its derivatives D, C and its error r."""
         slot = self._free.pop()
         self._onset[slot] = self.pairs
         self._crossed_before[slot], self._information_before[slot] = self._crossed, self._information
@@ -50,7 +50,7 @@ class Onsets:
         self._thin()
 
     def since(self) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-        """Onsets (m,), ascending, and the sums from each of them on: (m, k, c), (m, c, c) and (m, c)."""
+        """Return onsets (m,), ascending, and the sums from each of them on: (m, k, c), (m, c, c) and (m, c)."""
         slots = self._slots
         return (
             self._onset[slots],
@@ -60,7 +60,7 @@ class Onsets:
         )
 
     def _thin(self) -> None:
-        """Drop the newest onset whose neighbours are near enough to each other for their age, all but the first."""
+        """Drop the newest onset, except the first, whose neighbours are near enough to each other for their age."""
         for k in range(len(self._slots) - 2, 0, -1):
             before, after = self._onset[self._slots[k - 1]], self._onset[self._slots[k + 1]]
             if after - before <= SPACING * (self.pairs - after):

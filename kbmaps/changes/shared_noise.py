@@ -1,4 +1,4 @@
-"""How much of their noise neighbours on a path share, and how little a run of them therefore says."""
+"""Noise that neighbours on a path share, and the variance of means of runs of them."""
 
 from __future__ import annotations
 
@@ -10,32 +10,32 @@ from scipy.special import ndtr, stdtrit  # pyright: ignore[reportMissingTypeStub
 
 from kbmaps.arrays import FloatArray, frozen
 
-# Errors of a model are shared by about so many neighbours of a path, where nothing is known of it: 20 degrees of it.
+# Default number of neighbours of a path that share a model's error: 20 degrees of it.
 USUALLY_SHARED = 10
-# Sums over longer lags than this, or than this share of the series, would be more noise than sum.
+# Sums over longer lags than this, or than this share of the series, would be dominated by noise.
 _LONGEST_LAG, _LONGEST_LAG_SHARE = 200, 0.125
-# Neighbours share something where their products are so many standard errors above 0.
+# Neighbours share an error if their products are this many standard errors above 0.
 _CLEARLY = 2.0
-# A Gaussian coordinate is so far out once in as many pairs as lie between false alarms [sigmas]: there the estimated
-# variance has to hold.
+# The estimated variance must hold in the tail [sigmas], where a Gaussian coordinate falls once in as many pairs as lie
+# between false alarms.
 _TAIL_SIGMAS = 4.5
-# Longer runs than that are as such.
+# Longer runs are treated as this long.
 _LONGEST_RUN = 1000
-# Residuals that are 0 tell of no variance; no model is so much better than its claim.
+# Lower bound: residuals of 0 determine no variance, and no model is this much better than its claim.
 _LEAST = 1e-12
-# A fit takes at most this share of what neighbours share.
+# A fit absorbs at most this share of the error that neighbours share.
 _MOST_TAKEN = 0.8
 
 
 @dataclass(frozen=True, eq=False)
 class SharedNoise:
-    """The variance of whitened residuals, and of means of runs of neighbours times their length.
+    """Variance of whitened residuals, and of means of runs of neighbours times their length.
 
     Attributes:
-        variances: n times the variance of the mean of n neighbours, for n = 1, 2, ... (m,); constant from there on.
-            A model that errs may err alike all along a walk: a change has to be larger than that, however many pairs
+        variances: n times the variance of the mean of n neighbours, for n = 1, 2, ... (m,); constant from there on. A
+            model's error may be the same all along a walk: a change has to be larger than that, however many pairs
             show it.
-        whole: the same of all pairs of a long walk, where such errors are of all signs.
+        whole: the same for all pairs of a long walk, where such errors have both signs.
     """
 
     variances: FloatArray
@@ -50,34 +50,43 @@ class SharedNoise:
         return float(self.variances[0])
 
     def of_runs(self, lengths: FloatArray) -> FloatArray:
-        """n times the variance of the mean of n neighbours, for these n (m,)."""
+        """Return n times the variance of the mean of n neighbours, for these n (m,)."""
         return self.variances[np.minimum(lengths.astype(np.intp), len(self.variances)) - 1]
 
     @classmethod
     def claimed(cls, share: float) -> SharedNoise:
-        """That of residuals of unit variance, of which this share is a model's error and so shared by neighbours."""
+        """Return the noise of unit-variance residuals that share a model's error with their neighbours.
+
+        Args:
+            share: of the variance, due to the model's error.
+        """
         alike = 1.0 + share * np.arange(_LONGEST_RUN if share > 0.0 else 1, dtype=np.float64)
         return cls(alike, 1.0 + share * (USUALLY_SHARED - 1))
 
     @classmethod
     def repeated(cls, share: float) -> SharedNoise:
-        """That of residuals of unit variance, of which this share may be the same for some neighbours, and no longer.
+        """Return the noise of unit-variance residuals of which a share may repeat for some neighbours.
 
         A joint that turns by whole ticks from pair to pair, or hardly at all, is rounded in the same way each time.
+
+        Args:
+            share: of the variance, due to that rounding.
         """
         alike = 1.0 + share * np.arange(USUALLY_SHARED, dtype=np.float64)
         return cls(alike, float(alike[-1]))
 
     @classmethod
     def of(cls, residuals: FloatArray, used: float = 0.0) -> SharedNoise:
-        """That of residuals (n, 3), n at least 2, in their order, as large as it may well be.
+        """Estimate the noise of residuals (n, 3), n at least 2, in their order; an upper estimate.
 
         n Var(mean of n) = γ_0 + 2 Σ_{k<n} (1 − k/n) γ_k with the autocovariances γ, for as long as pairs of
-        neighbouring lags stay positive (Geyer 1992, initial positive sequence). A variance of ν independent parts makes
-        a Gaussian a Student variable, which is far out more often: the variances are raised by as much.
+        neighbouring lags stay positive (Geyer 1992, initial positive sequence). With a variance estimated from ν
+        independent parts, a Gaussian becomes a Student variable, which has heavier tails: the variances are raised to
+        match.
 
         Args:
-            used: how many numbers were fitted to the residuals.
+            residuals: (n, 3).
+            used: number of parameters fitted to the residuals.
         """
         n = len(residuals)
         square = max(float(np.square(residuals).mean()), _LEAST) * 3 * n / max(3 * n - used, n)
@@ -87,7 +96,7 @@ class SharedNoise:
         variances = square + 2.0 * shares @ kept
         together = np.maximum(variances / square, 1.0)
         if len(kept):
-            # What neighbours share has fewer independent parts, of which a fit takes more: new pairs show more of it.
+            # A shared error has fewer independent parts, of which a fit absorbs more: new pairs show more of it.
             taken = min(used * float(together[-1]) / (3.0 * n), _MOST_TAKEN)
             alone = max(square - max(float(kept[0]), 0.0), 0.0)
             variances = alone + (variances - alone) / (1.0 - taken)
@@ -99,18 +108,21 @@ class SharedNoise:
         return cls(variances, whole)
 
     def at_least(self, other: SharedNoise) -> SharedNoise:
-        """The larger of both."""
+        """Return the larger of both."""
         lengths = np.arange(1.0, max(len(self.variances), len(other.variances)) + 1)
         variances = np.maximum(self.of_runs(lengths), other.of_runs(lengths))
         return SharedNoise(variances, max(self.whole, other.whole))
 
     def times(self, factor: float) -> SharedNoise:
-        """With all variances multiplied."""
+        """Return the noise with all variances multiplied."""
         return SharedNoise(factor * self.variances, factor * self.whole)
 
 
 def _autocovariances(residuals: FloatArray, chance: float) -> FloatArray:
-    """Those of residuals (n, 3) at lags 1, 2, ... for as long as neighbours clearly share something, perhaps none."""
+    """Return autocovariances of residuals (n, 3) at lags 1, 2, ... while neighbours clearly share an error.
+
+    May be empty.
+    """
     n = len(residuals)
     longest = min(int(n * _LONGEST_LAG_SHARE), _LONGEST_LAG) // 2 * 2
     lags = np.array([float(np.vdot(residuals[k:], residuals[:-k])) / (3 * (n - k)) for k in range(1, longest + 1)])
@@ -122,6 +134,6 @@ def _autocovariances(residuals: FloatArray, chance: float) -> FloatArray:
 
 
 def _raised(parts: FloatArray) -> FloatArray:
-    """By how much variances of so many independent parts have to be raised."""
+    """Return the factor that raises variances estimated from this many independent parts."""
     tail = float(ndtr(-_TAIL_SIGMAS))
     return np.square(stdtrit(np.maximum(parts, 3.0), 1.0 - tail) / _TAIL_SIGMAS)

@@ -1,4 +1,4 @@
-"""The noise of single pairs: what the camera claims, and what joints are read wrong by."""
+"""Noise of single pairs: the camera's measurement noise and the joints' reading errors."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ import numpy as np
 
 from kbmaps.arrays import FloatArray, frozen
 
-# So many steps towards the most probable variances; each makes them more probable.
+# Number of steps towards the maximum likelihood; each increases it.
 _STEPS = 60
-# A difference of neighbours counts as at most so many sigmas: it may be an outlier.
+# A difference of neighbours is clipped to this many sigmas: it may be an outlier.
 _CLIPPED_SIGMAS = 4.0
-# Of fewer pairs for each variance nothing is learnt.
+# Minimum number of pairs for each estimated variance.
 _FEWEST = 10
-# A variance is not taken for less than this share of all: it would vanish in rounding.
+# Lower bound of a variance as a share of all: it would vanish in rounding.
 _LEAST = 1e-9
-# Where the six numbers of a symmetric matrix are: xx, yy, zz, yz, xz, xy.
+# Positions of the six numbers of a symmetric matrix: xx, yy, zz, yz, xz, xy.
 _ROWS, _COLUMNS = [0, 1, 2, 1, 0, 0], [0, 1, 2, 2, 2, 1]
 
 
 @dataclass(frozen=True, eq=False)
 class WhiteNoise:
-    """Variances of what makes a pair err by itself, and not its neighbours as well.
+    """Variances of the error that each pair has by itself, not shared with its neighbours.
 
     A pair's error has the covariance
 
@@ -33,8 +33,8 @@ class WhiteNoise:
     encoder's ticks move the predicted position along them, so the axes of the position err together.
 
     Attributes:
-        claimed: a, by how much the claimed covariance is too small; never below 1, as what a camera claims may be
-            shared by neighbours where the marker is partly hidden for a while.
+        claimed: a, the factor by which the claimed covariance is too small; never below 1, as a camera's claimed error
+            may be shared by neighbours where the marker is partly hidden for a while.
         beside: b, the same on all axes [m²].
         joints: s_j², of the joints' readings (d,) [rad², m²].
     """
@@ -48,21 +48,21 @@ class WhiteNoise:
 
     @classmethod
     def as_claimed(cls, joints: int) -> Self:
-        """What the camera claims, for so many joints."""
+        """Return the noise that the camera claims, for this number of joints."""
         return cls(1.0, 0.0, np.zeros(joints))
 
     @classmethod
     def of(cls, errors: FloatArray, covariances: FloatArray, derivatives: FloatArray) -> Self:
-        """As the differences of neighbours show it, where errors of the model cancel.
+        """Estimate the noise from differences of neighbours, in which errors of the model cancel.
 
-        The most probable variances of Gaussian differences, by the steps of Zhou, Hu, Zhou and Lange (2019, "MM
-        algorithms for variance components models"), which neither leave the positive ones nor miss. As claimed, where
-        there are too few pairs.
+        Maximum likelihood variances of Gaussian differences, by the MM algorithm of Zhou, Hu, Zhou and Lange (2019, "MM
+        algorithms for variance components models"). It keeps variances positive and each step increases the likelihood.
+        With too few pairs, the noise is as claimed.
 
         Args:
             errors: of a model's predictions (n, 3) [m], in the order of the pairs.
             covariances: claimed of the measured positions (n, 3, 3) [m²].
-            derivatives: of the positions by the joints (n, 3, d) [m/rad, or 1 for a sliding joint].
+            derivatives: of the positions by the joints (n, 3, d) [m/rad, or 1 for a prismatic joint].
         """
         joints = derivatives.shape[2]
         if len(errors) - 1 < _FEWEST * (joints + 2):
@@ -77,23 +77,23 @@ class WhiteNoise:
         spread = spread * units[:, None, None]
         shares, likelihood = _most_probable(spread, off)
         of_camera, without_joints = _most_probable(spread[:, joints:], off)
-        # Joints that turn in all directions can be much like round noise: they need evidence (Schwarz 1978).
+        # The errors of joints that turn in all directions resemble isotropic noise: they need evidence (Schwarz 1978).
         if likelihood - without_joints < 0.5 * joints * np.log(3.0 * len(off)):
             shares = np.concatenate([np.zeros(joints), of_camera])
         variances = shares * units
         return cls(max(float(variances[-2]), 1.0), float(variances[-1]), variances[:joints])
 
     def of_readings(self, derivatives: FloatArray) -> FloatArray:
-        """What the joints' readings have in pairs' errors (n, 3, 3) [m²]; the argument as of `of`."""
+        """Return the part of the joints' readings in pairs' errors (n, 3, 3) [m²]; the argument as in `of`."""
         return (derivatives * self.joints) @ derivatives.mT
 
     def covariances(self, covariances: FloatArray, derivatives: FloatArray) -> FloatArray:
-        """Of pairs' errors (n, 3, 3) [m²]; arguments as of `of`."""
+        """Return covariances of pairs' errors (n, 3, 3) [m²]; arguments as in `of`."""
         return self.claimed * covariances + self.beside * np.eye(3) + self.of_readings(derivatives)
 
 
 def _most_probable(spread: FloatArray, off: FloatArray) -> tuple[FloatArray, float]:
-    """Shares (k,) of covariances (n, k, 3, 3) in that of `off` (n, 3), and their log-likelihood [nats]."""
+    """Return shares (k,) of covariances (n, k, 3, 3) in that of `off` (n, 3), and their log-likelihood [nats]."""
     n, k = spread.shape[:2]
     parts = np.ascontiguousarray(spread[:, :, _ROWS, _COLUMNS].transpose(1, 2, 0)).reshape(k, 6 * n)
     shares, likelihood = np.full(k, 1.0 / k), -np.inf
@@ -112,7 +112,7 @@ def _most_probable(spread: FloatArray, off: FloatArray) -> tuple[FloatArray, flo
 
 
 def _inverse_root(covariances: FloatArray) -> FloatArray:
-    """Inverses of the Cholesky factors (6, n), row by row, of covariances (6, n), in the order of `_ROWS`."""
+    """Return inverses of the Cholesky factors (6, n), row by row, of covariances (6, n), in the order of `_ROWS`."""
     xx, yy, zz, yz, xz, xy = covariances
     a = 1.0 / np.sqrt(xx)
     lower_yx, lower_zx = xy * a, xz * a
@@ -124,30 +124,30 @@ def _inverse_root(covariances: FloatArray) -> FloatArray:
 
 
 def _turned(root: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Lower triangles (6, n) times vectors (3, n)."""
+    """Return lower triangles (6, n) times vectors (3, n)."""
     (a, b, c, d, e, f), (x, y, z) = root, vectors
     return np.stack([a * x, b * x + c * y, d * x + e * y + f * z])
 
 
 def _turned_back(root: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Transposed lower triangles (6, n) times vectors (3, n)."""
+    """Return transposed lower triangles (6, n) times vectors (3, n)."""
     (a, b, c, d, e, f), (x, y, z) = root, vectors
     return np.stack([a * x + b * y + d * z, c * y + e * z, f * z])
 
 
 def _inverse_of(root: FloatArray) -> FloatArray:
-    """Transposed lower triangles times themselves (6, n), where what is off the diagonal counts twice."""
+    """Return transposed lower triangles times themselves (6, n); off-diagonal entries are doubled."""
     a, b, c, d, e, f = root
     return np.stack([a * a + b * b + d * d, c * c + e * e, f * f, 2.0 * e * f, 2.0 * d * f, 2.0 * (b * c + d * e)])
 
 
 def inverse_roots(covariances: FloatArray) -> FloatArray:
-    """The symmetric roots of their inverses (n, 3, 3), which turn no axis more than they must."""
+    """Return the symmetric roots of the inverses (n, 3, 3), which rotate no axis more than necessary."""
     values, vectors = np.linalg.eigh(covariances)
     return (vectors / np.sqrt(values)[:, None, :]) @ vectors.mT
 
 
 def _outer(derivatives: FloatArray) -> FloatArray:
-    """Of each joint's column (n, 3, d) with itself, (n, d, 3, 3)."""
+    """Return the outer product of each joint's column (n, 3, d) with itself, (n, d, 3, 3)."""
     columns = derivatives.mT
     return columns[..., :, None] * columns[..., None, :]

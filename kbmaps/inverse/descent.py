@@ -1,4 +1,4 @@
-"""From one configuration to the nearest one that reaches a goal: damped steps within the joint limits."""
+"""Descent from one configuration to the nearest one that reaches a goal: damped steps within the joint limits."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from kbmaps.arrays import FloatArray
 from kbmaps.inverse.reach import Goal
 from kbmaps.inverse.resolved_rates import bounded_step
 
-# The damping is this share of the error's square, times what the gain of the last steps made of it.
+# The damping is this share of the error's square, times a factor adapted to the gain of the last steps.
 _FIRST_SHARE, _LEAST_SHARE, _MOST_SHARE = 0.1, 1e-4, 1e6
 _DAMPING_FLOOR_M2 = 1e-18
 # No joint moves by more than this share of its half range in one step: the derivative does not hold farther.
 _LONGEST_STEP = 0.5
-# An error is stuck when its direction is this nearly perpendicular to what every free joint can do.
+# An error is stuck when its direction is this nearly perpendicular to the motion of every free joint.
 _STUCK_COSINE = 1e-5
 _LEAST_GAIN = 1e-4
-# Nearness to a posture: when its square falls by less than this share a step, it has settled.
+# The descent to a posture has settled when its squared distance falls by less than this share a step.
 _SETTLED = 1e-6
 _LEAST_PORTION = 1e-3
 _CORRECTIONS = 4
@@ -26,7 +26,7 @@ _CORRECTIONS = 4
 
 @dataclass(frozen=True, eq=False)
 class JointRange:
-    """Where the joints may be: lower ≤ q ≤ upper (d,), and the half range of each that counts as a large move."""
+    """Joint limits lower ≤ q ≤ upper (d,), and the half range of each joint as its scale."""
 
     lower: FloatArray
     upper: FloatArray
@@ -39,13 +39,13 @@ class JointRange:
 
 @dataclass(frozen=True, eq=False)
 class Descent:
-    """Where a descent ended.
+    """End of a descent.
 
     Attributes:
         q: the configuration (d,).
-        error: what is missing there [m].
+        error: the remaining error there [m].
         steps: derivatives evaluated.
-        ended: whether no step from there can lessen the error, or none is needed; else the steps ran out.
+        ended: True if no step from there can lessen the error, or none is needed; False if the steps ran out.
     """
 
     q: FloatArray
@@ -55,7 +55,7 @@ class Descent:
 
 
 def descend(goal: Goal, start: FloatArray, joints: JointRange, max_steps: int) -> Descent:
-    """Levenberg–Marquardt on the error, the damping proportional to the error's square (Sugihara 2011)."""
+    """Run Levenberg–Marquardt on the error, the damping proportional to the error's square (Sugihara 2011)."""
     q = np.clip(start, joints.lower, joints.upper)
     error, share = goal.error(q), _FIRST_SHARE
     none = np.zeros(len(q))
@@ -87,7 +87,7 @@ def descend(goal: Goal, start: FloatArray, joints: JointRange, max_steps: int) -
 
 
 def _is_stuck(scaled_jacobian: FloatArray, error: FloatArray, q: FloatArray, joints: JointRange) -> bool:
-    """Whether all that could lessen the error is forbidden by the limits, or perpendicular to it."""
+    """Return True if all motions that could lessen the error violate the limits, or are perpendicular to it."""
     pull = scaled_jacobian.T @ error
     forbidden = ((q <= joints.lower) & (pull < 0.0)) | ((q >= joints.upper) & (pull > 0.0))
     reach = np.linalg.norm(scaled_jacobian, axis=0) * float(np.linalg.norm(error))
@@ -95,10 +95,10 @@ def _is_stuck(scaled_jacobian: FloatArray, error: FloatArray, q: FloatArray, joi
 
 
 def settle(goal: Goal, reached: Descent, posture: FloatArray, joints: JointRange, max_steps: int) -> Descent:
-    """Along the configurations that reach the goal, to the one locally nearest to `posture` in half ranges.
+    """Move along the configurations that reach the goal, to the one locally nearest to `posture` in half ranges.
 
-    Each step projects the way to the posture into the null space (Liégeois 1977), then corrects what curvature cost.
-    Where that fails, or leads no nearer, half the step is tried.
+    Each step projects the way to the posture into the null space (Liégeois 1977), then corrects the error from
+    curvature. Where that fails, or leads no nearer, half the step is tried.
     """
     q, steps, portion = reached.q, reached.steps, 1.0
     error = reached.error

@@ -1,4 +1,4 @@
-"""Inverse kinematics: joint values that put the marker where it is wanted, on any model with a derivative."""
+"""Inverse kinematics: joint values for a target position or pose, on any model with a derivative."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ STARTS, POSE_STARTS = 16, 48
 MAX_STEPS = 3000
 TOLERANCE_M = 1e-7
 TOLERANCE_RAD = 1e-7
-# Starts are chosen among so many times as many samples near the target.
+# Starts are chosen among this many times as many samples near the target.
 _CANDIDATES = 8
 
 
 @dataclass(frozen=True, eq=False)
 class InverseSolution:
-    """Joint values for one target, and what is missing.
+    """Joint values for one target, with the remaining error.
 
     Attributes:
         q: joint values (d,) [rad, m] within the limits: of all that was found, the nearest to the target.
-        x: where the model puts the marker there (3,) [m].
+        x: the model's marker position there (3,) [m].
         distance: from x to the target [m].
-        angle: between the orientation there and the target's [rad]; None where none was asked for.
-        converged: whether distance and angle are within the tolerance.
+        angle: between the orientation there and the target's [rad]; None without a target orientation.
+        converged: True if distance and angle are within the tolerance.
         reason: "reached"; "out_of_reach": no start leads to the target, and from q no small move leads nearer;
             "steps_ran_out": it may be in reach.
-        steps: derivatives that were evaluated.
-        starts: configurations that were started from.
+        steps: number of derivatives evaluated.
+        starts: number of configurations started from.
     """
 
     q: FloatArray
@@ -57,10 +57,9 @@ class InverseSolution:
 class InverseKinematics:
     """Finds joint values for positions, or poses, of a model.
 
-    Resolved motion rate control (Whitney 1969), damped (Levenberg–Marquardt), within joint limits, from several
-    starts: the configuration at hand, then samples of the whole range that come near the target, as far apart from
-    each other as they can be. The same arguments give the same answer. A model that changes needs a new one (about
-    10 ms at d = 7).
+    Resolved motion rate control (Whitney 1969), damped (Levenberg–Marquardt), within joint limits, from several starts:
+    the given configuration, then samples of the whole range that come near the target, as far apart from each other as
+    possible. The same arguments give the same answer. A model that changes needs a new instance (about 10 ms at d = 7).
 
     Args:
         model: positions and their derivative, as every map, chain and learner of this package has them; for poses also
@@ -69,14 +68,14 @@ class InverseKinematics:
         lower, upper: joint limits (d,) [rad, m]. A joint without a limit (infinite) may go anywhere; its samples are
             taken from one turn.
         seed: of the samples.
-        samples: how many.
-        starts: how many configurations are tried at most; None: 16 for a position, 48 for a pose.
+        samples: number of samples.
+        starts: maximum number of starting configurations; None: 16 for a position, 48 for a pose.
         max_steps: of all starts together; each takes about one evaluation of `model.jacobian`.
         tolerance, angle_tolerance: distance [m] and angle [rad] that count as reached.
 
     Raises:
         ShapeError, NonFiniteError
-        SettingError: no such model, limits the wrong way round, or a setting that is not positive.
+        SettingError: not such a model, lower limits above upper ones, or a setting that is not positive.
         DegenerateDataError: the model has learnt too few pairs to predict.
 
     Example:
@@ -127,12 +126,15 @@ class InverseKinematics:
 
     @property
     def middle(self) -> FloatArray:
-        """The middle of each joint's range (d,): a posture that keeps away from the limits."""
+        """Middle of each joint's range (d,): a posture that keeps away from the limits."""
         return self._middle
 
     @cached_property
     def lever(self) -> float:
-        """Length [m] at which a radian counts as much as a metre: RMS distance of what is in reach to its middle."""
+        """Length [m] at which a radian counts as much as a metre.
+
+        RMS distance of the reachable positions from their mean.
+        """
         return max(float(np.sqrt(np.square(self._positions - self._positions.mean(axis=0)).sum(axis=1).mean())), 1e-6)
 
     def solve(
@@ -143,17 +145,20 @@ class InverseKinematics:
         start: ArrayLike | None = None,
         posture: ArrayLike | None = None,
     ) -> InverseSolution:
-        """Joint values that put the marker at x (3,) [m].
+        """Return joint values that put the marker at x (3,) [m].
 
         Args:
-            rotation: its orientation too: a rotation matrix (3, 3) or a unit quaternion x, y, z, w (4,).
-            start: where the arm is (d,); tried first, so that the answer is near to it where that leads to the target.
-            posture: a configuration (d,) to be near to, each joint measured in its half range, as far as the target
-                leaves a choice; `middle` keeps away from the limits. Locally the nearest to the solution found first.
+            x: target position (3,) [m].
+            rotation: target orientation: a rotation matrix (3, 3) or a unit quaternion x, y, z, w (4,).
+            start: the arm's configuration (d,); tried first, so that the answer is near to it if that leads to the
+                target.
+            posture: preferred configuration (d,), each joint measured in its half range, as far as the target leaves a
+                choice; `middle` keeps away from the limits. The answer is locally the nearest to the solution found
+                first.
 
         Raises:
             ShapeError, NonFiniteError, RotationError
-            SettingError: a rotation is asked for of a model without orientation.
+            SettingError: a rotation was given, and the model has no orientation.
         """
         goal = self._goal(vector("x", x, 3), rotation)
         first = None if start is None else vector("start", start, self._model.joints)
@@ -175,7 +180,7 @@ class InverseKinematics:
         return PoseGoal(self._model, x, wanted, self.lever, self._tolerance, self._angle_tolerance)
 
     def _search(self, goal: PositionGoal | PoseGoal, first: FloatArray | None) -> tuple[Descent, int, int]:
-        """The best descent, the steps of all, and how many starts were tried."""
+        """Return the best descent, the steps of all, and the number of starts tried."""
         starts = self._spread_starts(goal, first)
         best = descend(goal, next(starts), self._joints, self._max_steps)
         steps, tried = best.steps, 1
@@ -189,7 +194,7 @@ class InverseKinematics:
         return best, steps, tried
 
     def _spread_starts(self, goal: PositionGoal | PoseGoal, first: FloatArray | None) -> Iterator[FloatArray]:
-        """`first`, then samples near the goal: the nearest, then always the one farthest from all before."""
+        """Yield `first`, then samples near the goal: the nearest, then always the one farthest from all before."""
         if first is not None:
             yield first
         near = self._samples[self._nearest(goal)]
@@ -206,7 +211,7 @@ class InverseKinematics:
         return POSE_STARTS if isinstance(goal, PoseGoal) else STARTS
 
     def _nearest(self, goal: PositionGoal | PoseGoal) -> IntArray:
-        """Indices of the samples nearest to the goal, the nearest first."""
+        """Return indices of the samples nearest to the goal, the nearest first."""
         count = min(_CANDIDATES * self._most_starts(goal), len(self._samples))
         # Among some thousand points a search tree would not be faster.
         if isinstance(goal, PoseGoal):
@@ -218,7 +223,7 @@ class InverseKinematics:
         return nearest[np.argsort(square[nearest], kind="stable")]
 
     def _pose_features(self, model: PoseModel) -> FloatArray:
-        """Those of the samples; made when the first pose is asked for."""
+        """Return the samples' features; computed for the first pose."""
         if self._features is None:
             rotations = model.orientation(self._samples, orthonormal=True)
             self._features = _pose_features(self._positions, rotations, self.lever)
@@ -242,7 +247,7 @@ class InverseKinematics:
 
 
 def _check_model(model: object) -> None:
-    """Raises SettingError: it lacks what a `PositionModel` has."""
+    """Raise SettingError if the model lacks an attribute of a `PositionModel`."""
     if missing := [name for name in ("joints", "predict", "jacobian") if not hasattr(model, name)]:
         raise SettingError(
             f"inverse kinematics needs a model with joints, predict and jacobian; a {type(model).__name__} has no "
@@ -251,12 +256,12 @@ def _check_model(model: object) -> None:
 
 
 def _pose_features(x: FloatArray, rotations: FloatArray, lever: float) -> FloatArray:
-    """Points (..., 12) whose distances are those of poses: for small angles metres, and radians times lever."""
+    """Return points (..., 12) whose distances are those of poses: for small angles metres, and radians times lever."""
     turned = rotations.reshape(*x.shape[:-1], 9) * (lever / np.sqrt(2.0))
     return np.concatenate([x, turned], axis=-1)
 
 
 def _one_turn(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The limits; where there are none, one turn from the one there is, or about 0."""
+    """Return the limits; where there are none, one turn from the one there is, or about 0."""
     begin = np.where(np.isfinite(low), low, np.where(np.isfinite(high), high - 2.0 * np.pi, -np.pi))
     return begin, np.where(np.isfinite(high), high, begin + 2.0 * np.pi)

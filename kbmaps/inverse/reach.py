@@ -1,4 +1,4 @@
-"""What is to be reached, a position or a pose, as errors that a step of the joints can lessen."""
+"""Goals of inverse kinematics, a position or a pose, as errors that a step of the joints can lessen."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from kbmaps.rotations import rotation_vector
 
 
 class Goal(Protocol):
-    """Something to reach. Errors are in m, also those of an orientation."""
+    """Goal of inverse kinematics. Errors are in m, also those of an orientation."""
 
     def error(self, q: FloatArray) -> FloatArray:
-        """What is missing (m,) [m] at q (d,)."""
+        """Return the remaining error (m,) [m] at q (d,)."""
         ...
 
     def jacobian(self, q: FloatArray) -> FloatArray:
-        """How a step of the joints lessens it, to first order (m, d)."""
+        """Return the decrease of the error by a step of the joints, to first order (m, d)."""
         ...
 
     def reached(self, error: FloatArray) -> bool:
-        """Whether so small an error counts as none."""
+        """Return True if the error is within the tolerance."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class PositionGoal:
-    """The marker at x (3,) [m], to within the tolerance [m]."""
+    """Target position x (3,) [m] of the marker, to within the tolerance [m]."""
 
     model: PositionModel
     x: FloatArray
@@ -48,11 +48,11 @@ class PositionGoal:
 
 @dataclass(frozen=True, eq=False)
 class PoseGoal:
-    """The marker at x (3,) [m] with the orientation `rotation` (3, 3).
+    """Target position x (3,) [m] of the marker with the orientation `rotation` (3, 3).
 
     Attributes:
         lever: the length [m] at which a radian of orientation counts as much as the arc that it makes.
-        tolerance, angle_tolerance: how near is near enough [m], [rad].
+        tolerance, angle_tolerance: errors that count as reached [m], [rad].
     """
 
     model: PoseModel

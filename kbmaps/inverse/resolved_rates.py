@@ -25,19 +25,19 @@ def resolved_rates(
     preferred: ArrayLike | None = None,
     scale: ArrayLike | None = None,
 ) -> FloatArray:
-    """Joint rates u (d,) [rad/s, m/s] that give the velocity as well as damping and limits let them.
+    """Return joint rates u (d,) [rad/s, m/s] that give the velocity as well as damping and limits allow.
 
     u minimises ‖J u − v‖² + damping² ‖(u − preferred) / scale‖² within the limits: Whitney 1969 with the damping of
-    Wampler 1986 and Nakamura and Hanafusa 1986. For little damping what J leaves free follows `preferred`. For a joint
-    that is held at its limit the others make up as far as they can.
+    Wampler 1986 and Nakamura and Hanafusa 1986. With little damping, the null space of J follows `preferred`. The other
+    joints compensate as far as they can for a joint that is held at its limit.
 
     Args:
         jacobian: J (m, d), m = 3 for a position [m/rad] or 6 for a pose.
         velocity: v (m,) [m/s].
         damping: greater than 0, in the units of v over those of u / scale.
         low, high: limits of the rates (d,), low ≤ high; None: without.
-        preferred: rates (d,) to stay near to; None: zero.
-        scale: what counts as an equally large rate of each joint (d,), greater than 0; None: 1.
+        preferred: preferred rates (d,); None: zero.
+        scale: equally large rate of each joint (d,), greater than 0; None: 1.
 
     Raises:
         ShapeError, NonFiniteError, SettingError
@@ -63,7 +63,7 @@ def resolved_rates(
     scales = np.ones(d) if scale is None else vector("scale", scale, d)
     if not (scales > 0.0).all():
         raise SettingError("scale must be greater than 0 for every joint")
-    # Below rounding the damping would not keep the solution finite where J loses rank.
+    # Below rounding, damping would not keep the solution finite where J loses rank.
     damping_square = max(damping * damping, _ROUNDING * float(np.square(J * scales).sum()), _ROUNDING)
     return bounded_step(J, vector("velocity", velocity, m), damping_square, (lows, highs), wanted, scales)
 
@@ -76,10 +76,10 @@ def bounded_step(
     preferred: FloatArray,
     scale: FloatArray,
 ) -> FloatArray:
-    """`resolved_rates` for trusted input.
+    """Return `resolved_rates` for checked input.
 
-    An active-set method for least squares with bounds (Stark and Parker 1995): joints are held at bounds, and let go
-    again where that lessens the cost. The cost is strictly convex, so it ends at the one best step.
+    An active-set method for least squares with bounds (Stark and Parker 1995): joints are held at bounds, and released
+    where that lessens the cost. The cost is strictly convex, so the method ends at the global optimum.
     """
     low, high = bounds
     free = np.ones(len(preferred), dtype=np.bool_)
@@ -102,7 +102,8 @@ def bounded_step(
             free[first] = False
             continue
         step = inside
-        # Half the cost's slope in the scaled joints; a held joint is let go where it points away from its bound.
+        # Half the cost's slope in the scaled joints; a held joint is released where the slope points away from its
+        # bound.
         slope = damping_square * (step - preferred) / scale - scale * (jacobian.T @ (wanted - jacobian @ step))
         gain = np.where(free | (low == high), 0.0, np.where(step <= low, -slope, slope))
         best = int(gain.argmax())
@@ -120,7 +121,7 @@ def _unbounded_step(
     scale: FloatArray,
     free: BoolArray,
 ) -> FloatArray:
-    """With S = diag(scale) over the free joints: base + S² Jᵀ (J S² Jᵀ + damping²)⁻¹ (v − J base)."""
+    """Return base + S² Jᵀ (J S² Jᵀ + damping²)⁻¹ (v − J base), with S = diag(scale) over the free joints."""
     scaled = jacobian * (scale * free)
     gram = scaled @ scaled.T
     np.einsum("ii->i", gram)[:] += damping_square

@@ -1,1 +1,1 @@
-"""Maps of fewer pairs than control points, through the product kernel, with a prior of equal or structured variance."""
+"""Maps of fewer pairs than control points, learnt through the product kernel."""

@@ -1,4 +1,4 @@
-"""A KB-Map from values on a grid of three joint values a joint."""
+"""Conversion of a model to a KB-Map from values on a grid of three values per joint."""
 
 from __future__ import annotations
 
@@ -16,12 +16,14 @@ _THIRD_OF_A_TURN = 2.0 * math.pi / 3.0
 
 
 def sampled_map(model: Predictor, bases: Sequence[JointBasis]) -> KBMap:
-    """The KB-Map in these bases that agrees with a model at 3^d configurations (2 for each prismatic joint).
+    """Return the KB-Map in these bases that agrees with a model at 3^d configurations (2 for each prismatic joint).
 
-    If the model is a KB-Map in another form, as a rigid chain is or a kernel learner around one, they agree everywhere.
+    If the model is a KB-Map in another form, such as a rigid chain or a kernel learner around one, they agree
+    everywhere.
 
     Raises:
-        NetSizeError: more than 3^13. BasisError, and what the model raises for joint values that are not its own.
+        NetSizeError: more than 3^13 control points.
+        BasisError, and errors of the model for joint values outside its domain.
     """
     check_net_size(bases, POSITION_OUTPUTS)
     nodes = [_nodes(basis) for basis in bases]
@@ -34,7 +36,7 @@ def sampled_map(model: Predictor, bases: Sequence[JointBasis]) -> KBMap:
 
 
 def _nodes(basis: JointBasis) -> FloatArray:
-    """Values where the basis functions are well told apart: the ends of its range and the middle [rad, m]."""
+    """Return values at which the basis functions differ well: the ends of the range and the middle [rad, m]."""
     if basis.is_prismatic:
         return np.array(basis.parameters[:2])
     if basis.kind == "orthonormal":

@@ -1,4 +1,4 @@
-"""The pairs that a learner goes by, as far as its memory reaches."""
+"""Storage of the pairs within a learner's memory."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from kbmaps.pairs import checked_pairs, stored_pairs, with_units
 
 
 class KeptPairs:
-    """The last pairs, with what a model that stands behind the learner predicts for them.
+    """Last pairs, with the predictions of the learner's prior model for them.
 
     Attributes:
-        q, x, sigma, behind: configurations (n, d), positions (n, 3), their 1-sigma (n,), NaN where it was not told, and
-            the model's positions (n, 3).
-        total: how many pairs have come.
+        q, x, sigma, behind: configurations (n, d), positions (n, 3), their 1-sigma (n,), NaN where unknown, and the
+            prior model's positions (n, 3).
+        total: number of pairs so far.
     """
 
     STORED = ("q", "x", "sigma", "behind")
@@ -37,11 +37,11 @@ class KeptPairs:
         return len(self.q)
 
     def checked(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Pairs as `add` takes them. Raises ShapeError, NonFiniteError, SettingError."""
+        """Return checked pairs for `add`. Raises ShapeError, NonFiniteError, SettingError."""
         return checked_pairs(q, x, sigma, self.q.shape[1])
 
     def add(self, q: FloatArray, x: FloatArray, sigma: FloatArray, model: Predictor) -> None:
-        """Takes in checked pairs; the oldest go as the memory says."""
+        """Add checked pairs; drop the oldest as the memory requires."""
         behind = model.predict(q)
         kept = self._memory.kept(len(self.q) + len(q))
         self.q = _last(self.q, q, kept)
@@ -51,11 +51,11 @@ class KeptPairs:
         self.total += len(q)
 
     def replace_model(self, model: Predictor) -> None:
-        """Another model behind the same pairs."""
+        """Replace the prior model behind the same pairs."""
         self.behind = model.predict(self.q)
 
     def observations(self, kernel: ProductKernel, features: FloatArray) -> Observations:
-        """The pairs, weighted by their sigma and their age, with features (n, 3, p)."""
+        """Return the pairs, weighted by their sigma and their age, with features (n, 3, p)."""
         pairs = with_units(self.q, self.x, self.sigma)
         shares = self._memory.weights(len(self.q))
         weights = shares / np.square(pairs.unit)
@@ -76,14 +76,15 @@ class KeptPairs:
         return float(np.sqrt(np.square(with_units(self.q, self.x, self.sigma).unit).mean()))
 
     def arrays(self) -> dict[str, FloatArray]:
-        """For `kbmaps.packed`."""
+        """Return the state as arrays for `kbmaps.packed`."""
         return {"q": self.q, "x": self.x, "sigma": self.sigma, "behind": self.behind}
 
     def restore(self, arrays: Mapping[str, FloatArray], total: int) -> None:
-        """The pairs that `arrays` gave.
+        """Restore the pairs from `arrays`.
 
         Raises:
-            ModelFormatError: they do not fit each other. KeyError.
+            ModelFormatError: they do not fit each other.
+            KeyError: one is missing.
         """
         q, x, sigma = stored_pairs(arrays, self.q.shape[1])
         behind = arrays["behind"]

@@ -1,7 +1,7 @@
 """Gaussian inference on KB-Maps with as many unknowns as pairs: no vector of 3^d numbers is formed.
 
 Positions are y = H β + r + e with features H whose coefficients are β ~ N(0, 1), a KB-Map r whose coefficients are
-N(0, τ²) each, so that r has the covariance τ² k(q, q'), and noise e of variance s². With λ = s² / τ² all of it
+N(0, τ²) each, so that r has the covariance τ² k(q, q'), and noise e of variance s². With λ = s² / τ² everything
 follows from one Cholesky factorisation of K + λ I (Rasmussen and Williams, Gaussian Processes for Machine Learning,
 2006, sections 2.2 and 2.7).
 """
@@ -23,27 +23,27 @@ from kbmaps.maps.noise_evidence import VARIANCE_FLOOR, LinearEvidence
 
 Precision = float | Literal["evidence"] | None
 
-# Limits of the search for λ and where it begins, relative to the mean diagonal of the Gram matrix.
+# Limits and start of the search for λ, relative to the mean diagonal of the Gram matrix.
 _SEARCH_LIMITS, _SEARCH_START = (1e-12, 1e6), 1e-4
-# Relative to the trace of the Gram matrix: just enough to keep its Cholesky factorisation alive.
+# Relative to the trace of the Gram matrix: just enough for a stable Cholesky factorisation.
 _VANISHING_RIDGE = 1e-15
-# The refinement of the exact solution ends when a step no longer lessens what is left to this share.
+# The refinement of the exact solution ends when a step no longer reduces the residual to this share.
 _REFINEMENTS, _PROGRESS = 200, 0.95
 _BLOCK = 256
 
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Pairs as the inference sees them: rows multiplied by `scale`, so that their noise is equal.
+    """Pairs in the form of the inference: rows multiplied by `scale`, so that their noise is equal.
 
     Attributes:
         weights: of every joint (n, d, 3).
         scale: roots (n,) of the pairs' weights.
-        errors: what the prior's mean leaves to explain, scaled (n, 3).
+        errors: scaled residuals of the prior's mean (n, 3).
         features: H, scaled (n, 3, p).
-        count: how many pairs the scaled ones are worth; less than n where some are partly forgotten.
-        log_weights: logarithms of the pairs' inverse variances, summed.
-        noise_known: whether the noise of the scaled errors is 1, or to be estimated.
+        count: effective number of pairs; less than n where some are partly forgotten.
+        log_weights: sum of the logarithms of the pairs' inverse variances.
+        noise_known: True if the noise of the scaled errors is 1; False if it is to be estimated.
     """
 
     weights: FloatArray
@@ -56,9 +56,11 @@ class Observations:
 
 
 class KernelFit:
-    """The posterior after some observations.
+    """Posterior after some observations.
 
     Args:
+        kernel: the product kernel.
+        observations: the pairs.
         precision: λ; "evidence" takes the most probable one; None explains the pairs exactly by the smallest
             coefficients (without features, where no pair contradicts another).
 
@@ -85,8 +87,9 @@ class KernelFit:
         if isinstance(precision, str):
             mean = self._gram.trace / len(observations.scale)
             low, high = (limit * mean for limit in _SEARCH_LIMITS)
-            # Where pairs are few, evidence may be level towards τ = 0, a prior mean that is right everywhere. A density
-            # of τ that is level there (Gelman 2006) stops at what the pairs speak for, and the claim with it.
+            # With few pairs, the evidence may be flat towards τ = 0, a prior mean that is right everywhere. A density
+            # of τ that is flat there (Gelman 2006) keeps τ, and so the predicted uncertainty, at the value that the
+            # pairs support.
             precision = most_evident(
                 lambda tried: self._log_evidence(tried) - 0.5 * math.log1p(tried / mean),
                 _SEARCH_START * mean,
@@ -96,7 +99,7 @@ class KernelFit:
         self._condition(precision)
 
     def mean(self, weights: FloatArray, features: FloatArray) -> FloatArray:
-        """What the posterior adds to the prior's mean (m, 3), for joint weights (m, d, 3) and features (m, 3, p)."""
+        """Return the posterior mean minus the prior's (m, 3), for joint weights (m, d, 3) and features (m, 3, p)."""
         added = features @ self.change
         for start in range(0, len(weights), _BLOCK):
             part = slice(start, start + _BLOCK)
@@ -104,7 +107,7 @@ class KernelFit:
         return added
 
     def variance(self, weights: FloatArray, features: FloatArray) -> FloatArray:
-        """Posterior variance (m, 3) of each coordinate without noise [m²]."""
+        """Return the posterior variance (m, 3) of each coordinate without noise [m²]."""
         variance = np.empty((len(weights), 3))
         for start in range(0, len(weights), _BLOCK):
             part = slice(start, start + _BLOCK)
@@ -116,14 +119,14 @@ class KernelFit:
         return variance
 
     def unexplained(self, weights: FloatArray) -> FloatArray:
-        """Share (m,) in 0..1 of the map's prior variance that the pairs leave open."""
+        """Return the share (m,) in 0..1 of the map's prior variance that remains after the pairs."""
         shares = [
             self._left_open(part, self._kernel_rows(part)) / self._kernel.diagonal(part) for part in _parts(weights)
         ]
         return np.concatenate(shares)
 
     def _left_open(self, weights: FloatArray, rows: FloatArray) -> FloatArray:
-        """k(q, q) − kᵀ (K + λ I)⁻¹ k (m,)."""
+        """Return k(q, q) − kᵀ (K + λ I)⁻¹ k (m,)."""
         taken = np.einsum("mn,nm->m", rows, self._gram.solve(rows.T))
         return np.clip(self._kernel.diagonal(weights) - taken, 0.0, None)
 
@@ -131,7 +134,7 @@ class KernelFit:
         return self._kernel.between(weights, self._seen.weights) * self._seen.scale
 
     def _scaled_gram(self) -> FloatArray:
-        """K (n, n) of the scaled rows, its upper triangle, Fortran-ordered."""
+        """Return K (n, n) of the scaled rows, its upper triangle, Fortran-ordered."""
         weights, scale = self._seen.weights, self._seen.scale
         size = len(scale)
         gram = np.zeros((size, size), order="F")
@@ -142,21 +145,24 @@ class KernelFit:
         return gram
 
     def _times_gram(self, multipliers: FloatArray) -> FloatArray:
-        """K @ multipliers, from K's entries anew: the factorisation has taken their place."""
+        """Return K @ multipliers, recomputing K's entries: the factorisation has overwritten them."""
         products = [self._kernel_rows(part) @ multipliers for part in _parts(self._seen.weights)]
         return np.concatenate(products) * self._seen.scale[:, None]
 
     def _evidence_of_noise(self, precision: float) -> tuple[LinearEvidence, FloatArray]:
-        """Of s² at λ, with K + λ I factorised; and the directions V (p, p) of β that belong to it."""
+        """Return the evidence of s² at λ, and the directions V (p, p) of β that belong to it.
+
+        K + λ I must be factorised.
+        """
         seen = self._seen
         # Whitened by (K / λ + I)^(-1/2), the pairs are H β + e with equal independent noise.
         scale = math.sqrt(precision)
         errors = scale * self._gram.whiten(seen.errors).ravel()
         features = scale * self._gram.whiten(self._flat).reshape(errors.size, -1)
-        # With fewer coordinates than features, rows of zeros: every direction of β is to have its place in V.
+        # With fewer coordinates than features, add rows of zeros, so that V includes every direction of β.
         lacking = max(features.shape[1] - errors.size, 0)
         errors, features = np.pad(errors, (0, lacking)), np.pad(features, ((0, lacking), (0, 0)))
-        # Not by Hᵀ H: of a wide prior, rounding would be more than what the pairs say of its narrow directions.
+        # Not by Hᵀ H: for a wide prior, rounding would exceed the pairs' information about its narrow directions.
         reach, sizes, directions = np.linalg.svd(features, full_matrices=False)
         along = errors @ reach
         unreached = float(np.square(errors - reach @ along).sum())
@@ -172,12 +178,12 @@ class KernelFit:
         return 1.0 if self._seen.noise_known else evidence.best_variance()
 
     def _complete(self, evidence: LinearEvidence, precision: float, noise_variance: float) -> float:
-        """The log evidence with the determinants that whitening and scaling left out."""
+        """Return the log evidence with the determinants that whitening and scaling left out."""
         spread = self._gram.log_determinant - len(self._seen.scale) * math.log(precision)
         return float(evidence.at(np.array([noise_variance]))[0]) + 1.5 * (self._seen.log_weights - spread)
 
     def _condition(self, precision: float) -> None:
-        """The posterior at λ."""
+        """Compute the posterior at λ."""
         if not self._gram.factorise(precision):
             raise SettingError(f"precision = {precision:.3g} is below rounding here; use None or a larger one")
         evidence, directions = self._evidence_of_noise(precision)
@@ -190,12 +196,15 @@ class KernelFit:
         self._solved_features = self._gram.solve(self._flat)
         errors = self._seen.errors - self._seen.features @ self.change
         multipliers = self._gram.solve(errors)
-        # One step of refinement mends the rounding of the factorisation.
+        # One step of refinement corrects the rounding of the factorisation.
         remaining = errors - self._times_gram(multipliers) - precision * multipliers
         self._multipliers = multipliers + self._gram.solve(remaining)
 
     def _explain_exactly(self) -> None:
-        """The smallest coefficients that explain the errors: iterated Tikhonov, as `ExactLearner` without λ."""
+        """Compute the smallest coefficients that explain the errors.
+
+        Iterated Tikhonov, as `ExactLearner` without λ.
+        """
         errors = self._seen.errors
         ridge = _VANISHING_RIDGE * self._gram.trace
         while not self._gram.factorise(ridge):
@@ -218,5 +227,5 @@ class KernelFit:
 
 
 def _parts(weights: FloatArray) -> list[FloatArray]:
-    """Blocks of rows; one empty block for none."""
+    """Return blocks of rows; one empty block if there are no rows."""
     return [weights[start : start + _BLOCK] for start in range(0, max(len(weights), 1), _BLOCK)]

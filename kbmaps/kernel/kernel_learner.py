@@ -1,4 +1,7 @@
-"""KB-Maps of any number of joints, learnt through their kernel. Ulbrich et al. 2009, eqs. (16)-(18), in dual form."""
+"""Learner of KB-Maps of any number of joints, through their kernel.
+
+Ulbrich et al. 2009, eqs. (16)-(18), in dual form.
+"""
 
 from __future__ import annotations
 
@@ -23,24 +26,24 @@ from kbmaps.model import Estimate
 from kbmaps.packed import complete, count, named, number, pack, restoring, unpack
 
 _KIND = "kernel learner, 1"
-# Of positions, relative to the largest coordinate.
+# Rounding of positions, relative to the largest coordinate.
 _ROUNDING = 1e-11
 
 
 class KernelLearner(KernelRegression):
     """Learns a KB-Map around a prior from n pairs with n² numbers instead of 3^d control points. A `Model`.
 
-    The same solution as `ExactLearner` where both can be computed; this one for fewer pairs than control points, and
-    for more joints than a net has room for. It is fitted when first asked after `learn`, at n³ / 3 multiplications for
-    each λ that is tried (0.3 s at 1,000 pairs), and depends on the pairs that the memory keeps only.
+    Gives the same solution as `ExactLearner` where both can be computed. Use this one for fewer pairs than control
+    points, and for more joints than a net has room for. The fit runs on first use after `learn`, at n³ / 3
+    multiplications for each λ that is tried (0.3 s at 1,000 pairs). It depends only on the pairs that the memory keeps.
 
     Args:
-        bases: what "nearest to the prior" means; scaled orthonormal ones (`learning_bases`) are advised.
-        prior: what is predicted far from all pairs: a `RigidChain`, a `KBMap`, or anything with `predict`, which must
-            not change meanwhile (`rebase`); None for the origin of the measurement frame.
+        bases: the metric of "nearest to the prior"; scaled orthonormal ones (`learning_bases`) are advised.
+        prior: prediction far from all pairs: a `RigidChain`, a `KBMap`, or anything with `predict`, which must not
+            change meanwhile (`rebase`); None for the origin of the measurement frame.
         precision: λ = (noise / standard deviation of the control points)² as in `ExactLearner.solve`; "evidence" takes
-            the most evident one; None explains noise-free pairs exactly, up to as many as there are control points.
-        memory: which of the old pairs count.
+            the most probable one; None explains noise-free pairs exactly, up to as many as there are control points.
+        memory: the old pairs that count.
 
     Raises:
         SettingError: a precision that is neither None, "evidence", nor a number above 0.
@@ -64,7 +67,7 @@ class KernelLearner(KernelRegression):
 
     @property
     def prior_precision(self) -> float:
-        """λ of the present fit; 0 for the exact one.
+        """λ of the current fit; 0 for the exact one.
 
         Raises:
             DegenerateDataError: no pair has been learnt.
@@ -77,9 +80,11 @@ class KernelLearner(KernelRegression):
         return math.sqrt(self._fitted().prior_variance)
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
-        """Pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
+        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
 
         Args:
+            q: joint values.
+            x: measured positions.
             sigma: 1-sigma of the positions [m], () or (n,); None where it is to be estimated.
 
         Raises:
@@ -98,18 +103,18 @@ class KernelLearner(KernelRegression):
         self._fit = None
 
     def rebase(self, prior: Predictor) -> None:
-        """Another prior for the same pairs, or the same one after it has changed."""
+        """Replace the prior for the same pairs, or use the same one after it has changed."""
         self._pairs.replace_model(prior)
         self._prior, self._fit = prior, None
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and whether data was there.
+        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and True where data is near.
 
-        Support has a law of its own here: a configuration has it while the pairs leave at most `SUPPORT_LIMIT` of its
-        prior variance open. With fewer pairs than control points each pair takes up directions of its own and is known
-        to its noise alone, exact ones to rounding, so that by the law of `Estimate` next to nothing but the pairs
-        themselves would have it. Where λ is so large that even at the pairs more is left open, these have none either.
-        Before the first pair sigma is infinite: how good the prior is, only pairs can tell.
+        Support has its own rule here: a configuration is in support if the pairs leave at most `SUPPORT_LIMIT` of its
+        prior variance. With fewer pairs than control points, each pair determines directions of its own and is known to
+        its noise alone. By the rule of `Estimate`, almost nothing except the pairs themselves would then be in support.
+        Where λ is so large that more than the limit remains even at the pairs, they are not in support either. Before
+        the first pair, sigma is infinite: only pairs can show the quality of the prior.
 
         Raises:
             ShapeError, NonFiniteError
@@ -126,10 +131,10 @@ class KernelLearner(KernelRegression):
         return Estimate(self.predict(batch), sigma, fit.unexplained(weights) <= SUPPORT_LIMIT).like(angles)
 
     def to_bytes(self) -> bytes:
-        """The learner with the pairs that count; `from_bytes` gives the same predictions to the last bit.
+        """Return the learner with the pairs that count; `from_bytes` restores the same predictions to the last bit.
 
-        A prior that is neither a `KBMap` nor a `RigidChain` stays behind. That which is given in its place has to
-        predict the same at the pairs, up to rounding; predictions differ as it does.
+        A prior that is neither a `KBMap` nor a `RigidChain` is not stored. The one given in its place has to predict
+        the same at the pairs, up to rounding; elsewhere predictions differ as the priors do.
         """
         behind, arrays = packable(self._prior)
         fields: dict[str, Any] = {
@@ -143,13 +148,14 @@ class KernelLearner(KernelRegression):
 
     @classmethod
     def from_bytes(cls, data: bytes, prior: Predictor | None = None) -> Self:
-        """The learner in `data`.
+        """Return the learner in `data`.
 
         Args:
-            prior: the one it had, where that does not travel.
+            data: the result of `to_bytes`.
+            prior: the learner's prior, if it is not stored.
 
         Raises:
-            ModelFormatError: it is none of this kind, or damaged, or its prior is missing or predicts otherwise.
+            ModelFormatError: wrong type of model, or damaged, or its prior is missing or predicts otherwise.
         """
         fields, arrays = unpack(data, _KIND)
         with restoring("a kernel learner"):
@@ -171,12 +177,12 @@ class KernelLearner(KernelRegression):
 
 
 def _same(x: FloatArray, other: FloatArray) -> bool:
-    """Whether positions (n, 3) are the same but for the rounding of other batches."""
+    """Return True if positions (n, 3) are the same up to the rounding of other batches."""
     return bool((np.abs(x - other) <= _ROUNDING * np.abs(other).max(initial=0.0)).all())
 
 
 def _parse_precision(value: Any) -> Precision:
-    """Raises ModelFormatError."""
+    """Return a stored precision. Raises ModelFormatError."""
     return value if value is None or value == "evidence" else number(value, "the precision")
 
 

@@ -1,4 +1,4 @@
-"""What learners through the product kernel share: pairs that are kept, and a fit of them made when it is needed."""
+"""Common base of learners through the product kernel: kept pairs, fitted on demand."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from kbmaps.memory import Memory
 
 
 class KernelRegression(ABC):
-    """A model behind, a linear change of it, and a KB-Map for the rest, fitted to the pairs that the memory keeps.
+    """Prior model, a linear change of it, and a KB-Map for the rest, fitted to the pairs that the memory keeps.
 
     Args:
         bases: of the KB-Map.
         precision: λ of it, see `KernelLearner`.
-        memory: which of the old pairs count; all of them if None.
+        memory: the old pairs that count; all of them if None.
     """
 
     def __init__(self, bases: Sequence[JointBasis], precision: Precision, memory: Memory | None) -> None:
@@ -48,17 +48,21 @@ class KernelRegression(ABC):
 
     @property
     def pairs(self) -> int:
-        """How many pairs have been learnt, those that no longer count included."""
+        """Number of learnt pairs, those that no longer count included."""
         return self._pairs.total
 
     @property
     def kept(self) -> int:
-        """How many pairs count."""
+        """Number of pairs that count."""
         return len(self._pairs)
 
     @property
     def noise(self) -> float:
-        """1-sigma of a measured coordinate [m]: as estimated, or as told with the pairs. Raises DegenerateDataError."""
+        """Noise of a measured coordinate, 1-sigma [m]: estimated, or given with the pairs.
+
+        Raises:
+            DegenerateDataError: no pair has been learnt.
+        """
         return math.sqrt(self._fitted().noise_variance) * self._pairs.mean_unit
 
     @property
@@ -67,7 +71,7 @@ class KernelRegression(ABC):
         return self._fitted().log_evidence
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
+        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
 
         Raises:
             ShapeError, NonFiniteError
@@ -79,9 +83,9 @@ class KernelRegression(ABC):
         return x[0] if angles.ndim == 1 else x
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) at q (n, d).
+        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) at q (n, d).
 
-        Exact where the model behind is a KB-Map, also one in another form, as a chain is.
+        Exact if the prior model is a KB-Map, also in another form such as a chain.
 
         Raises:
             ShapeError, NonFiniteError
@@ -89,19 +93,19 @@ class KernelRegression(ABC):
         return slopes(self, q, self.bases)
 
     def to_kbmap(self) -> KBMap:
-        """The learnt map with its 3^d control points, exact where the model behind is a KB-Map or a rigid chain.
+        """Return the learnt map with its 3^d control points, exact if the prior model is a KB-Map or a rigid chain.
 
         Raises:
-            NetSizeError: more than 3^13.
+            NetSizeError: more than 3^13 control points.
         """
         return sampled_map(self, self.bases)
 
     @abstractmethod
     def _behind(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Positions (n, 3) of the model behind at q (n, d), and the columns (n, 3, p) of its linear change."""
+        """Return positions (n, 3) of the prior model at q (n, d), and the columns (n, 3, p) of its linear change."""
 
     def _features(self) -> FloatArray:
-        """Those columns at the kept pairs."""
+        """Return those columns at the kept pairs."""
         return self._behind(self._pairs.q)[1]
 
     def _fitted(self) -> KernelFit:

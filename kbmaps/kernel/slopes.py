@@ -1,4 +1,4 @@
-"""Derivatives of maps that are in {1, cos θ, sin θ} of every joint, from two values a joint."""
+"""Derivatives of maps that are in {1, cos θ, sin θ} of every joint, from two values per joint."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from kbmaps.arrays import FloatArray, rows_or_vector
 from kbmaps.chains.carried import Predictor
 from kbmaps.maps.basis import JointBasis
 
-# Large enough that rounding costs two digits only, small enough for a map that is not quite of this kind.
+# Large enough that rounding costs only two digits, small enough for a map that is not exactly of this form.
 _STEP = 1e-2
 
 
 def slopes(model: Predictor, q: ArrayLike, bases: Sequence[JointBasis]) -> FloatArray:
-    """Derivative (3, d) [m/rad, or m/m] of a model's positions at q (d,), or (n, 3, d) at q (n, d).
+    """Return the derivative (3, d) [m/rad, or m/m] of a model's positions at q (d,), or (n, 3, d) at q (n, d).
 
-    f(θ + h) − f(θ − h) = 2 sin h f'(θ) for any f = a + b cos θ + c sin θ and any h, so that this is no approximation
-    for KB-Maps, whatever form they have; likewise with 2 h for a joint that slides.
+    f(θ + h) − f(θ − h) = 2 sin h f'(θ) for any f = a + b cos θ + c sin θ and any h. So this is exact for KB-Maps in any
+    form; likewise with 2 h for a prismatic joint.
 
     Raises:
         ShapeError, NonFiniteError

@@ -1,4 +1,4 @@
-"""A nominal chain whose tolerances are a linear prior, and a KB-Map for what is not rigid about the arm."""
+"""Learner of a nominal chain with a linear prior from its tolerances, and a KB-Map for non-rigid deviations."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ _KIND = "structured learner, 2"
 
 
 class StructuredLearner(KernelRegression):
-    """f(q) = f_nominal(q) + J(q) β + r(q), linear in what is learnt. A `Model`.
+    """Learns f(q) = f_nominal(q) + J(q) β + r(q), linear in the unknowns. A `Model`.
 
-    J is the derivative of the nominal chain by its parameters and β has the variances S of the tolerances, so that J β
-    has the covariance J S Jᵀ; r is a KB-Map around zero whose scale the evidence chooses. For given scales the
-    posterior is in closed form, without local optima, and a KB-Map, since every column of J is one. What it misses of a
-    far-off chain is the curvature, which r makes up for where pairs are. Fitted when first asked after `learn`,
-    from the pairs that the memory keeps.
+    J is the derivative of the nominal chain by its parameters. β has the variances S of the tolerances, so that J β has
+    the covariance J S Jᵀ. r is a KB-Map around zero whose scale the evidence chooses. For given scales the posterior is
+    in closed form, without local optima, and a KB-Map, since every column of J is one. It neglects the curvature of a
+    chain far from nominal, which r absorbs where there are pairs. The fit runs on first use after `learn`, with the
+    pairs that the memory keeps.
 
     Args:
-        nominal: the chain as drawn.
-        tolerances: how far the real one may be from it.
+        nominal: the nominal chain.
+        tolerances: standard deviations of the real chain about it.
         bases: of r; scaled orthonormal ones (`learning_bases`) are advised.
-        memory: which of the old pairs count.
+        memory: the old pairs that count.
 
     Raises:
-        BasisError: another number of bases than joints, or of other kinds.
+        BasisError: the number or the kinds of bases do not match the joints.
     """
 
     def __init__(
@@ -64,12 +64,12 @@ class StructuredLearner(KernelRegression):
 
     @property
     def nominal(self) -> RigidChain:
-        """The chain that learning started from."""
+        """Chain that learning started from."""
         return self._nominal
 
     @property
     def change(self) -> FloatArray:
-        """The most probable parameters (size,) as in `ChainParameters`, to first order (read-only)."""
+        """Most probable parameters (size,) as in `ChainParameters`, to first order (read-only)."""
         change = np.zeros(self._parameters.size)
         if self.kept:
             change[self._free] = self._std * self._fitted().change
@@ -81,9 +81,11 @@ class StructuredLearner(KernelRegression):
         return math.sqrt(self._fitted().prior_variance)
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
-        """Pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
+        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
 
         Args:
+            q: joint values.
+            x: measured positions.
             sigma: 1-sigma of the positions [m], () or (n,); None where it is to be estimated.
 
         Raises:
@@ -93,7 +95,7 @@ class StructuredLearner(KernelRegression):
         self._fit = None
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and whether data was there.
+        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and True where data is near.
 
         Raises:
             ShapeError, NonFiniteError
@@ -112,7 +114,7 @@ class StructuredLearner(KernelRegression):
         return Estimate(x + fit.mean(weights, features), np.sqrt(variance), inside).like(angles)
 
     def to_bytes(self) -> bytes:
-        """The learner with the pairs that count; `from_bytes` gives the same predictions to the last bit."""
+        """Return the learner with the pairs that count; `from_bytes` restores the same predictions to the last bit."""
         fields: dict[str, Any] = {
             "bases": describe_bases(self.bases),
             "tolerances": describe_tolerances(self._tolerances),
@@ -123,7 +125,7 @@ class StructuredLearner(KernelRegression):
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """The learner in `data`. Raises ModelFormatError: it is none of this kind, or damaged."""
+        """Return the learner in `data`. Raises ModelFormatError: wrong type of model, or damaged."""
         fields, arrays = unpack(data, _KIND)
         with restoring("a structured learner"):
             named(fields, "the fields", ("bases", "tolerances", "memory", "pairs"))
@@ -134,6 +136,6 @@ class StructuredLearner(KernelRegression):
         return learner
 
     def _behind(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Nominal positions (n, 3) and the columns of J times their tolerances (n, 3, p)."""
+        """Return nominal positions (n, 3) and the columns of J times their tolerances (n, 3, p)."""
         x, jacobian = self._parameters.linearised(np.zeros(self._parameters.size), q)
         return x, jacobian[:, :, self._free] * self._std

@@ -1,1 +1,1 @@
-"""Kinematic Bézier Maps and what learns them directly: the instant and the exact learner."""
+"""Kinematic Bézier Maps and their direct learners: incremental (NLMS) and exact least squares."""

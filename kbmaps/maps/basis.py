@@ -1,4 +1,4 @@
-"""The functions of one joint: three for a revolute joint, two for a prismatic one.
+"""Basis functions of one joint: three for a revolute joint, two for a prismatic one.
 
 Every revolute basis spans {1, cos θ, sin θ}. It is evaluated through two half-angle sines
 
@@ -39,7 +39,7 @@ DEFAULT_SCALE = 0.7
 
 
 class Terms(NamedTuple):
-    """How a basis is evaluated: weights = products @ mix.
+    """Evaluation of a basis: weights = products @ mix.
 
     products = (first², first·second, second²) for a revolute joint with the sines of the module's docstring,
     and (1 − s, s) with s = (q − low) / (high − low) for a prismatic one, whose phases are (low, high − low).
@@ -69,7 +69,7 @@ def _orthonormal(low: float, high: float, scale: float) -> Terms:
     _check_range(low, high)
     _check_scale(scale)
     centre = 0.5 * (low + high)
-    # Uniform over more than a turn is taken as uniform over the circle.
+    # A range of more than a turn is treated as uniform over the circle.
     half_range = min(0.5 * (high - low), math.pi)
     nodes, shares = _legendre()
     sine_square_mean = float(shares @ np.sin(half_range * nodes) ** 2)
@@ -108,7 +108,7 @@ def _check_scale(scale: float) -> None:
 
 @cache
 def _legendre() -> tuple[FloatArray, FloatArray]:
-    """Nodes on [−1, 1] and shares (sum 1) that integrate the squares of our functions to rounding."""
+    """Return nodes on [−1, 1] and shares (sum 1) that integrate the squares of our functions to rounding."""
     nodes, shares = cast(tuple[FloatArray, FloatArray], np.polynomial.legendre.leggauss(32))
     return frozen(nodes), frozen(0.5 * shares)
 
@@ -124,7 +124,7 @@ _BUILDERS: Mapping[BasisKind, Callable[..., Terms]] = {
 
 @dataclass(frozen=True)
 class JointBasis:
-    """The basis functions of one joint. Angles [rad], strokes of prismatic joints [m].
+    """Basis functions of one joint. Angles [rad], strokes of prismatic joints [m].
 
     Build it by one of the class methods. Two bases are equal when kind and parameters are.
 
@@ -157,30 +157,34 @@ class JointBasis:
 
     @classmethod
     def bernstein(cls, alpha: float, centre: float = 0.0) -> JointBasis:
-        """The paper's basis: b0 is the point at centre − alpha, b2 at centre + alpha, b1 where their tangents meet."""
+        """Return the paper's basis: b0 at centre − alpha, b2 at centre + alpha, b1 where their tangents meet."""
         return cls("bernstein", (float(alpha), float(centre)))
 
     @classmethod
     def trigonometric(cls) -> JointBasis:
-        """{1, cos θ, sin θ}."""
+        """Return the basis {1, cos θ, sin θ}."""
         return cls("trigonometric", ())
 
     @classmethod
     def orthonormal(cls, low: float, high: float, scale: float = DEFAULT_SCALE) -> JointBasis:
-        """Orthogonal for θ uniform on [low, high] [rad]: the constant 1, then two functions of RMS `scale`.
+        """Return a basis of the constant 1 and two functions of RMS `scale`, orthogonal on [low, high] [rad].
 
-        A scale below one makes a learner that moves the coefficients as little as possible prefer smooth changes.
+        Orthogonal for θ uniform on the range. A scale below one makes a learner that changes the coefficients as little
+        as possible prefer smooth changes.
         """
         return cls("orthonormal", (float(low), float(high), float(scale)))
 
     @classmethod
     def prismatic(cls, low: float, high: float) -> JointBasis:
-        """{1 − s, s} with s = (q − low) / (high − low): the Bernstein basis of degree one. Strokes [m]."""
+        """Return {1 − s, s} with s = (q − low) / (high − low): the Bernstein basis of degree one. Strokes [m]."""
         return cls("prismatic", (float(low), float(high)))
 
     @classmethod
     def prismatic_orthonormal(cls, low: float, high: float, scale: float = DEFAULT_SCALE) -> JointBasis:
-        """Orthogonal for q uniform on [low, high] [m]: the constant 1, then a linear function of RMS `scale`."""
+        """Return a basis of the constant 1 and a linear function of RMS `scale`, orthogonal on [low, high] [m].
+
+        Orthogonal for q uniform on the range.
+        """
         return cls("prismatic_orthonormal", (float(low), float(high), float(scale)))
 
     @property
@@ -193,7 +197,7 @@ class JointBasis:
         return 2 if self.is_prismatic else 3
 
     def weights(self, theta: ArrayLike) -> FloatArray:
-        """Basis functions (..., size) at joint values (...) [rad or m]."""
+        """Return the basis functions (..., size) at joint values (...) [rad or m]."""
         value = np.asarray(theta, dtype=np.float64)
         start, second = self.terms.phases
         if self.is_prismatic:
@@ -206,7 +210,7 @@ class JointBasis:
         return products @ self.terms.mix
 
     def derivatives(self, theta: ArrayLike) -> FloatArray:
-        """Derivatives (..., size) of the basis functions [1/rad or 1/m]."""
+        """Return the derivatives (..., size) of the basis functions [1/rad or 1/m]."""
         value = np.asarray(theta, dtype=np.float64)
         first, second = self.terms.phases
         if self.is_prismatic:
@@ -219,7 +223,7 @@ class JointBasis:
         return products @ self.terms.mix
 
     def change_to(self, other: JointBasis) -> FloatArray:
-        """Matrix A (size, size) with: coefficients in `other` = A @ coefficients in this basis.
+        """Return the matrix A (size, size) with: coefficients in `other` = A @ coefficients in this basis.
 
         Raises:
             BasisError: one of the two is prismatic, the other is not.
@@ -229,7 +233,7 @@ class JointBasis:
         return cast(FloatArray, np.linalg.solve(other.matrix, self.matrix))
 
     def to_bernstein(self) -> JointBasis:
-        """The Bernstein basis to show this joint's control points in: itself where it already is one.
+        """Return the Bernstein basis for this joint's control points: itself if it already is one.
 
         Otherwise alpha is three quarters of half the range, within 40..70 degrees, about the range's middle.
         """
@@ -244,7 +248,7 @@ class JointBasis:
         return JointBasis.bernstein(alpha, 0.5 * (low + high))
 
     def _monomials_of_products(self) -> FloatArray:
-        """products = (1, cos θ, sin θ) @ this, or (1, q) @ this."""
+        """Return the matrix M with products = (1, cos θ, sin θ) @ M, or (1, q) @ M."""
         first, second = self.terms.phases
         if self.is_prismatic:
             return np.array([[1.0 + first / second, -first / second], [-1.0 / second, 1.0 / second]])
@@ -257,11 +261,11 @@ class JointBasis:
 def learning_bases(
     low: ArrayLike, high: ArrayLike, prismatic: Sequence[bool] | None = None, scale: float = DEFAULT_SCALE
 ) -> tuple[JointBasis, ...]:
-    """The scaled orthonormal bases that learners should work in, one a joint, for the joints' ranges.
+    """Return the scaled orthonormal bases recommended for learners, one per joint, for the joints' ranges.
 
     Args:
         low, high: ends of each joint's range (d,) [rad, or m for a prismatic joint].
-        prismatic: which joints are prismatic; None means none.
+        prismatic: True for each joint that is prismatic; None means none.
         scale: RMS of the functions that are not constant.
 
     Raises:
@@ -285,10 +289,10 @@ def learning_bases(
 
 
 def check_bases(bases: Sequence[JointBasis], prismatic: Sequence[bool]) -> None:
-    """Checks bases for joints of these kinds.
+    """Check bases for joints of these kinds.
 
     Raises:
-        BasisError: another number of bases, or one of the wrong kind.
+        BasisError: wrong number of bases, or one of the wrong kind.
     """
     if len(bases) != len(prismatic):
         raise BasisError(f"need {len(prismatic)} bases, one a joint; got {len(bases)}")
@@ -302,7 +306,7 @@ def check_bases(bases: Sequence[JointBasis], prismatic: Sequence[bool]) -> None:
 
 
 def check_net_size(bases: Sequence[JointBasis], outputs: int) -> None:
-    """Raises NetSizeError unless a net in these bases is of a sane size."""
+    """Raise NetSizeError unless a net in these bases is of a sane size."""
     points = math.prod(basis.size for basis in bases)
     if points > LARGEST_NET:
         raise NetSizeError(points, outputs)

@@ -1,7 +1,7 @@
-"""How far to trust the prior, asked of the data in blocks.
+"""Choice of the prior's weight by cross-validation over blocks of pairs.
 
-Neighbouring pairs of a guided arm share their errors (time stamps, shading of the marker, play), so that the evidence,
-which takes noise for independent, mistakes shared errors for shape. A block of pairs that was left out as a whole
+Neighbouring pairs of a guided arm share their errors (time stamps, shading of the marker, backlash). The evidence
+assumes independent noise, and so mistakes shared errors for shape. A block of pairs that was left out as a whole
 shares none of its errors with the others.
 """
 
@@ -20,21 +20,21 @@ from kbmaps.maps.stack import BasisStack
 
 MOST_BLOCKS = 20
 FEWEST_BLOCKS = 4
-# Along a guided path, pairs this far apart share little of their errors any more.
+# Along a guided path, pairs this far apart share little of their errors.
 BLOCK_PAIRS = 30
-# The precisions tried, relative to the kernel's mean diagonal: from next to nothing to hardly any learning.
+# Candidate precisions, relative to the kernel's mean diagonal: from almost no prior to hardly any learning.
 PRECISIONS = 10.0 ** np.arange(-13.0, 3.25, 0.5)
-# What is taken while there are too few pairs to ask.
+# Precision used while there are too few pairs for blocks.
 FIRST_PRECISION = 1e-3
-# Neighbours of a path are nearly the same configuration: so much of their prior variance is shared. In bases over the
-# whole turn that is a step of 8 degrees, along which what bends three times as fast still shares 0.95.
+# Neighbours on a path are nearly the same configuration: they share this much of their prior variance. In bases over
+# the whole turn that is a step of 8 degrees, along which a function that bends three times as fast still shares 0.95.
 PATH_CORRELATION = 0.995
-# Relative to the largest eigenvalue of the kernel: what lies below is rounding.
+# Relative to the largest eigenvalue of the kernel: smaller ones are rounding.
 _SMALLEST_EIGENVALUE = 1e-15
 
 
 def follow_a_path(prior: KBMap, q: ArrayLike) -> bool:
-    """Whether the configurations q (n, d) [rad, m], in their order, are neighbours on a path rather than apart.
+    """Return True if the configurations q (n, d) [rad, m], in their order, are neighbours on a path.
 
     Raises:
         ShapeError, NonFiniteError.
@@ -46,15 +46,15 @@ def follow_a_path(prior: KBMap, q: ArrayLike) -> bool:
 
 
 def blockwise_precision(prior: KBMap, q: ArrayLike, x: ArrayLike) -> float:
-    """The precision λ of the prior for `ExactLearner.solve` that left-out blocks of pairs speak for.
+    """Return the precision λ of the prior for `ExactLearner.solve` with the best predictions of left-out blocks.
 
     The pairs are cut into runs of neighbours, and those of each run, at most `BLOCK_PAIRS`, are predicted from all
     other runs. Of the precisions that do this equally well, to one standard error, the largest is taken: the data do
-    not ask for a more flexible map (Breiman et al., Classification and Regression Trees, 1984, section 3.4.3).
+    not require a more flexible map (Breiman et al., Classification and Regression Trees, 1984, section 3.4.3).
 
     Args:
         prior: in the bases that the learner works in.
-        q, x: pairs in the order in which they came, (n, d) [rad, m] and (n, 3) [m].
+        q, x: pairs in the order of recording, (n, d) [rad, m] and (n, 3) [m].
 
     Returns:
         λ as in `ExactLearner.solve`; with too few pairs for `FEWEST_BLOCKS`, one that trusts the prior.
@@ -81,13 +81,13 @@ def blockwise_precision(prior: KBMap, q: ArrayLike, x: ArrayLike) -> float:
 
 
 def _kernel(prior: KBMap, q: FloatArray) -> FloatArray:
-    """Inner products of the weight vectors: a product over the joints (n, n)."""
+    """Return the inner products of the weight vectors: a product over the joints (n, n)."""
     left, right = BasisStack(prior.bases).halves(q)
     return (left @ left.T) * (right @ right.T)
 
 
 def _left_out_errors(kernel: FloatArray, errors: FloatArray, blocks: int, precisions: FloatArray) -> FloatArray:
-    """Mean distance between left-out positions and their predictions from all other blocks [m]: (λ, block).
+    """Return the mean distance between left-out positions and their predictions from all other blocks [m]: (λ, block).
 
     With C = K + λI, the errors of block B predicted from the others are ([C⁻¹]_BB)⁻¹ (C⁻¹ e)_B: Rasmussen and Williams,
     Gaussian Processes for Machine Learning, 2006, eq. (5.12), for blocks. One eigendecomposition of K serves all λ.

@@ -1,4 +1,4 @@
-"""A control net contracted with the weights of joint angles, and moved towards targets: the NumPy path."""
+"""Evaluation and update of a control net at joint angles: the NumPy path."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class NumpyNet:
         stack: of the bases.
         planes: the net (outputs · left_size, right_size): one row for each output and left weight, one column for each
             right weight. Shared, not copied; `step` and `replay` write to it.
-        check_q: of joint angles, a vector (d,) or also rows (n, d).
-        check_x: of a vector of targets (outputs,).
+        check_q: check of joint angles, a vector (d,) or also rows (n, d).
+        check_x: check of a vector of targets (outputs,).
     """
 
     def __init__(self, stack: BasisStack, planes: FloatArray, check_q: Check, check_x: Check) -> None:
@@ -36,7 +36,7 @@ class NumpyNet:
         self._check_q, self._check_x = check_q, check_x
 
     def outputs(self, q: ArrayLike, begin: int, end: int) -> FloatArray:
-        """Outputs begin..end at q: (end − begin,) or (n, end − begin)."""
+        """Return outputs begin..end at q: (end − begin,) or (n, end − begin)."""
         angles, stack, count = self._check_q(q), self._stack, end - begin
         planes = self._planes[begin * stack.left_size : end * stack.left_size]
         if angles.ndim == 1:
@@ -49,7 +49,7 @@ class NumpyNet:
         return out
 
     def derivatives(self, q: ArrayLike, begin: int, end: int) -> FloatArray:
-        """Derivatives of outputs begin..end by the joints: (end − begin, d) or (n, end − begin, d)."""
+        """Return derivatives of outputs begin..end by the joints: (end − begin, d) or (n, end − begin, d)."""
         angles = self._check_q(q)
         if angles.ndim == 1:
             return self._derivatives_of_few(angles, begin, end)
@@ -59,7 +59,7 @@ class NumpyNet:
         return out
 
     def step(self, q: ArrayLike, x: ArrayLike, mu0: float) -> None:
-        """One step of normalised least mean squares towards the targets x (outputs,) at q (d,)."""
+        """Take one step of normalised least mean squares towards the targets x (outputs,) at q (d,)."""
         angles, target = self._check_q(q), self._check_x(x)
         left, right = self._stack.halves(angles)
         predicted = self._planes.dot(right).reshape(self._outputs, -1).dot(left)
@@ -70,13 +70,16 @@ class NumpyNet:
         lapack.add_outer_in_place(self._planes, (error[:, None] * left).ravel(), right)
 
     def replay(self, q: FloatArray, x: FloatArray, order: IntArray, mu0: FloatArray) -> None:
-        """A step of mu0 (k,) for each index in `order` (k,) of the pairs q (n, d), x (n, outputs), all trusted."""
+        """Take a step of mu0 (k,) for each index in `order` (k,) of the pairs q (n, d), x (n, outputs).
+
+        Inputs are not checked.
+        """
         for start in range(0, len(order), _BLOCK):
             part = slice(start, start + _BLOCK)
             self._replay_block(q[order[part]], x[order[part]], mu0[part])
 
     def _replay_block(self, q: FloatArray, targets: FloatArray, mu0: FloatArray) -> None:
-        """A block of consecutive steps as one triangular solve.
+        """Take a block of consecutive steps as one triangular solve.
 
         Step j sees the errors left by the steps i < j: e_j = x_j − f(q_j) − Σ_{i<j} μ_i k_ij / k_ii e_i with
         k_ij = w_i · w_j, a product over the joints.
@@ -111,12 +114,17 @@ class NumpyNet:
 
 
 def contracted(planes: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
-    """Outputs (n, outputs) of planes (outputs · left_size, right_size) for many rows' halves (n, ·) of the weights."""
+    """Return outputs (n, outputs) of many rows.
+
+    Args:
+        planes: the net (outputs · left_size, right_size).
+        left, right: halves (n, ·) of the rows' weights.
+    """
     rows, width = left.shape
     by_left = (planes @ right.T).reshape(len(planes) // width, width, rows)
     return np.einsum("oln,nl->no", by_left, left)
 
 
 def _batches(count: int) -> Iterator[slice]:
-    """Rows in batches small enough to stay in the cache."""
+    """Yield batches of rows small enough to stay in the cache."""
     return (slice(start, start + _BATCH_ROWS) for start in range(0, count, _BATCH_ROWS))

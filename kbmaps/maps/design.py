@@ -1,4 +1,4 @@
-"""All pairs of a least-squares problem, kept as they came, and what its matrix does without being formed."""
+"""Pairs of a least-squares problem, and products with its matrix, which is never formed."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _FIRST_CAPACITY = 256
 
 
 class Design:
-    """The matrix A (n, m) with the rows √weight · w(q)ᵀ, and the targets (n, outputs) likewise scaled.
+    """Matrix A (n, m) with the rows √weight · w(q)ᵀ, and the targets (n, outputs) likewise scaled.
 
-    A pair takes (d + outputs + 1) numbers and A times something the cost of predictions; w(q) is a Kronecker product
-    and never formed. The sums for AᵀA are brought up to date block by block once there are more pairs than unknowns.
-    Inputs are trusted.
+    A pair takes (d + outputs + 1) numbers, and a product with A costs as much as predictions; w(q) is a Kronecker
+    product and never formed. The sums for AᵀA are updated block by block once there are more pairs than unknowns.
+    Inputs are not checked.
     """
 
     def __init__(self, bases: Sequence[JointBasis], outputs: int) -> None:
@@ -40,11 +40,11 @@ class Design:
 
     @property
     def overdetermined(self) -> bool:
-        """Whether there are more pairs than unknowns."""
+        """True if there are more pairs than unknowns."""
         return self._pairs > self.unknowns
 
     def add(self, q: FloatArray, targets: FloatArray, weights: FloatArray) -> None:
-        """More pairs q (n, d), targets (n, outputs), of weights (n,)."""
+        """Add pairs q (n, d), targets (n, outputs), of weights (n,)."""
         end = self._pairs + len(q)
         if end > len(self._table):
             grown = np.empty((max(end, 2 * len(self._table)), self._table.shape[1]))
@@ -58,12 +58,12 @@ class Design:
             self._update_moments()
 
     def fade(self, weight: float) -> None:
-        """Multiplies the weight of all pairs so far by a factor in 0..1."""
+        """Multiply the weight of all pairs so far by a factor in 0..1."""
         self._table[: self._pairs, self._stack.joints :] *= math.sqrt(weight)
         self._moments.scale(weight)
 
     def keep(self, count: int) -> None:
-        """Drops all but the last `count` pairs."""
+        """Drop all but the last `count` pairs."""
         gone = self._pairs - count
         if gone <= 0:
             return
@@ -73,16 +73,16 @@ class Design:
         self._pairs, self._in_moments = count, self._in_moments - counted
         self._left_moments += counted
         if self._left_moments > max(count, _BLOCK):
-            # What was added and taken off again leaves its rounding behind.
+            # Adding and subtracting the same terms leaves rounding errors behind.
             self._moments.clear()
             self._in_moments = self._left_moments = 0
 
     def errors(self, coefficients: FloatArray) -> FloatArray:
-        """Targets − A @ coefficients (m, outputs): (n, outputs)."""
+        """Return targets − A @ coefficients (m, outputs): (n, outputs)."""
         return self._table[: self._pairs, self._stack.joints : -1] - self.times(coefficients)
 
     def times(self, coefficients: FloatArray) -> FloatArray:
-        """A @ coefficients (m, outputs): (n, outputs)."""
+        """Return A @ coefficients (m, outputs): (n, outputs)."""
         planes = coefficients.T.reshape(-1, self._stack.right_size)
         product = np.empty((self._pairs, self.outputs))
         for part, left, right in self._blocks():
@@ -90,7 +90,7 @@ class Design:
         return product
 
     def transposed_times(self, values: FloatArray) -> FloatArray:
-        """Aᵀ @ values (n, outputs): (m, outputs)."""
+        """Return Aᵀ @ values (n, outputs): (m, outputs)."""
         planes = np.zeros((self.outputs * self._stack.left_size, self._stack.right_size))
         for part, left, right in self._blocks():
             by_output = values[part].T[:, None, :] * left.T
@@ -98,7 +98,7 @@ class Design:
         return planes.reshape(self.outputs, -1).T
 
     def gram(self) -> FloatArray:
-        """A new AᵀA (m, m) where overdetermined, else A Aᵀ (n, n); Fortran-ordered, the upper triangle counts."""
+        """Return a new AᵀA (m, m) if overdetermined, else A Aᵀ (n, n); Fortran-ordered, the upper triangle counts."""
         if self.overdetermined:
             self._update_moments()
             return self._moments.gram()
@@ -111,19 +111,19 @@ class Design:
         return kernel.T
 
     def rows(self) -> FloatArray:
-        """A itself (n, m)."""
+        """Return A itself (n, m)."""
         left, right = self._all_halves()
         return (left[:, :, None] * right[:, None, :]).reshape(self._pairs, -1)
 
     def factor(self, errors: FloatArray) -> RowFactor:
-        """A and the errors (n, outputs) as triangular QR factors. Takes a while: see `RowFactor`."""
+        """Return A and the errors (n, outputs) as triangular QR factors. Slow: see `RowFactor`."""
         factor = RowFactor(self.unknowns, self.outputs)
         for part, left, right in self._blocks():
             factor.add((left[:, :, None] * right[:, None, :]).reshape(len(left), -1), errors[part])
         return factor
 
     def _blocks(self) -> Iterator[tuple[slice, FloatArray, FloatArray]]:
-        """Blocks of rows, with the scaled left and the right halves of their weights."""
+        """Yield blocks of rows, with the scaled left and the right halves of their weights."""
         for start in range(0, self._pairs, _BLOCK):
             part = slice(start, min(start + _BLOCK, self._pairs))
             left, right = self._stack.halves(self._table[part, : self._stack.joints])

@@ -1,4 +1,4 @@
-"""Choosing the scale of a prior by the marginal likelihood of the data."""
+"""Choice of a prior's scale by the marginal likelihood of the data."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from collections.abc import Callable
 
 # Multiplicative step of the search.
 _STEP = math.log(8.0)
-# A vertex nearer than this share of a step is not tried: evidence is level there, and a try costs a factorisation.
+# A vertex nearer than this share of a step is not tried: evidence is flat there, and a try costs a factorisation.
 _NEAR = 0.1
 
 
 def most_evident(log_evidence: Callable[[float], float], start: float, low: float, high: float) -> float:
-    """The positive scale of the greatest evidence near `start`.
+    """Return the positive scale of the greatest evidence near `start`.
 
-    Climbs in steps of a factor until both neighbours are lower, then tries the vertex of the parabola
-    through the three, unless that is next to the middle one.
+    Climbs in steps of a factor until both neighbours are lower. Then tries the vertex of the parabola through the
+    three, unless that is next to the middle one.
 
     Args:
-        log_evidence: of a scale. Where the search starts at its end, the best scale is the last one it is asked for.
-        start: where to begin; taken into the limits.
+        log_evidence: of a scale. If the search ends where it started, the best scale is the last one evaluated.
+        start: first scale; clipped to the limits.
         low, high: limits of the scale.
     """
     lowest, highest = math.log(low), math.log(high)
@@ -47,7 +47,7 @@ def most_evident(log_evidence: Callable[[float], float], start: float, low: floa
 
 
 def _vertex(positions: tuple[float, float, float], heights: tuple[float, float, float]) -> float:
-    """Where the parabola through three points, the middle one highest, has its maximum."""
+    """Return the maximum of the parabola through three points, the middle one highest."""
     (a, b, c), (fa, fb, fc) = positions, heights
     left, right = (b - a) * (fb - fc), (b - c) * (fb - fa)
     if left == right:

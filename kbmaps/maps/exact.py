@@ -21,7 +21,7 @@ from kbmaps.maps.least_squares import nearest_solution
 from kbmaps.maps.targets import pose_targets
 from kbmaps.memory import Memory
 
-# Evidence: limits of the search for lambda, relative to the mean diagonal of the Gram matrix.
+# Limits of the evidence's search for lambda, relative to the mean diagonal of the Gram matrix.
 _SEARCH_LIMITS = (1e-12, 1e6)
 _FIRST_PRECISION = 1e-2
 # Variances below (1 pm)² are rounding.
@@ -30,12 +30,12 @@ _VARIANCE_FLOOR = 1e-24
 
 @dataclass(frozen=True)
 class ExactSolution:
-    """A fitted map and what the fit says about it.
+    """Fitted map with the quality of the fit.
 
     Attributes:
-        map: in the bases of the prior that the learner was given.
-        noise_std: estimated noise of one coordinate at weight 1 [m]; None where the data do not tell.
-        orientation_noise_std: the same of one entry of the rotation matrices; None also where none were learnt.
+        map: in the bases of the learner's prior.
+        noise_std: estimated noise of one coordinate at weight 1 [m]; None where the data do not determine it.
+        orientation_noise_std: the same of one entry of the rotation matrices; None also without orientations.
         prior_precision: λ = (noise_std / spread of the prior's coefficients)²; 0 for the unregularised solution.
         log_evidence: log marginal likelihood of all that was learnt at λ; None for the unregularised solution.
         residual_rms: weighted RMS distance between the map's positions and those it was fitted to [m].
@@ -61,10 +61,10 @@ class ExactSolution:
 
 @dataclass(frozen=True)
 class _Fit:
-    """One λ before refinement, with its evidence and the noise variances of positions and of orientations.
+    """Fit at one λ before refinement, with its evidence and the noise variances of positions and of orientations.
 
-    The solution is the change of the coefficients (m, outputs); with fewer pairs than unknowns, the multipliers
-    (n, outputs) that it comes from. What it leaves of the errors (n, outputs) is known in the first case.
+    The solution is the change of the coefficients (m, outputs). With fewer pairs than unknowns, it is the multipliers
+    (n, outputs) that the change comes from. `remaining` (n, outputs) holds the residuals, in the first case only.
     """
 
     precision: float
@@ -75,19 +75,19 @@ class _Fit:
 
 
 class ExactLearner:
-    """Collects pairs, and solves for the map when asked.
+    """Collects pairs, and solves for the map on demand.
 
-    The pairs are kept as they came, and with more of them than control points the sums for their Gram matrix; the prior
-    is no part of either, so it may change (`rebase`). At d = 7 a pair takes 88 bytes, 6 µs to learn and 5 µs of each
-    solve, of which the rest is one Cholesky factorisation of at most (3^d)², within 8 · 9^d bytes (38 MB).
-    Where the data are too one-sided for it, the solution comes from a QR factorisation of all pairs: exact, and slow.
+    The pairs are kept as they came. With more of them than control points, so are the sums for their Gram matrix. The
+    prior is part of neither, so it may change (`rebase`). At d = 7 a pair takes 88 bytes, 6 µs to learn and 5 µs of
+    each solve. The rest of a solve is one Cholesky factorisation of at most (3^d)², within 8 · 9^d bytes (38 MB). Where
+    the data are too one-sided for it, the solution comes from a QR factorisation of all pairs: exact, and slow.
 
     Args:
-        prior: where the solution stays in the directions that the data do not show. With an orientation, that is learnt
+        prior: the solution in the directions that the data do not determine. If it has an orientation, that is learnt
             too: its nine planes have a noise of their own and share λ with the position's.
-        bases: what the solution is computed in; it decides what "nearest to the prior" means. None takes the prior's.
-            Scaled orthonormal bases over the joints' ranges (`learning_bases`) are advised.
-        memory: what becomes of old pairs; all count by default.
+        bases: the bases of the solution, and so the metric of "nearest to the prior". None takes the prior's. Scaled
+            orthonormal bases over the joints' ranges (`learning_bases`) are advised.
+        memory: treatment of old pairs; all count by default.
 
     Raises:
         BasisError: bases do not fit the prior.
@@ -114,14 +114,14 @@ class ExactLearner:
         self._outputs = len(prior.net)
         self._design = Design(self._bases, self._outputs)
         self._pairs = 0
-        # The weights that the kept pairs came with; what is forgotten of them is in the design.
+        # Original weights of the kept pairs; the design holds them after forgetting.
         self._told = np.empty(0)
         self._last_precision = _FIRST_PRECISION
         self.rebase(prior)
 
     @property
     def pairs(self) -> int:
-        """How many pairs have been learnt, forgotten ones included."""
+        """Number of learnt pairs, forgotten ones included."""
         return self._pairs
 
     @property
@@ -129,11 +129,11 @@ class ExactLearner:
         return self._prior
 
     def rebase(self, prior: KBMap) -> None:
-        """Another prior for the same data.
+        """Replace the prior for the same data.
 
         Raises:
-            ShapeError: the prior has an orientation and the one before had none, or the other way round.
-            BasisError: it has other joints.
+            ShapeError: only one of the new prior and the old one has an orientation.
+            BasisError: wrong number of joints.
         """
         if len(prior.net) != self._outputs:
             raise ShapeError("prior.net", f"({self._outputs}, ...) as before", prior.net.shape)
@@ -145,16 +145,18 @@ class ExactLearner:
     def learn(
         self, q: ArrayLike, x: ArrayLike, weight: ArrayLike | None = None, rotation: ArrayLike | None = None
     ) -> None:
-        """One pair, q (d,) [rad] and x (3,) [m], or many, (n, d) and (n, 3).
+        """Learn one pair, q (d,) [rad] and x (3,) [m], or many, (n, d) and (n, 3).
 
         Args:
+            q: joint values.
+            x: measured positions.
             weight: relative inverse variance of each pair, () or (n,), greater than 0; None means 1.
             rotation: the orientations, rotation matrices (n, 3, 3) or quaternions x, y, z, w (n, 4), for one pair also
-                (3, 3) or (4,); where the prior has an orientation, and only there.
+                (3, 3) or (4,); required if the prior has an orientation, and only then.
 
         Raises:
             ShapeError, NonFiniteError, RotationError
-            SettingError: a weight that is not positive, rotations too many or too few. Nothing has changed.
+            SettingError: a weight that is not positive, rotations missing or not expected. Nothing has changed.
         """
         angles = np.atleast_2d(rows_or_vector("q", q, len(self._bases)))
         positions = np.atleast_2d(rows_or_vector("x", x, POSITION_OUTPUTS))
@@ -171,13 +173,13 @@ class ExactLearner:
         self._pairs += len(angles)
 
     def solve(self, prior_precision: float | Literal["evidence"] | None = None) -> ExactSolution:
-        """The map for all pairs so far.
+        """Return the map for all pairs so far.
 
         Args:
             prior_precision: None: least squares without regularisation; where the pairs do not determine it, the
-                solution nearest to the prior in the learner's bases. λ > 0: minimises
-                Σ weight ‖f(q) − x‖² + λ ‖g − g0‖² over the coefficients g, the posterior mean for a Gaussian prior of
-                variance noise² / λ around g0. "evidence": λ of the greatest marginal likelihood.
+                solution nearest to the prior in the learner's bases. λ > 0: minimises Σ weight ‖f(q) − x‖² + λ ‖g −
+                g0‖² over the coefficients g, the posterior mean for a Gaussian prior of variance noise² / λ around g0.
+                "evidence": λ of the greatest marginal likelihood.
 
         Raises:
             SettingError: prior_precision is neither None, "evidence", nor a number above 0.
@@ -209,7 +211,7 @@ class ExactLearner:
         return self._solution(change, noises, 0.0, None, squares)
 
     def _refined(self, gram: ShiftedGram, errors: FloatArray, fit: _Fit) -> ExactSolution:
-        """One step of refinement through the pairs themselves mends the rounding of the Gram matrix."""
+        """Take one step of refinement through the pairs, which corrects the rounding of the Gram matrix."""
         gram.factorise(fit.precision)
         design, change = self._design, fit.solution
         if fit.remaining is not None:
@@ -224,9 +226,9 @@ class ExactLearner:
         return self._solution(change, noises, fit.precision, fit.log_evidence, squares)
 
     def _fit(self, gram: ShiftedGram, errors: FloatArray, rhs: FloatArray, precision: float) -> _Fit:
-        """Evidence of λ. The errors of one coordinate are N(0, s² (A Aᵀ / λ + I)).
+        """Fit at λ, with its evidence. The errors of one coordinate are N(0, s² (A Aᵀ / λ + I)).
 
-        With fewer pairs than unknowns through A Aᵀ, else through AᵀA, of the same determinant but for powers of λ.
+        With fewer pairs than unknowns through A Aᵀ, else through AᵀA, of the same determinant except for powers of λ.
         """
         if not gram.factorise(precision):
             raise SettingError(f"prior_precision = {precision:.3g} is below rounding here; use None or a larger one")
@@ -247,7 +249,7 @@ class ExactLearner:
 
     @property
     def _count(self) -> float:
-        """How many pairs there are, each for as much as is not forgotten of it."""
+        """Effective number of pairs, with forgetting."""
         return float(self._memory.weights(len(self._told)).sum())
 
     @property
@@ -256,12 +258,12 @@ class ExactLearner:
 
     @property
     def _parts(self) -> list[slice]:
-        """The outputs that share a noise: the positions, and the orientations where there are any."""
+        """Outputs that share a noise: the positions, and the orientations if there are any."""
         positions = slice(0, POSITION_OUTPUTS)
         return [positions] if self._outputs == POSITION_OUTPUTS else [positions, slice(POSITION_OUTPUTS, POSE_OUTPUTS)]
 
     def _most_evident(self, gram: ShiftedGram, errors: FloatArray, rhs: FloatArray) -> _Fit:
-        """λ of the greatest evidence: climbs from the last one in steps, then takes the vertex of a parabola."""
+        """Return the fit at λ of the greatest evidence, searched from the last λ on."""
         mean = gram.trace / gram.size
         low, high = (limit * mean for limit in _SEARCH_LIMITS)
         fits: dict[float, _Fit] = {}

@@ -1,4 +1,4 @@
-"""The rows of a least-squares problem in bounded memory."""
+"""Rows of a least-squares problem in bounded memory."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _NOTHING = 1e-150
 class RowFactor:
     """Rows A (k, m) and targets (k, outputs) of a least-squares problem, never more of them than unknowns.
 
-    Up to m rows are kept as they come. From then on A is their triangular QR factor, into which later rows are
-    folded: for every g, the squares of A g − targets stay the sum over all rows ever added, up to what no g can reach,
-    at the same memory and the same cost a row. No normal equations are formed, so nothing is lost to squaring
-    the condition number. Inputs are trusted.
+    Up to m rows are kept as they come. From then on A is their triangular QR factor, into which later rows are folded:
+    for every g, the squares of A g − targets stay the sum over all rows ever added, up to a constant that no g changes.
+    Memory and cost per row stay constant. No normal equations are formed, so no digits are lost to squaring the
+    condition number. Inputs are not checked.
     """
 
     def __init__(self, unknowns: int, outputs: int) -> None:
@@ -28,7 +28,7 @@ class RowFactor:
 
     @property
     def rows(self) -> FloatArray:
-        """A (k, m); upper triangular once k = m."""
+        """Matrix A (k, m); upper triangular once k = m."""
         return self._rows[: self._filled]
 
     @property
@@ -37,7 +37,7 @@ class RowFactor:
         return self._targets[: self._filled]
 
     def add(self, rows: FloatArray, targets: FloatArray) -> None:
-        """More rows (n, m) with targets (n, outputs)."""
+        """Add rows (n, m) with targets (n, outputs)."""
         taken = 0
         if not self._triangular:
             taken = min(len(rows), self.unknowns - self._filled)
@@ -57,7 +57,7 @@ class RowFactor:
 
 
 class ShiftedGram:
-    """K + λ I factorised for one λ after the other, within K's own buffer.
+    """Factorises K + λ I for one λ after the other, within K's own buffer.
 
     The Cholesky factor lives in the lower triangle and the diagonal, K itself in the upper one and a copy of its
     diagonal.
@@ -75,7 +75,7 @@ class ShiftedGram:
 
     @property
     def size(self) -> int:
-        """Its rows and columns k."""
+        """Number of rows and columns k."""
         return len(self._diagonal)
 
     @property
@@ -83,7 +83,7 @@ class ShiftedGram:
         return float(self._diagonal.sum())
 
     def factorise(self, shift: float) -> bool:
-        """Factorises K + shift·I; False (and unusable until the next call) if it is not positive definite."""
+        """Factorise K + shift·I; return False (unusable until the next call) if it is not positive definite."""
         if self.shift == shift:
             return True
         size, step = len(self._buffer), self._COPY_COLUMNS
@@ -98,11 +98,11 @@ class ShiftedGram:
         return positive
 
     def solve(self, rhs: FloatArray) -> FloatArray:
-        """Solution of (K + shift·I) y = rhs."""
+        """Return the solution of (K + shift·I) y = rhs."""
         return lapack.cholesky_solve(self._buffer, rhs)
 
     def whiten(self, rhs: FloatArray) -> FloatArray:
-        """L⁻¹ rhs, with L Lᵀ = K + shift·I."""
+        """Return L⁻¹ rhs, with L Lᵀ = K + shift·I."""
         return lapack.lower_solve(self._buffer, rhs)
 
     @property

@@ -1,4 +1,4 @@
-"""The Kinematic Bézier Map: forward kinematics that is linear in its control points."""
+"""Kinematic Bézier Map: forward kinematics that is linear in its control points."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ class KBMap:
     f(q) = Σ_i w_i(q) b_i with w = w_1(q_1) ⊗ … ⊗ w_d(q_d). Ulbrich et al. 2009, eqs. (10) and (15).
 
     Attributes:
-        bases: one basis a joint, in the order of q.
+        bases: one basis per joint, in the order of q.
         net: the coefficients as planes (outputs, m1, ..., md), m = 3 for a revolute joint and 2 for a prismatic one;
             control points [m] where the bases are Bernstein. Read-only. Outputs 0..2 are the position x, y, z [m];
             a map of 12 outputs continues with the columns e1, e2, e3 of the marker's rotation matrix.
-        metadata: short texts that travel with the map; no part of `digest`.
+        metadata: short texts stored with the map; not part of `digest`.
 
     Raises:
         ShapeError, NonFiniteError, BasisError
@@ -92,7 +92,7 @@ class KBMap:
         return self.net.shape[0] == POSE_OUTPUTS
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Marker position (3,) [m] for joint angles q (d,) [rad], or (n, 3) for (n, d).
+        """Return the marker position (3,) [m] for joint angles q (d,) [rad], or (n, 3) for (n, d).
 
         Raises:
             ShapeError, NonFiniteError
@@ -100,20 +100,22 @@ class KBMap:
         return self._kernel.outputs(q, 0, POSITION_OUTPUTS)
 
     def orientation(self, q: ArrayLike, *, orthonormal: bool = False) -> FloatArray:
-        """The marker's axes e1, e2, e3 as columns of (3, 3), or (n, 3, 3).
+        """Return the marker's axes e1, e2, e3 as columns of (3, 3), or (n, 3, 3).
 
         Args:
-            orthonormal: the nearest rotation to what was learnt, which by itself is orthonormal as far as it is exact.
+            q: joint angles (d,) or (n, d) [rad].
+            orthonormal: return the nearest rotation; the learnt matrix is orthonormal only as far as it is exact.
 
         Raises:
-            ShapeError: the map holds positions only, or q has the wrong length. NonFiniteError.
+            ShapeError: the map holds positions only, or q has the wrong length.
+            NonFiniteError
         """
         self._require_orientation()
         axes = _as_columns(self._kernel.outputs(q, POSITION_OUTPUTS, POSE_OUTPUTS))
         return nearest_rotation(axes) if orthonormal else axes
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d).
+        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d).
 
         Raises:
             ShapeError, NonFiniteError
@@ -121,12 +123,13 @@ class KBMap:
         return self._kernel.derivatives(q, 0, POSITION_OUTPUTS)
 
     def angular_jacobian(self, q: ArrayLike) -> FloatArray:
-        """Angular velocity (3, d) of the orthonormal orientation R [rad/rad, or rad/m], or (n, 3, d) for q (n, d).
+        """Return the angular velocity (3, d) of the orthonormal orientation R [rad/rad, or rad/m], or (n, 3, d).
 
         In the measurement frame: dR/dq_k = [column k]× R.
 
         Raises:
-            ShapeError: the map holds positions only, or q has the wrong length. NonFiniteError.
+            ShapeError: the map holds positions only, or q has the wrong length.
+            NonFiniteError
         """
         self._require_orientation()
         checked = rows_or_vector("q", q, self.joints)
@@ -136,7 +139,7 @@ class KBMap:
         return nearest_rotation_rates(_as_columns(axes), turning)
 
     def weights(self, q: ArrayLike) -> FloatArray:
-        """The full weight vector (3^d,) for q (d,), or (n, 3^d): the Kronecker product over the joints.
+        """Return the full weight vector (3^d,) for q (d,), or (n, 3^d): the Kronecker product over the joints.
 
         Raises:
             ShapeError, NonFiniteError
@@ -146,10 +149,10 @@ class KBMap:
         return full[0] if checked.ndim == 1 else full
 
     def in_basis(self, bases: Sequence[JointBasis]) -> KBMap:
-        """The same map with its net expressed in other bases; exact up to rounding.
+        """Return the same map with its net expressed in other bases; exact up to rounding.
 
         Raises:
-            BasisError: another number of joints, or a prismatic basis for a revolute joint.
+            BasisError: wrong number of joints, or a prismatic basis for a revolute joint.
         """
         target = tuple(bases)
         if len(target) != self.joints:
@@ -161,14 +164,15 @@ class KBMap:
         return KBMap(target, net, self.metadata)
 
     def with_metadata(self, metadata: Mapping[str, str]) -> KBMap:
-        """The same map with other texts."""
+        """Return the same map with other metadata."""
         return KBMap(self.bases, self.net, metadata)
 
     def with_tool(self, marker_shift: ArrayLike) -> KBMap:
-        """The map with its marker moved by a vector δ (3,) [m] given in the marker frame: G + E1 δ1 + E2 δ2 + E3 δ3.
+        """Return the map with its marker moved by δ (3,) [m] in the marker frame: G + E1 δ1 + E2 δ2 + E3 δ3.
 
         Raises:
-            ShapeError: the map holds positions only, or δ has the wrong length. NonFiniteError.
+            ShapeError: the map holds positions only, or δ has the wrong length.
+            NonFiniteError
         """
         self._require_orientation()
         shift = vector("marker_shift", marker_shift, 3)
@@ -178,10 +182,10 @@ class KBMap:
         return KBMap(self.bases, net, self.metadata)
 
     def with_alpha(self, alpha: ArrayLike, centre: ArrayLike = 0.0) -> KBMap:
-        """The same map with Bézier control points for another α; exact up to rounding.
+        """Return the same map with Bézier control points for another α; exact up to rounding.
 
         Args:
-            alpha: α [rad], one for all revolute joints or one a joint (d,); prismatic joints keep their Bézier basis.
+            alpha: α [rad], one for all revolute joints or one per joint (d,); prismatic joints keep their Bézier basis.
             centre: the angle that −α and α are counted from [rad], likewise.
 
         Raises:
@@ -198,13 +202,15 @@ class KBMap:
 
     @classmethod
     def from_control_points(cls, bases: Sequence[JointBasis], points: ArrayLike) -> KBMap:
-        """The map of Bézier control points (m1, ..., md, 3) [m], as `control_points` gives them.
+        """Return the map of Bézier control points (m1, ..., md, 3) [m], as in `control_points`.
 
         Args:
-            bases: one a joint, Bernstein or prismatic.
+            bases: one per joint, Bernstein or prismatic.
+            points: the control points (m1, ..., md, 3) [m].
 
         Raises:
-            BasisError: a basis whose coefficients are no control points. ShapeError, NonFiniteError.
+            BasisError: a basis whose coefficients are not control points.
+            ShapeError, NonFiniteError
         """
         for k, basis in enumerate(bases):
             if basis.to_bernstein() != basis:
@@ -218,30 +224,30 @@ class KBMap:
 
     @property
     def control_points(self) -> FloatArray:
-        """Bézier control points (m1, ..., md, 3) [m], in the bases that `JointBasis.to_bernstein` names.
+        """Bézier control points (m1, ..., md, 3) [m], in the bases of `JointBasis.to_bernstein`.
 
-        `with_alpha` chooses other bases first.
+        Use `with_alpha` first for other bases.
         """
         bernstein = self.in_basis([basis.to_bernstein() for basis in self.bases])
         return frozen(np.moveaxis(bernstein.net[:POSITION_OUTPUTS], 0, -1))
 
     @property
     def digest(self) -> str:
-        """Sixteen hexadecimal digits that tell this map (bases and net) from any other."""
+        """Sixteen hexadecimal digits that identify this map (bases and net)."""
         state = hashlib.blake2b(repr([(b.kind, b.parameters) for b in self.bases]).encode(), digest_size=8)
         state.update(self.net.astype("<f8", copy=False).tobytes())
         return state.hexdigest()
 
     def to_bytes(self) -> bytes:
-        """The map as one self-describing byte string (see `kbmaps.maps.serial`)."""
+        """Return the map as one self-describing byte string (see `kbmaps.maps.serial`)."""
         return serial.encode(self.bases, self.net, self.metadata)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> KBMap:
-        """The map that `to_bytes` wrote.
+        """Return the map in the bytes of `to_bytes`.
 
         Raises:
-            ModelFormatError: the bytes are damaged, truncated, or something else.
+            ModelFormatError: the bytes are damaged, truncated, or of another format.
         """
         return cls(*serial.decode(data))
 
@@ -251,7 +257,7 @@ class KBMap:
 
 
 def _as_columns(axes: FloatArray) -> FloatArray:
-    """Outputs (..., 9), three a unit vector, as matrices (..., 3, 3) with the unit vectors as columns."""
+    """Return outputs (..., 9), three per unit vector, as matrices (..., 3, 3) with the unit vectors as columns."""
     return axes.reshape(*axes.shape[:-1], 3, 3).swapaxes(-1, -2)
 
 
@@ -265,7 +271,7 @@ def _one_a_joint(name: str, values: ArrayLike, joints: int) -> list[float]:
 
 
 def prediction_errors(kbmap: KBMap, q: ArrayLike, x: ArrayLike) -> FloatArray:
-    """Distances (n,) [m] between predicted and given positions x (n, 3) [m] at q (n, d) [rad].
+    """Return distances (n,) [m] between predicted and given positions x (n, 3) [m] at q (n, d) [rad].
 
     Raises:
         ShapeError, NonFiniteError

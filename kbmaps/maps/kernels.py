@@ -1,7 +1,7 @@
-"""Which of two paths the innermost loops take: compiled, or NumPy. Both do the same to rounding.
+"""Choice between the compiled and the NumPy path of the innermost loops. Both agree up to rounding.
 
-The compiled one is there when a C compiler was at hand as kbmaps was built. BODYSCHEMA_PURE=1 in the environment
-of a process leaves it aside.
+The compiled path exists if a C compiler was present when kbmaps was built. BODYSCHEMA_PURE=1 in the environment of a
+process disables it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ KernelPath = Literal["compiled", "numpy"]
 
 
 class NetKernel(Protocol):
-    """Works on a net as `NumpyNet` says."""
+    """Operations on a net, as in `NumpyNet`."""
 
     def outputs(self, q: ArrayLike, begin: int, end: int, /) -> FloatArray: ...
     def derivatives(self, q: ArrayLike, begin: int, end: int, /) -> FloatArray: ...
@@ -35,10 +35,11 @@ class NetKernel(Protocol):
 
 
 class FilterKernel(Protocol):
-    """Takes pairs into the state of a `RigidFilter`; returns how many, its noise² and what that rests on.
+    """Compiled update of a `RigidFilter` with pairs.
 
-    `learn_one` checks its pair and writes it to a row (d + 4). It returns None, and nothing has changed, for one that
-    is not yet float64 of the right shape, or is wrong.
+    `learn` returns the number of learnt pairs, the noise² and the number of coordinates that this rests on. `learn_one`
+    checks its pair and writes it to a row (d + 4). It returns None, and changes nothing, if the pair is not float64 of
+    the right shape, or invalid.
     """
 
     def learn(
@@ -70,7 +71,7 @@ class FilterKernel(Protocol):
 
 
 class _Compiled(Protocol):
-    """The module kbmaps._kernels, built from csrc."""
+    """Module kbmaps._kernels, built from csrc."""
 
     def Net(
         self,
@@ -101,18 +102,18 @@ _chosen = ContextVar("_chosen", default=_available)
 
 
 def kernels_in_use() -> KernelPath:
-    """The path of maps and learners that are made now."""
+    """Return the path of maps and learners created now."""
     return "numpy" if _chosen.get() is None else "compiled"
 
 
 def available() -> tuple[KernelPath, ...]:
-    """The paths that this process can take."""
+    """Return the paths available in this process."""
     return ("numpy",) if _available is None else ("numpy", "compiled")
 
 
 @contextmanager
 def using(path: KernelPath) -> Generator[None]:
-    """Maps and learners made within take this path for good; for comparing the two.
+    """Create maps and learners on this path within the context, for good; for comparing the two.
 
     Raises:
         SettingError: there are no compiled kernels.
@@ -129,7 +130,7 @@ def using(path: KernelPath) -> Generator[None]:
 
 
 def net_kernel(stack: BasisStack, planes: FloatArray, check_q: Check, check_x: Check) -> NetKernel:
-    """The chosen path's kernel for a net; the arguments are those of `NumpyNet`."""
+    """Return the chosen path's kernel for a net; the arguments are those of `NumpyNet`."""
     compiled = _chosen.get()
     if compiled is None:
         return NumpyNet(stack, planes, check_q, check_x)
@@ -138,7 +139,7 @@ def net_kernel(stack: BasisStack, planes: FloatArray, check_q: Check, check_x: C
 
 
 def filter_kernel(*arrays: FloatArray) -> FilterKernel | None:
-    """The compiled loop of `RigidFilter`, if that is the path."""
+    """Return the compiled loop of `RigidFilter`, if that is the path."""
     compiled = _chosen.get()
     return None if compiled is None else compiled.RigidFilter(*(np.ascontiguousarray(array) for array in arrays))
 

@@ -1,4 +1,4 @@
-"""Least squares without regularisation: what determines a map, exactly, and no more of a change than that."""
+"""Least squares without regularisation: the smallest change that explains the data exactly."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from kbmaps.maps.factor import ShiftedGram
 
 # Below this reciprocal condition number a triangular solve would return rounding errors.
 _SMALLEST_RCOND = 1e-13
-# The same of a Gram matrix, of which the refinement through the pairs needs only the first digits.
+# The same for a Gram matrix, of which the refinement through the pairs needs only the first digits.
 _SMALLEST_GRAM_RCOND = 1e-15
-# Refinement has to gain this factor a step, or the Gram matrix is too near to singular to be of use.
+# Refinement must gain this factor per step; otherwise the Gram matrix is too near to singular.
 _LEAST_GAIN = 10.0
-# Relative to the trace of the Gram matrix: just enough to keep its Cholesky factorisation alive.
+# Relative to the trace of the Gram matrix: just enough for a stable Cholesky factorisation.
 _VANISHING_RIDGE = 1e-13
 _REFINEMENTS = 30
 
 
 def nearest_solution(design: Design, errors: FloatArray) -> FloatArray:
-    """The smallest change (m, outputs) of the coefficients that explains errors (n, outputs) best.
+    """Return the smallest change (m, outputs) of the coefficients that explains errors (n, outputs) best.
 
-    By Cholesky factors of the Gram matrix where they will do: refinement through the pairs themselves then brings what
-    a QR factorisation would (corrected seminormal equations, Björck 1987), at a tenth of its cost.
+    Uses Cholesky factors of the Gram matrix where they suffice. Refinement through the pairs then matches a QR
+    factorisation (corrected seminormal equations, Björck 1987), at a tenth of its cost.
     """
     gram = ShiftedGram(design.gram())
     if gram.factorise(0.0) and gram.rcond > _SMALLEST_GRAM_RCOND:
@@ -36,7 +36,7 @@ def nearest_solution(design: Design, errors: FloatArray) -> FloatArray:
 
 
 def _refined(design: Design, gram: ShiftedGram, errors: FloatArray) -> FloatArray | None:
-    """Steps of refinement down to rounding; None where they gain too little."""
+    """Refine down to rounding; return None if the steps gain too little."""
 
     def step(remaining: FloatArray) -> FloatArray:
         if design.overdetermined:
@@ -57,7 +57,7 @@ def _refined(design: Design, gram: ShiftedGram, errors: FloatArray) -> FloatArra
 
 
 def _by_rows(design: Design, errors: FloatArray) -> FloatArray:
-    """Through the rows themselves or their QR factor."""
+    """Solve through the rows themselves or their QR factor."""
     if design.overdetermined:
         factor = design.factor(errors)
         rows, targets = factor.rows, factor.targets
@@ -69,9 +69,9 @@ def _by_rows(design: Design, errors: FloatArray) -> FloatArray:
 
 
 def _nearest(rows: FloatArray, errors: FloatArray) -> FloatArray:
-    """The smallest change of the coefficients (m, outputs) that explains `errors` (k, outputs), whatever the rank.
+    """Return the smallest change of the coefficients (m, outputs) that explains `errors` (k, outputs), at any rank.
 
-    Iterated Tikhonov: each pass leaves the share λ / (σ² + λ) of what a singular value σ has still to explain, and
+    Iterated Tikhonov: for a singular value σ, each pass leaves the share λ / (σ² + λ) of the remaining error, and
     corrects the rounding of the pass before. Directions with σ² far below λ stay at the prior.
     """
     gram = ShiftedGram((rows @ rows.T).T)

@@ -1,4 +1,4 @@
-"""Normalised least-mean-squares: the instant learner."""
+"""Normalised least-mean-squares learner, which updates the map with each pair."""
 
 from __future__ import annotations
 
@@ -22,12 +22,13 @@ _KIND = "nlms, 1"
 
 
 class NLMS:
-    """Moves the control points a step towards each new pair, the least that mends the share mu0 of its error.
+    """Moves the control points with each new pair by the smallest step that corrects the share mu0 of its error.
 
-    Learns what the map it starts from has, the position or position and orientation, in that map's bases; scaled
+    Learns the outputs of the map it starts from, position or position and orientation, in that map's bases; scaled
     orthonormal ones (`learning_bases`) are advised.
 
     Args:
+        kbmap: the map to start from.
         mu0: the share, constant or as a `StepSize` of the pairs learnt so far.
 
     Raises:
@@ -69,17 +70,19 @@ class NLMS:
 
     @property
     def pairs(self) -> int:
-        """How many steps have been made, replayed ones included."""
+        """Number of steps so far, replayed ones included."""
         return self._pairs
 
     @property
     def map(self) -> KBMap:
-        """What has been learnt so far: a snapshot that later learning does not touch."""
+        """Snapshot of the learnt map; later learning does not change it."""
         sizes = [basis.size for basis in self._bases]
         return KBMap(self._bases, self._planes.reshape(self._outputs, *sizes))
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Marker position (3,) [m] for joint angles q (d,) [rad], or (n, 3) for (n, d), as `map` would, without a copy.
+        """Return the marker position (3,) [m] at joint angles q (d,) [rad], or (n, 3) at (n, d).
+
+        Equal to `map.predict`, without a copy of the map.
 
         Raises:
             ShapeError, NonFiniteError
@@ -87,14 +90,16 @@ class NLMS:
         return self._reader.outputs(q, 0, POSITION_OUTPUTS)
 
     def learn(self, q: ArrayLike, x: ArrayLike, rotation: ArrayLike | None = None) -> None:
-        """One step for marker position x (3,) [m] at joint angles q (d,) [rad].
+        """Take one step for marker position x (3,) [m] at joint angles q (d,) [rad].
 
         Args:
+            q: joint angles (d,) [rad].
+            x: marker position (3,) [m].
             rotation: the orientation, (3, 3) or a quaternion x, y, z, w (4,); for a map with orientation only.
 
         Raises:
             ShapeError, NonFiniteError, RotationError
-            SettingError: a rotation too many or too few. Nothing has changed.
+            SettingError: a rotation missing or not expected. Nothing has changed.
         """
         mu = self._step_size.at(self._pairs)
         if rotation is None and self._outputs == POSITION_OUTPUTS:
@@ -107,16 +112,19 @@ class NLMS:
     def replay(
         self, q: ArrayLike, x: ArrayLike, order: ArrayLike | None = None, rotation: ArrayLike | None = None
     ) -> None:
-        """Steps for the pairs q (n, d) [rad], x (n, 3) [m] in the sequence `order` (indices), else as they stand.
+        """Take steps for the pairs q (n, d) [rad], x (n, 3) [m] in the sequence `order` (indices), or as they stand.
 
         Equal to `learn` on each of them up to rounding, at a fraction of its cost.
 
         Args:
+            q: joint angles (n, d) [rad].
+            x: marker positions (n, 3) [m].
+            order: indices of the pairs; None: each once, in their order.
             rotation: the orientations, (n, 3, 3) or quaternions (n, 4), as for `learn`.
 
         Raises:
             ShapeError, NonFiniteError, RotationError
-            SettingError: an index outside the pairs, rotations too many or too few. Nothing has changed.
+            SettingError: an index outside the pairs, rotations missing or not expected. Nothing has changed.
         """
         angles = rows("q", q, self._stack.joints)
         positions = rows("x", x, POSITION_OUTPUTS)
@@ -129,7 +137,7 @@ class NLMS:
         self._pairs += len(sequence)
 
     def to_bytes(self) -> bytes:
-        """The learner as it is; `from_bytes` learns on to the last bit as this one would."""
+        """Return the learner's state; a learner restored by `from_bytes` continues to the last bit as this one."""
         settings = self._step_size
         fields: dict[str, Any] = {
             "bases": describe_bases(self._bases),
@@ -142,7 +150,7 @@ class NLMS:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """The learner in `data`. Raises ModelFormatError: it is none of this kind, or damaged."""
+        """Return the learner in `data`. Raises ModelFormatError: wrong type of model, or damaged."""
         fields, arrays = unpack(data, _KIND)
         with restoring("an NLMS learner"):
             named(fields, "the fields", ("bases", "mu0", "decay", "floor", "pairs"))

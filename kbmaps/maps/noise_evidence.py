@@ -1,4 +1,4 @@
-"""The noise of a linear model with a known prior, from the evidence."""
+"""Noise of a linear model with a known prior, estimated by the evidence."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from kbmaps.arrays import FloatArray
 # Variances below (1 pm)² are rounding.
 VARIANCE_FLOOR = 1e-24
 _ROUNDS, _POINTS = 5, 41
-# How far the best variance is looked for around the mean square: below it by as much as float64 can tell, and above.
+# Range of the search for the best variance around the mean square: below it down to float64's resolution, and above.
 _LEAST_SHARE, _GREATEST_SHARE = 1e-20, 1e2
 
 
@@ -19,14 +19,15 @@ _LEAST_SHARE, _GREATEST_SHARE = 1e-20, 1e2
 class LinearEvidence:
     """Log evidence of y = H β + e as a function of the variance s² of the noise e, with β ~ N(0, 1).
 
-    With H = U diag(√γ) Vᵀ, a = Uᵀ y and y₀ what of y no β reaches,
+    With H = U diag(√γ) Vᵀ, a = Uᵀ y and y₀ the part of y that no β reaches,
 
         −2 log p(y) = N log(2π s²) + Σ log(1 + γ / s²) + y₀ᵀ y₀ / s² + Σ a² / (s² + γ).
 
-    All terms are positive: as a difference of yᵀ y and what β explains of it, the noise of a wide prior is rounding.
+    All terms are positive. Computed as a difference of yᵀ y and the part that β explains, the noise of a wide prior
+    would be rounding.
 
     Attributes:
-        count: N, how many coordinates y has; not whole where pairs are partly forgotten.
+        count: N, the number of coordinates of y; not whole where pairs are partly forgotten.
         unreached: y₀ᵀ y₀.
         eigenvalues: γ (p,).
         along: a (p,).
@@ -38,18 +39,18 @@ class LinearEvidence:
     along: FloatArray
 
     def mean(self, variance: float) -> FloatArray:
-        """Posterior mean of Vᵀ β (p,) at this s²."""
+        """Return the posterior mean of Vᵀ β (p,) at this s²."""
         return np.sqrt(self.eigenvalues) * self.along / (variance + self.eigenvalues)
 
     def at(self, variances: FloatArray) -> FloatArray:
-        """Log evidence (m,) at variances (m,)."""
+        """Return the log evidence (m,) at variances (m,)."""
         column = variances[:, None]
         misfit = self.unreached / variances + (np.square(self.along) / (column + self.eigenvalues)).sum(axis=1)
         spread = np.log1p(self.eigenvalues / column).sum(axis=1)
         return -0.5 * (self.count * np.log(2.0 * np.pi * variances) + spread + misfit)
 
     def best_variance(self) -> float:
-        """The variance of the greatest evidence, found on ever finer grids of its logarithm."""
+        """Return the variance of the greatest evidence, found on ever finer grids of its logarithm."""
         mean = (self.unreached + float(np.square(self.along).sum())) / self.count
         if not len(self.eigenvalues):
             return max(mean, VARIANCE_FLOOR)

@@ -1,4 +1,4 @@
-"""Joint bases as a stored model holds them."""
+"""Conversion of joint bases to and from the form of a stored model."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from kbmaps.maps.basis import PARAMETER_NAMES, BasisKind, JointBasis
 
 
 def describe_bases(bases: Sequence[JointBasis]) -> list[list[Any]]:
-    """Bases as JSON holds them: [kind, parameters...] each."""
+    """Return bases as JSON holds them: [kind, parameters...] each."""
     return [[basis.kind, *basis.parameters] for basis in bases]
 
 
 def parse_bases(value: Any) -> tuple[JointBasis, ...]:
-    """The bases that `describe_bases` gave. Raises ModelFormatError."""
+    """Return the bases from `describe_bases`. Raises ModelFormatError."""
     if not isinstance(value, list) or not value:
         raise ModelFormatError("the bases are not a list of at least one")
     return tuple(_parse_basis(entry) for entry in cast(list[Any], value))

@@ -35,7 +35,7 @@ _ALLOWED_OUTPUTS = (3, 12)
 
 
 def encode(bases: Sequence[JointBasis], net: FloatArray, metadata: Mapping[str, str]) -> bytes:
-    """The byte string for a net (outputs, m1, ..., md)."""
+    """Return the byte string for a net (outputs, m1, ..., md)."""
     described = [
         {"kind": basis.kind, "parameters": dict(zip(PARAMETER_NAMES[basis.kind], basis.parameters, strict=True))}
         for basis in bases
@@ -47,10 +47,10 @@ def encode(bases: Sequence[JointBasis], net: FloatArray, metadata: Mapping[str, 
 
 
 def decode(data: bytes) -> tuple[tuple[JointBasis, ...], FloatArray, dict[str, str]]:
-    """Bases, net and metadata from a byte string.
+    """Return bases, net and metadata from a byte string.
 
     Raises:
-        ModelFormatError: the bytes are damaged, truncated, or something else.
+        ModelFormatError: the bytes are damaged, truncated, or of another format.
     """
     if not isinstance(data, bytes | bytearray | memoryview):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise ModelFormatError(f"a stored map is bytes, as to_bytes gives them; got {type(data).__name__}")
@@ -68,7 +68,7 @@ def decode(data: bytes) -> tuple[tuple[JointBasis, ...], FloatArray, dict[str, s
 
 
 def _split(view: memoryview) -> tuple[bytes, memoryview]:
-    """Header and net, once magic, version, lengths and checksum are right."""
+    """Return header and net, after checking magic, version, lengths and checksum."""
     if len(view) < _PREFIX.size + _CHECKSUM_BYTES:
         raise ModelFormatError(f"{len(view)} bytes are too few for a stored map")
     magic, version, header_length = cast(tuple[bytes, int, int], _PREFIX.unpack_from(view))

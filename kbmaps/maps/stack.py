@@ -1,4 +1,4 @@
-"""The bases of all joints together: weight vectors as Kronecker products of two halves of the joints."""
+"""Bases of all joints together: weight vectors as Kronecker products of two halves of the joints."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ _SECOND = np.array([0, 1, 1])
 class BasisStack:
     """Evaluates all joints at once and keeps the weight vector factored into a left and a right half.
 
-    The full weight vector is kron(left, right). With about as many joints on either side, both are of length
-    3^(d/2), so contracting a net of 3^d control points with them needs no vector of length 3^d.
-    Inputs are trusted: validated by the callers.
+    The full weight vector is kron(left, right). With about as many joints on either side, both are of length 3^(d/2),
+    so contracting a net of 3^d control points with them needs no vector of length 3^d. Inputs are not checked: callers
+    validate them.
     """
 
     def __init__(self, bases: Sequence[JointBasis]) -> None:
@@ -45,10 +45,13 @@ class BasisStack:
 
     @property
     def tables(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """What `joint_weights` computes with: half phases (2, d), mixing matrices (d, 3, 3), 1 where prismatic (d,)."""
+        """Constant inputs of `joint_weights`.
+
+        Half phases (2, d), mixing matrices (d, 3, 3), 1 where prismatic (d,).
+        """
         return np.ascontiguousarray(self._half_phases), self._mix, self._slides.astype(np.float64)
 
-    # Tables of 3^(d/2) entries a joint, made when first asked for: a tensor train of 30 joints has no use for them.
+    # Tables of 3^(d/2) entries per joint, built on first use: a tensor train of 30 joints does not need them.
     @cached_property
     def _left_index(self) -> IntArray:
         return _factor_index(self.sizes[: self.split], 0)
@@ -59,7 +62,7 @@ class BasisStack:
 
     @cached_property
     def _halves_index(self) -> IntArray:
-        """Both side by side; the side of fewer joints is filled up with the entry after the last weight, a 1."""
+        """Both indices side by side; the side of fewer joints is padded with the entry after the last weight, a 1."""
         factors = self.joints - self.split
         index = np.full((factors, self.left_size + self.right_size), 3 * self.joints, dtype=np.intp)
         index[: self.split, : self.left_size] = self._left_index
@@ -67,11 +70,11 @@ class BasisStack:
         return index
 
     def joint_weights(self, q: FloatArray) -> FloatArray:
-        """Basis functions (..., d, 3) of every joint for q (..., d); a prismatic joint's third entry is 0."""
+        """Return basis functions (..., d, 3) of every joint for q (..., d); a prismatic joint's third entry is 0."""
         return (self._products(q) @ self._mix_all).reshape(*q.shape, 3)
 
     def joint_derivatives(self, q: FloatArray) -> FloatArray:
-        """Derivatives (..., d, 3) of the basis functions of every joint."""
+        """Return derivatives (..., d, 3) of the basis functions of every joint."""
         first, second = self._half_phases
         phases = np.stack([2.0 * first, first + second, 2.0 * second])
         products = 0.5 * np.sin(q[..., None, :] - phases)
@@ -82,7 +85,7 @@ class BasisStack:
         return (products.reshape(*q.shape[:-1], -1) @ self._mix_all).reshape(*q.shape, 3)
 
     def _products(self, q: FloatArray) -> FloatArray:
-        """The three products (..., 3 d) that the basis functions are mixed from, as `basis.Terms` has them."""
+        """Return the three products (..., 3 d) that the basis functions are mixed from, as in `basis.Terms`."""
         if q.ndim > 1:
             return self._products_of_rows(q.reshape(-1, self.joints).T).T.reshape(*q.shape[:-1], 3 * self.joints)
         sines = np.sin(0.5 * q - self._half_phases)
@@ -93,7 +96,7 @@ class BasisStack:
         return products.reshape(-1)
 
     def _products_of_rows(self, q: FloatArray) -> FloatArray:
-        """The same (3 d, n) for many rows, transposed, q (d, n): inner loops over rows are long ones."""
+        """Return `_products` (3 d, n) for many rows, transposed, q (d, n): the inner loops then run over the rows."""
         sines = np.sin(0.5 * q - self._half_phases[:, :, None])
         products = np.empty((3, *q.shape))
         for place, (first, second) in enumerate(((0, 0), (0, 1), (1, 1))):
@@ -105,7 +108,7 @@ class BasisStack:
         return products.reshape(3 * self.joints, q.shape[1])
 
     def halves(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Left (left_size,) and right (right_size,) weights for q (d,); for q (n, d) with a leading n."""
+        """Return left (left_size,) and right (right_size,) weights for q (d,); for q (n, d) with a leading n."""
         if q.ndim > 1:
             weights = self.joint_weights(q)
             return self.left(weights), self.right(weights)
@@ -116,26 +119,27 @@ class BasisStack:
         return both[: self.left_size], both[self.left_size :]
 
     def left(self, weights: FloatArray) -> FloatArray:
-        """The left half's Kronecker product of joint weights (..., d, 3)."""
+        """Return the left half's Kronecker product of joint weights (..., d, 3)."""
         if weights.ndim == 2:
             return np.multiply.reduce(weights.take(self._left_index), axis=0)
         return self._kronecker(weights, 0, self.split)
 
     def right(self, weights: FloatArray) -> FloatArray:
-        """The right half's Kronecker product of joint weights (..., d, 3)."""
+        """Return the right half's Kronecker product of joint weights (..., d, 3)."""
         if weights.ndim == 2:
             return np.multiply.reduce(weights.take(self._right_index), axis=0)
         return self._kronecker(weights, self.split, self.joints)
 
     def full(self, q: FloatArray) -> FloatArray:
-        """Full weight vectors (n, 3^d) for q (n, d)."""
+        """Return full weight vectors (n, 3^d) for q (n, d)."""
         left, right = self.halves(q)
         return (left[:, :, None] * right[:, None, :]).reshape(len(q), -1)
 
     def _kronecker(self, weights: FloatArray, begin: int, end: int) -> FloatArray:
-        """For a batch, joint by joint from the last: less memory than gathering all factors.
+        """Return the Kronecker product for a batch, joint by joint from the last.
 
-        Made transposed, for long inner loops over the rows, and returned as a transposed view.
+        Needs less memory than gathering all factors. Built transposed, for long inner loops over the rows, and returned
+        as a transposed view.
         """
         count = len(weights)
         factors = np.ascontiguousarray(weights[:, begin:end].transpose(1, 2, 0))
@@ -146,9 +150,10 @@ class BasisStack:
 
 
 def _factor_index(sizes: tuple[int, ...], first_joint: int) -> IntArray:
-    """Which of the flat joint weights (3 a joint) multiply to each entry of their Kronecker product: (joints, entries).
+    """Return the indices (joints, entries) of the joint weights that multiply to each product entry.
 
-    For a single vector, gathering and reducing costs a third of a chain of outer products.
+    They count the flat joint weights, 3 per joint. For a single vector, gathering and reducing costs a third of a chain
+    of outer products.
     """
     digits = (
         np.array(np.unravel_index(np.arange(math.prod(sizes)), sizes), dtype=np.intp) if sizes else np.empty((0, 1))

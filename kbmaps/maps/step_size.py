@@ -1,4 +1,4 @@
-"""How large a share of each error an instant learner mends."""
+"""Step size of an incremental learner: the share of each error that it corrects."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ DEFAULT_MU0 = 0.5
 
 @dataclass(frozen=True)
 class StepSize:
-    """μ(t) = max(floor, mu0 / (1 + t / decay)) after t pairs: constant unless a decay is given.
+    """Step size μ(t) = max(floor, mu0 / (1 + t / decay)) after t pairs: constant unless a decay is given.
 
-    Any μ between 0 and 2 is stable. A constant one leaves noise of about 1.6 σ √(μ / (2 − μ)) in the map; one that
-    decays averages the noise out down to what the floor leaves, and the floor keeps the map able to follow changes.
+    Any μ between 0 and 2 is stable. A constant one leaves noise of about 1.6 σ √(μ / (2 − μ)) in the map. One that
+    decays averages the noise down to the level of the floor, and the floor keeps the map able to follow changes.
 
     Attributes:
-        mu0: share of the first error that is mended.
-        decay: after how many pairs it is half of that; infinity for never.
-        floor: what it never falls below.
+        mu0: share of the first error that is corrected.
+        decay: number of pairs after which it is half of that; infinity for never.
+        floor: lower bound of μ.
 
     Raises:
         SettingError: mu0 is not between 0 and 2, decay not above 0, or floor not within 0..mu0.
@@ -44,9 +44,9 @@ class StepSize:
             object.__setattr__(self, name, float(getattr(self, name)))
 
     def at(self, pairs: int) -> float:
-        """μ after so many pairs."""
+        """Return μ after this many pairs."""
         return max(self.floor, self.mu0 / (1.0 + pairs / self.decay))
 
     def run(self, pairs: int, steps: int) -> FloatArray:
-        """μ (steps,) of the next steps after so many pairs."""
+        """Return μ (steps,) of the next steps after this many pairs."""
         return np.maximum(self.floor, self.mu0 / (1.0 + np.arange(pairs, pairs + steps) / self.decay))

@@ -1,4 +1,4 @@
-"""How well the data cover a configuration."""
+"""Coverage of a configuration by the data."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from kbmaps.maps.basis import JointBasis
 from kbmaps.maps.stack import BasisStack
 
 DEFAULT_CAPACITY = 256
-# Measured on guided paths of seven joints: the spread claimed from these holds 70 to 75 % of the errors of a fit.
+# Measured on guided paths of seven joints: the resulting spread covers 70 to 75 % of the errors of a fit.
 DEFAULT_NOISE = 1e-3
 DEFAULT_THRESHOLD = 2e-3
 SUPPORT_LIMIT = 0.1
 
 
 class SupportSet:
-    """A chosen few of the learnt configurations that stand for all of them.
+    """Subset of the learnt configurations that represents all of them.
 
     Under a Gaussian prior on the coefficients, prediction errors at two configurations are correlated like the kernel
-    k(q, q') = w(q) · w(q') = Π_k w_k(q_k) · w_k(q'_k). The unexplained fraction of q is the share of its prior
-    variance that is left once the errors at the chosen configurations are known: 0 where data were, up to 1 far away.
+    k(q, q') = w(q) · w(q') = Π_k w_k(q_k) · w_k(q'_k). The unexplained fraction of q is the share of its prior variance
+    that remains once the errors at the chosen configurations are known: 0 at the data, up to 1 far away.
 
-    A configuration joins when more than `threshold` of it is unexplained. When `capacity` is reached the threshold
-    doubles and the set is chosen anew from itself, so that it thins out evenly instead of forgetting new regions.
+    A configuration joins when more than `threshold` of it is unexplained. When `capacity` is reached, the threshold
+    doubles and the set is selected again from itself, so that it thins out evenly instead of forgetting new regions.
 
     Args:
-        bases: the learner's bases; they decide how far knowledge carries.
+        bases: the learner's bases; they determine the range of each configuration's influence.
         capacity: greatest number of configurations kept.
-        noise: variance of what is known at a configuration, relative to its prior variance.
-        threshold: unexplained fraction from which on a configuration joins.
+        noise: variance at a known configuration, relative to its prior variance.
+        threshold: unexplained fraction above which a configuration joins.
 
     Raises:
         SettingError: capacity below 2, noise or threshold not within 0..1.
@@ -71,21 +71,21 @@ class SupportSet:
 
     @property
     def size(self) -> int:
-        """How many configurations are kept."""
+        """Number of kept configurations."""
         return self._size
 
     @property
     def threshold(self) -> float:
-        """Unexplained fraction from which on a configuration joins at present."""
+        """Unexplained fraction above which a configuration joins at present."""
         return self._threshold
 
     @property
     def configurations(self) -> FloatArray:
-        """The kept configurations (size, d) [rad, m]."""
+        """Kept configurations (size, d) [rad, m]."""
         return self._q[: self._size].copy()
 
     def add(self, q: ArrayLike) -> bool:
-        """Offers a learnt configuration (d,) [rad, m]; True if it joined.
+        """Add a learnt configuration (d,) [rad, m] if it is new enough; return True if it joined.
 
         Raises:
             ShapeError, NonFiniteError: nothing has changed.
@@ -103,7 +103,7 @@ class SupportSet:
         return True
 
     def unexplained(self, q: ArrayLike) -> float | FloatArray:
-        """Share in [0, 1] of the prior variance at q (d,) that the data leave open; (n,) for q (n, d).
+        """Return the share in [0, 1] of the prior variance at q (d,) that the data leave; (n,) for q (n, d).
 
         Raises:
             ShapeError, NonFiniteError
@@ -118,7 +118,7 @@ class SupportSet:
         return np.clip(1.0 - np.square(reduced).sum(axis=1), 0.0, 1.0)
 
     def covers(self, q: ArrayLike, limit: float = SUPPORT_LIMIT) -> bool | BoolArray:
-        """Whether at most `limit` of q (d,) is unexplained; (n,) for q (n, d).
+        """Return True if at most `limit` of q (d,) is unexplained; (n,) for q (n, d).
 
         Raises:
             ShapeError, NonFiniteError
@@ -126,9 +126,10 @@ class SupportSet:
         return self.unexplained(q) <= limit
 
     def spread(self, q: ArrayLike) -> float | FloatArray:
-        """Standard deviation of a predicted coordinate at q (d,), for coefficients of prior standard deviation 1.
+        """Return the standard deviation of a predicted coordinate at q (d,), or (n,) for q (n, d).
 
-        Times `ExactSolution.prior_std` it is the 1-sigma [m] that the fit leaves open; (n,) for q (n, d).
+        For coefficients of prior standard deviation 1. Times `ExactSolution.prior_std` it is the 1-sigma [m] that the
+        fit leaves.
 
         Raises:
             ShapeError, NonFiniteError
@@ -140,7 +141,7 @@ class SupportSet:
         return float(spread) if angles.ndim == 1 else spread
 
     def _normalised(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Left and right weights of unit length, so that k(q, q) = 1."""
+        """Return left and right weights of unit length, so that k(q, q) = 1."""
         left, right = self._stack.halves(q)
         if q.ndim == 1:
             return left / math.sqrt(left @ left), right / math.sqrt(right @ right)
@@ -150,7 +151,7 @@ class SupportSet:
         )
 
     def _reduced(self, left: FloatArray, right: FloatArray) -> FloatArray:
-        """The kernel with the kept configurations, seen through the inverse Cholesky factor (size,)."""
+        """Return the inverse Cholesky factor times the kernel with the kept configurations (size,)."""
         size = self._size
         kernel = (self._left[:size] @ left) * (self._right[:size] @ right)
         return self._inverse[:size, :size] @ kernel
@@ -164,7 +165,7 @@ class SupportSet:
         self._size = size + 1
 
     def _thin(self) -> None:
-        """Doubles the threshold (never beyond half way to 1) and chooses anew among the kept configurations."""
+        """Double the threshold (never beyond half way to 1) and select again among the kept configurations."""
         kept = self.configurations
         while self._size == len(self._q):
             self._threshold = min(2.0 * self._threshold, 0.5 * (1.0 + self._threshold))

@@ -1,4 +1,4 @@
-"""What a learner is shown, as the outputs of a map."""
+"""Conversion of measured positions and orientations to the outputs of a map."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from kbmaps.rotations import rotation_matrices
 
 
 def pose_targets(positions: FloatArray, rotation: ArrayLike | None, outputs: int) -> FloatArray:
-    """Outputs (n, 3 or 12) of a map for checked positions (n, 3) [m] and, where it has them, orientations.
+    """Return outputs (n, 3 or 12) of a map for checked positions (n, 3) [m] and, if it has them, orientations.
 
     Args:
+        positions: checked positions (n, 3) [m].
         rotation: (n, 3, 3), or unit quaternions x, y, z, w (n, 4); for one pair also (3, 3) or (4,).
         outputs: of the map.
 

@@ -1,1 +1,1 @@
-"""What the pairs leave open, what more of them would gain, and where to measure next."""
+"""Planning of further measurements: the remaining uncertainty, the gain of more pairs, and the best next poses."""

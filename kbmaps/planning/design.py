@@ -1,4 +1,4 @@
-"""Which poses teach most: what a pair would do to the uncertainty over a region, before it is measured."""
+"""Optimal poses to measure next, by the reduction of uncertainty over a region, before any measurement."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from kbmaps.errors import SettingError
 from kbmaps.planning.posterior import Posterior
 
 _EYE = np.eye(3)
-# Values that each joint is tried at when a chosen pose is improved within its limits.
+# Values tried per joint when a chosen pose is improved within its limits.
 _EXCHANGE_VALUES = 9
 # Rounds in which each pose of a plan is improved in the presence of the others; a third gains 2 % at most.
 _PLAN_ROUNDS = 2
-# A variance [m²] below which an error is taken for none.
+# Variance [m²] below which an error counts as zero.
 _TINY_VARIANCE = 1e-24
 
 
 class ExperimentDesign:
-    """The uncertainty over a region as pairs are added whose outcome is not known yet.
+    """Uncertainty over a region as pairs are added whose measurement is not known yet.
 
-    That of a model linear in its parameters does not depend on what is measured, only on where (Fedorov 1972), so it
-    can be foretold. Poses are given by their `roots`, as `Posterior.roots` has them.
+    The uncertainty of a model linear in its parameters depends only on the poses, not on the measurements (Fedorov
+    1972), so it can be predicted. Poses are given by their `roots`, as in `Posterior.roots`.
 
     Args:
-        posterior: what is known now.
-        region: poses (t, d) where the model is to be good.
+        posterior: the current posterior.
+        region: poses (t, d) at which the model is to be accurate.
 
     Raises:
         ShapeError, NonFiniteError
@@ -53,14 +53,13 @@ class ExperimentDesign:
 
     @property
     def least_error(self) -> float:
-        """Mean distance [m] that no number of pairs mends: the model's misfit."""
+        """Mean distance [m] that remains with any number of pairs: the model's discrepancy."""
         return float(mean_distances(self._floor_square * _EYE[None])[0])
 
     def gains(self, roots: FloatArray) -> FloatArray:
-        """By how much (n,) [m] the RMS errors over the region would fall with one pair at each of `roots` (n, 3, p).
+        """Return the reduction (n,) [m] of the RMS errors over the region by one pair at each of `roots` (n, 3, p).
 
-        The fall is to first order in the variances, which is what it is at least: a square root lies below its
-        tangents.
+        To first order in the variances, which is a lower bound: a square root lies below its tangents.
         """
         seen = self._reduced(roots)
         by_outcome = seen @ self._moment @ seen.swapaxes(1, 2)
@@ -68,24 +67,24 @@ class ExperimentDesign:
         return cast(FloatArray, np.einsum("nii->n", np.linalg.solve(outcome, by_outcome)))
 
     def add(self, roots: FloatArray) -> None:
-        """Takes pairs at `roots` (n, 3, p) for measured."""
+        """Count pairs at `roots` (n, 3, p) as measured."""
         self._factor = self._with(roots)
         self._settle()
 
     def begin_with(self, roots: FloatArray) -> None:
-        """Takes pairs at `roots` (n, 3, p) for measured, and no others."""
-        # In units of the posterior's own root the present covariance is the identity.
+        """Count pairs at `roots` (n, 3, p) as measured, and no others."""
+        # In units of the posterior's own root the current covariance is the identity.
         self._factor = np.eye(self._region.shape[2])
         self.add(roots)
 
     def error_after(self, roots: FloatArray) -> float:
-        """`error` [m] as it would be with pairs at `roots` (n, 3, p) too."""
+        """Return `error` [m] after further pairs at `roots` (n, 3, p)."""
         return self._mean_error(_under(self._with(roots), self._region))
 
     def _with(self, roots: FloatArray) -> FloatArray:
-        """L (p, p), lower triangular, with L Lᵀ the information of pairs at `roots` (n, 3, p) too.
+        """Return L (p, p), lower triangular, with L Lᵀ the information including pairs at `roots` (n, 3, p).
 
-        The information itself is not summed: where pairs tell 1e8 times what was known, nothing else would be left.
+        The information itself is not summed: where pairs add 1e8 times the prior information, the prior would be lost.
         """
         stacked = np.concatenate([self._factor.T, roots.reshape(-1, roots.shape[2]) / math.sqrt(self._noise_square)])
         return cast(FloatArray, np.linalg.qr(stacked, mode="r")).T
@@ -114,7 +113,7 @@ class _Exchange:
         self._values = np.linspace(low, high, _EXCHANGE_VALUES)
 
     def improved(self, pose: FloatArray) -> FloatArray:
-        """The pose (d,) after one round in which each joint goes to the best of a few values, or stays."""
+        """Return the pose (d,) after one round in which each joint moves to the best of a few values, or stays."""
         best = pose
         for joint in range(len(pose)):
             tried = np.tile(best, (_EXCHANGE_VALUES + 1, 1))
@@ -126,11 +125,14 @@ class _Exchange:
 def next_pose(
     posterior: Posterior, region: ArrayLike, candidates: ArrayLike, *, limits: tuple[ArrayLike, ArrayLike] | None = None
 ) -> FloatArray:
-    """The pose (d,) among candidates (n, d) whose pair lowers the error over the region (t, d) most.
+    """Return the pose (d,) among candidates (n, d) whose pair lowers the error over the region (t, d) most.
 
     Args:
-        limits: lower and upper joint limits (d,) each; where given, the best candidate is improved within them, one
-            joint at a time (coordinate exchange, Meyer and Nachtsheim 1995).
+        posterior: the current posterior.
+        region: poses (t, d) at which the model is to be accurate.
+        candidates: poses (n, d) to choose from.
+        limits: lower and upper joint limits (d,) each; if given, the best candidate is improved within them, one joint
+            at a time (coordinate exchange, Meyer and Nachtsheim 1995).
 
     Raises:
         ShapeError, NonFiniteError
@@ -147,11 +149,10 @@ def next_poses(
     *,
     limits: tuple[ArrayLike, ArrayLike] | None = None,
 ) -> FloatArray:
-    """Poses (count, d) to take together before the model is asked again.
+    """Return poses (count, d) to measure together before the model is updated.
 
     Each is the best after those before it, and no candidate is taken twice. With `limits`, as in `next_pose`, each is
-    then improved in the presence of all others: a plan for many pairs is better than the best next one
-    after the other.
+    then improved in the presence of all others: a joint plan for many pairs is better than repeating `next_pose`.
 
     Raises:
         ShapeError, NonFiniteError
@@ -180,10 +181,10 @@ def next_poses(
 def next_stretch(
     posterior: Posterior, region: ArrayLike, start: ArrayLike, goals: ArrayLike, *, pairs: int, step: float
 ) -> FloatArray:
-    """Poses (at most `pairs`, d) on the straight way from `start` (d,) towards one of the goals (n, d).
+    """Return poses (at most `pairs`, d) on the straight path from `start` (d,) towards one of the goals (n, d).
 
-    For an arm that is led by hand or must be watched all the way: of the ways to the goals, each in steps of `step`
-    [norm over all joints] and no longer than `pairs` steps, the one after which the error is least.
+    For an arm that is guided by hand or must be watched all the way. Each path advances in steps of `step` [norm over
+    all joints] and has no more than `pairs` steps. The path with the smallest resulting error is returned.
 
     Raises:
         ShapeError, NonFiniteError
@@ -201,10 +202,10 @@ def next_stretch(
 
 
 def mean_distances(covariances: FloatArray) -> FloatArray:
-    """Mean length (n,) of Gaussian vectors with covariances (n, 3, 3).
+    """Return the mean length (n,) of Gaussian vectors with covariances (n, 3, 3).
 
-    The squared length has the first two moments of a Gamma distribution (Satterthwaite 1946), whose mean square root is
-    known. Exact for one direction and for three equal ones; in between within 2.5 %.
+    The squared length is matched to the first two moments of a Gamma distribution (Satterthwaite 1946), whose mean
+    square root is known. Exact for one direction and for three equal ones; in between within 2.5 %.
     """
     traces = np.einsum("nii->n", covariances)
     squares = np.einsum("nij,nij->n", covariances, covariances)
@@ -221,7 +222,7 @@ def _steps(begin: FloatArray, end: FloatArray, pairs: int, step: float) -> Float
 
 
 def _under(factor: FloatArray, roots: FloatArray) -> FloatArray:
-    """R L⁻ᵀ (n, 3, p) for the information L Lᵀ: the roots under it."""
+    """Return R L⁻ᵀ (n, 3, p), the roots under the information L Lᵀ."""
     flat = roots.reshape(-1, roots.shape[2])
     reduced = cast(FloatArray, solve_triangular(factor, flat.T, lower=True, check_finite=False))
     return reduced.T.reshape(roots.shape)

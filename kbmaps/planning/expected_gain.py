@@ -1,4 +1,4 @@
-"""Whether there is enough data: what further pairs of which motion would still gain."""
+"""Forecast of the accuracy gained by further pairs of different motions."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from kbmaps.errors import SettingError
 from kbmaps.planning.design import ExperimentDesign
 from kbmaps.planning.posterior import Posterior
 
-# Designs drawn from each motion and averaged: one alone is luck where the pairs are few.
+# Random designs per motion, averaged: a single one depends on chance where the pairs are few.
 _DESIGNS = 6
 SAME, ALL = "as so far", "all joints"
 
 
 @dataclass(frozen=True)
 class ExpectedError:
-    """What one kind of motion would lead to.
+    """Expected errors after one kind of motion.
 
     Attributes:
         motion: its name.
-        errors: expected mean error [m] after each number of pairs asked for.
+        errors: expected mean error [m] after each requested number of pairs.
     """
 
     motion: str
@@ -36,13 +36,13 @@ class ExpectedError:
 
 @dataclass(frozen=True)
 class Forecast:
-    """What further pairs would still gain over a region.
+    """Expected gain of further pairs over a region.
 
     Attributes:
         now: expected mean error [m].
-        least: the part of it [m] that no pair mends, since the model cannot follow the arm.
-        pairs: numbers of further pairs, as asked for.
-        motions: what they would lead to, the motion that gains most first.
+        least: the part of it [m] that no pair reduces, since the model cannot follow the arm.
+        pairs: requested numbers of further pairs.
+        motions: their expected errors, the motion that gains most first.
     """
 
     now: float
@@ -51,14 +51,14 @@ class Forecast:
     motions: tuple[ExpectedError, ...]
 
     def error_after(self, motion: str, pairs: int) -> float:
-        """Expected mean error [m]. Raises SettingError: it was not asked for."""
+        """Return the expected mean error [m]. Raises SettingError: it is not in the forecast."""
         for expected in self.motions:
             if expected.motion == motion and pairs in self.pairs:
                 return expected.errors[self.pairs.index(pairs)]
         raise SettingError(f"{pairs} pairs of the motion {motion!r} are not in the forecast")
 
     def is_enough(self, share: float = 0.1) -> bool:
-        """Whether no motion would lower the error by more than a share of what it is now."""
+        """Return True if no motion would lower the error by more than this share of its current value."""
         return all(expected.errors[-1] >= (1.0 - share) * self.now for expected in self.motions)
 
 
@@ -69,11 +69,14 @@ def expected_gain(
     pairs: Sequence[int],
     rng: np.random.Generator,
 ) -> Forecast:
-    """The error over a region (t, d) after further pairs of each motion, foretold from where they would be taken.
+    """Predict the error over a region (t, d) after further pairs of each motion, from their poses alone.
 
     Args:
-        motions: poses (n, d) by name, e.g. of `candidate_motions`; pairs are drawn from them with replacement.
-        pairs: how many further pairs, ascending.
+        posterior: the current posterior.
+        region: poses (t, d) at which the model is to be accurate.
+        motions: poses (n, d) by name, e.g. of `candidate_motions`; pairs are sampled from them with replacement.
+        pairs: numbers of further pairs, ascending.
+        rng: random generator of the samples.
 
     Raises:
         ShapeError, NonFiniteError
@@ -105,19 +108,22 @@ def candidate_motions(
     together: int = 1,
     count: int = 300,
 ) -> dict[str, FloatArray]:
-    """Poses (count, d) of the motions that an arm could go on with.
+    """Return poses (count, d) of the motions with which an arm could continue.
 
     "as so far" is spread like the poses seen, "all joints" over the whole ranges. The others move one joint, or
-    `together` of them, over the range and leave the rest as "as so far" has them; they are named after the joints.
+    `together` of them, over the range and leave the rest as in "as so far"; they are named after the joints.
 
     Args:
         seen: poses (n, d) of the pairs so far [rad, m].
         lower, upper: the joints' limits (d,).
+        rng: random generator of the poses.
         names: of the joints; None counts them from 1.
+        together: number of joints that the other motions move.
+        count: number of poses per motion.
 
     Raises:
         ShapeError, NonFiniteError
-        SettingError: nothing was seen, limits or names do not fit, or `together` or `count` are below 1.
+        SettingError: no poses seen, limits or names do not fit, or `together` or `count` are below 1.
     """
     poses = np.atleast_2d(np.asarray(seen, dtype=np.float64))
     d = poses.shape[1]
@@ -143,18 +149,18 @@ def _errors(
     drawn = rng.integers(0, len(pool), (_DESIGNS, counts[-1]))
     errors: list[float] = []
     for count in counts:
-        # A pose that is drawn k times tells as much as one pair there with the noise over √k.
+        # A pose that occurs k times is worth one pair there with the noise over √k.
         times = [np.bincount(row[:count], minlength=len(pool)) for row in drawn]
         errors.append(float(np.mean([design.error_after(pool * np.sqrt(k)[:, None, None]) for k in times])))
     return tuple(errors)
 
 
 def _resampled(poses: FloatArray, count: int, rng: np.random.Generator) -> FloatArray:
-    """Poses (count, d) like those given: each joint spread as it was, and going with the others as it did.
+    """Return poses (count, d) distributed like those given: each joint's spread, and the correlations of the joints.
 
     A smoothed bootstrap that keeps the covariance (Silverman and Young 1987), with Silverman's Gaussian bandwidth, of
-    the joints' normal scores; so smoothing does not carry joints beyond where they have been. As many poses as chance
-    has a share in the correlations have their joints drawn independently.
+    the joints' normal scores; so smoothing does not carry joints beyond the range seen. A share of the poses equal to
+    the part of the correlations that is due to chance has its joints sampled independently.
     """
     n, d = poses.shape
     ranked = np.sort(poses, axis=0)
@@ -175,9 +181,9 @@ def _resampled(poses: FloatArray, count: int, rng: np.random.Generator) -> Float
 
 
 def _chance_in_correlations(scores: FloatArray) -> float:
-    """The share of the squared correlations of scores (n, d) that independent joints would show too, in 0..1.
+    """Return the share of the squared correlations of scores (n, d) that independent joints would show too, in 0..1.
 
-    It is by how much correlations are best shrunk towards none (Schäfer and Strimmer 2005, target "D").
+    It is the optimal shrinkage of correlations towards zero (Schäfer and Strimmer 2005, target "D").
     """
     n, d = scores.shape
     if n < 3 or d == 1:

@@ -1,4 +1,4 @@
-"""What a model cannot follow, told from noise by what neighbouring residuals share."""
+"""Systematic error of a model, separated from noise by the correlation of neighbouring residuals."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from kbmaps.arrays import FloatArray, IntArray, rows
 from kbmaps.errors import ShapeError
 from kbmaps.planning.posterior import Posterior
 
-# Fewer pairs of neighbours say nothing; and what they share counts beyond so many of its standard errors.
+# Minimum number of neighbour couples, and of standard errors that their shared part must exceed.
 _LEAST_NEIGHBOURS, _SURE = 10, 2.0
 
 
 def systematic_error(posterior: Posterior, q: ArrayLike, residuals: ArrayLike) -> float:
-    """1-sigma [m] of the part of each coordinate's residual that neighbouring poses share; 0 where chance explains it.
+    """Return the 1-sigma [m] of the part of a coordinate's residual that neighbouring poses share; 0 if due to chance.
 
-    Noise is independent from pair to pair, a joint that bends or a lens that distorts errs alike at poses near each
-    other. The mean product of residuals of neighbours is therefore what is systematic, after the fit's own part has
-    been taken out: it makes the residuals of neighbours i and j share −R_i R_jᵀ. It is a lower bound, since
-    neighbours are not the same pose: the sparser the poses, the more of it is taken for noise.
+    Noise is independent from pair to pair, while a bending joint or a distorting lens errs alike at poses near each
+    other. The mean product of residuals of neighbours is therefore the systematic part, once the fit's own part has
+    been removed: it makes the residuals of neighbours i and j share −R_i R_jᵀ. The result is a lower bound, since
+    neighbours are not the same pose: the sparser the poses, the more of it counts as noise.
 
     Args:
         posterior: of the model that has learnt the pairs.
@@ -50,11 +50,11 @@ def systematic_error(posterior: Posterior, q: ArrayLike, residuals: ArrayLike) -
 
 
 def _neighbours(poses: FloatArray) -> tuple[IntArray, IntArray]:
-    """Each pose with the one nearest to it, each such couple once, joints counted in their standard deviations."""
+    """Return each pose with its nearest one, each such couple once, distances in standard deviations of the joints."""
     std = poses.std(axis=0)
     scaled = poses / np.where(std > 0.0, std, 1.0)
     nearest = cast(IntArray, KDTree(scaled).query(scaled, 2)[1])  # pyright: ignore[reportUnknownMemberType]
-    # Where poses are equal a pose may not be found first among its own neighbours.
+    # Where poses are equal, a pose may not be found first among its own neighbours.
     own = np.arange(len(poses))
     found = np.where(nearest[:, 0] == own, nearest[:, 1], nearest[:, 0])
     couples = np.unique(np.sort(np.stack([own, found], axis=1), axis=1), axis=0)

@@ -1,4 +1,4 @@
-"""What is known about a model's parameters, as far as it shows in positions."""
+"""Posterior of a model's parameters, as far as positions show it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
 
 
 class Posterior(Protocol):
-    """A Gaussian posterior of a model that is linear, or linearised, in its parameters."""
+    """Gaussian posterior of a model that is linear, or linearised, in its parameters."""
 
     @property
     def joints(self) -> int:
@@ -28,25 +28,25 @@ class Posterior(Protocol):
 
     @property
     def noise(self) -> float:
-        """1-sigma of each coordinate of a further pair [m]; what the model cannot follow counts as noise."""
+        """Noise of each coordinate of a further pair, 1-sigma [m], model discrepancy included."""
         ...
 
     @property
     def floor(self) -> float:
-        """1-sigma of a coordinate [m] by which the model errs however many pairs there are; 0 where it fits."""
+        """Error of a coordinate that remains with any number of pairs, 1-sigma [m]; 0 where the model fits."""
         ...
 
     def roots(self, q: ArrayLike) -> FloatArray:
-        """Matrices R (n, 3, p) [m] at q (n, d): R_i R_jᵀ is the covariance of the positions at q_i and q_j."""
+        """Return matrices R (n, 3, p) [m] at q (n, d): R_i R_jᵀ is the covariance of the positions at q_i and q_j."""
         ...
 
 
 class ChainPosterior:
-    """A rigid chain's posterior, linearised at the most probable chain, or where its learner has linearised the pairs.
+    """Posterior of a rigid chain, linearised at the most probable chain, or at its learner's linearisation point.
 
     Args:
         nominal: the chain that the parameters change.
-        change: where it is linearised (size,) as in `ChainParameters`.
+        change: linearisation point (size,) as in `ChainParameters`.
         covariance: of the change (size, size) [rad², m²].
         noise: 1-sigma of a coordinate of a further pair [m].
         floor: 1-sigma of a coordinate that no rigid chain explains [m].
@@ -72,9 +72,10 @@ class ChainPosterior:
 
     @classmethod
     def of(cls, learner: RigidLearner | RecursiveRigidLearner, *, noise: float | None = None) -> ChainPosterior:
-        """What a learner knows now. Its floor is 0 unless the pairs were told a noise that does not explain them.
+        """Return the posterior of a learner. Its floor is 0 unless the pairs' given noise does not explain them.
 
         Args:
+            learner: the learner, which may go on learning.
             noise: 1-sigma of a coordinate of further pairs [m]; None takes that of the pairs so far. A recursive
                 learner knows only the noise of pairs that came without their sigma.
 
@@ -99,9 +100,10 @@ class ChainPosterior:
 
     @classmethod
     def of_belief(cls, belief: ChainBelief, *, noise: float, floor: float = 0.0) -> ChainPosterior:
-        """What is believed of a chain.
+        """Return the posterior in a belief about a chain.
 
         Args:
+            belief: Gaussian over the parameters of the chain.
             noise: 1-sigma of a coordinate of a further pair [m].
             floor: 1-sigma of a coordinate that no rigid chain explains [m].
 
@@ -116,7 +118,7 @@ class ChainPosterior:
         return self._parameters.reference.joints
 
     def with_floor(self, floor: float) -> ChainPosterior:
-        """The same with another floor [m], e.g. one found by `systematic_error` where the noise was not told.
+        """Return the same with another floor [m], e.g. from `systematic_error` where the noise was not given.
 
         Raises:
             SettingError: floor is negative.
@@ -126,7 +128,7 @@ class ChainPosterior:
         return changed
 
     def roots(self, q: ArrayLike) -> FloatArray:
-        """Matrices R (n, 3, p) [m] at q (n, d): R_i R_jᵀ is the covariance of the positions at q_i and q_j.
+        """Return matrices R (n, 3, p) [m] at q (n, d): R_i R_jᵀ is the covariance of the positions at q_i and q_j.
 
         Raises:
             ShapeError, NonFiniteError

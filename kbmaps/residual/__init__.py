@@ -1,1 +1,1 @@
-"""A rigid chain and what it does not explain: a smooth remainder learnt with it."""
+"""Rigid chain with a smooth remainder that is learnt with it."""

@@ -1,4 +1,4 @@
-"""Errors that neighbours on a path share: how much, and what each pair tells beyond the one before it."""
+"""Correlation of errors between neighbours on a path, and the independent part of each pair."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from collections.abc import Callable
 from kbmaps.arrays import FloatArray
 from kbmaps.residual.evidence import PRICE
 
-# Correlations of neighbours' errors that are tried.
+# Candidate correlations of neighbours' errors.
 CORRELATIONS = (0.0, 0.2, 0.4, 0.55, 0.65, 0.75, 0.8, 0.85, 0.88, 0.91, 0.94, 0.97)
 
 
 def innovations(series: FloatArray, correlation: float) -> FloatArray:
-    """A series (n, ...) whose errors are an autoregression of first order, freed of what the entry before tells.
+    """Return a series (n, ...) with first-order autoregressive errors, freed of the correlation with the entry before.
 
-    e_k = ρ e_{k−1} + √(1 − ρ²) fresh_k. What comes out has independent errors of the same size: Prais and Winsten 1954.
+    e_k = ρ e_{k−1} + √(1 − ρ²) fresh_k. The result has independent errors of the same size: Prais and Winsten 1954.
     """
     if correlation == 0.0:
         return series
@@ -26,9 +26,9 @@ def innovations(series: FloatArray, correlation: float) -> FloatArray:
 
 
 def most_probable(evidence: Callable[[float], float], present: float) -> float:
-    """Of `CORRELATIONS`, the one of the greatest log evidence on the way uphill from the present one.
+    """Return the correlation of the greatest log evidence in `CORRELATIONS`, climbing from the current one.
 
-    None, unless the pairs speak for one: it has to gain as much as a group of deviations.
+    Returns 0 unless the pairs support one: it has to gain as much evidence as a group of deviations.
     """
     found: dict[int, float] = {}
 

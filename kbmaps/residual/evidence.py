@@ -1,4 +1,4 @@
-"""Linear Gaussian models whose weights come in groups: how probable the data are, and which groups they pay for."""
+"""Linear Gaussian models with grouped weights: evidence, and selection of groups by it."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ import numpy as np
 from kbmaps.arrays import FloatArray, IntArray
 from kbmaps.lapack import lower_inverse
 
-# What a group's variance is tried at, over the variance at which its best seen direction would just show.
+# Candidate variances of a group, relative to the variance at which its best determined direction is barely visible.
 _TRIED = 10.0 ** np.arange(0.0, 7.0, 0.5)
-# Prior odds against a group [nats]. Its variance is the best of many, which a likelihood pays for too readily.
+# Prior odds against a group [nats]. Its variance is optimised, which inflates the likelihood.
 PRICE = 2.0
-# Models less probable than the best by more than so many nats are left out of averages.
+# Models less probable than the best by more than this many nats are left out of averages.
 _WINDOW = 4.0
-# A group that gains less is left out of averages: with or without it is next to the same.
+# A group that gains less is left out of averages: it makes almost no difference.
 _LEAST_GAIN = 0.5
-# Sets of groups less probable than the chosen one by more than so many nats are not what others grow from.
+# Sets of groups less probable than the chosen one by more than this many nats are not extended.
 _SWAP_WINDOW = 8.0
 _ROUNDS = 40
 _SETTLED = 0.02
-# A variance is no smaller: weights are of the order of radians or metres.
+# Lower bound of a variance: weights are of the order of radians or metres.
 _LEAST_VARIANCE = 1e-24
 
 
@@ -47,12 +47,12 @@ class Moments:
 
     @classmethod
     def of(cls, design: FloatArray, target: FloatArray) -> Moments:
-        """Of rows (N, P) and targets (N,)."""
+        """Return the moments of rows (N, P) and targets (N,)."""
         return cls(design.T @ design, design.T @ target, float(target @ target), len(target))
 
     @classmethod
     def total(cls, parts: Sequence[Moments]) -> Moments:
-        """Of the rows of all parts, at least one, over the same columns."""
+        """Return the moments of the rows of all parts, at least one, over the same columns."""
         gram, product = parts[0].gram.copy(), parts[0].product.copy()
         for part in parts[1:]:
             gram += part.gram
@@ -60,7 +60,7 @@ class Moments:
         return cls(gram, product, sum(part.square for part in parts), sum(part.count for part in parts))
 
     def minus(self, other: Moments) -> Moments:
-        """The moments without the rows of `other`."""
+        """Return the moments without the rows of `other`."""
         return Moments(
             self.gram - other.gram, self.product - other.product, self.square - other.square, self.count - other.count
         )
@@ -68,14 +68,14 @@ class Moments:
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Weights of the active columns given the data.
+    """Posterior of the active columns' weights.
 
     Attributes:
         mean: (A,).
         spread: W (A, A) with the covariance W Wᵀ.
         square: whitened squared residuals.
         log_evidence: log marginal likelihood up to a constant of the rows.
-        used: how many weights the data determine, by group.
+        used: number of weights that the data determine, by group.
     """
 
     mean: FloatArray
@@ -87,10 +87,10 @@ class Posterior:
 
 @dataclass(frozen=True, eq=False)
 class Average:
-    """The weights of several models, averaged by how probable the models are.
+    """Weights averaged over several models by their probability.
 
     Attributes:
-        groups: that any of the models has, beside the one that all have.
+        groups: of any of the models, besides the one that all have.
         mean: (A,) over the columns of "" and then of the groups.
         spread: W (A, A) with the covariance W Wᵀ.
     """
@@ -104,16 +104,17 @@ class GroupedModel:
     """Weights N(centre, variance of their group), rows with noise of one variance.
 
     The group of the name "" is always active; its variance is 1 and its prior mean `centre`. The others' prior means
-    are 0 and their variances are found: groups that the evidence (MacKay 1992) does not pay for are left out.
+    are 0 and their variances are estimated: groups that the evidence (MacKay 1992) does not support are left out.
 
     Args:
         moments: over the columns of all groups.
-        columns: where each group's columns are.
+        columns: the columns of each group.
         centre: prior mean of the weights of the group "".
-        least_noise: the noise is no smaller [rows' unit].
-        noise: where it starts.
-        noise_before: noise [rows' unit] that was seen before, and how many rows that counts for.
-        blocks: of runs of neighbouring rows, if a group must also better the prediction of each run from the others.
+        least_noise: lower bound of the noise [rows' unit].
+        noise: its initial value.
+        noise_before: noise [rows' unit] from earlier data, and the number of rows that it counts for.
+        blocks: moments of runs of neighbouring rows, if a group must also improve the prediction of each run from the
+            others.
     """
 
     def __init__(
@@ -135,7 +136,7 @@ class GroupedModel:
         self.variances: dict[str, float] = {}
 
     def posterior(self, moments: Moments | None = None, active: Mapping[str, float] | None = None) -> Posterior:
-        """Of the active groups, for other moments or other groups if so told."""
+        """Return the posterior of the active groups, or of other moments or groups if given."""
         active = self.variances if active is None else active
         moments = self._moments if moments is None else moments
         index = self.index(active)
@@ -160,17 +161,17 @@ class GroupedModel:
         return Posterior(mean, spread, square, evidence, self._used(active, 1.0 - shrunk))
 
     def square_of(self, weights: FloatArray) -> float:
-        """Σ (a·w)² over the rows, for weights of the active columns."""
+        """Return Σ (a·w)² over the rows, for weights of the active columns."""
         index = self.index()
         return float(weights @ (self._moments.gram[np.ix_(index, index)] @ weights))
 
     def index(self, groups: Iterable[str] | None = None) -> IntArray:
-        """The columns of the active groups, in the order of the posterior's weights."""
+        """Return the columns of the active groups, in the order of the posterior's weights."""
         spans = [self._columns[name] for name in ("", *(self.variances if groups is None else groups))]
         return np.array([column for span in spans for column in range(span.start, span.stop)], dtype=np.intp)
 
     def select(self, candidates: tuple[str, ...]) -> None:
-        """Takes up groups while the evidence gains by more than `PRICE`, then leaves those that it does not need."""
+        """Add groups while the evidence gains by more than `PRICE`, then drop those that it does not need."""
         self.settle()
         refused: set[str] = set()
         while True:
@@ -188,15 +189,15 @@ class GroupedModel:
         self.prune()
 
     def prune(self) -> None:
-        """Leaves groups that the evidence does not need, the least needed first."""
+        """Drop groups that the evidence does not need, the least needed first."""
         while self._leave_the_least_needed():
             self.settle()
 
     def average(self, candidates: Sequence[str]) -> Average:
-        """Over the active groups and all sets that have one fewer, one more, or another in place of one.
+        """Return the average over the active groups and all sets that differ by one group less, more, or exchanged.
 
-        By evidence and prior odds of e^−PRICE a group. Hoeting et al., "Bayesian model averaging", Statistical
-        Science 14, 1999; improbable models are left out (Occam's window there).
+        Weighted by evidence and prior odds of e^−PRICE per group. Hoeting et al., "Bayesian model averaging",
+        Statistical Science 14, 1999; improbable models are left out (Occam's window there).
         """
         whole = self.posterior()
         models, log_odds = [(dict(self.variances), whole)], [0.0]
@@ -234,7 +235,7 @@ class GroupedModel:
         return Average(groups, mean, cast(FloatArray, np.linalg.qr(rows, mode="r")).T)
 
     def settle(self, rounds: int = _ROUNDS) -> None:
-        """The noise and the groups' variances that make the data most probable, by MacKay's fixed point."""
+        """Set the noise and the groups' variances that make the data most probable, by MacKay's fixed point."""
         for _ in range(rounds):
             posterior = self.posterior()
             used = sum(posterior.used.values())
@@ -257,7 +258,7 @@ class GroupedModel:
         return (square + rows * before**2) / max(self._moments.count - used + rows, 1.0)
 
     def _try(self, group: str, variance: float) -> None:
-        """Takes up a group unless left-out blocks speak against it."""
+        """Add a group unless left-out blocks contradict it."""
         before, errors = (dict(self.variances), self.noise), self._left_out_errors()
         self.variances[group] = variance
         self.settle()
@@ -267,7 +268,7 @@ class GroupedModel:
                 self.variances, self.noise = before
 
     def _left_out_errors(self) -> FloatArray:
-        """Squared error of each block, predicted from all others."""
+        """Return the squared error of each block, predicted from all others."""
         index = self.index()
         errors: list[float] = []
         for block in self._blocks:
@@ -291,7 +292,7 @@ class GroupedModel:
         return True
 
     def _gain(self, group: str, active: Mapping[str, float], posterior: Posterior) -> tuple[float, float]:
-        """Evidence that a group adds at its best variance, and that variance; all else stays.
+        """Return the evidence that a group adds at its best variance, and that variance; all else stays.
 
         With the rows' part of the group that the active columns do not explain, S = U Λ Uᵀ and z, the gain is
         ½ Σ (v y² / (1 + v λ) − ln (1 + v λ)), y = Uᵀ z.
@@ -330,7 +331,7 @@ class GroupedModel:
 
 
 def _cholesky(matrix: FloatArray) -> FloatArray:
-    """Lower factor; where rounding has made the matrix indefinite, of the nearest that it has not (a tighter prior).
+    """Return the lower Cholesky factor; if rounding made the matrix indefinite, that of a nearby one (tighter prior).
 
     Raises:
         LinAlgError: it is indefinite by more than rounding.

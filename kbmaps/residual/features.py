@@ -1,4 +1,4 @@
-"""How real arms differ from rigid chains, as small groups of features with a shape but no size yet."""
+"""Deviations of real arms from rigid chains, as small groups of features of known shape and unknown size."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ COMPLIANCE = "compliance"
 # Errors of a position [m], as polynomials of the position (the camera's) or functions of the readings.
 CAMERA_GROUPS = ("affine", "quadratic", "cubic")
 SMOOTH_GROUPS = ("one joint", "two joints", "three joints")
-# Groups with more features than this are left out: arms of many joints then do with the lower orders.
+# Larger groups are left out: arms of many joints then use the lower orders only.
 MOST_FEATURES = 500
 # With more joints, loads are lumped into two points: the marker and the middle of all joints beyond.
 _JOINTS_WITH_OWN_LOADS = 8
-# Ranges of a joint narrower than this [rad, m] would blow its functions up.
+# Narrower joint ranges [rad, m] would scale the functions up too far.
 _LEAST_RANGE = 1e-3
-# So much of what smooth functions over the pairs' reach are worth is shared by neighbours on a path.
+# Neighbours on a path share this much of smooth functions over the pairs' reach.
 _PATH_CORRELATION = 0.9
-# A camera may ride on a head with so many joints, behind which stands the link where gravity is constant.
+# A camera may be mounted on a head with up to this many joints; the link behind them then has constant gravity.
 _MOST_NECK_JOINTS = 3
 
 Weights = Mapping[str, FloatArray]
@@ -38,7 +38,7 @@ Weights = Mapping[str, FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """A distorted chain around a change and weights, at n configurations.
+    """Distorted chain linearised around a change and weights, at n configurations.
 
     Attributes:
         x: positions (n, 3) [m].
@@ -53,7 +53,7 @@ class Linearised:
 
 @dataclass(frozen=True, eq=False)
 class ResidualScaling:
-    """What makes features of the order of 1 where data is, and where on the hand the last load acts.
+    """Scaling that makes features of the order of 1 at the data, and the place of the last load on the hand.
 
     Attributes:
         middle, half: of the ranges of the joints' readings (d,) [rad, m].
@@ -83,7 +83,7 @@ class ResidualScaling:
 
     @classmethod
     def of(cls, q: FloatArray, x: FloatArray) -> ResidualScaling:
-        """That of pairs (n, d) [rad, m] and (n, 3) [m], at least one."""
+        """Return the scaling of pairs (n, d) [rad, m] and (n, 3) [m], at least one."""
         low, high = q.min(axis=0), q.max(axis=0)
         half = np.maximum(0.5 * (high - low), _LEAST_RANGE)
         centre = x.mean(axis=0)
@@ -92,14 +92,14 @@ class ResidualScaling:
 
     @classmethod
     def whole_turns(cls, joints: int) -> ResidualScaling:
-        """That of pairs nobody has seen yet."""
+        """Return the scaling to use without pairs."""
         return cls(np.zeros(joints), np.full(joints, math.pi), np.zeros(3), 1.0)
 
 
 class ResidualFeatures:
-    """A rigid chain with errors of its joints, of what measures it, and of what nobody has thought of.
+    """Rigid chain with errors of its joints and its camera, and smooth errors without a named cause.
 
-        x(q) = p + Σ_g ψ_g w_g,     p = f(c, q + Σ_g φ_g(q) w_g)
+        x(q) = p + Σ_g ψ_g w_g,   p = f(c, q + Σ_g φ_g(q) w_g)
 
     with the chain f at the change c, the angle groups' φ, and ψ of p (camera groups) or of q (smooth groups).
 
@@ -120,7 +120,7 @@ class ResidualFeatures:
         self._loads = {group: self._load_mask(k) for group, k in self._still.items()}
 
     def size(self, group: str) -> int:
-        """Number of features of a group."""
+        """Return the number of features of a group."""
         if group in CAMERA_GROUPS:
             return 3 * (4, 6, 10)[CAMERA_GROUPS.index(group)]
         if group in SMOOTH_GROUPS:
@@ -128,24 +128,26 @@ class ResidualFeatures:
         return int(self._mask(group).sum())
 
     def groups(self) -> tuple[str, ...]:
-        """The groups that there are for this arm."""
+        """Return the groups available for this arm."""
         names = (*READING_GROUPS, *self._still, *CAMERA_GROUPS, *SMOOTH_GROUPS)
         return tuple(group for group in names if 0 < self.size(group) <= MOST_FEATURES)
 
     def approximate(self, groups: Iterable[str]) -> tuple[str, ...]:
-        """Those groups whose law is one of engineering and not of geometry."""
+        """Return the groups whose law is an engineering approximation instead of geometry."""
         return tuple(group for group in groups if group in self._still)
 
     def follow_a_path(self, q: FloatArray) -> bool:
-        """Whether configurations (n, d), in their order, are neighbours on a path: in functions
-        that are scaled to their reach."""
+        """Return True if configurations (n, d), in their order, are neighbours on a path.
+
+        Judged by functions that are scaled to the configurations' reach.
+        """
         weights = self._stack.joint_weights(q)
         inner, square = np.einsum("nkm,nkm->nk", weights[:-1], weights[1:]), np.square(weights).sum(axis=2)
         shared = (inner / np.sqrt(square[:-1] * square[1:])).prod(axis=1)
         return bool(len(shared)) and bool(np.median(shared) > _PATH_CORRELATION)
 
     def positions(self, chain: RigidChain, weights: Weights, q: FloatArray) -> FloatArray:
-        """Positions (n, 3) [m] at q (n, d)."""
+        """Return positions (n, 3) [m] at q (n, d)."""
         error, _ = self._angle_errors(chain, weights, q, ())
         p = chain.positions(q + error)
         return p + self._offsets(p, q, weights)
@@ -153,10 +155,10 @@ class ResidualFeatures:
     def linearised(
         self, change: FloatArray, chain: RigidChain, weights: Weights, q: FloatArray, groups: Sequence[str]
     ) -> Linearised:
-        """Positions at q (n, d) and their derivatives by the change, of which `chain` is the chain, and by weights.
+        """Return positions at q (n, d) and their derivatives by the change, which gives `chain`, and by weights.
 
-        That the camera magnifies moves of p by a little, and yielding changes the torque, is left out of the
-        derivatives, not of the positions.
+        Two second-order effects are left out of the derivatives, not of the positions: the camera magnifies changes of
+        p slightly, and compliance changes the torque.
         """
         error, shapes = self._angle_errors(chain, weights, q, groups)
         p, jacobian = self.parameters.linearised(change, q + error)
@@ -172,9 +174,9 @@ class ResidualFeatures:
     def _angle_errors(
         self, chain: RigidChain, weights: Weights, q: FloatArray, groups: Sequence[str]
     ) -> tuple[FloatArray, dict[str, FloatArray]]:
-        """What is added to the readings (n, d) [rad, m], and φ (n, d, m) of the angle groups with weights or asked for.
+        """Return offsets of the readings (n, d) [rad, m], and φ (n, d, m) of the angle groups weighted or requested.
 
-        Torques are those where the joints have yielded to the torques of the readings.
+        Torques are evaluated where the joints have yielded to the torques of the readings.
         """
         names = [g for g in (*READING_GROUPS, *self._still) if g in weights or g in groups]
         shapes = {group: self._reading_functions(group, q) for group in names if group in READING_GROUPS}
@@ -192,7 +194,7 @@ class ResidualFeatures:
         return error + self._weighted(torques, weights, q), {**shapes, **torques}
 
     def _weighted(self, shapes: Weights, weights: Weights, q: FloatArray) -> FloatArray:
-        """Σ_m φ_jm w_jm over those groups that have weights (n, d)."""
+        """Return Σ_m φ_jm w_jm over those groups that have weights (n, d)."""
         total = np.zeros_like(q)
         for group, functions in shapes.items():
             if group in weights:
@@ -212,7 +214,7 @@ class ResidualFeatures:
         return total
 
     def _mask(self, group: str) -> BoolArray:
-        """Which of a group's functions (d, m) there are."""
+        """Return True for each of a group's functions (d, m) that exists."""
         if group in self._still:
             return self._loads[group]
         if group == "gain":
@@ -220,7 +222,7 @@ class ResidualFeatures:
         return np.repeat(~self._prismatic[:, None], 2, axis=1)
 
     def _reading_functions(self, group: str, q: FloatArray) -> FloatArray:
-        """φ (n, d, m); of the order of 1 for revolute joints, of the positions' spread [m] for others."""
+        """Return φ (n, d, m); of the order of 1 for revolute joints, of the positions' spread [m] for others."""
         if group == "gain":
             units = np.where(self._prismatic, self.scaling.scale, 1.0)
             return ((q - self.scaling.middle) / self.scaling.half * units)[..., None]
@@ -228,7 +230,7 @@ class ResidualFeatures:
         return np.stack([np.cos(turns), np.sin(turns)], axis=-1)
 
     def _loaded_frames(self, chain: RigidChain, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The chain's frames (n, d+1, 4, 4), and where loads are supposed for each joint (n, d or 1, loads, 3)."""
+        """Return the chain's frames (n, d+1, 4, 4), and the places of each joint's loads (n, d or 1, loads, 3)."""
         frames = chain.frames(q)
         points = frames[:, :, :3, 3]
         if self.scaling.load is not None:
@@ -239,10 +241,10 @@ class ResidualFeatures:
         return frames, self._places(points)
 
     def _torques(self, group: str, frames: FloatArray, places: FloatArray) -> FloatArray:
-        """Torque (force, for a prismatic joint) about each joint of unit weights at each load's place (n, d, 3 loads).
+        """Return torques (force, if prismatic) about each joint by unit weights at each load's place (n, d, 3 loads).
 
         z·((p − o) × e) = e·(z × (p − o)): a weight's torque is a component of the Jacobian of its place p, here along
-        x, y, z of the frame where gravity stands still. Positions' spread counts as the unit of length.
+        x, y, z of the frame in which gravity is constant. The positions' spread counts as the unit of length.
         """
         axes = np.einsum("nkij,kj->nki", frames[:, :-1, :3, :3], self.parameters.reference.axes)
         origins = frames[:, :-1, :3, 3]
@@ -253,14 +255,14 @@ class ResidualFeatures:
         return torques.reshape(*torques.shape[:2], 3 * torques.shape[2])
 
     def _places(self, points: FloatArray) -> FloatArray:
-        """Where loads are supposed for each joint (n, d or 1, loads, 3), of the frames' origins (n, d+1, 3)."""
+        """Return the places of each joint's loads (n, d or 1, loads, 3), from the frames' origins (n, d+1, 3)."""
         if self.joints <= _JOINTS_WITH_OWN_LOADS:
             return points[:, None, 1:]
         beyond = np.cumsum(points[:, :0:-1], axis=1)[:, ::-1] / np.arange(self.joints, 0, -1)[:, None]
         return np.stack([beyond, np.broadcast_to(points[:, -1:], beyond.shape)], axis=2)
 
     def _load_mask(self, still: int) -> BoolArray:
-        """Which loads (d, 3 loads) act on which joint: those beyond it; on none before the link that stands still."""
+        """Return True where a load (d, 3 loads) acts on a joint: loads beyond it; none before the fixed link."""
         if self.joints <= _JOINTS_WITH_OWN_LOADS:
             acts = np.triu(np.ones((self.joints, self.joints), dtype=np.bool_))
         else:
@@ -269,7 +271,7 @@ class ResidualFeatures:
         return np.repeat(acts, 3, axis=1)
 
     def _offset_functions(self, group: str, p: FloatArray, q: FloatArray) -> FloatArray:
-        """ψ (n, m) of a camera or a smooth group."""
+        """Return ψ (n, m) of a camera or a smooth group."""
         if group in SMOOTH_GROUPS:
             weights = self._stack.joint_weights(q)[:, :, 1:].reshape(len(q), 2 * self.joints)
             return np.multiply.reduce(weights[:, self._products[group]], axis=2)
@@ -280,7 +282,7 @@ class ResidualFeatures:
 
 
 def _for_each_axis(functions: FloatArray) -> FloatArray:
-    """Derivatives (n, 3, 3 m) of Σ_m ψ_m w_m by the weights w (m, 3), flattened, from ψ (n, m)."""
+    """Return derivatives (n, 3, 3 m) of Σ_m ψ_m w_m by the weights w (m, 3), flattened, from ψ (n, m)."""
     n, m = functions.shape
     derivatives = np.zeros((n, 3, 3 * m))
     for axis in range(3):
@@ -289,7 +291,10 @@ def _for_each_axis(functions: FloatArray) -> FloatArray:
 
 
 def _products(prismatic: BoolArray, order: int) -> IntArray:
-    """Which joint functions (two a joint) multiply to each product of `order` different joints (count, order)."""
+    """Return indices (count, order) of the joint functions in each product of `order` different joints.
+
+    A revolute joint has two functions, a prismatic one has one.
+    """
     sizes = [1 if slides else 2 for slides in prismatic]
     chosen = [
         [2 * joint + part for joint, part in zip(joints, parts, strict=True)]

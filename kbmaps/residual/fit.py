@@ -1,4 +1,4 @@
-"""The most probable distorted chain: which distortions the pairs pay for, of what size, and how sure all of it is."""
+"""Most probable distorted chain: selection of distortions by evidence, their sizes, and the uncertainty."""
 
 from __future__ import annotations
 
@@ -23,31 +23,31 @@ from kbmaps.robust import MEDIAN_NORM, OUTLIER_SIGMAS, ROUNDING_M
 _ROUNDS, _SELECTIONS = 6, 2
 # Few enough rows for a processor's cache.
 _ROWS_AT_ONCE = 150
-# With fewer coordinates of pairs on a path no group is taken up: there is no telling it from what neighbours share.
+# With fewer coordinates of pairs on a path, no group is added: it cannot be separated from shared errors.
 _FEWEST_ON_PATH = 30
-# Runs of pairs left out in turn on a path.
+# Number of runs of pairs left out in turn on a path.
 _BLOCKS = 8
-# A step that moves the predictions by less than this share of what the weights leave open is the last.
+# A step that moves the predictions by less than this share of their posterior uncertainty is the last.
 _SMALL_STEP = 0.05
 # Fixed-point rounds in which the noise settles well enough to compare correlations.
 _NOISE_ROUNDS = 4
-# The noise that a prior has seen counts as so many coordinates.
+# A prior's noise counts as this many coordinates.
 _NOISE_ROWS = 10.0
-# Told noise explains a sum of squared residuals up to so many of its standard deviations (χ²) above its mean.
+# A given noise explains a sum of squared residuals up to this many of its standard deviations (χ²) above its mean.
 _MISFIT_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, eq=False)
 class ResidualFit:
-    """A distorted chain and how sure it is.
+    """Distorted chain with its uncertainty.
 
     Attributes:
-        model: what was found.
+        model: the fitted model.
         noise: estimated noise over unit; at least 1 where the units are the noise.
         freedom: residual coordinates minus those that all weights have used up.
         shared: correlation of the errors of neighbours on a path; 0 where pairs are apart.
-        inliers: which pairs (n,) are no outliers.
-        groups: that the pairs speak for, or the prior has; the model averages over others too.
+        inliers: True for each pair (n,) that is not an outlier.
+        groups: supported by the pairs or part of the prior; the model averages over others too.
     """
 
     model: ResidualModel
@@ -59,10 +59,10 @@ class ResidualFit:
 
 
 class _Fitter:
-    """One fit on its way: Gauss-Newton rounds around which groups and variances are found anew.
+    """State of one fit: Gauss-Newton rounds, each of which selects groups and variances again.
 
-    What the prior knows, the chain's change and the weights of its groups, are the weights of the group "", counted
-    in columns of the prior's root. Other weights, of the same groups or others, come on top of them.
+    The prior's parameters, the chain's change and the weights of its groups, are the weights of the group "", counted
+    in columns of the prior's root. Other weights, of the same groups or others, are added to them.
     """
 
     def __init__(self, prior: ResidualModel, pairs: Pairs, change: FloatArray) -> None:
@@ -81,7 +81,7 @@ class _Fitter:
         self._unfold()
 
     def _unfold(self) -> None:
-        """The chain and all weights at the present place."""
+        """Compute the chain and all weights at the current estimate."""
         size = self._parameters.size
         self.change = self._present[:size]
         self.chain = self._parameters.chain(self.change)
@@ -95,7 +95,7 @@ class _Fitter:
             start = end
 
     def step(self, select: bool) -> float:
-        """To the most probable weights; how far that moves predictions, over what the weights leave open of them."""
+        """Step to the most probable weights; return the change of predictions over their uncertainty."""
         groups = self._considered() if select else tuple(self.variances)
         model = self._model(groups, select)
         model.variances = dict(self.variances)
@@ -113,7 +113,7 @@ class _Fitter:
         return math.sqrt(max(moved, 0.0) / max(self.used, 1.0))
 
     def average(self) -> Average:
-        """The last step: to the mean over all probable sets of groups."""
+        """Take the last step: to the mean over all probable sets of groups."""
         groups = self._considered()
         model = self._model(groups, ask_correlation=True)
         model.variances = dict(self.variances)
@@ -123,11 +123,11 @@ class _Fitter:
 
     @property
     def chosen(self) -> tuple[str, ...]:
-        """The groups of the prior and of the most probable set."""
+        """Groups of the prior and of the most probable set."""
         return tuple(dict.fromkeys((*self._known, *self.variances)))
 
     def _considered(self) -> tuple[str, ...]:
-        """All groups with no more features than there are coordinates; the largest only where the one before is in."""
+        """Return groups with no more features than coordinates; the largest only if the one before is active."""
         coordinates = 3 * int(self.inliers.sum())
         if self._on_path and coordinates < _FEWEST_ON_PATH:
             return tuple(self.variances)
@@ -141,7 +141,7 @@ class _Fitter:
         return tuple(group for group in self._features.groups() if asked(group))
 
     def _judge_pairs(self, residuals: FloatArray) -> None:
-        """The middle residual tells what is typical, the noise of the last round what is meant to be."""
+        """Select inliers by the larger of the middle residual and the noise of the last round."""
         norms = np.linalg.norm(residuals, axis=1)
         typical = max(float(np.median(norms)) / MEDIAN_NORM, self._least_noise)
         bound = typical if math.isinf(self.noise) else max(typical, self.noise)
@@ -150,7 +150,7 @@ class _Fitter:
             self.noise = typical
 
     def _model(self, groups: Sequence[str], ask_correlation: bool) -> GroupedModel:
-        """The linear model around the present weights; those of the group "" are steps, the others' whole."""
+        """Return the linear model around the current weights; those of the group "" are steps, the others' whole."""
         x = self._features.positions(self.chain, self.weights, self._pairs.q)
         residuals = (self._pairs.x - x) / self._pairs.unit[:, None]
         self._judge_pairs(residuals)
@@ -182,9 +182,9 @@ class _Fitter:
         )
 
     def _correlation(self, runs: Sequence[IntArray]) -> float:
-        """The most probable correlation of neighbours' errors in runs of pairs, with the present groups.
+        """Return the most probable correlation of neighbours' errors in runs of pairs, with the current groups.
 
-        The weights are integrated out: residuals show less of it, for the weights follow what neighbours share.
+        The weights are integrated out: residuals show less correlation, because the weights follow the shared errors.
         """
         groups = tuple(self.variances)
         rows = [self._rows(run, groups) for run in runs]
@@ -199,9 +199,9 @@ class _Fitter:
         return most_probable(evidence, self.shared)
 
     def _rows(self, run: IntArray, groups: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-        """Rows (n, 3, P) and targets (n, 3) of some pairs, in units.
+        """Return rows (n, 3, P) and targets (n, 3) of some pairs, in units.
 
-        What the groups on top explain at present is added to the target, for their weights are whole.
+        The current part of the added groups is included in the target, since their weights are whole.
         """
         needed = tuple(dict.fromkeys((*groups, *self._known)))
         point = self._features.linearised(self.change, self.chain, self.weights, self._pairs.q[run], needed)
@@ -216,7 +216,7 @@ class _Fitter:
         return design / unit[:, :, None], target / unit
 
     def _before_step(self, groups: Iterable[str]) -> FloatArray:
-        """Where the weights are before the step."""
+        """Return the weights before the step."""
         parts = [np.zeros(len(self._free))]
         parts += [self._fresh.get(g, np.zeros(self._features.size(g))) for g in groups]
         return np.concatenate(parts)
@@ -231,7 +231,7 @@ class _Fitter:
         self._unfold()
 
     def model(self, spread: FloatArray) -> ResidualModel:
-        """The present weights, and how sure they are by the spread of the model's."""
+        """Return the current weights as a model, with their uncertainty from the spread of the linear model."""
         ends = np.cumsum([self._parameters.size, *map(len, self.weights.values())]).tolist()
         places = dict(zip(self.weights, itertools.pairwise(ends), strict=True))
         root = np.zeros((ends[-1], spread.shape[1]))
@@ -246,7 +246,7 @@ class _Fitter:
 
 
 def fit_residual(prior: ResidualModel, pairs: Pairs, change: FloatArray) -> ResidualFit | None:
-    """The fit around the chain at `change`, the most probable rigid one; None if nothing speaks for more than that."""
+    """Fit around the most probable rigid chain, at `change`; return None if nothing supports more than that."""
     fitter = _Fitter(prior, pairs, change)
     for turn in range(_ROUNDS):
         length = fitter.step(turn < _SELECTIONS)
@@ -268,13 +268,13 @@ def fit_residual(prior: ResidualModel, pairs: Pairs, change: FloatArray) -> Resi
 
 
 def _moments(design: FloatArray, target: FloatArray, correlation: float) -> Moments:
-    """Of rows (n, 3, P) and targets (n, 3), freed of what neighbours share."""
+    """Return the moments of rows (n, 3, P) and targets (n, 3), freed of the correlation of neighbours."""
     return Moments.of(
         innovations(design, correlation).reshape(-1, design.shape[2]), innovations(target, correlation).ravel()
     )
 
 
 def _beyond_chance(noise: float, freedom: float) -> float:
-    """Told noise, 1, unless the residuals are larger than what chance can make of it."""
+    """Return the given noise, 1, unless the residuals are larger than chance explains."""
     explained = freedom + _MISFIT_SIGMAS * math.sqrt(2.0 * freedom)
     return 1.0 if noise**2 * freedom <= explained else noise

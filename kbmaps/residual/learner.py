@@ -1,4 +1,4 @@
-"""Learning an arm that is nearly a rigid chain: the chain, and what it errs by, from all pairs at once."""
+"""Batch learner of a nearly rigid arm: the chain and its deviations, from all pairs at once."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ _LEAST_FREEDOM = 10.0
 
 
 class ResidualLearner:
-    """A rigid chain around a nominal one, and smooth deviations from it where the pairs ask for them.
+    """Fits a rigid chain around a nominal one, and smooth deviations from it where the pairs support them.
 
-    Deviations come in groups: eccentric encoders, gear gains, joints that yield under load, a distorting camera, and
-    smooth functions of one to three joints. The chain's tolerances and each group's variance are the prior; the
-    variances are those that make the pairs most probable, and what is predicted is the average over those sets of
-    groups that are about as probable as the best. Where the pairs speak for no group, that is `RigidLearner` to a
-    fraction of its sigma; to the last bit where no set with a group comes near, as without noise.
+    Deviations come in groups: eccentric encoders, gear gains, compliant joints, a distorting camera, and smooth
+    functions of one to three joints. The chain's tolerances and each group's variance are the prior; the variances are
+    those that make the pairs most probable. The prediction averages over the sets of groups that are about as probable
+    as the best. Where the pairs support no group, it equals `RigidLearner` to a fraction of its sigma. Where no set
+    with a group comes near in probability, as without noise, it is equal to the last bit.
 
     Args:
-        nominal: the chain as drawn, or as `find_chain` found it.
-        tolerances: how far the real one may be from it.
-        prior: what is believed before the first pair, where more is known than the tolerances: of the same chain, or of
-            its deviations too. So an arm that got another tool is learnt on: `learner.model.with_other_tool(0.2)`.
+        nominal: the nominal chain, or one found by `find_chain`.
+        tolerances: standard deviations of the real chain about it.
+        prior: Gaussian prior, where more is known than the tolerances: of the same chain, or of its deviations too. Use
+            it to continue with another tool: `learner.model.with_other_tool(0.2)`.
 
     Raises:
         ShapeError: the prior is one of another chain.
@@ -65,30 +65,30 @@ class ResidualLearner:
 
     @property
     def pairs(self) -> int:
-        """How many pairs have been learnt."""
+        """Number of learnt pairs."""
         return len(self._q)
 
     @property
     def rigid(self) -> RigidLearner:
-        """The rigid chain that explains the same pairs best; its report has hand-eye, tool centre point and zeros."""
+        """Best rigid chain for the same pairs; its report has hand-eye, tool centre point and joint offsets."""
         return self._rigid
 
     @property
     def model(self) -> ResidualModel:
-        """What has been learnt, as a value that later learning does not touch."""
+        """Snapshot of the learnt model; later learning does not change it."""
         self._fitted()
         return self._model_before if self._model is None else self._model
 
     @property
     def chain(self) -> RigidChain:
-        """The rigid part of the model."""
+        """Rigid part of the model."""
         return self.model.chain
 
     @property
     def deviations(self) -> dict[str, float]:
-        """By how much each group of deviations that the pairs speak for moves the learnt positions (RMS) [m].
+        """Motion of the learnt positions (RMS) [m] by each group of deviations that the pairs support.
 
-        Groups that the prior has count as spoken for; those that are in the average beside the best set do not.
+        Groups of the prior count as supported; groups that are only in the average, not in the best set, do not.
         """
         fit = self._fitted()
         if fit is None:
@@ -97,14 +97,16 @@ class ResidualLearner:
 
     @property
     def inliers(self) -> BoolArray:
-        """Which pairs (n,), as they came, are no outliers."""
+        """True for each pair (n,), in the order of learning, that is not an outlier."""
         fit = self._fitted()
         return self._rigid.inliers if fit is None else fit.inliers.copy()
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
-        """Pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
+        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
 
         Args:
+            q: joint values.
+            x: measured positions.
             sigma: 1-sigma of the positions [m], () or (n,); None where it is to be estimated, as in `RigidLearner`.
 
         Raises:
@@ -118,7 +120,7 @@ class ResidualLearner:
         self._model = self._fit = None
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
+        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
 
         Raises:
             ShapeError, NonFiniteError
@@ -126,7 +128,7 @@ class ResidualLearner:
         return self._rigid.predict(q) if self._is_rigid else self.model.predict(q)
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d), to about 1e-12.
+        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d), to about 1e-12.
 
         Raises:
             ShapeError, NonFiniteError
@@ -134,9 +136,9 @@ class ResidualLearner:
         return self._rigid.jacobian(q) if self._is_rigid else self.model.jacobian(q)
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and whether data was there.
+        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and True where data is near.
 
-        Where the told noise does not explain the residuals, what is left over adds to sigma everywhere.
+        Where the given noise does not explain the residuals, the excess is added to sigma everywhere.
 
         Raises:
             ShapeError, NonFiniteError
@@ -151,7 +153,7 @@ class ResidualLearner:
         return Estimate(x, sigma, near_data(variance, self._widest)).like(angles)
 
     def to_bytes(self) -> bytes:
-        """The learner with all its pairs; `from_bytes` gives the same predictions to the last bit."""
+        """Return the learner with all its pairs; `from_bytes` restores the same predictions to the last bit."""
         arrays = chain_arrays(self._rigid.nominal) | {"q": self._q, "x": self._x, "sigma": self._sigma}
         prior, belief = self._prior, self._belief
         known = {"model": prior.to_bytes().hex()} if prior else belief and {"belief": belief.to_bytes().hex()}
@@ -159,7 +161,7 @@ class ResidualLearner:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """The learner in `data`. Raises ModelFormatError: it is none of this kind, or damaged."""
+        """Return the learner in `data`. Raises ModelFormatError: wrong type of model, or damaged."""
         fields, arrays = unpack(data, _KIND)
         with restoring("a rigid chain with residual"):
             named(fields, "the fields", ("tolerances", "prior"))
@@ -174,16 +176,16 @@ class ResidualLearner:
 
     @property
     def _is_rigid(self) -> bool:
-        """Whether the rigid chain is all there is: nothing was found beside it, now or by who made the prior."""
+        """True if no deviation from the rigid chain was found, by this learner or in its prior."""
         return self._fitted() is None and not self.model.weights
 
     @property
     def _model_before(self) -> ResidualModel:
-        """What is known without pairs."""
+        """Model without pairs."""
         return self._prior or ResidualModel.of_belief(self._rigid.belief)
 
     def _fitted(self) -> ResidualFit | None:
-        """The fit; None without pairs, and where they speak for nothing but the rigid chain."""
+        """Return the fit; None without pairs, or if they support nothing but the rigid chain."""
         if self._model is None and self.pairs:
             pairs = with_units(self._q, self._x, self._sigma)
             before = self._prior
@@ -191,7 +193,8 @@ class ResidualLearner:
                 load = None if before is None else before.features.scaling.load
                 scaling = replace(ResidualScaling.of(self._q, self._x), load=load)
                 before = ResidualModel.of_belief(self._rigid.prior, scaling, 0.0 if before is None else before.noise)
-            # Noise that nobody told must be seen in residuals that the chain alone leaves, or anything explains them.
+            # A noise that was not given must be visible in the rigid chain's residuals; otherwise anything explains
+            # them.
             if pairs.known or before.weights or before.noise > 0.0 or self._rigid.scatter.freedom >= _LEAST_FREEDOM:
                 self._fit = fit_residual(before, pairs, self._rigid.change)
             self._model = self._rigid_model(before) if self._fit is None else self._fit.model
@@ -208,7 +211,7 @@ class ResidualLearner:
 
 
 def _stored_prior(value: Any) -> ChainBelief | ResidualModel | None:
-    """The prior among the fields of stored bytes. Raises ModelFormatError, TypeError, ValueError."""
+    """Return the prior among the fields of stored bytes. Raises ModelFormatError, TypeError, ValueError."""
     if value is None:
         return None
     if isinstance(value, dict) and "belief" in value:

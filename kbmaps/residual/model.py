@@ -1,4 +1,4 @@
-"""A rigid chain with what the arm does beside it, as learnt: an immutable map from joint values to positions."""
+"""Rigid chain with learnt deviations: an immutable map from joint values to positions."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from kbmaps.residual.features import ResidualFeatures, ResidualScaling
 _KIND = "rigid chain with residual, fitted, 2"
 _SCALING = ("middle", "half", "centre", "load")
 _GROUP = "group "
-# Lumped loads on linear springs are true to some per cent of the yielding that they explain.
+# Lumped loads on linear springs are accurate to a few per cent of the deflection that they explain.
 _LAW_ERROR = 0.03
 _BLOCK = 1024
-# Differences of fourth order [rad, m]: what is left out and what is rounded are both some 1e-13 of the derivative.
+# Fourth-order differences [rad, m]: truncation and rounding errors are both about 1e-13 of the derivative.
 _STEP = 1e-3
 _STENCIL = np.array([-2.0, -1.0, 1.0, 2.0])
 _SLOPES = np.array([1.0, -8.0, 8.0, -1.0]) / 12.0
@@ -36,16 +36,16 @@ _SLOPES = np.array([1.0, -8.0, 8.0, -1.0]) / 12.0
 
 @dataclass(frozen=True, eq=False)
 class ResidualModel:
-    """A chain and the weights of the groups of deviations that pairs spoke for, as a Gaussian.
+    """Gaussian over a chain and the weights of the groups of deviations that the pairs support.
 
-    What `ResidualLearner` has learnt, without its pairs. It can be what another learner begins with.
+    The result of `ResidualLearner`, without its pairs. It can be the prior of another learner.
 
     Attributes:
         features: the chain's parameters and the groups' functions.
         change: of the chain's parameters, most probable (size,) [rad, m].
         weights: of each group, most probable (features,).
         root: W (size + features of all groups, k) with the covariance W Wᵀ of the change, then the weights.
-        noise: 1-sigma of a coordinate of what was measured [m], as the pairs showed it; 0 where none did.
+        noise: 1-sigma of a measured coordinate [m], estimated from pairs; 0 without pairs.
 
     Raises:
         ShapeError, NonFiniteError
@@ -83,7 +83,7 @@ class ResidualModel:
 
     @classmethod
     def of_belief(cls, belief: ChainBelief, scaling: ResidualScaling | None = None, noise: float = 0.0) -> Self:
-        """A rigid chain and nothing else."""
+        """Return a rigid chain without deviations."""
         scaling = scaling or ResidualScaling.whole_turns(belief.parameters.reference.joints)
         return cls(ResidualFeatures(belief.parameters, scaling), belief.mean, {}, belief.root, noise)
 
@@ -94,29 +94,29 @@ class ResidualModel:
 
     @cached_property
     def chain(self) -> RigidChain:
-        """The rigid part."""
+        """Rigid part of the model."""
         return self.features.parameters.chain(self.change)
 
     @property
     def mean(self) -> FloatArray:
-        """The change, then the weights."""
+        """Change, then the weights."""
         return np.concatenate([self.change, *self.weights.values()])
 
     @property
     def belief(self) -> ChainBelief:
-        """What is believed of the rigid part, whatever the deviations are."""
+        """Posterior of the rigid part, with the deviations marginalised."""
         parameters = self.features.parameters
         return ChainBelief(parameters, self.change, self.root[: parameters.size], self.noise)
 
     @property
     def digest(self) -> str:
-        """Sixteen hexadecimal digits that tell this map (not how sure it is) from any other."""
+        """Sixteen hexadecimal digits that identify this map, its uncertainty left out."""
         arrays = self._arrays()
         del arrays["root"]
         return hashlib.blake2b(pack(_KIND, {"scale": self.features.scaling.scale}, arrays), digest_size=8).hexdigest()
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Positions (n, 3) [m] at q (n, d) [rad, m], or (3,) at q (d,).
+        """Return positions (n, 3) [m] at q (n, d) [rad, m], or (3,) at q (d,).
 
         Raises:
             ShapeError, NonFiniteError
@@ -126,7 +126,7 @@ class ResidualModel:
         return x[0] if angles.ndim == 1 else x
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Derivative (n, 3, d) of the positions [m/rad, or m/m], or (3, d) at q (d,).
+        """Return the derivative (n, 3, d) of the positions [m/rad, or m/m], or (3, d) at q (d,).
 
         Raises:
             ShapeError, NonFiniteError
@@ -141,7 +141,7 @@ class ResidualModel:
         return slopes[0] if angles.ndim == 1 else slopes
 
     def predict_with_variance(self, q: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Positions at q (n, d) and the variance of each coordinate to first order, both (n, 3) [m, m²].
+        """Return positions at q (n, d) and the first-order variance of each coordinate, both (n, 3) [m, m²].
 
         Raises:
             ShapeError, NonFiniteError
@@ -159,7 +159,7 @@ class ResidualModel:
         return x, variance
 
     def effects(self, q: ArrayLike) -> dict[str, float]:
-        """By how much each group moves the positions at q (n, d), root mean square of the distances [m]; 0 of none.
+        """Return each group's motion of the positions at q (n, d), root mean square of the distances [m]; 0 for no q.
 
         Raises:
             ShapeError, NonFiniteError
@@ -170,9 +170,9 @@ class ResidualModel:
         return {group: math.sqrt(float(np.square(move).sum()) / max(len(move), 1)) for group, move in moves.items()}
 
     def with_other_tool(self, tolerance: float) -> Self:
-        """The same arm with a marker that was moved, by `tolerance` (1-sigma of each component [m]).
+        """Return the same arm with a marker displaced by `tolerance` (1-sigma of each component [m]).
 
-        The arm's joints yield and err as before; the hand's load stays where it was.
+        The joints' compliance and errors stay as they are; the hand's load stays in its place.
 
         Raises:
             SettingError: the tolerance is not positive.
@@ -186,10 +186,11 @@ class ResidualModel:
         return replace(widened, features=ResidualFeatures(parameters, scaling))
 
     def widened(self, columns: IntArray, std: FloatArray) -> Self:
-        """The same arm but for some parameters of the chain that were changed, by `std` (k,) [rad, m] (1-sigma).
+        """Return the same arm with the uncertainty of some chain parameters increased.
 
         Args:
-            columns: which (k,).
+            columns: indices (k,) of these parameters.
+            std: 1-sigma of each change (k,) [rad, m].
         """
         changed = np.zeros((len(self.root), len(columns)))
         changed[columns, np.arange(len(columns))] = std
@@ -197,12 +198,15 @@ class ResidualModel:
         return replace(self, root=root)
 
     def to_bytes(self) -> bytes:
-        """The model as one self-describing byte string; `from_bytes` gives the same predictions to the last bit."""
+        """Return the model as one self-describing byte string.
+
+        `from_bytes` restores the same predictions to the last bit.
+        """
         return pack(_KIND, {"scale": self.features.scaling.scale, "noise": self.noise}, self._arrays())
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """The model in `data`. Raises ModelFormatError: it is none of this kind, or damaged."""
+        """Return the model in `data`. Raises ModelFormatError: wrong type of model, or damaged."""
         fields, arrays = unpack(data, _KIND)
         with restoring("a rigid chain with residual"):
             settings = numbers(named(fields, "the fields", ("scale", "noise")))

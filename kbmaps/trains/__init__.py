@@ -1,1 +1,1 @@
-"""Tensor trains: maps of many joints in a few numbers each, and what learns them."""
+"""Tensor trains: maps of many joints in few numbers per joint, and their learner."""

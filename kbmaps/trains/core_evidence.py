@@ -1,4 +1,4 @@
-"""How far from rigid an arm is, as its pairs tell: the evidence of a family of priors of the cores."""
+"""Non-rigidity of an arm, estimated from its pairs by the evidence of a family of priors of the cores."""
 
 from __future__ import annotations
 
@@ -11,14 +11,17 @@ from kbmaps.arrays import FloatArray
 from kbmaps.trains.core_prior import CORE_NUMBERS, CoreFamily, CorePrior
 from kbmaps.trains.fit import TensorProblem, whitened_jacobian
 
-# What is tried, and what is believed before the pairs: a few parts in a thousand, give or take a decade.
+# Candidates, and the centre of the prior over them: a few parts in a thousand, within about a decade.
 ELLIPSE_STDS = tuple(float(std) for std in np.geomspace(1e-4, 3e-2, 11))
 USUAL_ELLIPSE_STD = 0.003
 _DECADE = math.log(10.0)
 
 
 def core_equations(problem: TensorProblem, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """J (3 n, 36 d) and y (3 n,) of a problem linearised at z: y = J c + e for cores c (36 d,), with e ~ N(0, I)."""
+    """Return J (3 n, 36 d) and y (3 n,) of a problem linearised at z.
+
+    y = J c + e for cores c (36 d,), with e ~ N(0, I).
+    """
     prior = problem.prior
     plain = CorePrior(prior.mean, np.tile(np.eye(CORE_NUMBERS), (prior.joints, 1, 1)))
     jacobian = whitened_jacobian(problem.weights, problem.maps(z), plain) / np.repeat(problem.std, 3)[:, None]
@@ -27,7 +30,7 @@ def core_equations(problem: TensorProblem, z: FloatArray) -> tuple[FloatArray, F
 
 
 def likely_ellipse_std(family: CoreFamily, jacobian: FloatArray, positions: FloatArray) -> float:
-    """The most probable of `ELLIPSE_STDS`, for what pairs tell of the cores, linearised at a fit to them.
+    """Return the most probable of `ELLIPSE_STDS`, for pairs linearised at a fit to them.
 
     With c = m + S z, z ~ N(0, I), y - J m = r and z marginalised,
 
@@ -38,6 +41,7 @@ def likely_ellipse_std(family: CoreFamily, jacobian: FloatArray, positions: Floa
         2 log p = rᵀ J S (I + Sᵀ Jᵀ J S)⁻¹ Sᵀ Jᵀ r - log |I + Sᵀ Jᵀ J S| + terms without S.
 
     Args:
+        family: the priors to choose from.
         jacobian, positions: J (3 n, 36 d) and y (3 n,) of `core_equations`.
     """
     residuals = positions - jacobian @ family.mean.ravel()
@@ -51,7 +55,10 @@ def likely_ellipse_std(family: CoreFamily, jacobian: FloatArray, positions: Floa
 
 
 def _by_coordinates(family: CoreFamily, jacobian: FloatArray, residuals: FloatArray) -> list[float]:
-    """Log evidence of each of `ELLIPSE_STDS`; S Sᵀ is what rigid motions do, and the square of each times the rest."""
+    """Return the log evidence of each of `ELLIPSE_STDS`, from matrices of the size of the coordinates.
+
+    S Sᵀ is the rigid part plus the square of each standard deviation times the rest.
+    """
     joints = len(family.mean)
     blocks = jacobian.reshape(-1, joints, CORE_NUMBERS).swapaxes(0, 1)
     moved = (blocks @ family.motions).swapaxes(0, 1).reshape(len(jacobian), -1)
@@ -65,7 +72,7 @@ def _by_coordinates(family: CoreFamily, jacobian: FloatArray, residuals: FloatAr
 
 
 def _by_cores(family: CoreFamily, jacobian: FloatArray, residuals: FloatArray) -> list[float]:
-    """Log evidence of each of `ELLIPSE_STDS`."""
+    """Return the log evidence of each of `ELLIPSE_STDS`."""
     joints, size = len(family.mean), jacobian.shape[1]
     blocks = (jacobian.T @ jacobian).reshape(joints, CORE_NUMBERS, joints, CORE_NUMBERS)
     slope = (jacobian.T @ residuals).reshape(joints, CORE_NUMBERS, 1)
@@ -80,7 +87,7 @@ def _by_cores(family: CoreFamily, jacobian: FloatArray, residuals: FloatArray) -
 
 
 def _inverse_square(matrix: FloatArray, vector: FloatArray) -> tuple[float, float]:
-    """vᵀ M⁻¹ v and log |M|, which is infinite where M is not positive definite up to rounding."""
+    """Return vᵀ M⁻¹ v and log |M|, which is infinite where M is not positive definite up to rounding."""
     factor, positive = lapack.cholesky_lower(np.asfortranarray(matrix))
     if not positive:
         return 0.0, math.inf

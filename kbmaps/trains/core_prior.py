@@ -1,4 +1,4 @@
-"""What is known of a tensor train's cores before any pair."""
+"""Prior of a tensor train's cores."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class CorePrior:
 
     @classmethod
     def vague(cls, joints: int, length: float, std: float = 1.0) -> CorePrior:
-        """Nothing known but the size of things: mean 0, every number of std `std`, translations `std`·length [m]."""
+        """Return a prior of known size only: mean 0, every number of std `std`, translations `std`·length [m]."""
         sizes = std * np.tile([1.0, 1.0, 1.0, length], 9)
         return cls(np.zeros((joints, CORE_NUMBERS)), np.tile(np.diag(sizes), (joints, 1, 1)))
 
@@ -61,23 +61,24 @@ class CorePrior:
         ellipse_std: float,
         length: float,
     ) -> CorePrior:
-        """A nominal chain whose links are turned and shifted a little, and which is not quite rigid.
+        """Return the prior of a nominal chain with uncertain links, which is not quite rigid.
 
-        To first order a small rigid motion ahead of joint k changes its core along six directions, and a shift of the
-        marker the last core along three. They carry the geometry's uncertainty; every number of every core has
-        `ellipse_std` of its own on top, for what no rigid chain can do.
+        To first order, a small rigid motion before joint k changes its core along six directions, and a shift of the
+        marker changes the last core along three. They carry the geometry's uncertainty. In addition, every number of
+        every core has `ellipse_std` of its own, for deviations that no rigid chain can have.
 
         Args:
             chain: the nominal model.
-            bases: one a joint.
+            bases: one per joint.
             turn_std: of each component of a link's rotation [rad].
             shift_std: of each component of a link's shift, at the joint [m].
-            marker_std: of each component of the marker's place [m].
+            marker_std: of each component of the marker's position [m].
             ellipse_std: of each number of a core; of a translation, times `length`.
             length: of a typical link [m].
 
         Raises:
-            SettingError: a standard deviation or the length is not positive. BasisError: bases do not fit the chain.
+            SettingError: a standard deviation or the length is not positive.
+            BasisError: bases do not fit the chain.
         """
         family = CoreFamily.around(
             chain, bases, turn_std=turn_std, shift_std=shift_std, marker_std=marker_std, length=length
@@ -90,12 +91,12 @@ class CorePrior:
         return len(self.mean)
 
     def cores(self, z: FloatArray) -> FloatArray:
-        """Cores (d, 3, 3, 4) at z (36 d,)."""
+        """Return the cores (d, 3, 3, 4) at z (36 d,)."""
         moved = self.mean + (self.spread @ z.reshape(self.joints, CORE_NUMBERS, 1))[:, :, 0]
         return moved.reshape(self.joints, 3, 3, 4)
 
     def whitened(self, cores: FloatArray) -> FloatArray:
-        """The z (36 d,) of cores (d, 3, 3, 4)."""
+        """Return the z (36 d,) of cores (d, 3, 3, 4)."""
         off = cores.reshape(self.joints, CORE_NUMBERS, 1) - self.mean[:, :, None]
         z: FloatArray = np.linalg.solve(self.spread, off).astype(np.float64, copy=False)
         return z.ravel()
@@ -103,11 +104,11 @@ class CorePrior:
 
 @dataclass(frozen=True, eq=False)
 class CoreFamily:
-    """Priors around one nominal chain that differ in how far the arm may be from rigid.
+    """Priors around one nominal chain that differ in the expected deviation from rigidity.
 
     Attributes:
         mean: (d, 36), the cores of the nominal chain.
-        motions: (d, 36, m), what rigid motions of a link do to its core, each of one standard deviation.
+        motions: (d, 36, m), changes of a core by rigid motions of its link, each of one standard deviation.
         length: of a typical link [m].
     """
 
@@ -138,10 +139,11 @@ class CoreFamily:
         marker_std: float,
         length: float,
     ) -> CoreFamily:
-        """The family of `CorePrior.around`.
+        """Return the family of `CorePrior.around`.
 
         Raises:
-            SettingError: a standard deviation or the length is not positive. BasisError: bases do not fit the chain.
+            SettingError: a standard deviation or the length is not positive.
+            BasisError: bases do not fit the chain.
         """
         settings = {"turn_std": turn_std, "shift_std": shift_std, "marker_std": marker_std, "length": length}
         for name, value in settings.items():
@@ -158,11 +160,11 @@ class CoreFamily:
 
     @property
     def sizes(self) -> FloatArray:
-        """What each number of a core is measured by (36,): 1, or for translations `length`."""
+        """Unit of each number of a core (36,): 1, or for translations `length`."""
         return np.tile([1.0, 1.0, 1.0, self.length], 9)
 
     def prior(self, ellipse_std: float) -> CorePrior:
-        """The prior whose cores have `ellipse_std` of their own in each number, times `length` in translations.
+        """Return the prior whose cores have `ellipse_std` of their own in each number, times `length` in translations.
 
         Raises:
             SettingError: ellipse_std is not positive.
@@ -177,7 +179,7 @@ class CoreFamily:
 def _motions(
     core: FloatArray, joint_place: FloatArray, basis: JointBasis, turn_std: float, shift_std: float
 ) -> list[FloatArray]:
-    """Changes (36,) of a core (3, 3, 4) under rotations about and shifts of the joint, each of one std."""
+    """Return changes (36,) of a core (3, 3, 4) by rotations about and shifts of the joint, each of one std."""
     constant = np.zeros(3)
     constant[: basis.size] = np.linalg.solve(basis.matrix, np.eye(basis.size)[0])
     changes: list[FloatArray] = []
@@ -193,7 +195,7 @@ def _motions(
 
 
 def _marker_shifts(core: FloatArray) -> list[FloatArray]:
-    """Changes (3, 3, 4) of the last core when the marker moves by 1 m along each of its frame's axes."""
+    """Return changes (3, 3, 4) of the last core when the marker moves by 1 m along each of its frame's axes."""
     changes: list[FloatArray] = []
     for column in range(3):
         change = np.zeros((3, 3, 4))

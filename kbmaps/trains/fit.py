@@ -1,4 +1,4 @@
-"""The most likely tensor train for given pairs: alternating least squares, then Levenberg–Marquardt."""
+"""Most likely tensor train for given pairs: alternating least squares, then Levenberg–Marquardt."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _SMALLEST_GAIN = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class TensorProblem:
-    """Pairs and what is known beforehand: the objective Σ ‖(x − f(q)) / std‖² + ‖z‖² over the whitened cores z.
+    """Pairs and prior: the objective Σ ‖(x − f(q)) / std‖² + ‖z‖² over the whitened cores z.
 
     Attributes:
         weights: basis functions (n, d, 3).
         x: positions (n, 3) [m].
         std: of one coordinate of each pair (n,) [m].
-        prior: the Gaussian that z is the standard form of.
+        prior: the Gaussian of which z is the standard form.
     """
 
     weights: FloatArray
@@ -40,7 +40,7 @@ class TensorProblem:
         return flat.reshape(*flat.shape[:2], 3, 4)
 
     def residuals(self, z: FloatArray) -> FloatArray:
-        """x − f(q) (n, 3) [m]."""
+        """Return x − f(q) (n, 3) [m]."""
         return self.x - suffixes(self.maps(z))[0]
 
     def objective(self, z: FloatArray) -> float:
@@ -48,12 +48,12 @@ class TensorProblem:
         return float(np.square(scaled).sum() + z @ z)
 
     def scaled_jacobian(self, z: FloatArray) -> FloatArray:
-        """Derivative of f / std by z (3 n, 36 d)."""
+        """Return the derivative of f / std by z (3 n, 36 d)."""
         return whitened_jacobian(self.weights, self.maps(z), self.prior) / np.repeat(self.std, 3)[:, None]
 
 
 def whitened_jacobian(weights: FloatArray, maps: FloatArray, prior: CorePrior) -> FloatArray:
-    """Derivative of the positions by z (3 n, 36 d), for basis functions (n, d, 3) and maps (d, n, 3, 4)."""
+    """Return the derivative of the positions by z (3 n, 36 d), for basis functions (n, d, 3) and maps (d, n, 3, 4)."""
     linear, points = prefixes(maps), suffixes(maps)
     count, joints = weights.shape[:2]
     jacobian = np.empty((3 * count, CORE_NUMBERS * joints))
@@ -64,7 +64,10 @@ def whitened_jacobian(weights: FloatArray, maps: FloatArray, prior: CorePrior) -
 
 
 def _core_jacobian(linear: FloatArray, weights: FloatArray, points: FloatArray) -> FloatArray:
-    """Derivative of the positions by one core (3 n, 36): rows L[o, a] w[j] (r, 1)[b] at (pair, o), (j, a, b)."""
+    """Return the derivative of the positions by one core (3 n, 36).
+
+    Rows L[o, a] w[j] (r, 1)[b] at (pair, o), (j, a, b).
+    """
     count = len(weights)
     right = np.empty((count, 3, 4))
     right[:, :, :3] = weights[:, :, None] * points[:, None, :]
@@ -74,7 +77,7 @@ def _core_jacobian(linear: FloatArray, weights: FloatArray, points: FloatArray) 
 
 
 def alternate(problem: TensorProblem, z: FloatArray, sweeps: int) -> FloatArray:
-    """Alternating least squares: each core in turn at its best while the others rest.
+    """Run alternating least squares: optimise each core in turn with the others fixed.
 
     Grasedyck, Kluge, Krämer 2015, section 3, for an affine train and with the prior as ridge.
     """
@@ -108,7 +111,7 @@ class LevenbergMarquardt:
     """Damped Gauss–Newton on a TensorProblem.
 
     The damping is a multiple of the identity in whitened cores. Gauge freedoms (an affine change of the frame between
-    two cores) need nothing else: the step has no part along them but what the prior asks for.
+    two cores) need no further treatment: along them, the step follows the prior alone.
     """
 
     damping: float = _FIRST_DAMPING
@@ -116,7 +119,7 @@ class LevenbergMarquardt:
     converged: bool = field(default=False, init=False)
 
     def run(self, problem: TensorProblem, z: FloatArray, limit: int) -> tuple[FloatArray, float]:
-        """z and its objective after at most `limit` steps."""
+        """Return z and its objective after at most `limit` steps."""
         value = problem.objective(z)
         self.converged = False
         for _ in range(limit):
@@ -144,7 +147,7 @@ class LevenbergMarquardt:
 
 
 def _normal_matrix(jacobian: FloatArray) -> tuple[FloatArray, bool]:
-    """The smaller of JᵀJ and JJᵀ, and whether it is the latter."""
+    """Return the smaller of JᵀJ and JJᵀ, and True if it is the latter."""
     dual = jacobian.shape[0] < jacobian.shape[1]
     return (jacobian @ jacobian.T if dual else jacobian.T @ jacobian), dual
 
@@ -152,7 +155,10 @@ def _normal_matrix(jacobian: FloatArray) -> tuple[FloatArray, bool]:
 def _damped_step(
     jacobian: FloatArray, normal: FloatArray, dual: bool, residual: FloatArray, z: FloatArray, damping: float
 ) -> FloatArray | None:
-    """Minimises ‖residual − J δ‖² + ‖z + δ‖² + damping·mean(diag JᵀJ) ‖δ‖²; None if not positive definite."""
+    """Return the damped step δ; None if the matrix is not positive definite.
+
+    δ minimises ‖residual − J δ‖² + ‖z + δ‖² + damping·mean(diag JᵀJ) ‖δ‖².
+    """
     shift = 1.0 + damping * float(normal.trace()) / jacobian.shape[1]
     shifted = np.array(normal, order="F")
     shifted[np.diag_indices(len(normal))] += shift

@@ -1,4 +1,4 @@
-"""A tensor train that learns from pairs, in one go or as a stream."""
+"""Learner of a tensor train, from all pairs at once or from a stream."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from kbmaps.trains.train import TensorTrain
 KIND = "tensor learner, 3"
 _FIELDS = ("bases", "settings", "pairs", "waiting", "searches", "length")
 _FITTED = ("z", "sure", "used", "information", "absorbed")
-# Relative to the residuals under the prior: the noise that the first fit around a prior starts with.
+# Initial noise of the first fit around a prior, relative to the residuals under the prior.
 _FIRST_NOISE = 0.1
-# A refit that leaves this many times the noise of the fit before has lost its way and is searched anew.
+# A refit with this many times the noise of the fit before has diverged, and the search starts again.
 _LOST = 3.0
 _SHARE_BEFORE_REFIT = 4
-# Times the pairs that could just determine a train: to search at all, and until a search has found what it should.
+# Multiples of the minimum number of pairs for a train: to start a search, and to stop repeating it.
 _PAIRS_TO_SEARCH = 1.5
 _SEARCHES_UNTIL = 1.5
 
@@ -43,14 +43,15 @@ _SEARCHES_UNTIL = 1.5
 class TensorLearner:
     """Learns a TensorTrain. A `kbmaps.model.Model`.
 
-    With a prior, every fit is the most likely train under it (`TensorLearner.around` makes one of a nominal chain).
-    Without, the first fits search from random chains once there are `pairs_needed`; later ones go on from the one
-    before. Where no sigma is given the noise is found from the residuals.
+    With a prior, every fit is the most likely train under it (`TensorLearner.around` makes one from a nominal chain).
+    Without, the first fits search from random chains once there are `pairs_needed`; later ones continue from the one
+    before. Where no sigma is given, the noise is estimated from the residuals.
 
     Args:
-        bases: one a joint; orthonormal over the joints' ranges (`learning_bases`) are advised.
-        prior: what is known of the cores, in these bases; None where nothing is. Of a family every fit takes the
-            member that its pairs speak for.
+        bases: one per joint; orthonormal over the joints' ranges (`learning_bases`) are advised.
+        prior: prior of the cores, in these bases; None without one. Of a family, every fit takes the member that its
+            pairs support.
+        settings: of the learner; the defaults if None.
 
     Raises:
         ShapeError: the prior has another number of joints.
@@ -105,13 +106,20 @@ class TensorLearner:
         marker_std: float = 0.03,
         ellipse_std: float | None = None,
     ) -> TensorLearner:
-        """A learner with a nominal chain as prior; the standard deviations as in `CorePrior.around`.
+        """Return a learner with a nominal chain as prior; the standard deviations as in `CorePrior.around`.
 
         Args:
-            ellipse_std: how far from rigid the arm is; None finds it by the evidence of the pairs at every fit.
+            chain: the nominal chain.
+            bases: one per joint.
+            settings: of the learner; the defaults if None.
+            turn_std: of each component of a link's rotation [rad].
+            shift_std: of each component of a link's shift, at the joint [m].
+            marker_std: of each component of the marker's position [m].
+            ellipse_std: the arm's deviation from rigidity; None estimates it by the evidence of the pairs at every fit.
 
         Raises:
-            SettingError: a standard deviation is not positive. BasisError: bases do not fit the chain.
+            SettingError: a standard deviation is not positive.
+            BasisError: bases do not fit the chain.
         """
         length = max(float(np.linalg.norm(chain.fixed[:, :3, 3], axis=1).mean()), 1e-3)
         family = CoreFamily.around(
@@ -126,20 +134,20 @@ class TensorLearner:
 
     @property
     def pairs(self) -> int:
-        """How many pairs have been learnt."""
+        """Number of learnt pairs."""
         return self._pairs
 
     @property
     def kept(self) -> int:
-        """How many pairs are in the window."""
+        """Number of pairs in the window."""
         return len(self._q)
 
     @property
     def pairs_needed(self) -> int:
-        """Pairs before the first fit where there is no prior: half as many again as three numbers each could do with.
+        """Minimum number of pairs for the first fit without a prior: 1.5 times one third of the free parameters.
 
-        The train has Σ 12 m_k numbers over all joints but the last and 3 m_d of that, less 12 for the frame between
-        any two cores: 24 d − 15 for revolute joints.
+        The train has Σ 12 m_k numbers over all joints but the last and 3 m_d of that, less 12 for the frame between any
+        two cores: 24 d − 15 for revolute joints.
         """
         sizes = [basis.size for basis in self.bases]
         numbers = 12 * sum(sizes[:-1]) + 3 * sizes[-1] - 12 * (self.joints - 1)
@@ -147,7 +155,7 @@ class TensorLearner:
 
     @property
     def train(self) -> TensorTrain:
-        """The train as fitted last.
+        """Train of the last fit.
 
         Raises:
             DegenerateDataError: there is no prior, and fewer than `pairs_needed` pairs so far.
@@ -161,19 +169,21 @@ class TensorLearner:
 
     @property
     def noise(self) -> float | None:
-        """Noise of a coordinate at the last fit [m]: as found, or the RMS of the given sigmas; None before."""
+        """Noise of a coordinate at the last fit [m]: estimated, or the RMS of the given sigmas; None before."""
         return None if self._fit is None else self._fit.noise
 
     @property
     def outliers(self) -> BoolArray:
-        """Which of the pairs of the last fit, oldest first, were left out as wrong."""
+        """True for each pair of the last fit, oldest first, that was left out as an outlier."""
         return np.zeros(0, dtype=np.bool_) if self._fit is None else ~self._fit.used
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
-        """Pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
+        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
 
         Args:
-            sigma: 1-sigma of a coordinate [m], () or (n,); None where the learner has to find it out.
+            q: joint values.
+            x: measured positions.
+            sigma: 1-sigma of a coordinate [m], () or (n,); None where the learner has to estimate it.
 
         Raises:
             ShapeError, NonFiniteError, SettingError (a sigma that is not positive): nothing has changed.
@@ -186,12 +196,12 @@ class TensorLearner:
         self._waiting += len(angles)
         if self.settings.window is not None:
             self._keep(self.settings.window)
-        # A quarter more pairs may change much while they are few.
+        # While pairs are few, a quarter more may change much.
         if self._waiting >= min(self.settings.refit_every, max(1, self.kept // _SHARE_BEFORE_REFIT)):
             self.refit()
 
     def forget(self, keep: int) -> None:
-        """Drops all but the last `keep` pairs. The train stays until the next fit.
+        """Drop all but the last `keep` pairs. The train stays until the next fit.
 
         Raises:
             SettingError: keep below 0.
@@ -201,14 +211,14 @@ class TensorLearner:
         self._keep(keep)
 
     def tool_changed(self, tolerance: float) -> None:
-        """Tells that the marker was moved: keeps what is known of all other cores, and forgets the pairs.
+        """Allow for a marker that was moved: keep the posterior of all other cores, and forget the pairs.
 
-        The train so far becomes the prior's mean. Each core's covariance is the one it has while the others rest,
-        which pins the frames between them. The last core is as free as a marker moved so far makes it: along the axes
-        of its frame where a nominal chain gave them, and any way where nothing did.
+        The current train becomes the prior's mean. Each core's covariance is the one with the others fixed, which pins
+        the frames between them. The last core is as free as a marker moved by the tolerance: along the axes of its
+        frame if a nominal chain gave them, otherwise in any direction.
 
         Args:
-            tolerance: 1-sigma of each component of the move [m].
+            tolerance: 1-sigma of each component of the displacement [m].
 
         Raises:
             SettingError: the tolerance is not positive.
@@ -221,7 +231,7 @@ class TensorLearner:
         self.rebase(prior)
 
     def rebase(self, prior: CorePrior) -> None:
-        """Another prior for the same pairs; the next fit starts from its mean.
+        """Replace the prior for the same pairs; the next fit starts from its mean.
 
         Raises:
             ShapeError: it has another number of joints.
@@ -234,7 +244,7 @@ class TensorLearner:
         self._waiting = self.kept
 
     def refit(self) -> None:
-        """Fits to all kept pairs now; without a prior only once there are `pairs_needed` of them."""
+        """Fit to all kept pairs now; without a prior only once there are `pairs_needed` of them."""
         if self.kept < (self.pairs_needed if self._searches else 1):
             return
         data = Pairs(self._stack.joint_weights(self._q), self._x, self._sigma)
@@ -248,7 +258,7 @@ class TensorLearner:
 
     @property
     def posterior(self) -> TensorPosterior:
-        """How sure the train is, as fitted last; the prior before.
+        """Posterior of the train at the last fit; the prior before.
 
         Raises:
             DegenerateDataError: there is neither a prior nor enough pairs.
@@ -258,7 +268,7 @@ class TensorLearner:
         return self._posterior
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
+        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
 
         Raises:
             ShapeError, NonFiniteError
@@ -267,7 +277,7 @@ class TensorLearner:
         return self.train.predict(q)
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d); exact.
+        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d); exact.
 
         Raises:
             ShapeError, NonFiniteError
@@ -276,9 +286,9 @@ class TensorLearner:
         return self.train.jacobian(q)
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Positions at q (n, d), or (d,), with the standard deviation that Gauss and Newton's posterior leaves them.
+        """Return positions at q (n, d), or (d,), with the standard deviation of the Gauss-Newton posterior.
 
-        Where residuals show joints or an instrument that err as no train does, what that leaves open adds to it
+        Where residuals show joint or instrument errors that no train can follow, their uncertainty is added
         (`kbmaps.trains.misfit`).
 
         Raises:
@@ -292,7 +302,7 @@ class TensorLearner:
         return Estimate(self.predict(batch), np.sqrt(variance), inside).like(angles)
 
     def to_bytes(self) -> bytes:
-        """The train, its prior, the kept pairs and the settings as one self-describing byte string."""
+        """Return the train, its prior, the kept pairs and the settings as one self-describing byte string."""
         arrays = {"q": self._q, "x": self._x, "sigma": self._sigma}
         if self._prior is not None:
             arrays |= {"mean": self._prior.mean, "spread": self._prior.spread}
@@ -316,10 +326,10 @@ class TensorLearner:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """The learner that `to_bytes` wrote.
+        """Return the learner in the bytes of `to_bytes`.
 
         Raises:
-            ModelFormatError: the bytes are damaged, truncated, or something else.
+            ModelFormatError: the bytes are damaged, truncated, or of another format.
         """
         content, arrays = unpack(data, KIND)
         with restoring("a tensor learner"):
@@ -370,7 +380,7 @@ class TensorLearner:
         return self._prior
 
     def _with_likely_prior(self, data: Pairs, fit: Fit) -> Fit:
-        """The fit under the member of the family that the pairs speak for."""
+        """Return the fit under the member of the family that the pairs support."""
         if self._family is None:
             return fit
         prior = self._known_prior()
@@ -383,7 +393,7 @@ class TensorLearner:
         return refine(data, self._prior, z, fit.noise, robust=self.settings.robust)
 
     def _fitted(self, data: Pairs) -> Fit:
-        """The fit to all kept pairs; gives a learner without a prior a vague one of the pairs' size."""
+        """Return the fit to all kept pairs; give a learner without a prior a vague one of the pairs' size."""
         rng = np.random.default_rng(self.settings.seed)
         if self._prior is None:
             self._prior = CorePrior.vague(self.joints, data.size / math.sqrt(self.joints))
@@ -403,7 +413,7 @@ class TensorLearner:
 
 
 def _of_rows(name: str, values: FloatArray, length: int, width: int) -> FloatArray:
-    """Finite `values` of shape (length, width). Raises ShapeError, NonFiniteError."""
+    """Return finite `values` of shape (length, width). Raises ShapeError, NonFiniteError."""
     if len(values) != length:
         raise ShapeError(name, f"({length}, {width})", values.shape)
     return rows(name, values, width)

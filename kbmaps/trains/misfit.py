@@ -1,4 +1,4 @@
-"""What no tensor train follows: joints that turn by a little more or less than they say, an instrument that bends."""
+"""Errors that no tensor train can follow: of joint readings and compliance, and of a distorting instrument."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from kbmaps.arrays import FloatArray
 from kbmaps.maps.basis import JointBasis
 from kbmaps.trains.train import TensorTrain
 
-# Standard deviations that are tried: of a joint's errors [rad], or in prismatic joints and 1 m away [m].
+# Candidate standard deviations: of a joint's errors [rad], or in prismatic joints and 1 m away [m].
 _STDS = np.geomspace(1e-5, 1e-1, 17)
 _SWEEPS = 2
 _ROUNDING = 1e-10
-# Twice the gain in log evidence that speaks for a kind of errors; by chance one arm in twelve has as much.
+# Minimum of twice the gain in log evidence for a kind of errors; one arm in twelve reaches it by chance.
 _TELLING = 2.0
 
 
 def misfit_directions(train: TensorTrain, q: FloatArray) -> FloatArray:
-    """What errors of joints and instrument do to the marker (n, 3, 5 d + 18) [m/rad, m/m], for trusted q (n, d).
+    """Return the effect of joint and instrument errors on the marker (n, 3, 5 d + 18) at q (n, d).
 
-    A joint's error is a second harmonic of its reading (a train has the constant and the first: so do eccentric
-    encoders, gears and what else repeats err), or proportional to the moment of a force on the marker, along each axis
-    of the measurement frame (so do elastic joints err). The instrument's is any quadratic function of the position
-    (so do lenses err; a train follows the linear ones).
+    In m/rad, or m/m; q is not checked. A joint's error is a second harmonic of its reading, or proportional to the
+    moment of a force on the marker along each axis of the measurement frame. The first models eccentric encoders, gears
+    and other periodic errors (a train has the constant and the first harmonic), the second elastic joints. The
+    instrument's error is any quadratic function of the position, as of lenses (a train follows linear ones).
     """
     slopes = train.jacobian(q)
     phases = _phases(train.bases, q)
     errors = [np.cos(phases), np.sin(phases)]
-    # By as much at a lever of 1 m as by a harmonic; so does the instrument 1 m away.
+    # Scaled so that at a lever of 1 m they equal a harmonic; likewise the instrument 1 m away.
     errors += [slopes[:, axis] for axis in range(3)]
     x = train.predict(q)
     squares = (x[:, :, None] * x[:, None, :])[:, *np.triu_indices(3)]
@@ -38,17 +38,17 @@ def misfit_directions(train: TensorTrain, q: FloatArray) -> FloatArray:
 
 
 def misfit_sizes(joints: int) -> tuple[int, int, int]:
-    """How many directions are harmonics of joints, joints under load, and the instrument's."""
+    """Return the number of directions for joints' harmonics, joints under load, and the instrument."""
     return 2 * joints, 3 * joints, 18
 
 
 def likely_misfit(
     directions: FloatArray, absorbed: FloatArray, residuals: FloatArray, sizes: tuple[int, ...]
 ) -> FloatArray:
-    """The most likely standard deviation of each group of errors; 0 where the pairs speak for none.
+    """Return the most likely standard deviation of each group of errors; 0 if the pairs support none.
 
-    With y = J z + G w + e in units of the noise, z ~ N(0, I), w ~ N(0, D²) and z marginalised, what counts of w is
-    C = Gᵀ (I + J Jᵀ)⁻¹ G, and Gᵀ r of the residuals r at the best z:
+    With y = J z + G w + e in units of the noise, z ~ N(0, I), w ~ N(0, D²) and z marginalised, the information about w
+    is C = Gᵀ (I + J Jᵀ)⁻¹ G, and Gᵀ r of the residuals r at the best z:
 
         2 log p(D) - 2 log p(0) = rᵀ G D (I + D C D)⁻¹ D Gᵀ r - log |I + D C D|.
 
@@ -59,7 +59,8 @@ def likely_misfit(
         sizes: of the groups, k in all.
     """
     values, vectors = np.linalg.eigh(directions.T @ directions - absorbed.T @ absorbed)
-    # What the cores make up for all but rounding shows nothing; without noise the rounding would be taken for much.
+    # Directions that the cores absorb up to rounding are not determined; without noise, rounding would look
+    # significant.
     values = np.maximum(values, _ROUNDING * max(float(values.max(initial=0.0)), 1e-300))
     matrix = (vectors * values) @ vectors.T
     pull = directions.T @ residuals
@@ -82,7 +83,7 @@ def _gain(matrix: FloatArray, pull: FloatArray, spread: FloatArray) -> float:
 
 
 def _phases(bases: Sequence[JointBasis], q: FloatArray) -> FloatArray:
-    """Twice the angle of a revolute joint; a prismatic one's stroke counts as a turn."""
+    """Return twice the angle of a revolute joint; a prismatic one's stroke counts as a turn."""
     phases = 2.0 * q
     for k, basis in enumerate(bases):
         if basis.is_prismatic:

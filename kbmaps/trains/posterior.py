@@ -1,4 +1,4 @@
-"""How sure a tensor train is, and what it cannot follow."""
+"""Posterior of a tensor train, including errors that it cannot follow."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from kbmaps.trains.misfit import likely_misfit, misfit_directions, misfit_sizes
 from kbmaps.trains.train import TensorTrain
 
 _BATCH_ROWS = 512
-# By how much the axes of the last frame may be off, as a share of a marker's move.
+# Assumed error of the last frame's axes, as a share of a marker's displacement.
 _FRAME_ERROR = 0.05
 
 
 class TensorPosterior:
-    """Gauss and Newton's posterior of a train's cores. A `kbmaps.planning.posterior.Posterior`.
+    """Gauss-Newton posterior of a train's cores. A `kbmaps.planning.posterior.Posterior`.
 
     Args:
         train: the most likely one.
@@ -46,29 +46,30 @@ class TensorPosterior:
         self._misfit, self._absorbed = np.zeros(len(self._sizes)), np.zeros((size, sum(self._sizes)))
 
     def judge(self, q: FloatArray, residuals: FloatArray, std: FloatArray) -> None:
-        """Finds what the train does not follow from what it leaves of its pairs; once somebody asks.
+        """Set the residuals from which errors that the train does not follow are estimated, on demand.
 
         Args:
-            q: configurations (n, d) of the pairs that the fit used; residuals: (n, 3) [m] there.
+            q: configurations (n, d) of the pairs that the fit used.
+            residuals: (n, 3) [m] there.
             std: of a coordinate of each (n,) [m], as in `information`.
         """
         self._left, self._learnt = (q, residuals, std), q
 
     @property
     def misfit(self) -> FloatArray:
-        """Standard deviations (3,) [rad, m] of errors that no train follows; 0 where the pairs speak for none."""
+        """Standard deviations (3,) [rad, m] of errors that no train follows; 0 where the pairs support none."""
         self._judge_what_is_left()
         return self._misfit
 
     @property
     def absorbed(self) -> FloatArray:
-        """How the cores make up for such errors (36 d, 5 d + 18)."""
+        """Part of such errors that the cores absorb (36 d, 5 d + 18)."""
         self._judge_what_is_left()
         return self._absorbed
 
     @property
     def widest(self) -> float:
-        """The greatest variance of a position among the pairs that the fit used [m²] (`kbmaps.model.widest`)."""
+        """Greatest variance of a position among the pairs that the fit used [m²] (`kbmaps.model.widest`)."""
         if self._learnt is not None:
             self._widest, self._learnt = widest(self.variance(self._learnt)), None
         return self._widest
@@ -83,17 +84,22 @@ class TensorPosterior:
         self.take(likely_misfit(directions, absorbed, residuals.ravel() / scale[:, 0], self._sizes), absorbed)
 
     def take(self, misfit: FloatArray, absorbed: FloatArray) -> None:
-        """The standard deviations (3,) [rad, m], and how the cores make up for the errors (36 d, 5 d + 18)."""
+        """Set the standard deviations of the errors (3,) [rad, m], and the part that the cores absorb.
+
+        Args:
+            misfit: standard deviations (3,) [rad, m].
+            absorbed: part of the errors that the cores absorb (36 d, 5 d + 18).
+        """
         self._misfit, self._absorbed, self._left = misfit, absorbed, None
 
     def restore(self, misfit: FloatArray, absorbed: FloatArray, widest: float) -> None:
-        """What `misfit`, `absorbed` and `widest` were of a posterior that was stored."""
+        """Restore `misfit`, `absorbed` and `widest` of a stored posterior."""
         self.take(misfit, absorbed)
         self._widest = widest
 
     @cached_property
     def _root(self) -> FloatArray:
-        """A root of the cores' covariance (36 d, 36 d)."""
+        """Root of the cores' covariance (36 d, 36 d)."""
         return np.eye(CORE_NUMBERS * self.joints) if self.information is None else inverse_roots(self.information)
 
     @property
@@ -102,7 +108,7 @@ class TensorPosterior:
         return self._prior.joints
 
     def roots(self, q: ArrayLike) -> FloatArray:
-        """Matrices R (n, 3, p) [m] at q (n, d): R_i R_jᵀ is the covariance of the positions at q_i and q_j.
+        """Return matrices R (n, 3, p) [m] at q (n, d): R_i R_jᵀ is the covariance of the positions at q_i and q_j.
 
         Raises:
             ShapeError, NonFiniteError
@@ -115,7 +121,7 @@ class TensorPosterior:
         return np.concatenate([linear, np.repeat(self.misfit, self._sizes) * left], axis=2)
 
     def variance(self, q: FloatArray) -> FloatArray:
-        """Variance (n, 3) [m²] of each coordinate at q (n, d)."""
+        """Return the variance (n, 3) [m²] of each coordinate at q (n, d)."""
         variance = np.empty((len(q), 3))
         for start in range(0, len(q), _BATCH_ROWS):
             part = slice(start, start + _BATCH_ROWS)
@@ -123,10 +129,10 @@ class TensorPosterior:
         return variance
 
     def with_other_tool(self, tolerance: float) -> CorePrior:
-        """The cores' own posteriors, each while the others rest; the last as free as a moved marker makes it.
+        """Return each core's posterior with the others fixed; the last is as free as a displaced marker makes it.
 
         Args:
-            tolerance: 1-sigma of each component of the move [m].
+            tolerance: 1-sigma of each component of the displacement [m].
         """
         cores, spread = self._train.cores.reshape(self.joints, CORE_NUMBERS), self._prior.spread
         if self.information is not None:
@@ -145,14 +151,14 @@ class TensorPosterior:
 
 
 def inverse_roots(information: FloatArray) -> FloatArray:
-    """Square roots of (H + I)⁻¹ (..., m, m) for H (..., m, m), positive semidefinite up to rounding."""
+    """Return square roots of (H + I)⁻¹ (..., m, m) for H (..., m, m), positive semidefinite up to rounding."""
     values, vectors = np.linalg.eigh(information)
     roots: FloatArray = vectors / np.sqrt(1.0 + np.maximum(values, 0.0))[..., None, :]
     return roots
 
 
 def _marker_moves(last_core: FloatArray, std: float) -> FloatArray:
-    """Changes (36, moves) of the last core when the marker moves by `std` [m] each way."""
+    """Return changes (36, moves) of the last core when the marker moves by `std` [m] each way."""
     free = np.diag(np.tile([0.0, 0.0, 0.0, std], 9))
     if not last_core[:, :, :3].any():
         return free

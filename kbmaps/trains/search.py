@@ -1,4 +1,4 @@
-"""Fits of a tensor train with what the data say themselves: their noise, and which pairs are wrong."""
+"""Fits of a tensor train with the noise and the outliers estimated from the data."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from kbmaps.trains.core_prior import CorePrior
 from kbmaps.trains.fit import LevenbergMarquardt, TensorProblem, alternate
 from kbmaps.trains.train import TensorTrain
 
-# Relative to the spread of the positions: below it, residuals are rounding.
+# Relative to the spread of the positions: smaller residuals are rounding.
 _NOISE_FLOOR = 1e-13
-# Residuals below this share of the positions' spread: the pairs are explained, no further start is needed.
+# With residuals below this share of the positions' spread, no further start is needed.
 _EXPLAINED = 1e-4
 _FIRST_NOISE = 2e-2
 _SWEEPS = 40
@@ -27,22 +27,22 @@ _FIRST_STEPS = 30
 _ROUND_STEPS = 6
 _ROUNDS = 40
 _SAME_NOISE = 0.02
-# Starts that failed leave a tenth or more of the spread, and may agree on it by chance.
+# Failed starts leave a tenth or more of the spread, and may agree on it by chance.
 PLAUSIBLE = 0.1
-# Farther than this many robust standard deviations a pair is wrong: 1.5e-5 of good pairs are.
+# A pair farther than this many robust standard deviations is an outlier: 1.5e-5 of good pairs are.
 _OUTLIER_DISTANCE = 5.0
 _WEIGHT_SCALE = 4.0
 # Reweighting ends when no residual moves by more than this many standard deviations.
 _SAME_LENGTHS = 0.05
-# Random starts are tried on at most so many pairs a joint.
+# Random starts use at most this many pairs per joint.
 _SEARCH_PAIRS = 40
-# With fewer degrees of freedom a pair, residuals do not tell noise from outliers.
+# With fewer degrees of freedom per pair, residuals cannot separate noise from outliers.
 _LEAST_FREEDOM = 0.2
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Trusted pairs.
+    """Checked pairs.
 
     Attributes:
         weights: basis functions (n, d, 3).
@@ -56,7 +56,7 @@ class Pairs:
 
     @property
     def unknown(self) -> BoolArray:
-        """Which pairs come without a sigma (n,)."""
+        """True for each pair (n,) without a sigma."""
         return np.isnan(self.sigma)
 
     @property
@@ -67,21 +67,21 @@ class Pairs:
 
     @property
     def noise_floor(self) -> float:
-        """Where residuals are rounding [m]."""
+        """Size below which residuals are rounding [m]."""
         return _NOISE_FLOOR * self.size
 
     def chosen(self, mask: BoolArray) -> Pairs:
         return Pairs(self.weights[mask], self.x[mask], self.sigma[mask])
 
     def problem(self, prior: CorePrior, noise: float, trust: FloatArray | None = None) -> TensorProblem:
-        """The problem with `noise` [m] where no sigma is given, and variances divided by `trust` (n,)."""
+        """Return the problem with `noise` [m] where no sigma is given, and variances divided by `trust` (n,)."""
         std = np.where(self.unknown, noise, self.sigma)
         return TensorProblem(self.weights, self.x, std if trust is None else std / np.sqrt(trust), prior)
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Whitened cores z, the noise of a coordinate [m], and which pairs were used (n,)."""
+    """Whitened cores z, the noise of a coordinate [m], and True for each pair (n,) that was used."""
 
     z: FloatArray
     noise: float
@@ -89,7 +89,7 @@ class Fit:
 
 
 def refine(pairs: Pairs, prior: CorePrior, z: FloatArray, noise: float, *, robust: bool = True) -> Fit:
-    """The most likely train near z, with the noise found out in turn, and without the pairs that are wrong."""
+    """Return the most likely train near z, with the noise estimated in turn, and without the outliers."""
     plain = _settle(pairs, prior, z, noise)
     everything = np.ones(len(pairs.x), dtype=np.bool_)
     if not robust:
@@ -117,7 +117,10 @@ def search(
     *,
     robust: bool = True,
 ) -> Fit:
-    """The best of several fits from random rigid chains. Ends early when a start explains the pairs, or two agree."""
+    """Return the best of several fits from random rigid chains.
+
+    Ends early when one explains the pairs, or two agree.
+    """
     some = pairs
     if len(pairs.x) > _SEARCH_PAIRS * len(bases):
         mask = np.zeros(len(pairs.x), dtype=np.bool_)
@@ -139,7 +142,7 @@ def search(
 def _from_a_random_chain(pairs: Pairs, prior: CorePrior, bases: Sequence[JointBasis], rng: np.random.Generator) -> Fit:
     noise = _FIRST_NOISE * pairs.size
     chain = random_chain(bases, pairs.size / math.sqrt(len(bases)), rng)
-    # A given sigma would make the first steps as rugged as the data are exact.
+    # A small given sigma would make the objective of the first steps rugged.
     problem = TensorProblem(pairs.weights, pairs.x, np.full(len(pairs.x), noise), prior)
     z = alternate(problem, prior.whitened(TensorTrain.from_chain(chain, bases).cores), _SWEEPS)
     z, _ = LevenbergMarquardt().run(problem, z, _FIRST_STEPS)
@@ -152,7 +155,7 @@ def _from_a_random_chain(pairs: Pairs, prior: CorePrior, bases: Sequence[JointBa
 
 
 def random_chain(bases: Sequence[JointBasis], length: float, rng: np.random.Generator) -> RigidChain:
-    """A chain with random axes and links of about `length` [m] for joints of the bases' kinds."""
+    """Return a chain with random axes and links of about `length` [m] for joints of the bases' kinds."""
     joints = len(bases)
     fixed = np.tile(np.eye(4), (joints + 1, 1, 1))
     fixed[:, :3, :3] = Rotation.random(joints + 1, rng=rng).as_matrix()
@@ -163,10 +166,10 @@ def random_chain(bases: Sequence[JointBasis], length: float, rng: np.random.Gene
 
 
 def information(pairs: Pairs, prior: CorePrior, fit: Fit) -> tuple[FloatArray, FloatArray]:
-    """JᵀJ (36 d, 36 d) of the pairs that a fit used, by z: what they tell beyond the prior's unit matrix.
+    """Return JᵀJ (36 d, 36 d) of the pairs that a fit used, by z: the information beyond the prior's unit matrix.
 
-    Also the standard deviation of a coordinate of each (n,) [m] that it counts with. Where every sigma was given but
-    the residuals are larger, they count as if the sigmas were larger too.
+    Also returns the standard deviation of a coordinate of each (n,) [m] as weighted. Where every sigma was given but
+    the residuals are larger, all are scaled up accordingly.
     """
     good = pairs.chosen(fit.used)
     problem = good.problem(prior, fit.noise)
@@ -181,7 +184,10 @@ def information(pairs: Pairs, prior: CorePrior, fit: Fit) -> tuple[FloatArray, F
 
 
 def effective_parameters(problem: TensorProblem, z: FloatArray) -> float:
-    """How many numbers the pairs determine against the prior: Σ λ / (1 + λ) over the eigenvalues of JᵀJ."""
+    """Return the number of parameters that the pairs determine against the prior.
+
+    Σ λ / (1 + λ) over the eigenvalues λ of JᵀJ.
+    """
     jacobian = problem.scaled_jacobian(z)
     gram = jacobian @ jacobian.T if jacobian.shape[0] < jacobian.shape[1] else jacobian.T @ jacobian
     values = np.maximum(np.linalg.eigvalsh(gram), 0.0)
@@ -189,7 +195,10 @@ def effective_parameters(problem: TensorProblem, z: FloatArray) -> float:
 
 
 def _settle(pairs: Pairs, prior: CorePrior, z: FloatArray, noise: float) -> Fit:
-    """z and noise in turn until neither moves. The noise follows MacKay 1992: rss / (3 n − effective parameters)."""
+    """Fit z and noise in turn until neither moves.
+
+    The noise follows MacKay 1992: rss / (3 n − effective parameters).
+    """
     optimiser = LevenbergMarquardt()
     used = np.ones(len(pairs.x), dtype=np.bool_)
     for _ in range(_ROUNDS):
@@ -209,16 +218,16 @@ def _settle(pairs: Pairs, prior: CorePrior, z: FloatArray, noise: float) -> Fit:
 
 
 def _noise(pairs: Pairs, problem: TensorProblem, z: FloatArray) -> float:
-    """Noise of a coordinate of the pairs that came without a sigma [m]."""
+    """Return the noise of a coordinate of the pairs that came without a sigma [m]."""
     freedom = 1.0 - effective_parameters(problem, z) / (3.0 * len(pairs.x))
     mean_square = float(np.square(problem.residuals(z))[pairs.unknown].mean())
     return math.sqrt(mean_square / max(freedom, 1e-9))
 
 
 def _distances(pairs: Pairs, prior: CorePrior, fit: Fit) -> tuple[FloatArray, bool]:
-    """Residuals' lengths (n,) in robust standard deviations, and whether these mean anything.
+    """Return residuals' lengths (n,) in robust standard deviations, and True if these are meaningful.
 
-    The unit is what the median says; where every sigma is told, no less than that.
+    The unit comes from the median; where every sigma is given, it is at least that.
     """
     problem = pairs.problem(prior, fit.noise)
     freedom = 1.0 - effective_parameters(problem, fit.z) / (3.0 * len(pairs.x))
@@ -230,13 +239,13 @@ def _distances(pairs: Pairs, prior: CorePrior, fit: Fit) -> tuple[FloatArray, bo
 
 
 def _good(pairs: Pairs, prior: CorePrior, fit: Fit) -> BoolArray:
-    """Which pairs (n,) lie no farther from the fit than noise takes them."""
+    """Return True for each pair (n,) whose distance from the fit is within the noise."""
     lengths, telling = _distances(pairs, prior, fit)
     return lengths <= _OUTLIER_DISTANCE if telling else np.ones(len(lengths), dtype=np.bool_)
 
 
 def _reweighted(pairs: Pairs, prior: CorePrior, fit: Fit) -> Fit:
-    """Iteratively reweighted fit with Geman and McClure's weights (1 + r²)⁻²."""
+    """Return an iteratively reweighted fit with Geman and McClure's weights (1 + r²)⁻²."""
     optimiser = LevenbergMarquardt()
     z = fit.z
     for _ in range(_ROUNDS):

@@ -1,4 +1,4 @@
-"""The settings of a learner of tensor trains."""
+"""Settings of a learner of tensor trains."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from kbmaps.packed import count, flag, named
 
 @dataclass(frozen=True)
 class TensorSettings:
-    """How a TensorLearner works.
+    """Settings of a TensorLearner.
 
     Attributes:
-        window: how many of the last pairs are kept; None keeps all.
-        refit_every: pairs after which `learn` fits anew; earlier where they are a quarter of all kept pairs. Until
-            then they wait, or for `refit`.
+        window: number of the last pairs to keep; None keeps all.
+        refit_every: number of new pairs after which `learn` refits; earlier if they are a quarter of all kept pairs.
+            Until then they wait, or for `refit`.
         robust: leave out pairs that lie more than five robust standard deviations off.
-        starts: most random chains to start from where there is no prior.
+        starts: maximum number of random chains to start from without a prior.
         seed: of these random chains, so that the same pairs give the same train.
 
     Raises:
@@ -41,7 +41,7 @@ class TensorSettings:
 
 
 def parse_settings(value: Any) -> TensorSettings:
-    """The settings that `dataclasses.asdict` gave. Raises ModelFormatError, SettingError."""
+    """Return the settings from `dataclasses.asdict`. Raises ModelFormatError, SettingError."""
     stored = named(value, "the settings", [field.name for field in fields(TensorSettings)])
     whole = {name: count(stored[name], f"the setting {name}") for name in ("refit_every", "starts", "seed")}
     window = None if stored["window"] is None else count(stored["window"], "the setting window")

@@ -1,4 +1,4 @@
-"""Forward kinematics as a tensor train: one affine core a joint instead of 3^d control points."""
+"""Forward kinematics as a tensor train: one affine core per joint instead of 3^d control points."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ KIND = "tensor train"
 
 @dataclass(frozen=True, eq=False)
 class TensorTrain:
-    """Marker positions as a product of affine maps, one a joint.
+    """Marker positions as a product of affine maps, one per joint.
 
-    M_k(q_k) = Σ_j w_kj(q_k) B_kj with B_kj the upper three rows of an affine 4x4 matrix, and
-    x(q) = M_1(q_1) ∘ … ∘ M_d(q_d) applied to the origin. The control net of this map is a tensor train
-    (Oseledets 2011) of rank 4. Every rigid chain is one, and so is every chain whose joints move on ellipses.
+    M_k(q_k) = Σ_j w_kj(q_k) B_kj with B_kj the upper three rows of an affine 4x4 matrix, and x(q) = M_1(q_1) ∘ … ∘
+    M_d(q_d) applied to the origin. The control net of this map is a tensor train (Oseledets 2011) of rank 4. Every
+    rigid chain is one, and so is every chain whose joints move on ellipses.
 
     Attributes:
-        bases: one basis a joint, in the order of q.
+        bases: one basis per joint, in the order of q.
         cores: B (d, 3, 3, 4): joint, basis function, row, column; the last column of a core is a translation [m].
             A prismatic joint has two functions, its third slice is 0. The first three columns of the last core
             move no position. Read-only.
@@ -69,10 +69,10 @@ class TensorTrain:
 
     @classmethod
     def from_chain(cls, chain: RigidChain, bases: Sequence[JointBasis]) -> TensorTrain:
-        """The chain as a tensor train, exact up to rounding.
+        """Return the chain as a tensor train, exact up to rounding.
 
         Raises:
-            BasisError: another number of bases, or a revolute basis for a prismatic joint.
+            BasisError: wrong number of bases, or a revolute basis for a prismatic joint.
         """
         check_bases(bases, chain.prismatic.tolist())
         cores = np.zeros((chain.joints, 3, 3, 4))
@@ -91,7 +91,7 @@ class TensorTrain:
         return len(self.bases)
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Marker position (3,) [m] for joint values q (d,) [rad, m], or (n, 3) for (n, d).
+        """Return the marker position (3,) [m] for joint values q (d,) [rad, m], or (n, 3) for (n, d).
 
         Raises:
             ShapeError, NonFiniteError
@@ -101,7 +101,7 @@ class TensorTrain:
         return positions[0] if checked.ndim == 1 else positions
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d).
+        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d).
 
         Raises:
             ShapeError, NonFiniteError
@@ -117,10 +117,10 @@ class TensorTrain:
         return columns[0] if checked.ndim == 1 else columns
 
     def in_basis(self, bases: Sequence[JointBasis]) -> TensorTrain:
-        """The same map with its cores expressed in other bases; exact up to rounding.
+        """Return the same map with its cores expressed in other bases; exact up to rounding.
 
         Raises:
-            BasisError: another number of joints, or a prismatic basis for a revolute joint.
+            BasisError: wrong number of joints, or a prismatic basis for a revolute joint.
         """
         if len(bases) != self.joints:
             raise BasisError(f"need {self.joints} bases, one a joint; got {len(bases)}")
@@ -130,10 +130,10 @@ class TensorTrain:
         return TensorTrain(tuple(bases), cores)
 
     def to_kbmap(self) -> KBMap:
-        """The same map with its full control net: 3^d control points, so for few joints only.
+        """Return the same map with its full control net: 3^d control points, so for few joints only.
 
         Raises:
-            NetSizeError: more than 3^13.
+            NetSizeError: more than 3^13 control points.
         """
         check_net_size(self.bases, POSITION_OUTPUTS)
         tensor: FloatArray = np.array([0.0, 0.0, 0.0, 1.0])
@@ -147,19 +147,19 @@ class TensorTrain:
         return KBMap(self.bases, tensor[:3])
 
     def maps(self, q: FloatArray) -> FloatArray:
-        """The affine maps M_k(q_k) as (d, n, 3, 4) for q (n, d); q is trusted."""
+        """Return the affine maps M_k(q_k) as (d, n, 3, 4) for q (n, d), which is not checked."""
         return _mixed(self._stack.joint_weights(q), self.cores)
 
     def to_bytes(self) -> bytes:
-        """The map as one self-describing byte string (see `kbmaps.packed`)."""
+        """Return the map as one self-describing byte string (see `kbmaps.packed`)."""
         return pack(KIND, {"bases": describe_bases(self.bases)}, {"cores": self.cores})
 
     @classmethod
     def from_bytes(cls, data: bytes) -> TensorTrain:
-        """The map that `to_bytes` wrote.
+        """Return the map in the bytes of `to_bytes`.
 
         Raises:
-            ModelFormatError: the bytes are damaged, truncated, or something else.
+            ModelFormatError: the bytes are damaged, truncated, or of another format.
         """
         fields, arrays = unpack(data, KIND)
         with restoring("a tensor train"):
@@ -168,12 +168,12 @@ class TensorTrain:
 
 
 def apply(maps: FloatArray, points: FloatArray) -> FloatArray:
-    """Points (n, 3) moved by affine maps (n, 3, 4)."""
+    """Return points (n, 3) moved by affine maps (n, 3, 4)."""
     return (maps[:, :, :3] @ points[:, :, None])[:, :, 0] + maps[:, :, 3]
 
 
 def suffixes(maps: FloatArray) -> FloatArray:
-    """For affine maps (d, n, 3, 4): the marker (d+1, n, 3) as seen before each joint; the last is the origin."""
+    """Return, for affine maps (d, n, 3, 4), the marker (d+1, n, 3) seen before each joint; the last is the origin."""
     points = np.zeros((len(maps) + 1, maps.shape[1], 3))
     for k in range(len(maps) - 1, -1, -1):
         points[k] = apply(maps[k], points[k + 1])
@@ -181,7 +181,7 @@ def suffixes(maps: FloatArray) -> FloatArray:
 
 
 def prefixes(maps: FloatArray) -> FloatArray:
-    """For affine maps (d, n, 3, 4): the linear part (d, n, 3, 3) of the product of all maps before each joint."""
+    """Return, for affine maps (d, n, 3, 4), the linear part (d, n, 3, 3) of the product of maps before each joint."""
     linear = np.empty((len(maps), maps.shape[1], 3, 3))
     linear[0] = np.eye(3)
     for k in range(1, len(maps)):
@@ -190,13 +190,13 @@ def prefixes(maps: FloatArray) -> FloatArray:
 
 
 def _mixed(weights: FloatArray, cores: FloatArray) -> FloatArray:
-    """Σ_j weights[:, k, j] cores[k, j] for weights (n, d, 3): (d, n, 3, 4)."""
+    """Return Σ_j weights[:, k, j] cores[k, j] for weights (n, d, 3): (d, n, 3, 4)."""
     flat = weights.swapaxes(0, 1) @ cores.reshape(len(cores), 3, 12)
     return flat.reshape(*flat.shape[:2], 3, 4)
 
 
 def _monomial_terms(link: RigidChain) -> FloatArray:
-    """A (3 or 2, 4, 4) of a chain of one joint: T = A0 + cos q·A1 + sin q·A2, or A0 + q·A1 for a prismatic joint."""
+    """Return A (3 or 2, 4, 4) of a one-joint chain: T = A0 + cos q·A1 + sin q·A2, or A0 + q·A1 if prismatic."""
     if link.prismatic[0]:
         start, end = link.poses([[0.0], [1.0]])
         return np.stack([start, end - start])
