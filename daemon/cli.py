@@ -60,6 +60,8 @@ GROUPS = {
     },
 }
 COMMANDS = {name: summary for group in GROUPS.values() for name, summary in group.items()}
+# One object each: commands that are apps keep theirs, and two of the same name are refused.
+_SECTIONS = {title: cyclopts.Group(title, sort_key=place) for place, title in enumerate(GROUPS)}
 
 
 # Each paragraph is one line: the terminal's width breaks it.
@@ -85,8 +87,8 @@ def command_line(called: str | None = None) -> cyclopts.App:
         help_format="markdown" if called in COMMANDS else "plaintext",  # rendering markdown takes 0.1 s of CPU
     )
     line["--help"].group = line["--version"].group = cyclopts.Group("Options", sort_key=len(GROUPS))
-    for place, (title, commands) in enumerate(GROUPS.items()):
-        group = cyclopts.Group(title, sort_key=place)
+    for title, commands in GROUPS.items():
+        group = _SECTIONS[title]
         for order, (name, summary) in enumerate(commands.items()):
             own = None if name == called else summary
             line.command(f"bodyschema.daemon.commands.{name}:{name}", name=name, help=own, group=group, sort_key=order)
