@@ -57,7 +57,7 @@ class DriversConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def hardware(self) -> DynamixelConfig | FeetechConfig | SerialLinesConfig | Ros2Config | PluginConfig | None:
-        """What the joints are read from, if there is something."""
+        """Configuration of the hardware that the joints are read from, if any."""
         return self.dynamixel or self.feetech or self.serial_lines or self.ros2 or self.plugin
 
     def check(self, joints: Sequence[str], file: Path, text: str) -> None:

@@ -19,7 +19,7 @@ class AnyServo(Protocol):
 
     @property
     def id(self) -> int:
-        """Its number on the bus."""
+        """ID on the bus."""
         ...
 
     @property
@@ -49,8 +49,7 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
 
     When several servos are asked at once, each waits for the end of the answer before its own, or for as long as that
     answer would have taken. Each samples its position when its turn comes. Servos that share an ID talk at the same
-    time:
-    where their bytes differ, the zeros win.
+    time: where their bytes differ, the zeros win.
 
     Attributes:
         servos: in the order of the cable.
@@ -60,7 +59,7 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
     """
 
     overhead: int
-    """Size of a status packet without its data [bytes]."""
+    """Bytes of a status packet besides its data."""
 
     def __init__(self, servos: Iterable[ServoT], faults: Faults = no_faults) -> None:
         """Create a chain with its power on."""
@@ -108,7 +107,7 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
 
     @abstractmethod
     def _instructions_in(self, stream: bytearray) -> tuple[list[Any], int]:
-        """All complete instructions in `stream`, and how many of its bytes need not be seen again."""
+        """Return all complete instructions in `stream`, and the number of bytes consumed."""
 
     @abstractmethod
     def _answers(self, instruction: Any, t: float, baud: int) -> list[Reply]:
@@ -132,7 +131,7 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
     def _together(
         self, servos: list[ServoT], t: float, act: Callable[[ServoT, float], tuple[Any, bytes]], code: int
     ) -> list[Reply]:
-        """Return the joint answer of all servos with one ID (usually one servo); empty if no servo answers."""
+        """Return the common answer of all servos with one ID (usually one servo); empty if no servo answers."""
         if not servos:
             return []
         start = t + min(servo.return_delay_s for servo in servos)

@@ -50,7 +50,7 @@ class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
     unit: ClassVar[str] = "packets understood"
     kinds: ClassVar[FaultKinds]
     errors: ClassVar[Mapping[str, int]]
-    """Hardware error bits, by name of the fault."""
+    """Bits of what is wrong with a servo, by the names of the faults."""
 
     def __init__(
         self,

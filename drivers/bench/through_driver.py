@@ -22,11 +22,11 @@ LATENCY_MS = 40.0
 
 @dataclass(frozen=True)
 class Behind:
-    """A driver with its bench.
+    """An open driver and its emulator.
 
     Attributes:
-        driver: is open.
-        look: reads the joints of the bench as they are now; None when that did not work out.
+        driver: the open driver.
+        look: reads the emulated joints at their present angles; None when the reading failed.
     """
 
     driver: JointSource
@@ -34,15 +34,14 @@ class Behind:
 
 
 OpenBench = Callable[[Mapping[str, Angle]], AbstractContextManager[Behind]]
-"""Creates an emulator for joints, given by name, and opens the driver that reads them."""
+"""Puts joints, by name, on a bench, and opens the driver that reads them."""
 
 
 class ThroughDriver:
     """A `JointSource` that passes each reading of another source through an emulator and a driver.
 
     The driver does all its work, down to the bytes. The other source's clock stands still meanwhile, so its time stamps
-    are
-    kept. Only the encoder resolution changes the angles.
+    are kept. Only the encoder resolution changes the angles.
     """
 
     def __init__(self, source: JointSource, open_bench: OpenBench) -> None:
