@@ -11,7 +11,7 @@ WORST = 0.02  # largest difference of clock rates that is tolerated until the ra
 
 
 class DeviceClock:
-    """Bounds the time of an event that the device stamped with its own clock.
+    """Map from a device clock to host time, for events that answer a request.
 
     The host knows an interval for each event: after it asked, and before the answer arrived. The stamp gives another
     interval, one tick wide, up to the offset between the clocks. The intervals of all events share this offset, so it
@@ -99,7 +99,7 @@ QUICKEST_SIGMA_S = 1e-3 / math.sqrt(3)  # USB polls every millisecond, so the de
 
 
 class StreamClock:
-    """Estimates when a device did something that it stamped and sent without being asked.
+    """Map from a device clock to host time, for events that the device sends without being asked.
 
     The host knows only the arrival time. It is later than the event by a delay that is never negative and is often
     close to its minimum. So the clock offset follows the lower edge of arrival minus stamp, and the slope of this edge
@@ -132,9 +132,9 @@ class StreamClock:
         return math.hypot(QUICKEST_SIGMA_S, self._above_s * math.hypot(1 - fraction, fraction))
 
     def time(self, latest: float, stamp: int) -> float | None:
-        """When the event was that was heard of at `latest` [s].
+        """Return the time of the event whose message arrived at `latest` [s].
 
-        None when the stamp belongs to another time; nothing is learnt from it then.
+        Return None when the stamp does not belong to this time; the state is not updated then.
         """
         if not self._least:
             self._device_s = self._origin_s = stamp * self._tick_s

@@ -74,7 +74,7 @@ class EchoFree:
         self._port.write(data)
 
     def receive(self, until: float) -> bytes:
-        """Return what has arrived besides the echo, else what arrives next; empty when nothing arrives before `until`."""
+        """Return what has arrived besides the echo, else what arrives next; empty if nothing arrives before `until`."""
         while data := self._port.receive(until):
             others = self._without_own(data)
             if others:

@@ -1,4 +1,4 @@
-"""Scan the serial ports of this machine for servos, in every protocol at every rate, without writing to any register."""
+"""Scan the serial ports of this machine for servos, in every protocol at every rate, without writing a register."""
 
 from __future__ import annotations
 

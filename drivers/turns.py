@@ -14,7 +14,7 @@ def nearest_turn(raw: int, near: float, per_turn: int | None) -> int:
 
 
 class SpeedGate:
-    """Rejects positions that no joint can have reached in the time since the last accepted ones.
+    """Filter for positions that no joint can have reached in the time since the last accepted ones.
 
     A glitch ends with the next reading. Rejected positions that agree with each other show a real jump (`jumped`).
     """
@@ -39,8 +39,9 @@ class SpeedGate:
         return self._agreeing >= self.CONFIRMATIONS
 
     def offer(self, t: float, places: Sequence[float]) -> int | None:
-        """Return the first joint that cannot be at its position at `t` [s]. Return None and accept the positions
-        otherwise.
+        """Return the first joint that cannot be at its position at `t` [s].
+
+        Otherwise accept the positions and return None.
         """
         seen = (t, tuple(places))
         refused = self._implausible(self._believed, seen)

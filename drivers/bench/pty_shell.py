@@ -28,7 +28,7 @@ TCGETS2, TERMIOS2 = 0x802C542A, struct.Struct("=4I20s2I")
 
 
 class PtyShell:
-    """Serves a device on a pseudo-terminal whose name stays the same when it is unplugged and plugged in again.
+    """A device on a pseudo-terminal whose name stays the same when it is unplugged and plugged in again.
 
     Answers take the time they would take on a wire at the baud rate of the opened port.
     """

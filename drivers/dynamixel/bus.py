@@ -35,7 +35,7 @@ class Bus(ServoBus):
         return packets_of(protocol)
 
     def sync_write(self, register: Register, values: Mapping[int, int]) -> None:
-        """Write a register of servos of Protocol 2.0, by ID. Servos do not acknowledge it; read back if that matters."""
+        """Write a register of servos of Protocol 2.0, by ID. It is not acknowledged; read back if that matters."""
         data = {id: register.bytes(value) for id, value in values.items()}
         self.announce(PACKETS2.sync_write(register.address, register.size, data))
 

@@ -55,7 +55,7 @@ class DynamixelConfig(ServosConfig[BusConfig], frozen=True, forbid_unknown_field
     gaze: GazeConfig | None = None
 
     def check(self, joints: Sequence[str], file: Path, text: str) -> None:
-        """Raise ConfigError if servos, zero-force or gaze do not fit `joints` or each other; see `ServosConfig.check`."""
+        """Raise ConfigError if servos, zero-force or gaze do not fit `joints` or each other; see `ServosConfig`."""
         super().check(joints, file, text)
         for name, keys, what, remedy in self._powered_mistakes():
             line = line_of(text, (*self.table.split("."), name, *keys)) or line_of(text, (*self.table.split("."), name))

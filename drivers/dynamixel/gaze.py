@@ -138,7 +138,7 @@ class Gaze(PoweredJoints):
             )
 
     def _ticks(self, servo: FittedServo, ahead: float, samples: Mapping[str, Sample | None]) -> int:
-        """Return the goal register of a command that is `ahead` of the joint [rad], relative to the servo's position."""
+        """Return the goal register of a command `ahead` of the joint [rad], relative to the servo's position."""
         sample = samples[servo.joint]
         if sample is None:
             raise Drop("no reading")

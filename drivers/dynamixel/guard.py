@@ -223,8 +223,10 @@ class Currents:
         return self._share * min(max((now - self._begin_s) / self._ramp_s, 0.0), 1.0)
 
     def at(self, now: float, torques: FloatArray) -> FloatArray:
-        """Return the currents [A] (n,) for the torques that hold the arm [N·m] (n,). Raise Drop if these are not
-        finite.
+        """Return the currents [A] (n,) for the torques that hold the arm [N·m] (n,).
+
+        Raises:
+            Drop: the torques are not finite.
         """
         if torques.shape != self._limit.shape or not np.isfinite(torques).all():
             raise Drop("the model gives no torque for where the arm is. Look at the URDF's masses and joint limits")

@@ -96,7 +96,7 @@ class Packets2:
         return Status(packet[4], body[1], body[2:], len(packet))
 
     def take_fast(self, received: bytes | bytearray, at: int, count: int, size: int) -> tuple[Status, ...] | None:
-        """Return the parts of the common answer of `count` servos with `size` data bytes each, unstuffed; see `take`."""
+        """Return the parts of the common answer of `count` servos, `size` data bytes each, unstuffed; see `take`."""
         packet = self._complete(received, at)
         if packet is None:
             return None

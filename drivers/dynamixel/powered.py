@@ -146,8 +146,10 @@ class PoweredJoints(ABC):
 
     @abstractmethod
     def _prepare(self, servo: FittedServo) -> int:
-        """Check the servo's own limits and return the goal with which its torque is safe to switch on. Raise
-        RequestError.
+        """Check the servo's own limits and return a goal with which its torque is safe to switch on.
+
+        Raises:
+            RequestError: the limits do not allow it.
         """
 
     @abstractmethod

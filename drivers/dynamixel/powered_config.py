@@ -62,8 +62,7 @@ class PoweredConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 class ZeroForceConfig(PoweredConfig, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [drivers.dynamixel.zero_force]: the servos carry the arm, so that it can be guided by hand without
-    weight.
+    """The table [drivers.dynamixel.zero_force]: the servos carry the arm's weight for hand guiding.
 
     Attributes:
         joints: those that carry the arm; the torque of the others stays off.

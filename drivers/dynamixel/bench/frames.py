@@ -127,7 +127,7 @@ def status_packet(protocol: int, id: int, error: int, params: bytes) -> bytes:
 
 
 def fast_header(sizes: Sequence[int]) -> bytes:
-    """Build the start of the common answer to FAST_SYNC_READ and FAST_BULK_READ; `sizes` are the data bytes per servo."""
+    """Build the start of the answer to FAST_SYNC_READ and FAST_BULK_READ; `sizes` are the data bytes per servo."""
     length = 1 + sum(size + 4 for size in sizes)
     return HEADER2 + bytes((BROADCAST,)) + length.to_bytes(2, "little") + bytes((STATUS,))
 

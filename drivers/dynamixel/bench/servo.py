@@ -161,7 +161,7 @@ class Servo:
         self._heard_s = t
 
     def motor_current(self, t: float) -> float:
-        """Return the regulated motor current at `t` [A], positive where it turns the shaft forward; 0 in other modes."""
+        """Return the regulated motor current at `t` [A], positive if it turns the shaft forward; 0 in other modes."""
         self._look_at_watchdog(t)
         unit = self.model.current_unit
         if unit is None or not self["torque"] or self["watchdog"] == FIRED:
@@ -181,10 +181,9 @@ class Servo:
         return ((-ticks if self._is_reversed else ticks) - self.model.zero_ticks) * self.model.rad_per_tick
 
     def _look_at_watchdog(self, t: float) -> None:
-        """Stop the servo if no instruction arrived for too long (e-Manual, Bus Watchdog). It takes no goal any more
-        then.
+        """Stop the servo if no instruction arrived for too long (e-Manual, Bus Watchdog).
 
-        In current control the shaft is free then, in position control it is held in place.
+        It accepts no further goals. In current control the shaft is free then, in position control it is held in place.
         """
         if self.model.protocol == 1 or not self["torque"] or self["watchdog"] <= 0:
             return
