@@ -69,8 +69,7 @@ class DriversConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ConfigError(what, file=file, line=line, remedy="Take one out of [drivers]")
         if self.hardware is None:
             return
-        # For its marker topic the learner reads the joints of a ROS 2 robot even when the samples come from
-        # elsewhere.
+        # For its marker topic the learner reads a ROS 2 robot's joints even when the samples come from elsewhere.
         if self.recording is not None and (self.ros2 is None or self.ros2.marker is None):
             line = line_of(text, ("drivers", "recording"))
             what = f"both a recording and {HARDWARE[given[0]]}"

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 _PIECE = 2**20
-# For text written by a person or by one of our commands: ten times the largest URDF, log or table of ours.
+# For text written by a person or a command: over ten times the size of any URDF, log or table of ours.
 MOST_TEXT_BYTES = 2**24
 _KINDS = (
     (stat.S_ISCHR, "a device, not a file"),

@@ -9,8 +9,7 @@ import numpy as np
 from .camera import StereoCalibration
 from .records import FloatArray, frozen_array
 
-# Damping of the least-squares step, in squared tangents of angle. It keeps the step stable where the head points at the
-# marker along one of its own axes.
+# Damping of the step [squared tangents of angle]; stabilises it where one of the head's axes points at the marker.
 _DAMPING = 1e-2
 _LONGEST_STEP = 0.4
 _NEAREST_M = 0.05

@@ -1,4 +1,4 @@
-"""Suggestions for misspelt names."""
+"""Suggest the nearest known name for a misspelt one."""
 
 from __future__ import annotations
 

@@ -48,8 +48,7 @@ def _value(value: object) -> str:
         case bool():
             return "true" if value else "false"
         case str():
-            # The only JSON escape that TOML lacks is that of a lone surrogate, which text from a file does
-            # not contain.
+            # The only JSON escape that TOML lacks is that of a lone surrogate, which no file's text contains.
             return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
         case int() | float():
             return repr(value)

@@ -27,7 +27,7 @@ class GuardLimits:
     Attributes:
         joints: names, in the order of all arrays (n,).
         heartbeat_s: longest time between two checks.
-        doubtful_cycles: number of consecutive checks without a motion that is too many.
+        doubtful_cycles: torque goes off after this many consecutive checks without a reading.
         max_speed: of each joint [rad/s].
         current_limit: of each joint [A]; infinite where it is not monitored.
         overcurrent_s: longest time that a current may exceed its limit.

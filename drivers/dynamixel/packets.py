@@ -104,8 +104,7 @@ class Packets2:
         if packet[4] != BROADCAST or len(packet) != 8 + count * block:
             raise Garbled
         parts = [packet[8 + k * block : 8 + (k + 1) * block] for k in range(count)]
-        # A servo continues the checksum of what it heard: after a collision the last servo's checksum still
-        # fits.
+        # A servo continues the checksum of what it heard: after a collision the last one still fits.
         crc = crc16(packet[:8])
         for part in parts:
             crc = crc16(part[:-2], crc)

@@ -17,7 +17,7 @@ ANEW_AFTER_STALL_S = 10.0  # and catches up within this time
 
 
 class Refusal(StrEnum):
-    """Why a message, or the reading it would have completed, was not used."""
+    """Reason for not using a message, or the reading it would have completed."""
 
     MALFORMED = "malformed"  # not a sensor_msgs/JointState, truncated, or too long
     NO_POSITIONS = "no_positions"  # it names joints without positions

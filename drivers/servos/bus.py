@@ -125,7 +125,7 @@ class Owed:
     def size_for(self, request: Request, now: float, lately: Collection[int]) -> int | None:
         """Return the smallest number of bytes to request that no overdue answer of the same servos has.
 
-        Prefer one that is not in `lately`. Return None if there is none.
+        Prefer one that is not in `lately`. Return None if every size is taken.
         """
         if self._until:
             self._until = {answer: until for answer, until in self._until.items() if until > now}

@@ -50,7 +50,7 @@ class Plan:
 
     @property
     def complaints(self) -> list[str]:
-        """What is wrong where a slower method is used than the servos support."""
+        """Problems of groups that are read with a slower method than they support."""
         slower = [way for ways, taken in zip(self._groups, self._taken, strict=True) for way in ways[:taken]]
         return [way.complaint for way in slower if way.complaint is not None]
 
