@@ -1,3 +1,3 @@
-"""Joint encoders in: recordings now, servo chains and serial encoders beside them."""
+"""Drivers that read joint encoders: recordings, servo chains, serial encoders and ROS 2."""
 
 from __future__ import annotations

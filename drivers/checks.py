@@ -1,4 +1,4 @@
-"""Whether a serial port can be used: is it there, may it be opened, who has it, does its adapter keep bytes back?"""
+"""Check a serial port: that it exists, may be opened, is not in use, and has a low-latency adapter."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ LONGEST_COMMAND = 60
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One thing that was looked at.
+    """Result of one check.
 
     Attributes:
-        subject: what.
-        state: "wrong" keeps the arm from being read, "warning" makes it worse than it could be.
+        subject: what was checked.
+        state: "wrong" prevents reading the arm, "warning" degrades it.
         said: what was found.
-        mend: the command to type, or what to do; empty where nothing is to be done.
+        mend: the command to type, or what to do; empty if nothing needs doing.
     """
 
     subject: str
@@ -46,9 +46,9 @@ class Holder:
 
 
 def holders(port: str, root: Path = ROOT) -> list[Holder]:
-    """The other processes that have `port` open, as far as this user may see them.
+    """Return the other processes that have `port` open, as far as this user may see them.
 
-    Of a pseudo-terminal not the one that serves its other end.
+    For a pseudo-terminal the process that serves its other end is left out.
     """
     device = os.path.realpath(port)
     found = []
@@ -61,7 +61,7 @@ def holders(port: str, root: Path = ROOT) -> list[Holder]:
 def _has_open(process: Path, device: str) -> bool:
     try:
         opened = {os.readlink(descriptor) for descriptor in (process / "fd").iterdir()}
-    except OSError:  # it has ended, or is another user's
+    except OSError:  # the process has ended, or belongs to another user
         return False
     serves = device.startswith(PSEUDO_TERMINALS) and bool(opened & MASTERS)
     return device in opened and not serves
@@ -77,11 +77,13 @@ def _command(process: Path) -> str:
 
 
 def port_checks(name: str, port: str, root: Path = ROOT, *, ours: Collection[int] = ()) -> Iterator[Check]:
-    """What is to be said of the port of the bus `name`. Opens nothing.
+    """Yield the checks of the port of the bus `name`. Open nothing.
 
     Args:
+        name: of the bus.
+        port: path of the port.
         root: of the file system, for /dev, /proc and /sys.
-        ours: processes that shall have it open.
+        ours: processes that are expected to have it open.
     """
     subject = f"port of {name}"
     if not os.path.exists(port):
@@ -130,7 +132,7 @@ def _group(number: int) -> str:
 
 
 def _naming(subject: str, port: str, root: Path) -> Iterator[Check]:
-    """A hint where the port's name may be another one after the next plugging in."""
+    """Yield a warning if the port's name may change when it is plugged in again."""
     if not Path(port).name.startswith(ENUMERATED):
         return
     by_id = [name for name in serial_ports(root) if os.path.realpath(name) == os.path.realpath(port) and name != port]

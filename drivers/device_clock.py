@@ -1,4 +1,4 @@
-"""A device's own clock, which ticks coarsely, drifts and wraps, against the host's."""
+"""Map a device's own clock, which is coarse, drifts and wraps, to the host's clock."""
 
 from __future__ import annotations
 
@@ -7,27 +7,27 @@ from collections import deque
 
 RELEARN_AFTER_S = 30.0
 KNOWN_AFTER_S = 1.0
-WORST = 0.02  # difference of rates that is borne until the rate is known
+WORST = 0.02  # largest difference of clock rates that is tolerated until the rate is estimated
 
 
 class DeviceClock:
-    """Narrows down when a device did something that it stamped with its own clock.
+    """Map from a device clock to host time, for events that answer a request.
 
-    The host knows an interval for each event: not before it asked, not after it was told. The stamp knows another, one
-    tick wide, up to the offset of the two clocks. The intervals of all events have this offset in common, so it is
-    soon known to a fraction of a tick, and an event whose intervals do not meet is not what it pretends to be.
+    The host knows an interval for each event: after it asked, and before the answer arrived. The stamp gives another
+    interval, one tick wide, up to the offset between the clocks. The intervals of all events share this offset, so it
+    is soon known to a fraction of a tick. An event whose two intervals do not overlap carries a wrong stamp.
 
-    A device's rate that is not the host's is learnt: a clock without a crystal is wrong by a percent.
+    The ratio of the clock rates is estimated too: a clock without a crystal is off by a percent.
     """
 
     def __init__(self, tick_s: float, ticks: int, *, drift: float = 3e-4, slack_s: float = 0.5e-3) -> None:
-        """A clock of which nothing is known.
+        """Start without knowledge of the offset.
 
         Args:
             tick_s: length of a tick.
             ticks: the stamps count from 0 to this, excluded.
-            drift: difference of the two clocks' rates, until more is known, and how much it changes then.
-            slack_s: intervals that miss each other by this are still believed.
+            drift: difference of the clock rates until it is estimated, and its later change.
+            slack_s: intervals that miss each other by less are still accepted.
         """
         self._tick_s, self._ticks, self._slack_s = tick_s, ticks, slack_s
         self._rate, self._spread, self._drift = 1.0, drift, drift
@@ -37,9 +37,9 @@ class DeviceClock:
         self._begin: tuple[float, float, float] | None = None
 
     def narrow(self, earliest: float, latest: float, stamp: int) -> tuple[float, float] | None:
-        """The bounds of an event's time that the stamp leaves of `earliest` .. `latest` [s].
+        """Return the part of the interval `earliest` .. `latest` [s] that is consistent with the stamp.
 
-        None when the stamp belongs to another time; nothing is learnt from it then.
+        Return None when the stamp does not belong to this interval; the state is not updated then.
         """
         if self._begin is None:
             self._device_s = stamp * self._tick_s
@@ -57,7 +57,7 @@ class DeviceClock:
             return None
         offsets = self._offsets(earliest, latest, device_s)
         common = max(low, offsets[0]), min(high, offsets[1])
-        # Where they have nothing in common the wire was slower or faster than thought: begin anew with this event.
+        # Without overlap the delay on the wire differed from the assumption: restart from this event.
         self._low, self._high = common if common[0] <= common[1] else offsets
         self._host_s, self._device_s = latest, device_s
         first = max(earliest, device_s * self._rate + self._low)
@@ -74,7 +74,7 @@ class DeviceClock:
         return device_s + wrap_s * round((expected_s - device_s - self._tick_s / 2) / wrap_s)
 
     def _learn_rate(self, earliest: float, latest: float) -> None:
-        """Compare how long both clocks ran since the beginning, and begin anew now and then."""
+        """Update the rate from the time elapsed on both clocks, and restart the comparison every `RELEARN_AFTER_S`."""
         if self._begin is None or self._device_s - self._begin[2] < KNOWN_AFTER_S:
             return
         self._is_known = True
@@ -82,7 +82,7 @@ class DeviceClock:
         rate = (earliest + latest - self._begin[0] - self._begin[1]) / (2 * passed_s)
         unsure_s = (latest - earliest + self._begin[1] - self._begin[0]) / 2 + self._tick_s
         if unsure_s / passed_s < max(self._spread, abs(rate - self._rate)):
-            turned = (self._rate - rate) * self._device_s  # the offset now is not changed by the rate
+            turned = (self._rate - rate) * self._device_s  # keeps the offset at the present unchanged
             self._low, self._high = self._low + turned, self._high + turned
             self._rate, self._spread = rate, max(self._drift, unsure_s / passed_s)
         if passed_s > RELEARN_AFTER_S:
@@ -90,38 +90,38 @@ class DeviceClock:
 
 
 WINDOW_S, BUCKET_S = 20.0, 0.1
-EARLY_S = 1.0  # before so much is seen, nothing is said about the rate
+EARLY_S = 1.0  # until this much was observed, the rate stays 1
 LONGEST_HELD_S = 0.5
-AHEAD_S = 0.02  # a stamp of the future by less is the fault of news that were all held up before
-NEAR_EDGE = 6  # two buckets make the edge, and those of the next few tell how surely
-LATELY = 3  # buckets whose least delay is believed until the rate is known
-QUICKEST_SIGMA_S = 1e-3 / math.sqrt(3)  # USB polls once in a millisecond: nothing tells how long the quickest waited
+AHEAD_S = 0.02  # a stamp further ahead is rejected; one less ahead shows that all earlier messages were delayed
+NEAR_EDGE = 6  # two buckets define the edge; the next few show its uncertainty
+LATELY = 3  # buckets whose least delay is used until the rate is known
+QUICKEST_SIGMA_S = 1e-3 / math.sqrt(3)  # USB polls every millisecond, so the delay of the fastest message is unknown
 
 
 class StreamClock:
-    """Tells when a device did something that it stamped and sent by itself, without being asked.
+    """Map from a device clock to host time, for events that the device sends without being asked.
 
-    The host knows only when the news came: later than it happened, by a delay that is never negative and small again
-    and again. So the clocks' difference runs along the lower edge of arrival minus stamp, and this edge's slope is the
-    difference of their rates. (Moon, Skelly, Towsley 1999: the line below all points that is nearest to them; it
-    contains the edge of their lower convex hull over their mean.)
+    The host knows only the arrival time. It is later than the event by a delay that is never negative and is often
+    close to its minimum. So the clock offset follows the lower edge of arrival minus stamp, and the slope of this edge
+    is the difference of the clock rates. (Moon, Skelly, Towsley 1999: the nearest line below all points; it contains
+    the edge of their lower convex hull over their mean.)
 
     Attributes:
-        rate: how many host seconds a device second has.
-        sigma_s: 1-sigma of a time told now [s]; infinite while too little was heard.
+        rate: host seconds per device second.
+        sigma_s: 1-sigma of an estimated time [s]; infinite while there is too little data.
     """
 
     def __init__(self, tick_s: float, ticks: int) -> None:
-        """A clock of which nothing is known; the stamps count from 0 to `ticks`, excluded."""
+        """Start without data; the stamps count from 0 to `ticks`, excluded."""
         self._tick_s, self._wrap_s = tick_s, tick_s * ticks
         self._least: deque[tuple[float, float]] = deque()  # by bucket: device time, least arrival minus device time
         self._device_s = self._origin_s = self._bucket_s = 0.0
         self._offset_s, self.rate = 0.0, 1.0
-        self._edge_s = self._above_s = 0.0  # length of the edge; how far above it the next buckets' least are
+        self._edge_s = self._above_s = 0.0  # length of the edge; distance of the next buckets' minima above it
 
     @property
     def sigma_s(self) -> float:
-        """What the quickest news took, and how well the edge below all news is known."""
+        """1-sigma of an estimated time [s]: delay of the fastest message, and uncertainty of the edge."""
         if len(self._least) <= LATELY:
             return math.inf
         if not self._edge_s:
@@ -132,9 +132,9 @@ class StreamClock:
         return math.hypot(QUICKEST_SIGMA_S, self._above_s * math.hypot(1 - fraction, fraction))
 
     def time(self, latest: float, stamp: int) -> float | None:
-        """When the event was that was heard of at `latest` [s].
+        """Return the time of the event whose message arrived at `latest` [s].
 
-        None when the stamp belongs to another time; nothing is learnt from it then.
+        Return None when the stamp does not belong to this time; the state is not updated then.
         """
         if not self._least:
             self._device_s = self._origin_s = stamp * self._tick_s
@@ -183,7 +183,7 @@ class StreamClock:
 
 
 def _edge_below(points: list[tuple[float, float]], x: float) -> tuple[tuple[float, float], tuple[float, float]]:
-    """The edge of the lower convex hull of `points`, which are in the order of x, that lies over or under `x`."""
+    """Return the edge of the lower convex hull of `points` (sorted by x) at `x`."""
     hull: list[tuple[float, float]] = []
     for point in points:
         while len(hull) > 1 and _turns_down(hull[-2], hull[-1], point):

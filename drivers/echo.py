@@ -1,4 +1,4 @@
-"""Adapters that send back what is sent, as those do that only join both lines of a half-duplex bus."""
+"""Handle adapters that echo what is sent, such as those that tie both lines of a half-duplex bus together."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from bodyschema.interfaces.protocols import Clock
 
 log = logging.getLogger(__name__)
 
-PROBE = b"\x00"  # begins no packet
+PROBE = b"\x00"  # not the start of any packet
 BITS_PER_BYTE = 10
-HOST_S = 3e-3  # the operating system's part of the delay
+HOST_S = 3e-3  # the operating system's share of the delay
 
 
 class Port(Protocol):
@@ -27,23 +27,25 @@ class Port(Protocol):
         ...
 
     def receive(self, until: float) -> bytes:
-        """What has arrived, else what arrives next; nothing when that is not before `until` on the clock."""
+        """Return what has arrived, else what arrives next; empty when nothing arrives before `until` on the clock."""
         ...
 
     def flush(self) -> None:
-        """Forget what has arrived."""
+        """Discard what has arrived."""
         ...
 
     def close(self) -> None:
-        """Give it free."""
+        """Release the port."""
         ...
 
 
 def without_echo(port: Port, clock: Clock, latency_s: float) -> Port:
-    """Return `port`, without the echo of its adapter where there is one: a byte is sent to find out.
+    """Return `port`, wrapped to remove its adapter's echo if there is one. Send a byte to find out.
 
     Args:
-        latency_s: how long the adapter may keep bytes back.
+        port: the open port.
+        clock: the clock.
+        latency_s: longest time that the adapter holds bytes back.
     """
     port.flush()
     port.write(PROBE)
@@ -54,10 +56,10 @@ def without_echo(port: Port, clock: Clock, latency_s: float) -> Port:
 
 
 class EchoFree:
-    """A port whose adapter sends back what is sent."""
+    """A port whose adapter echoes what is sent."""
 
     def __init__(self, port: Port, clock: Clock) -> None:
-        """Nothing of what was sent is still to come back."""
+        """Start with no echo outstanding."""
         self._port, self._clock = port, clock
         self._own = bytearray()
 
@@ -72,7 +74,7 @@ class EchoFree:
         self._port.write(data)
 
     def receive(self, until: float) -> bytes:
-        """What has arrived besides what was sent, else what arrives next; nothing when that is not before `until`."""
+        """Return what has arrived besides the echo, else what arrives next; empty if nothing arrives before `until`."""
         while data := self._port.receive(until):
             others = self._without_own(data)
             if others:
@@ -80,19 +82,19 @@ class EchoFree:
         return b""
 
     def flush(self) -> None:
-        """Forget what has arrived."""
+        """Discard what has arrived."""
         while self._own and (data := self._port.receive(self._clock.now())):
             self._without_own(data)
         if not self._own:
             self._port.flush()
 
     def close(self) -> None:
-        """Give it free."""
+        """Release the port."""
         self._port.close()
 
     def _without_own(self, data: bytes) -> bytes:
         size = min(len(data), len(self._own))
-        if data[:size] != self._own[:size]:  # somebody else talked at the same time
+        if data[:size] != self._own[:size]:  # another device talked at the same time
             self._own.clear()
             return data
         del self._own[:size]

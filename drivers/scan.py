@@ -1,4 +1,4 @@
-"""Who is on the serial ports of this machine? Asked in every protocol at every rate; nothing is written to anybody."""
+"""Scan the serial ports of this machine for servos, in every protocol at every rate, without writing a register."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ADAPTERS = ("ttyUSB*", "ttyACM*")
 
 
 class ScannedPort(Protocol):
-    """What a scanner needs of a serial port."""
+    """A serial port as a scanner uses it."""
 
     @property
     def baud(self) -> int:
@@ -31,15 +31,15 @@ class ScannedPort(Protocol):
         ...
 
     def receive(self, until: float) -> bytes:
-        """What has arrived, else what arrives next; nothing when that is not before `until` on the clock."""
+        """Return what has arrived, else what arrives next; empty when nothing arrives before `until` on the clock."""
         ...
 
     def flush(self) -> None:
-        """Forget what has arrived."""
+        """Discard what has arrived."""
         ...
 
     def close(self) -> None:
-        """Give it free."""
+        """Release the port."""
         ...
 
 
@@ -48,11 +48,14 @@ class FoundServo:
     """A servo that answered.
 
     Attributes:
-        protocol: in words, as "Dynamixel 2.0".
+        port: the port it is on.
+        baud: bits per second.
+        protocol: its name, such as "Dynamixel 2.0".
+        id: on the bus.
         firmware: its version, as its maker writes it.
-        model: by name, or its number where it is not known; None when it does not tell.
-        voltage_v, temperature_c: as it says itself; None when it does not tell.
-        has_torque: its motor holds its place; None when it does not tell.
+        model: its name, or its number where the model is unknown; None when not reported.
+        voltage_v, temperature_c: as measured by the servo; None when not reported.
+        has_torque: True while the motor holds its position; None when not reported.
         troubles: what is wrong with it, and what to do.
         is_double: several servos answer to this ID.
     """
@@ -71,20 +74,20 @@ class FoundServo:
 
 
 class Scanner(Protocol):
-    """Finds the servos that speak one protocol."""
+    """Scanner for the servos that speak one protocol."""
 
     @property
     def protocol(self) -> str:
-        """Its name."""
+        """Name of the protocol."""
         ...
 
     @property
     def bauds(self) -> Sequence[int]:
-        """Rates at which such servos can be, the likely ones first [bit/s]."""
+        """Possible baud rates, likely ones first [bit/s]."""
         ...
 
     def scan(self, name: str, port: ScannedPort, clock: Clock, latency_s: float) -> Iterator[FoundServo]:
-        """The servos on an open port that is called `name`, in the order of their IDs. Never writes to a register."""
+        """Yield the servos on the open port `name` in the order of their IDs. Never write to a register."""
         ...
 
 
@@ -94,11 +97,12 @@ Tell = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class ScannedBus:
-    """What came of one port.
+    """Result of scanning one port.
 
     Attributes:
-        servos: who answered.
-        trouble: why it could not be scanned (through), or None.
+        port: that was scanned.
+        servos: those that answered.
+        trouble: why the scan failed or was cut short, or None.
     """
 
     port: str
@@ -107,7 +111,7 @@ class ScannedBus:
 
 
 def serial_ports(root: Path = Path("/")) -> list[str]:
-    """The USB serial ports of this machine, by the names that stay the same where there are such."""
+    """Return the USB serial ports of this machine, by their persistent names where there are any."""
     by_id = sorted((root / BY_ID).glob("*"))
     named = {link.resolve() for link in by_id}
     others = [port for pattern in ADAPTERS for port in sorted((root / "dev").glob(pattern))]
@@ -115,7 +119,7 @@ def serial_ports(root: Path = Path("/")) -> list[str]:
 
 
 def open_line(port: str, baud: int, clock: Clock) -> ScannedPort:
-    """A real port, open."""
+    """Open a real port."""
     return SerialLine.open(port, baud, clock.now)
 
 
@@ -129,11 +133,16 @@ def scan_port(
     latency_s: float = DEFAULT_LATENCY_S,
     open_port: OpenPort = open_line,
 ) -> ScannedBus:
-    """Ask at all rates, or at `bauds`, who is there.
+    """Find the servos on a port at all rates, or at `bauds`.
 
     Args:
-        tell: called with what is done next, and what was found.
-        latency_s: how long the adapter may keep bytes back.
+        port: to be scanned.
+        scanners: one per protocol.
+        clock: the clock.
+        tell: called with each step and with what was found.
+        bauds: rates to try; all by default.
+        latency_s: longest time that the adapter holds bytes back.
+        open_port: opens the port.
     """
     found: list[FoundServo] = []
     scanners = list(scanners)

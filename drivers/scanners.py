@@ -1,4 +1,4 @@
-"""All that is asked when ports are scanned."""
+"""Scanners of all supported protocols."""
 
 from __future__ import annotations
 
@@ -6,5 +6,5 @@ from .dynamixel.scan import PROTOCOL1, Protocol2Scanner
 from .feetech.scan import FEETECH_SERVOS
 from .servos.scan import PingScanner
 
-# PING is the same in Protocol 1.0 and Feetech's: both are found in one go.
+# PING is the same in Protocol 1.0 and in Feetech's protocol: one scan finds both.
 SCANNERS = (Protocol2Scanner(), PingScanner(PROTOCOL1, FEETECH_SERVOS))

@@ -1,4 +1,4 @@
-"""A serial port that two programs cannot open at once, that does not spin, and that says when it is gone."""
+"""Exclusive serial port that blocks without spinning and reports its loss."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ import serial
 
 from bodyschema.interfaces.errors import SourceError, SourceLost
 
-RETRY_S = 0.2  # how soon a port that went away is looked for again
-DEFAULT_LATENCY_S = 4e-3  # of adapters that do not say
+RETRY_S = 0.2  # period of looking for a lost port
+DEFAULT_LATENCY_S = 4e-3  # for adapters that do not report their latency
 LATENCY_OF = "/sys/bus/usb-serial/devices/{}/latency_timer"
 
 
 class BusLost(SourceLost):
-    """The port, or everything behind it, went away."""
+    """The port, or the device behind it, was lost."""
 
     def __init__(self, port: str, error: Exception) -> None:
         number = next((part for part in error.args if isinstance(part, int)), None)
@@ -30,7 +30,7 @@ class BusLost(SourceLost):
 
 
 def adapter_latency_s(port: str, latency_of: str = LATENCY_OF) -> float:
-    """How long the USB adapter of `port` may keep bytes back [s]."""
+    """Return how long the USB adapter of `port` may hold bytes back [s]."""
     file = Path(latency_of.format(Path(port).resolve().name))
     try:
         return int(file.read_text()) * 1e-3
@@ -42,23 +42,23 @@ class SerialLine:
     """An open serial port."""
 
     def __init__(self, device: serial.Serial, now: Callable[[], float]) -> None:
-        """Made by `open`."""
+        """Wrap an open device; see `open`."""
         self.device = device
         self._now = now
 
     @classmethod
     def open(cls, port: str, baud: int, now: Callable[[], float] = time.monotonic) -> SerialLine:
-        """Open `port` for this program alone.
+        """Open `port` exclusively.
 
         Raises:
             BusLost: there is no such port (any more).
-            SourceError: it is in use, or not to be opened by this user.
+            SourceError: it is in use, or this user may not open it.
         """
         try:
             device = serial.Serial(port, baud, timeout=0, exclusive=True)
         except (OSError, ValueError, termios.error) as error:
             raise _refused(port, baud, error) from error
-        with suppress(OSError, ValueError):  # not every adapter knows it; those of FTDI wait 16 ms without
+        with suppress(OSError, ValueError):  # not supported by every adapter; without it, those of FTDI wait 16 ms
             device.set_low_latency_mode(True)
         return cls(device, now)
 
@@ -68,21 +68,21 @@ class SerialLine:
         return self.device.baudrate
 
     def close(self) -> None:
-        """Give it free; closing again does no harm."""
+        """Release the port. Closing it again does no harm."""
         try:
             self.device.close()
         except (OSError, termios.error) as error:
             raise BusLost(str(self.device.port), error) from error
 
     def write(self, data: bytes) -> None:
-        """Send `data`; BusLost when that is not possible."""
+        """Send `data`. Raise BusLost on failure."""
         try:
             self.device.write(data)
         except (OSError, termios.error) as error:
             raise BusLost(str(self.device.port), error) from error
 
     def receive(self, until: float) -> bytes:
-        """What has arrived, else what arrives next; nothing when that is not before `until` on the clock."""
+        """Return what has arrived, else what arrives next; empty when nothing arrives before `until` on the clock."""
         if not self.wait(until):
             return b""
         try:
@@ -94,7 +94,7 @@ class SerialLine:
         return data
 
     def wait(self, until: float) -> bool:
-        """Whether there is something to receive before `until`."""
+        """Return True if there is something to receive before `until`."""
         try:
             readable, _, _ = select.select((self.device.fileno(),), (), (), max(0.0, until - self._now()))
         except (OSError, ValueError) as error:
@@ -102,10 +102,10 @@ class SerialLine:
         return bool(readable)
 
     def flush(self) -> None:
-        """Forget what has arrived."""
+        """Discard what has arrived."""
         try:
             self.device.reset_input_buffer()
-        except (OSError, termios.error) as error:  # an unplugged port raises termios.error, which is no OSError
+        except (OSError, termios.error) as error:  # an unplugged port raises termios.error, which is not an OSError
             raise BusLost(str(self.device.port), error) from error
 
 

@@ -1,4 +1,4 @@
-"""Which turn each joint is in, from where it was before."""
+"""Determine the turn of each multi-turn joint from its last known position."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .turns import nearest_turn
 
 log = logging.getLogger(__name__)
 
-LOOK_AGAIN_S = 1.0  # whether a joint was turned back
+LOOK_AGAIN_S = 1.0  # period of checking if a joint was turned back
 
 
 class Sensor(Protocol):
@@ -26,30 +26,30 @@ class Sensor(Protocol):
 
     @property
     def label(self) -> str:
-        """Which of the device's sensors it is."""
+        """Name of the sensor on its device."""
         ...
 
     @property
     def ticks_per_turn(self) -> int | None:
-        """After so many ticks it tells the same again; None where it does not turn on."""
+        """Ticks after which the reading repeats; None for a sensor that does not wrap."""
         ...
 
     def angle(self, ticks: int) -> float:
-        """The joint's angle [rad] at a position with its turns [ticks]."""
+        """Return the joint angle [rad] at a position with its turns [ticks]."""
         ...
 
     def ticks(self, angle: float) -> float:
-        """The position [ticks] at a joint's angle [rad]."""
+        """Return the position [ticks] at a joint angle [rad]."""
         ...
 
 
 class TurnCount:
-    """Positions with their turns [ticks], which go on from one reading to the next.
+    """Positions including whole turns [ticks], tracked from reading to reading.
 
     Attributes:
-        pose: where the joints were last [rad]; None before anything is known.
+        pose: last joint angles [rad]; None before the first reading.
         counts: the same [ticks].
-        lost: a joint that is not where it was, so that somebody has to say in which turn it is.
+        lost: a joint that is not where it was, so that the user must confirm its turn.
     """
 
     def __init__(
@@ -59,12 +59,12 @@ class TurnCount:
         max_move_deg: float,
         table: str,
     ) -> None:
-        """Nothing is read yet.
+        """Start without a reading.
 
         Args:
-            limits: of each joint [rad]: with less than a turn between them there is no doubt about the turn.
-            last_pose: where the joints were when they were read last [rad], shape (d,).
-            max_move_deg: how far a joint may have been moved since, where only the nearest turn tells.
+            limits: of each joint [rad]; a range below one turn determines the turn.
+            last_pose: joint angles of the last session [rad], shape (d,).
+            max_move_deg: how far a joint may have moved since then, where only the nearest turn determines it.
             table: of robot.toml, for messages.
         """
         self._limits, self._max_move_deg, self._table = list(limits), max_move_deg, table
@@ -75,27 +75,27 @@ class TurnCount:
         self.lost: str | None = None
 
     def accept(self) -> None:
-        """Somebody says that the turns nearest to where the joints were are right. From any thread."""
+        """Accept the turns nearest to the last pose as correct. May be called from any thread."""
         self._is_accepted = self.lost is not None
 
     def begin(self, sensors: Sequence[Sensor], raw: Sequence[int]) -> None:
-        """Find the turn of each joint by its limits, else by the last pose."""
+        """Determine the turn of each joint from its limits, else from the last pose."""
         self._sensors = list(sensors)
         self.counts = [self._nearest(place, ticks) for place, ticks in enumerate(raw)]
 
     def continued(self, raw: Sequence[int]) -> list[int]:
-        """What was read, with the turns that bring it nearest to what was kept last."""
+        """Return `raw` plus the whole turns that bring it nearest to the last kept positions."""
         together = zip(self._sensors, raw, self.counts, strict=True)
         return [nearest_turn(ticks, count, sensor.ticks_per_turn) for sensor, ticks, count in together]
 
     def keep(self, counts: list[int]) -> list[float]:
-        """Go on from here; the joints' angles [rad]."""
+        """Store positions and return the joint angles [rad]."""
         self.counts = counts
         self.pose = [sensor.angle(count) for sensor, count in zip(self._sensors, counts, strict=True)]
         return self.pose
 
     def check(self, raw: Sequence[int]) -> None:
-        """SourceLost when a joint of several turns is not where it was: nothing tells its turn then."""
+        """Raise SourceLost when a multi-turn joint is not where it was: its turn is unknown then."""
         if self.pose is None:
             return
         for place, (sensor, count) in enumerate(zip(self._sensors, self.counts, strict=True)):

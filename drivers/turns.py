@@ -1,4 +1,4 @@
-"""Positions across turns, and whether a joint can have come to where it is said to be."""
+"""Handle positions across turns, and check that a joint can have reached a reported position."""
 
 from __future__ import annotations
 
@@ -7,27 +7,26 @@ from collections.abc import Sequence
 
 
 def nearest_turn(raw: int, near: float, per_turn: int | None) -> int:
-    """`raw` plus whole turns, nearest to `near` [ticks]; `raw` itself where the sensor has no turns."""
+    """Return `raw` plus whole turns, nearest to `near` [ticks]; `raw` itself for a sensor that does not wrap."""
     if per_turn is None:
         return raw
     return raw + per_turn * math.floor((near - raw) / per_turn + 0.5)
 
 
 class SpeedGate:
-    """Refuses places that no joint can have come to in the time since the last believed ones.
+    """Filter for positions that no joint can have reached in the time since the last accepted ones.
 
-    A glitch is over with the next reading. Places that are refused, but agree with each other, tell that something
-    has jumped (`jumped`).
+    A glitch ends with the next reading. Rejected positions that agree with each other show a real jump (`jumped`).
     """
 
     CONFIRMATIONS = 5
 
     def __init__(self, fastest: Sequence[float], slack: Sequence[float]) -> None:
-        """A gate that has seen nothing.
+        """Start without a reading.
 
         Args:
-            fastest: speed of each joint that is still believed [units/s].
-            slack: how far each may be off besides [units].
+            fastest: highest plausible speed of each joint [units/s].
+            slack: additional tolerance of each position [units].
         """
         self._fastest, self._slack = tuple(fastest), tuple(slack)
         self._believed: tuple[float, tuple[float, ...]] | None = None
@@ -36,11 +35,14 @@ class SpeedGate:
 
     @property
     def jumped(self) -> bool:
-        """So many refused places in a row agreed with each other that they have to be true."""
+        """True if enough consecutive rejected positions agreed with each other to be accepted as real."""
         return self._agreeing >= self.CONFIRMATIONS
 
     def offer(self, t: float, places: Sequence[float]) -> int | None:
-        """The first joint that cannot be there at `t` [s]; None when all can, which is then believed."""
+        """Return the first joint that cannot be at its position at `t` [s].
+
+        Otherwise accept the positions and return None.
+        """
         seen = (t, tuple(places))
         refused = self._implausible(self._believed, seen)
         if refused is None:

@@ -1,3 +1,3 @@
-"""The Protocols and frozen records that all other packages speak."""
+"""Protocols and frozen records shared by all other packages."""
 
 from __future__ import annotations

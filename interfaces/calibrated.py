@@ -1,11 +1,11 @@
-"""A learnt chain in the terms of the robot's own files: joint origins, camera pose, place of the marker.
+"""Express a learnt chain in terms of the robot's files: joint origins, camera pose, marker position.
 
-A chain is a product of transforms, of which a camera sees only the whole. Where the parts are split is a convention:
+A chain is a product of transforms, of which a camera sees only the whole. How it is split into parts is a convention:
 
-- the camera's pose and the joints' zeros are what the learner says they are;
-- each link moves with the axis of its own joint, and with that alone, while all joints are at their zeros; so a mesh
-  stays on the part that it shows;
-- fixed joints, joints that stand still, and everything off the way from camera to marker keep their origins.
+- the camera's pose and the joint offsets are those of the learner;
+- each link moves with the axis of its own joint only, while all joints are at zero; so a mesh stays on the part that it
+  shows;
+- fixed joints, held joints, and everything off the path from camera to marker keep their origins.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from .urdf import UrdfJoint, inverse, standing
 
 @dataclass(frozen=True, eq=False)
 class CalibratedGeometry:
-    """Where a learnt chain puts what the robot's files place.
+    """Learnt values of the poses in the robot's files.
 
     Attributes:
         T_parent_joint: poses (4, 4) of the learnt joints' frames in their parent links, by joint; the axes in these
-            frames stay as they are.
+            frames are unchanged.
         T_parent_camera: pose (4, 4) of the measurement frame in the camera's parent link.
         marker_xyz: the marker (3,) in its link [m].
     """
@@ -42,13 +42,13 @@ class CalibratedGeometry:
     def of(
         cls, robot: RobotDescription, chain: RigidChain, *, T_measured_nominal: FloatArray, zeros: FloatArray
     ) -> Self:
-        """The geometry of `chain`, whatever the split.
+        """Return the geometry of `chain`, split as the module describes.
 
         Args:
             robot: the nominal model that the chain was learnt from.
-            chain: the learnt one, with the nominal one's axes and kinds of joints.
-            T_measured_nominal: how much of it is a move of the camera (4, 4), as `kbmaps.ChainReport` has it.
-            zeros: how much of it are zeros of the joints (d,) [rad, m], as `kbmaps.ChainReport` has them.
+            chain: the learnt one, with the axes and joint types of the nominal one.
+            T_measured_nominal: camera displacement (4, 4), as in `kbmaps.ChainReport`.
+            zeros: joint offsets (d,) [rad, m], as in `kbmaps.ChainReport`.
         """
         way = _Way.of(robot)
         at_zero = [_joint_motion(chain, k, value) for k, value in enumerate(zeros)]
@@ -57,8 +57,9 @@ class CalibratedGeometry:
         T_camera_parent = T_measured_nominal @ inverse(robot.camera.pose)
         if way.upward[0]:
             T_camera_parent = chain.fixed[0] @ inverse(way.between[0])
-        # Where the walk has come to, with all joints at zero and before the camera has moved. The link above a joint
-        # that is walked upward is the next joint's own where that leads up too; the topmost one stays as drawn.
+        # The pose reached on the path, with all joints at zero and before the camera has moved. The link above
+        # a joint that is walked upward is the next joint's own if that leads up too; the topmost one keeps its
+        # nominal pose.
         reached = inverse(T_measured_nominal) @ T_camera_parent @ way.between[0]
         origins: dict[str, FloatArray] = {}
         for k, joint in enumerate(way.joints):
@@ -78,7 +79,7 @@ class CalibratedGeometry:
 
 @dataclass(frozen=True)
 class _Way:
-    """From the camera's link to the marker's: the learnt joints (d), and what stands still between them (d+1)."""
+    """Path from the camera's link to the marker's: learnt joints (d), and fixed transforms between them (d+1)."""
 
     joints: list[UrdfJoint]
     upward: list[bool]
@@ -99,7 +100,7 @@ class _Way:
 
 
 def _moved_frames(chain: RigidChain, T_measured_nominal: FloatArray, at_zero: list[FloatArray]) -> list[FloatArray]:
-    """Frames of the joints and the marker (d+1) where all joints are at zero, in the nominal measurement frame."""
+    """Return frames of the joints and the marker (d+1) with all joints at zero, in the nominal measurement frame."""
     parts = [inverse(T_measured_nominal) @ chain.fixed[0]]
     parts += [inverse(zero) @ fixed for zero, fixed in zip(at_zero, chain.fixed[1:], strict=True)]
     return _frames(np.array(parts))

@@ -10,9 +10,9 @@ class SystemClock:
     """The machine's monotonic and wall clocks."""
 
     def now(self) -> float:
-        """Monotonic time [s]."""
+        """Return the monotonic time [s]."""
         return time.monotonic()
 
     def utc(self) -> str:
-        """Wall-clock time, ISO 8601 in UTC."""
+        """Return the wall-clock time, ISO 8601 in UTC."""
         return datetime.now(UTC).isoformat(timespec="milliseconds")

@@ -1,15 +1,15 @@
-"""The exceptions of everything that is not the maths (`kbmaps` has a tree of its own).
+"""Exceptions of all packages except the maths (`kbmaps` has a tree of its own).
 
 BodyschemaError
-├── ConfigError         a file of ours is wrong: names file, line, key and remedy
+├── ConfigError         a configuration file is wrong: names file, line, key and remedy
 │   └── RobotError      robot.toml and URDF do not fit each other
 ├── RecordingError      a recording cannot be read: names line and column
-├── SourceError         an encoder chain or a camera
-│   ├── SourceEnded     there will be no more readings (a recording is through)
-│   └── SourceLost      the device went away; opening it again may help
+├── SourceError         an encoder chain or a camera failed
+│   ├── SourceEnded     there will be no more readings (end of a recording)
+│   └── SourceLost      the device was lost; opening it again may help
 ├── StoreError          the pair store: foreign or damaged
 │   └── StoreUnwritable the disk is full, read-only or failing: trying again later may help
-├── BusError            zenoh: port in use, nobody there, time-out
+├── BusError            zenoh: port in use, no peer, time-out
 └── RequestError        a query that cannot be answered: says what is wrong with it
 """
 
@@ -57,9 +57,9 @@ class SourceEnded(SourceError):
 
 
 class SourceLost(SourceError):
-    """The device went away; opening it again may help, from `retry_s` on where the source knows that it is cheap.
+    """The device was lost. Opening it again may help, after `retry_s` where the source knows that this is cheap.
 
-    `brief` is the message in a sentence, where that has a table.
+    `brief` is the message in one sentence, if the full message contains a table.
     """
 
     def __init__(self, message: str = "", *, retry_s: float | None = None, brief: str = "") -> None:
@@ -72,11 +72,11 @@ class StoreError(BodyschemaError):
 
 
 class StoreUnwritable(StoreError):
-    """The disk takes nothing now; trying again later may help."""
+    """The disk accepts no data now; trying again later may help."""
 
 
 class BusError(BodyschemaError):
-    """zenoh: a port in use, nobody there, a time-out."""
+    """zenoh: a port in use, no peer, a time-out."""
 
 
 class RequestError(BodyschemaError):

@@ -1,4 +1,4 @@
-"""Python interpreters as child processes: none imports from the current folder, whose files are a user's own."""
+"""Start Python interpreters as child processes that do not import from the current folder."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def module_command(module: str, *arguments: str) -> list[str]:
 
 @contextmanager
 def safe_children() -> Iterator[None]:
-    """Start interpreters with `-P` where other packages write the command, as multiprocessing does (`python -c`)."""
+    """Start interpreters with `-P` even where another package builds the command, as multiprocessing does."""
     name = "PYTHONSAFEPATH"
     before = os.environ.get(name)
     os.environ[name] = "1"

@@ -1,4 +1,4 @@
-"""Files from outside: regular ones, and of each no more than a file of its kind can have."""
+"""Read external files safely: regular files only, up to the largest plausible size of their kind."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 _PIECE = 2**20
-# Of a text that a person or one of our commands writes: no URDF, log or table of ours has a tenth of it.
+# For text written by a person or a command: over ten times the size of any URDF, log or table of ours.
 MOST_TEXT_BYTES = 2**24
 _KINDS = (
     (stat.S_ISCHR, "a device, not a file"),
@@ -22,7 +22,7 @@ _KINDS = (
 
 
 class UnfitFile(OSError):
-    """A file that is not read: a device or a pipe, or larger than a file of its kind can be."""
+    """A file that is not read: a device or a pipe, or larger than plausible for its kind."""
 
 
 def check_regular(file: Path) -> None:
@@ -30,7 +30,7 @@ def check_regular(file: Path) -> None:
 
     Raises:
         UnfitFile: it is a device, a pipe or a socket, which may have no end.
-        OSError: it is a folder, or cannot be looked at.
+        OSError: it is a folder, or cannot be examined.
     """
     _require_regular(os.stat(file).st_mode)
 
@@ -40,13 +40,14 @@ def opened(file: Path, most: int) -> Iterator[BinaryIO]:
     """Open a regular file for reading.
 
     Args:
-        most: bytes that a file of its kind can have.
+        file: to be opened.
+        most: largest plausible size of its kind [bytes].
 
     Raises:
         UnfitFile: it is larger, or a device, a pipe or a socket.
         OSError: it cannot be read.
     """
-    check_regular(file)  # before it is opened: to open a port or a watchdog does something
+    check_regular(file)  # before it is opened: opening a port or a watchdog has side effects
     with open(file, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as stream:
         state = os.fstat(stream.fileno())
         _require_regular(state.st_mode)
@@ -56,10 +57,10 @@ def opened(file: Path, most: int) -> Iterator[BinaryIO]:
 
 
 def read_at_most(file: Path, most: int = MOST_TEXT_BYTES) -> bytes:
-    """Return the bytes of a regular file; raises as `opened`."""
+    """Return the bytes of a regular file. Raise the errors of `opened`."""
     data = bytearray()
     with opened(file, most) as stream:
-        while piece := stream.read(_PIECE):  # files of /proc tell no size
+        while piece := stream.read(_PIECE):  # files of /proc report no size
             data += piece
             if len(data) > most:
                 raise _too_large(most)

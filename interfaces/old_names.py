@@ -1,4 +1,4 @@
-"""The import names that plug-ins had before they began with `bodyschema`, for one more release."""
+"""Support the import names that plug-ins used before the prefix `bodyschema`, for one more release."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from pathlib import Path
 from types import ModuleType
 
 HOME = Path(__file__).resolve().parents[1]
-# What docs/extending.md told plug-ins to import from.
+# the parts that docs/extending.md told plug-ins to import from
 PARTS = ("drivers", "effects", "interfaces", "vision")
 
 
 class OldNames(MetaPathFinder):
-    """Finds `interfaces.camera` as `bodyschema.interfaces.camera`, unless another package has that name."""
+    """Finder of `interfaces.camera` as `bodyschema.interfaces.camera`, unless another package has that name."""
 
     def find_spec(
         self,
@@ -25,7 +25,7 @@ class OldNames(MetaPathFinder):
         path: Sequence[str] | None = None,  # noqa: ARG002
         target: ModuleType | None = None,  # noqa: ARG002
     ) -> ModuleSpec | None:
-        """Return the spec of a module of ours that is asked for by its old name."""
+        """Return the spec of one of our modules that is imported by its old name."""
         part = fullname.partition(".")[0]
         if part not in PARTS or _is_anothers(part):
             return None
@@ -38,7 +38,7 @@ class OldNames(MetaPathFinder):
 
 
 class _Alias(Loader):
-    """Gives the module that is already there under its full name, so that it is loaded once."""
+    """Loader that returns the module loaded under its full name, so that it is loaded once."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -53,7 +53,7 @@ class _Alias(Loader):
 
 
 def allow() -> None:
-    """Let plug-ins that are loaded from now on import by the old names, each with a FutureWarning."""
+    """Let plug-ins loaded from now on import by the old names, each with a FutureWarning."""
     if not any(isinstance(finder, OldNames) for finder in sys.meta_path):
         sys.meta_path.insert(0, OldNames())
 

@@ -1,6 +1,6 @@
-"""Drivers, trackers and effects of other packages that are installed here, found by their entry points.
+"""Find installed drivers, trackers and effects of other packages by their entry points.
 
-A robot.toml names one; it can name nothing that somebody with the right to install did not install.
+A robot.toml names one by its entry point, so it can only name installed packages.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ class PluginConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         name: of the entry point.
-        settings: handed to it as they are.
-        devices: the files in /dev that it opens; the service lets it open no others.
-        network: whether it hears or reaches other machines; the service lets it only then.
+        settings: passed to it unchanged.
+        devices: the files in /dev that it opens; the service grants access to no others.
+        network: True if it uses the network; the service grants access only then.
     """
 
     name: str
@@ -38,7 +38,7 @@ class PluginConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     network: bool = False
 
     def check(self, _: Sequence[str], file: Path, text: str) -> None:
-        """ConfigError when no installed package has such a driver."""
+        """Raise ConfigError when no installed package has such a driver."""
         try:
             _entry("bodyschema.drivers", self.name)
         except ConfigError as error:
@@ -47,7 +47,7 @@ class PluginConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def load(group: Group, name: str) -> Any:
-    """What the entry point `name` of `group` names.
+    """Return the object of the entry point `name` of `group`.
 
     Raises:
         ConfigError: no installed package has it, or it cannot be imported.
@@ -61,7 +61,7 @@ def load(group: Group, name: str) -> Any:
 
 
 def installed(group: Group) -> tuple[EntryPoint, ...]:
-    """Return what the packages that are installed here offer."""
+    """Return the entry points of all installed packages."""
     from importlib.metadata import entry_points
 
     found = tuple(entry_points(group=group))

@@ -1,14 +1,14 @@
-"""The columns of a recording: their names, which belong together, and what makes a value wrong.
+"""Names, groups and validity checks of a recording's columns.
 
 | columns | meaning |
 | --- | --- |
 | one per joint, under its URDF name | joint angles [rad] (m for a prismatic joint) |
 | x, y, z | marker position in the measurement frame [m] |
 | t | time [s], strictly increasing inside a segment |
-| segment | number of the run of pairs |
+| segment | number of the run of samples |
 | sx, sy, sz | 1-sigma of x, y, z [m]; or instead |
 | cxx, cxy, cxz, cyy, cyz, czz | upper triangle of their covariance [m²] |
-| ul, vl, ur, vr | pixel centres in the left and the right eye [px] |
+| ul, vl, ur, vr | pixel centres in the left and the right image [px] |
 | qx, qy, qz, qw | orientation of the marker, a unit quaternion |
 | current_<joint>, temperature_<joint> | [A], [°C] |
 """
@@ -40,16 +40,16 @@ QUATERNION_TOLERANCE = 1e-3
 LARGEST_SEGMENT = 2.0**53
 SMALLEST_SIGMA_M, LARGEST_SIGMA_M = 1e-100, 1e100  # their squares are still numbers
 _MEND_ROW = "Mend or delete the row"
-# More than any arm has; and of numbers ten hours at 100 pairs/s with 27 columns.
+# More columns than any arm needs, and ten hours at 100 samples/s with 27 columns.
 MOST_COLUMNS, MOST_NUMBERS = 1000, 100_000_000
 LONGEST_NAME = 200
 
 
 class Fault(Exception):
-    """Something is wrong with a table; the reader adds the file and turns the row into a line.
+    """Error in a table. The reader adds the file and converts the row to a line.
 
     Attributes:
-        row: index of the row, from 0; None when the header is meant.
+        row: index of the row, from 0; None for the header.
         column: name of the column, or None.
     """
 
@@ -58,7 +58,7 @@ class Fault(Exception):
         super().__init__(what)
 
     def moved(self, rows: int) -> Fault:
-        """Return the fault as counted in the whole table, where it was found in the part that begins at row `rows`."""
+        """Return the fault of a part that begins at row `rows`, with its row counted in the whole table."""
         return Fault(self.what, row=(self.row or 0) + rows, column=self.column, remedy=self.remedy)
 
 
@@ -75,21 +75,21 @@ class Table:
     values: FloatArray
 
     def columns(self, names: tuple[str, ...]) -> FloatArray:
-        """The columns `names`, shape (n, len(names))."""
+        """Return the columns `names`, shape (n, len(names))."""
         return self.values[:, [self.names.index(name) for name in names]]
 
     def has(self, names: tuple[str, ...]) -> bool:
-        """Whether the first of `names` is there (the header check makes groups whole)."""
+        """Return True if the first of `names` is present (the header check ensures complete groups)."""
         return names[0] in self.names
 
 
 def extra_columns(joints: tuple[str, ...]) -> tuple[str, ...]:
-    """Names of the columns that may accompany each joint."""
+    """Return the names of the optional columns of each joint."""
     return tuple(prefix + joint for prefix in EXTRA_PREFIXES for joint in joints)
 
 
 def check_joints(joints: tuple[str, ...]) -> None:
-    """Fault when a joint's name cannot be a column of its own."""
+    """Raise Fault when a joint's name cannot be the name of a column."""
     for joint in joints:
         if "," in joint or joint != joint.strip() or not joint.isprintable():
             raise Fault(f"a joint called {joint!r} cannot name a column", remedy="Rename the joint")
@@ -98,7 +98,7 @@ def check_joints(joints: tuple[str, ...]) -> None:
 
 
 def check_width(names: Sequence[str]) -> None:
-    """Fault when there are more columns than a recording can have."""
+    """Raise Fault when there are more columns than a recording can have."""
     if len(names) > MOST_COLUMNS:
         what = f"there are {len(names):,} columns; a recording has at most {MOST_COLUMNS:,}"
         raise Fault(what, remedy="Delete those that are none of a recording's")
@@ -108,7 +108,7 @@ def check_width(names: Sequence[str]) -> None:
 
 
 def check_header(names: tuple[str, ...], joints: tuple[str, ...]) -> None:
-    """Fault unless `names` are the columns of a recording of `joints`."""
+    """Raise Fault unless `names` are the columns of a recording of `joints`."""
     check_joints(joints)
     check_width(names)
     for name in names:
@@ -134,7 +134,7 @@ def check_header(names: tuple[str, ...], joints: tuple[str, ...]) -> None:
 
 
 def check_finite(table: Table) -> None:
-    """Fault at the first number, row by row, that is not finite."""
+    """Raise Fault at the first number, row by row, that is not finite."""
     bad = ~np.isfinite(table.values)
     if bad.any():
         row, column = np.argwhere(bad)[0]
@@ -143,7 +143,7 @@ def check_finite(table: Table) -> None:
 
 
 def check_values(table: Table) -> None:
-    """Fault at the first finite value that cannot be: times, segments, sigmas, covariances, quaternions."""
+    """Raise Fault at the first invalid finite value: times, segments, sigmas, covariances, quaternions."""
     if table.has(("t",)):
         _check_time(table)
     if table.has(("segment",)):
@@ -165,7 +165,7 @@ def check_values(table: Table) -> None:
 
 
 def positive_definite(cov: FloatArray) -> BoolArray:
-    """Which of the symmetric matrices (n, 3, 3) are positive definite, shape (n,), whatever their scale."""
+    """Return a mask (n,) of the symmetric matrices (n, 3, 3) that are positive definite, independent of their scale."""
     variances = np.diagonal(cov, axis1=1, axis2=2)
     good: BoolArray = np.asarray((variances > 0).all(axis=1))
     scale = np.sqrt(np.where(variances > 0, variances, 1.0))

@@ -1,4 +1,4 @@
-"""Recordings as CSV: a header, then numbers, every float with all the digits that bring it back exactly."""
+"""Read and write recordings as CSV: a header, then numbers, with enough digits to restore every float exactly."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from .recording_columns import MOST_NUMBERS, Fault, Table, check_finite, check_h
 from .records import FloatArray
 
 FIRST_ROW_LINE = 2
-# Of a file and of a line: a thousand columns of 25 digits take 25 KiB.
+# Limits of a file and of a line: a thousand columns of 25 digits take 25 KiB.
 MOST_BYTES, MOST_LINE_BYTES = 2**30, 2**20
-# What is taken apart at once: enough that Python's own time does not count, little beside the numbers of a recording.
+# Size of a parsed block: large enough to hide Python's overhead, small compared with the numbers of a recording.
 BLOCK_BYTES = 2**22
 
 
 def read_csv_table(file: Path, joints: tuple[str, ...]) -> Table:
-    """The numbers in `file`, all finite, under a checked header.
+    """Return the numbers in `file`, all finite, under a checked header.
 
     Raises:
         Fault: something is wrong with the text; rows count from 0 below the header.
@@ -57,10 +57,10 @@ def read_csv_table(file: Path, joints: tuple[str, ...]) -> Table:
 
 
 def csv_columns(file: Path) -> tuple[str, ...]:
-    """The names of the columns of `file`.
+    """Return the names of the columns of `file`.
 
     Raises:
-        Fault: it is no text, or empty.
+        Fault: it is not text, or empty.
         OSError: it cannot be read.
     """
     with opened(file, MOST_BYTES) as stream:
@@ -78,7 +78,7 @@ def write_csv_rows(out: TextIO, rows: Iterable[Iterable[float]], integers: froze
 
 
 def _header(stream: BinaryIO) -> tuple[str, ...]:
-    """Return the names in the first line. Raises Fault where it is missing or not text."""
+    """Return the names in the first line. Raise Fault where it is missing or not text."""
     line = _line(stream, -1)
     try:
         header = _lines(_decoded(line))[0] if line else ""
@@ -134,8 +134,8 @@ def _check_header_line(names: tuple[str, ...], joints: tuple[str, ...]) -> None:
 
 
 def _numbers(lines: list[str], names: tuple[str, ...], whole: bool) -> FloatArray:
-    """All rows at once; only when that fails are the fields looked at one by one."""
-    strict = all(line.isascii() and "_" not in line for line in lines)  # float() takes "1_0" and foreign digits
+    """Parse all rows at once. Only when that fails, look at the fields one by one."""
+    strict = all(line.isascii() and "_" not in line for line in lines)  # float() accepts "1_0" and non-ASCII digits
     if strict and all(_width(line) == len(names) for line in lines):
         fields = chain.from_iterable(line.split(",") for line in lines)
         try:
@@ -148,7 +148,7 @@ def _numbers(lines: list[str], names: tuple[str, ...], whole: bool) -> FloatArra
 
 
 def _width(line: str) -> int:
-    """Fields of a line, which is not taken apart for it: a hostile one has millions."""
+    """Return the number of fields of a line without splitting it: a hostile line has millions."""
     return line.count(",") + 1
 
 

@@ -1,4 +1,4 @@
-"""Recordings as Parquet. Needs the extra `export`."""
+"""Read and write recordings as Parquet. Needs the extra `export`."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from .errors import RecordingError
 from .limited import opened
 from .recording_columns import MOST_NUMBERS, Fault, Table, check_finite, check_header, check_width
 
-MOST_BYTES = 2**30  # as many numbers as are read take 0.8 GB
+MOST_BYTES = 2**30  # the largest number of values takes 0.8 GB
 INTEGER_COLUMNS = frozenset({"segment"})
 
 
 def read_parquet_table(file: Path, joints: tuple[str, ...]) -> Table:
-    """The numbers in `file`, all finite, under a checked header.
+    """Return the numbers in `file`, all finite, under a checked header.
 
     Raises:
         RecordingError: the extra `export` is not installed.
@@ -41,7 +41,7 @@ def read_parquet_table(file: Path, joints: tuple[str, ...]) -> Table:
 
 
 def parquet_columns(file: Path) -> tuple[str, ...]:
-    """The names of the columns of `file`; raises as `read_parquet_table`."""
+    """Return the names of the columns of `file`. Raise the errors of `read_parquet_table`."""
     with _opened(file) as parquet:
         names = tuple(parquet.schema_arrow.names)
     check_width(names)
@@ -49,7 +49,7 @@ def parquet_columns(file: Path) -> tuple[str, ...]:
 
 
 def _read(arrow: Any, parquet: Any) -> Any:
-    """All columns; a Fault when there are more numbers than fit, be it that the file tells of fewer.
+    """Read all columns. Raise Fault when there are too many numbers, even if the metadata claims fewer.
 
     A file of some kilobytes can hold billions of equal numbers.
     """
@@ -70,7 +70,7 @@ def _check_rows(rows: int, most: int) -> None:
 
 @contextmanager
 def _opened(file: Path) -> Iterator[Any]:
-    """The Parquet file; a Fault where what is read of it inside is not whole."""
+    """Open the Parquet file. Raise Fault where the content read inside the with block is damaged."""
     arrow, parquet = _modules(file)
     with opened(file, MOST_BYTES) as stream:
         try:

@@ -1,4 +1,4 @@
-"""Why frames become no pairs, in words, and what to do about each reason."""
+"""Descriptions and remedies of the reasons why frames are rejected."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Roll, pitch and yaw as URDF has them: R = Rz(yaw) · Ry(pitch) · Rx(roll)."""
+"""Roll, pitch and yaw as URDF defines them: R = Rz(yaw) · Ry(pitch) · Rx(roll)."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from .records import FloatArray
 
 
 def rpy_of(rotation: FloatArray) -> FloatArray:
-    """The angles (3,) [rad] of a rotation matrix (3, 3), exact to rounding also where roll and yaw are one."""
+    """Return the angles (3,) [rad] of a rotation matrix (3, 3), exact to rounding even in gimbal lock."""
     r = rotation
     pitch = np.arctan2(-r[2, 0], np.hypot(r[2, 1], r[2, 2]))
     roll = np.arctan2(r[2, 1], r[2, 2])
-    # Near a pitch of ±90° roll is anyone's guess. Yaw is taken from what is left after this very roll, so that the
-    # product is right whatever it was.
+    # Near a pitch of ±90° roll is arbitrary. Yaw is computed from the rotation left after this roll, so that the
+    # product is right in any case.
     sine, cosine = np.sin(roll), np.cos(roll)
     yaw = np.arctan2(sine * r[0, 2] - cosine * r[0, 1], cosine * r[1, 1] - sine * r[1, 2])
     return np.array([roll, pitch, yaw])

@@ -1,4 +1,4 @@
-"""Suggestions for misspelt names."""
+"""Suggest the nearest known name for a misspelt one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _CHOICE = re.compile(r"Invalid enum value (?P<value>'[^']*'|\S+)(?: - at `\$(?P<
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """A remedy for an unknown name: the nearest known one, or the list of all."""
+    """Return a remedy for an unknown name: the nearest known one, or the list of all."""
     names = list(known)
     close = get_close_matches(name, names, n=1)
     if close:
@@ -22,7 +22,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 
 def with_choices(message: str, kind: Any) -> str:
-    """msgspec's message about a value that is none of the known ones, with these."""
+    """Return msgspec's message about an unknown value, with the known ones added."""
     wrong = _CHOICE.match(message)
     if wrong is None:
         return message
@@ -33,12 +33,12 @@ def with_choices(message: str, kind: Any) -> str:
 
 
 def key_path(path: str) -> tuple[str, ...]:
-    """The keys in msgspec's path to a value, without the places in lists."""
+    """Return the keys in msgspec's path to a value, without list indices."""
     return tuple(part for part in re.sub(r"\[[^\]]*\]", "", path).split(".") if part)
 
 
 def hint_at(kind: Any, keys: Sequence[str]) -> Any:
-    """The type of what stands under `keys` in the struct `kind`; None when it has no such field."""
+    """Return the type of the value under `keys` in the struct `kind`; None when there is no such field."""
     for key in keys:
         struct = struct_in(kind)
         fields = {} if struct is None else {field.encode_name: field.type for field in msgspec.structs.fields(struct)}
@@ -47,7 +47,7 @@ def hint_at(kind: Any, keys: Sequence[str]) -> Any:
 
 
 def struct_in(hint: Any) -> type[msgspec.Struct] | None:
-    """The struct that a type is, or is made of."""
+    """Return the struct that a type is or contains."""
     if isinstance(hint, type) and issubclass(hint, msgspec.Struct):
         return hint
     return next((found for inner in get_args(hint) if (found := struct_in(inner)) is not None), None)

@@ -1,4 +1,4 @@
-"""TOML files into typed structs, with errors that name the line to mend."""
+"""Read TOML files into typed structs, with errors that name the line to fix."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ T = TypeVar("T")
 _UNKNOWN = re.compile(r"Object contains unknown field `(?P<field>[^`]*)`(?: - at `\$(?P<path>[^`]*)`)?")
 _HEADER = re.compile(r"\s*\[\[?([^\]]+)\]\]?")
 _KEY = re.compile(r"\s*([A-Za-z0-9_.\"'-]+)\s*=")
-# Strings and comments, as far as the text goes where one is not closed. Possessive: no text takes long.
+# Strings and comments, up to the end of the text where one is not closed. Possessive, so that no text takes long.
 _QUOTED = re.compile(
     r'''"""(?:[^"\\]++|\\.|"(?!""))*+(?:"{3,5}|\Z)|"(?:[^"\\\n]++|\\.)*+"?'''
     r"|'''(?:[^']++|'(?!''))*+(?:'{3,5}|\Z)|'[^'\n]*+'?|#[^\n]*+",
@@ -35,11 +35,12 @@ _PLACE = re.compile(r"(?P<what>.*?) - at `\$(?P<path>[^`]*)`$", re.DOTALL)
 def read_toml(
     file: Path, *, written_by: str = "`bodyschema config init` writes one", damaged: str = ""
 ) -> tuple[dict[str, Any], str]:
-    """The tables of `file` and its text; ConfigError with the line when it cannot be read.
+    """Return the tables of `file` and its text. Raise ConfigError with the line when it cannot be read.
 
     Args:
-        written_by: where one comes from, as the remedy of a file that is not there.
-        damaged: the remedy of a file whose text is none, if nobody wrote it by hand; else robot.toml is meant.
+        file: to be read.
+        written_by: the command that writes such a file, as the remedy if it does not exist.
+        damaged: the remedy for invalid text in a file not written by hand; by default that for a robot.toml.
     """
     try:
         data = read_at_most(file, MOST_BYTES)
@@ -63,12 +64,12 @@ def read_toml(
         ) from error
     except RecursionError as error:
         raise ConfigError("not TOML: nested too deeply", file=file, remedy="Close the brackets") from error
-    except ValueError as error:  # a whole number of thousands of digits
+    except ValueError as error:  # an integer of thousands of digits
         raise ConfigError(f"not TOML: {error}", file=file, remedy="Shorten the number") from error
 
 
 def line_of_endless_key(text: str) -> int | None:
-    """Return the first line (from 1) with a key of so many parts that reading it would take hours; else None."""
+    """Return the first line (from 1) with a key of so many parts that parsing it would take hours; else None."""
     bare = _QUOTED.sub(lambda found: "q" + "\n" * found[0].count("\n"), text)
     for number, line in enumerate(bare.split("\n"), 1):
         if line.count(".") > MOST_PARTS and any(piece.count(".") > MOST_PARTS for piece in _BETWEEN.split(line)):
@@ -103,10 +104,14 @@ def _decoded(data: bytes, file: Path, remedy: str) -> str:
 
 
 def convert(tables: object, kind: type[T], *, file: Path, text: str, prefix: tuple[str, ...] = ()) -> T:
-    """`tables` as the struct `kind`; ConfigError with the line when something is unknown, missing or wrong.
+    """Convert `tables` to the struct `kind`. Raise ConfigError with the line of an unknown, missing or wrong key.
 
     Args:
-        prefix: the keys under which `tables` stands in the file.
+        tables: as parsed.
+        kind: the struct.
+        file: for messages.
+        text: of the file.
+        prefix: the keys of `tables` in the file.
     """
     for keys, what in _unusable(tables, prefix):
         raise ConfigError(f"{'.'.join(keys)}: {what}", file=file, line=line_of(text, keys))
@@ -117,9 +122,10 @@ def convert(tables: object, kind: type[T], *, file: Path, text: str, prefix: tup
 
 
 def line_in_entry(text: str, name: str, place: int, key: str | None = None) -> int | None:
-    """The line (from 1) of `key` in the entry `place` (from 0) of the list of tables [[name]], which may be dotted.
+    """Return the line (from 1) of `key` in the entry `place` (from 0) of the array of tables [[name]].
 
-    That of the entry's heading where it has no such key, that of the list where it is written in another way.
+    `name` may be dotted. Return the line of the entry's heading if it has no such key, and that of the array if it is
+    written in another way.
     """
     lines = text.splitlines()
     headings = [k for k, line in enumerate(lines) if (m := _HEADER.match(line)) and _is_entry(line, m[1], name)]
@@ -139,7 +145,7 @@ def _is_entry(line: str, header: str, name: str) -> bool:
 
 
 def line_of(text: str, keys: tuple[str, ...]) -> int | None:
-    """The line (from 1) that gives the longest leading part of the key path `keys`; None when no line gives any."""
+    """Return the line (from 1) of the longest leading part of the key path `keys`; None when no line has any."""
     best: int | None = None
     longest = 0
     table: tuple[str, ...] = ()

@@ -1,4 +1,4 @@
-"""Tables as TOML text, for the files that the program writes itself. Comments are not its business."""
+"""Write tables as TOML text, for files that the program writes itself, without comments."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def toml_text(tables: Mapping[str, Any]) -> str:
-    """The TOML text that reads as `tables`: of tables, lists, texts, numbers and truth values."""
+    """Return the TOML text of `tables`, which may contain tables, lists, strings, numbers and booleans."""
     return "\n".join("\n".join(lines) + "\n" for lines in _tables((), tables))
 
 
 def _tables(path: tuple[str, ...], table: Mapping[str, Any]) -> list[list[str]]:
-    """One list of lines for each table, under its heading."""
+    """Return one list of lines for each table, beginning with its heading."""
     heading = [f"[{_dotted(path)}]"] if path else []
     own, inner = _parts(path, table)
     return [heading + own, *inner] if heading or own else inner
 
 
 def _parts(path: tuple[str, ...], table: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
-    """The lines of a table's plain values, which come first since they belong to the last heading; then its tables."""
+    """Return the lines of a table's plain values, which must follow its heading, and the lines of its inner tables."""
     own: list[str] = []
     inner: list[list[str]] = []
     for name, value in table.items():
@@ -48,7 +48,7 @@ def _value(value: object) -> str:
         case bool():
             return "true" if value else "false"
         case str():
-            # Of JSON's escapes only that of a lone surrogate is none of TOML's, and a text from a file has none.
+            # The only JSON escape that TOML lacks is that of a lone surrogate, which no file's text contains.
             return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
         case int() | float():
             return repr(value)
@@ -57,7 +57,7 @@ def _value(value: object) -> str:
         case list() | tuple():
             return "[" + ", ".join(map(_value, value)) + "]"
         case _:
-            # Dates and times, which TOML writes as Python's ISO format does.
+            # Dates and times: TOML uses Python's ISO format.
             return str(value)
 
 

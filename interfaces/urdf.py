@@ -1,4 +1,4 @@
-"""A URDF file as a tree of joints, read by a parser that fetches and expands nothing.
+"""Read a URDF file as a tree of joints, with a parser that fetches and expands nothing.
 
 Only kinematics, limits and masses are read. Meshes are never opened.
 """
@@ -23,8 +23,8 @@ from .suggest import did_you_mean
 
 REVOLUTE = frozenset({"revolute", "continuous"})
 MOVING = REVOLUTE | {"prismatic"}
-MOST_LINKS = 2000  # a humanoid with hands has some hundred
-# Sane ones are 1 long and some metres away; squares of these are far from where floats end.
+MOST_LINKS = 2000  # a humanoid with hands has a few hundred
+# Realistic axes have length 1 and offsets of metres; squares of these bounds are far from overflow.
 SHORTEST_AXIS, LARGEST_PLACE_M = 1e-9, 1e6
 MOST_QUOTED = 60  # characters of a wrong attribute in a message: one line of a terminal
 
@@ -34,7 +34,9 @@ class UrdfJoint:
     """One joint of a URDF.
 
     Attributes:
+        name: of the joint.
         kind: revolute, continuous, prismatic or fixed.
+        parent, child: its links.
         T_parent_joint: pose of the joint's frame in its parent link at zero, shape (4, 4).
         axis: unit axis in the joint's frame, shape (3,).
         lower, upper: limits [rad or m]; ±π where a revolute joint has none.
@@ -54,7 +56,7 @@ class UrdfJoint:
 
 @dataclass(frozen=True, slots=True)
 class PointMass:
-    """What gravity takes hold of in a link.
+    """Mass of a link.
 
     Attributes:
         mass_kg: the link's mass [kg].
@@ -67,9 +69,13 @@ class PointMass:
 
 @dataclass(frozen=True, slots=True)
 class UrdfTree:
-    """The joints of one URDF file by name; every link but the root has exactly one joint above it.
+    """The joints of one URDF file by name; every link but the root is the child of exactly one joint.
 
     Attributes:
+        file: path of the URDF.
+        name: of the robot.
+        links: names.
+        joints: by name.
         masses: of the links that state one, by link.
     """
 
@@ -97,18 +103,18 @@ class UrdfTree:
         return tree
 
     def joint(self, name: str) -> UrdfJoint:
-        """The joint called `name`; RobotError with a suggestion when there is none."""
+        """Return the joint called `name`. Raise RobotError with a suggestion when there is none."""
         if name not in self.joints:
             raise RobotError(f"there is no joint {name!r} in {self.file.name}", remedy=did_you_mean(name, self.joints))
         return self.joints[name]
 
     def require_link(self, name: str) -> None:
-        """RobotError with a suggestion when there is no link called `name`."""
+        """Raise RobotError with a suggestion when there is no link called `name`."""
         if name not in self.links:
             raise RobotError(f"there is no link {name!r} in {self.file.name}", remedy=did_you_mean(name, self.links))
 
     def path(self, start: str, end: str) -> list[tuple[UrdfJoint, bool]]:
-        """The joints between two links, in order; the flag is True where a joint is walked from child to parent."""
+        """Return the joints between two links in order; the flag is True where the path goes from child to parent."""
         up, down = self._to_root(start), self._to_root(end)
         while up and down and up[-1] is down[-1]:
             up.pop()
@@ -145,7 +151,7 @@ class UrdfTree:
                 remedy="Every link but one needs a joint whose child it is",
             )
         reached = list(roots)
-        for link in reached:  # grows on the way
+        for link in reached:  # the list grows during the loop
             reached += below[link]
         ring = sorted(links.difference(reached))
         if ring:
@@ -170,21 +176,22 @@ def chain_between(
     T_start_camera: FloatArray,
     marker_xyz: FloatArray,
 ) -> RigidChain:
-    """The rigid chain from the measurement frame to the marker.
+    """Return the rigid chain from the measurement frame to the marker.
 
     Args:
+        tree: the URDF.
         joints: names in the order of q; each has to lie between the two links.
-        held_at: positions [rad or m] of the joints on the way that are not among `joints`; 0 where not named.
+        held_at: positions [rad or m] of the other joints on the path; 0 where not named.
         start: the link that carries the camera.
         end: the link that carries the marker.
         T_start_camera: pose of the measurement frame in `start`, shape (4, 4).
         marker_xyz: the marker in `end` [m], shape (3,).
 
     Returns:
-        A chain whose joints are `joints` in their order along the way, and in the order of `joints`.
+        A chain whose joints are `joints`, in this order, which is also their order along the path.
 
     Raises:
-        RobotError: a joint does not lie between the links, or the order along the way is another one.
+        RobotError: a joint does not lie between the links, or the order along the path is another one.
     """
     way = tree.path(start, end)
     mimicking = next((joint for joint, _ in way if joint.mimics), None)
@@ -235,7 +242,7 @@ def _assemble(
 
 
 def standing(joint: UrdfJoint, upward: bool, position: float) -> FloatArray:
-    """What a joint that stands still at `position` [rad or m] adds to the way through it, shape (4, 4)."""
+    """Return the transform (4, 4) across a joint that is held at `position` [rad or m]."""
     T_parent_child = joint.T_parent_joint @ _motion(joint, position)
     return inverse(T_parent_child) if upward else T_parent_child
 
@@ -250,7 +257,7 @@ def _motion(joint: UrdfJoint, position: float) -> FloatArray:
 
 
 def inverse(T: FloatArray) -> FloatArray:
-    """The inverse of a transform (4, 4)."""
+    """Return the inverse of a transform (4, 4)."""
     return np.linalg.inv(T).astype(np.float64)
 
 
@@ -268,7 +275,7 @@ def _joint(element: Any, file: Path) -> UrdfJoint:
             remedy="Use revolute, continuous, prismatic or fixed joints",
         )
     axis = _numbers(element.find("axis"), "xyz", (1.0, 0.0, 0.0), file)
-    length = math.hypot(*axis)  # which does not overflow on the way
+    length = math.hypot(*axis)  # hypot does not overflow
     if kind != "fixed" and not SHORTEST_AXIS < length < 1.0 / SHORTEST_AXIS:
         what = "no length" if length == 0 else f"the length {length:.3g}"
         raise RobotError(
@@ -321,7 +328,7 @@ def _limits(joint: Any, kind: str, file: Path) -> tuple[float, float]:
 
 
 def _origin(element: Any, file: Path) -> FloatArray:
-    """The pose (4, 4) of the <origin> in `element`, the identity where there is none."""
+    """Return the pose (4, 4) of the <origin> in `element`, the identity where there is none."""
     origin = element.find("origin")
     T = np.eye(4)
     T[:3, :3] = rotation_of(_numbers(origin, "rpy", (0.0, 0.0, 0.0), file))
@@ -337,7 +344,7 @@ def _origin(element: Any, file: Path) -> FloatArray:
 
 
 def _numbers(element: Any, attribute: str, default: tuple[float, ...], file: Path) -> FloatArray:
-    """The finite numbers in an attribute, as many as `default` has, which stands for one that is not there."""
+    """Return the finite numbers in an attribute, as many as `default` has, which replaces a missing attribute."""
     if element is None or element.get(attribute) is None:
         return np.array(default)
     text = element.get(attribute)
@@ -360,14 +367,14 @@ def _short(text: str) -> str:
 
 
 def _owner(element: Any) -> str:
-    """The joint or link around `element`, as an error names it."""
+    """Return the joint or link around `element`, as named in an error."""
     for above in element.iterancestors("joint", "link"):
         return f"{above.tag} {_short(above.get('name', ''))}"
     return "the robot"
 
 
 def _by_name(root: Any, tag: str, file: Path) -> dict[str, Any]:
-    """The elements of one kind under the root, by their names."""
+    """Return the elements of one kind under the root, by their names."""
     found: dict[str, Any] = {}
     for element in root.iterfind(tag):
         name = element.get("name")

@@ -1,7 +1,7 @@
-"""Benches at the bytes: a port in virtual time or on a pseudo-terminal, and what can go wrong on the way.
+"""Emulator at the byte level: a port in virtual time or on a pseudo-terminal, with fault injection.
 
-What sits behind the port is a `device.Device`: a chain of servos (`drivers/dynamixel/bench`, `drivers/feetech/bench`)
-or encoders that talk of themselves (`drivers/serial_lines/bench`).
+Behind the port is a `device.Device`: a chain of servos (`drivers/dynamixel/bench`, `drivers/feetech/bench`) or encoders
+that send on their own (`drivers/serial_lines/bench`).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Faults as a user asks for them: `late`, `late=0.1`, `mute@elbow`, `overload@elbow`, `unplug`."""
+"""Parse faults given on the command line: `late`, `late=0.1`, `mute@elbow`, `overload@elbow`, `unplug`."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ OPTION = "--fault"
 
 @dataclass(frozen=True, slots=True)
 class FaultKinds:
-    """What can go wrong with a make of servos or encoders.
+    """Faults available for a vendor's servos or encoders.
 
     Attributes:
-        on_the_wire: with what it says.
-        of_one_joint: with one servo or encoder, `glitch` now and then, the others from the beginning.
+        on_the_wire: faults of transmitted packets, by name.
+        of_one_joint: faults of one servo or encoder; `glitch` recurs, the others are present from the start.
     """
 
     on_the_wire: Mapping[str, Fault]
@@ -40,18 +40,18 @@ class FaultKinds:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All of them."""
+        """Names of all faults."""
         return (*self.on_the_wire, *self.of_one_joint, *OF_ALL)
 
 
 @dataclass(frozen=True, slots=True)
 class AskedFault:
-    """One fault.
+    """One requested fault.
 
     Attributes:
         kind: its name.
-        joint: whose servo or encoder; None: all.
-        share: the probability that an answer suffers it, for those on the wire.
+        joint: joint whose servo or encoder is affected; None: all.
+        share: the probability that an answer is affected, for faults on the wire.
     """
 
     kind: str
@@ -60,12 +60,12 @@ class AskedFault:
 
     @classmethod
     def parsed(cls, text: str, joints: Collection[str], kinds: FaultKinds) -> AskedFault:
-        """The fault that `KIND[@JOINT][=SHARE]` names.
+        """Parse `KIND[@JOINT][=SHARE]`.
 
-        With a joint every answer of its servo suffers a fault on the wire, without one 2 % of all answers do.
+        A wire fault with a joint affects every answer of its servo; without a joint it affects 2 % of all answers.
 
         Raises:
-            ConfigError: there is no such kind or joint, or the share is no probability.
+            ConfigError: unknown kind or joint, or the share is not a probability.
         """
         named, _, share = text.partition("=")
         kind, _, joint = named.partition("@")
@@ -94,21 +94,21 @@ def _probability(text: str, share: str) -> float:
 
 
 class WireFaults:
-    """What happens to what is said on one bus."""
+    """Faults of the packets on one bus."""
 
     def __init__(self, faults: Sequence[tuple[int | None, float, Fault]], rng: Random) -> None:
-        """Faults with the ID that each strikes (None: all) and its probability."""
+        """Take triples of servo ID (None: all), probability and fault."""
         self._faults, self._rng = tuple(faults), rng
 
     @classmethod
     def asked(cls, faults: Sequence[AskedFault], kinds: FaultKinds, ids: Mapping[str, int], rng: Random) -> WireFaults:
-        """Those of `faults` that strike a bus; `ids` are by the joints that are on it."""
+        """Select those of `faults` that affect a bus; `ids` maps the joints on it to servo IDs."""
         here = [f for f in faults if f.kind in kinds.on_the_wire and (f.joint is None or f.joint in ids)]
         strike = [(None if f.joint is None else ids[f.joint], f.share, kinds.on_the_wire[f.kind]) for f in here]
         return cls(strike, Random(rng.random()))
 
     def __call__(self, reply: Reply) -> Reply:
-        """The answer as it arrives."""
+        """Return the answer as it arrives."""
         for id, share, fault in self._faults:
             if reply.data and id in (None, reply.id) and self._rng.random() < share:
                 reply = fault(reply, self._rng)

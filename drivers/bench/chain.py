@@ -1,4 +1,4 @@
-"""Servos on one wire, whatever their make: bytes in, bytes with times out."""
+"""Emulated servos on one wire, independent of the vendor: bytes in, timed bytes out."""
 
 from __future__ import annotations
 
@@ -10,34 +10,34 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from .device import Faults, OnlyAnswers, Reply, Sampling, byte_s, no_faults
 
-FORGET_AFTER_S = 0.02  # half an instruction is forgotten after so long
+FORGET_AFTER_S = 0.02  # an incomplete instruction is discarded after this pause
 BAUD_TOLERANCE = 0.03
 
 
 class AnyServo(Protocol):
-    """What a chain asks of a servo."""
+    """Interface of a servo on a chain."""
 
     @property
     def id(self) -> int:
-        """Its number on the bus."""
+        """ID on the bus."""
         ...
 
     @property
     def baud(self) -> int:
-        """The rate at which it listens [bit/s]."""
+        """Baud rate of the servo [bit/s]."""
         ...
 
     @property
     def return_delay_s(self) -> float:
-        """How long it waits before it answers."""
+        """Delay between instruction and answer [s]."""
         ...
 
     def angle(self, t: float) -> float:
-        """Where its shaft is at `t` [rad]."""
+        """Return the shaft angle at `t` [rad]."""
         ...
 
     def reboot(self, t: float) -> None:
-        """As by a power cycle."""
+        """Restart as after a power cycle."""
         ...
 
 
@@ -47,22 +47,22 @@ ServoT = TypeVar("ServoT", bound=AnyServo)
 class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
     """Servos on one half-duplex wire.
 
-    Where several are asked at once each waits for the end of the answer before its own, or for as long as that would
-    have taken. Each takes its position when its turn comes. Servos with one ID talk at the same time: where their
-    bytes differ, the zeros win.
+    When several servos are asked at once, each waits for the end of the answer before its own, or for as long as that
+    answer would have taken. Each samples its position when its turn comes. Servos that share an ID talk at the same
+    time: where their bytes differ, the zeros win.
 
     Attributes:
         servos: in the order of the cable.
-        faults: what happens to the answers.
-        samplings: by ID, when each told its position last.
-        instructions: how many were understood.
+        faults: applied to the answers.
+        samplings: by ID, time and angle of the last position sent.
+        instructions: number of instructions understood.
     """
 
     overhead: int
     """Bytes of a status packet besides its data."""
 
     def __init__(self, servos: Iterable[ServoT], faults: Faults = no_faults) -> None:
-        """A chain with its power on."""
+        """Create a chain with its power on."""
         self.servos = list(servos)
         self.faults = faults
         self.samplings: dict[int, Sampling] = {}
@@ -72,19 +72,22 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
         self._byte_s = 0.0
 
     def servo(self, id: int) -> ServoT:
-        """The first one of this ID; KeyError without one."""
+        """Return the first servo with this ID. Raise KeyError if there is none."""
         for servo in self.servos:
             if servo.id == id:
                 return servo
         raise KeyError(id)
 
     def power_cycle(self, t: float) -> None:
-        """All lose their power and get it back at `t`."""
+        """Cut the power of all servos and restore it at `t`."""
         for servo in self.servos:
             servo.reboot(t)
 
     def send(self, data: bytes, t: float, baud: int) -> list[Reply]:
-        """The host's `data`, whose first byte is on the wire at `t` [s] or when the wire is free; what is answered."""
+        """Send the host's `data` and return the answers.
+
+        The first byte is on the wire at `t` [s], or as soon as the wire is free.
+        """
         t = max(t, self._last_byte_s)
         if t - self._last_byte_s > FORGET_AFTER_S:
             self._stream.clear()
@@ -104,23 +107,23 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
 
     @abstractmethod
     def _instructions_in(self, stream: bytearray) -> tuple[list[Any], int]:
-        """All complete instructions in `stream`, and how many of its bytes need not be seen again."""
+        """Return all complete instructions in `stream`, and the number of bytes consumed."""
 
     @abstractmethod
     def _answers(self, instruction: Any, t: float, baud: int) -> list[Reply]:
-        """What is answered to an instruction that was heard at `t`."""
+        """Return the answers to an instruction received at `t`."""
 
     @abstractmethod
     def _read(self, servo: ServoT, address: int, size: int, t: float) -> tuple[int, bytes]:
-        """Error and data of part of a control table at `t`."""
+        """Return error and data of a part of the control table at `t`."""
 
     @abstractmethod
     def _packet(self, servo: ServoT, id: int, error: Any, params: bytes) -> bytes:
-        """A status packet of a servo that was asked by this ID."""
+        """Build a status packet of a servo that was addressed by this ID."""
 
     @abstractmethod
     def _will_answer(self, servo: ServoT, code: int) -> bool:
-        """Whether the status return level lets it answer to such an instruction."""
+        """Return True if the servo's status return level allows an answer to this instruction."""
 
     def _listening(self, baud: int) -> list[ServoT]:
         return [servo for servo in self.servos if abs((its := servo.baud) - baud) <= BAUD_TOLERANCE * its]
@@ -128,11 +131,11 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
     def _together(
         self, servos: list[ServoT], t: float, act: Callable[[ServoT, float], tuple[Any, bytes]], code: int
     ) -> list[Reply]:
-        """The answer of all servos of one ID, usually one; none where the status return level says so."""
+        """Return the common answer of all servos with one ID (usually one servo); empty if no servo answers."""
         if not servos:
             return []
         start = t + min(servo.return_delay_s for servo in servos)
-        id = servos[0].id  # whoever is given another one answers with that by which it was asked
+        id = servos[0].id  # a servo that is given a new ID still answers with the old one
         done = [(servo, act(servo, start)) for servo in servos]
         packets = [self._packet(servo, id, *told) for servo, told in done if self._will_answer(servo, code)]
         return [Reply(id, start, mixed(packets))] if packets else []
@@ -152,7 +155,7 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
 
 
 def mixed(packets: list[bytes]) -> bytes:
-    """What is heard when all talk at the same time."""
+    """Return the bytes heard when all packets are sent at the same time."""
     if len(packets) == 1:
         return packets[0]
     return bytes(reduce(and_, together) for together in zip(*packets, strict=False))

@@ -1,4 +1,4 @@
-"""What is behind a bench's port."""
+"""Interface of the emulated device behind a port."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from dataclasses import dataclass
 from random import Random
 from typing import Protocol
 
-BITS_PER_BYTE = 10  # with start and stop bit
+BITS_PER_BYTE = 10  # including start and stop bit
 
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """Something that is said, on its way.
+    """An answer in transit.
 
     Attributes:
-        id: who says it (the first one of a common answer).
+        id: ID of the sender (of the first one, for a common answer).
         start: when its first byte is on the wire [s].
-        data: its bytes; none when it is not sent.
+        data: its bytes; empty when it is not sent.
     """
 
     id: int
@@ -30,55 +30,55 @@ Fault = Callable[[Reply, Random], Reply]
 
 
 class Faults(Protocol):
-    """Decides what happens to each answer."""
+    """Function that applies faults to each answer."""
 
     def __call__(self, reply: Reply) -> Reply: ...
 
 
 def no_faults(reply: Reply) -> Reply:
-    """Everything arrives."""
+    """Return the answer unchanged."""
     return reply
 
 
 class Device(Protocol):
-    """Answers, or talks of itself."""
+    """A device that answers instructions or sends on its own."""
 
     def send(self, data: bytes, t: float, baud: int) -> list[Reply]:
-        """The host's `data`, whose first byte is on the wire at `t` [s]; what is answered, in its order."""
+        """Send the host's `data`, whose first byte is on the wire at `t` [s], and return the answers in order."""
         ...
 
     @property
     def speaks_at(self) -> float:
-        """When it says something of itself next [s]; never, infinity."""
+        """Time of the next unsolicited transmission [s]; infinity if there is none."""
         ...
 
     def speak(self, until: float, baud: int) -> list[Reply]:
-        """What it begins to say of itself by `until`, but has not said yet."""
+        """Return the unsolicited transmissions that begin by `until` and have not been returned yet."""
         ...
 
 
 class OnlyAnswers:
-    """A device that says nothing of itself."""
+    """A device that never sends on its own."""
 
     @property
     def speaks_at(self) -> float:
-        """Never."""
+        """Infinity: never."""
         return math.inf
 
     def speak(self, until: float, baud: int) -> list[Reply]:
-        """Nothing."""
+        """Return an empty list."""
         del until, baud
         return []
 
 
 def byte_s(baud: int) -> float:
-    """How long a byte takes [s]."""
+    """Return the duration of one byte [s]."""
     return BITS_PER_BYTE / baud
 
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """When a position was taken that was told, and the shaft's angle then [rad]."""
+    """Time [s] and shaft angle [rad] of a sampled position."""
 
     t: float
     angle: float

@@ -1,4 +1,4 @@
-"""The arm that a robot.toml describes, on pseudo-terminals."""
+"""Emulate the arm of a robot.toml on pseudo-terminals."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .asked_faults import NOW_AND_THEN, AskedFault
 from .device import Device
 from .pty_shell import PtyShell
 
-EVERY_S = 10.0  # what happens now and then
+EVERY_S = 10.0  # period of recurring faults
 UNPLUGGED_S = 3.0
 GLITCH_S = 0.1
 
@@ -23,10 +23,10 @@ Event = tuple[float, str, Callable[[], None]]
 
 
 class BenchArm(ABC):
-    """What is behind the ports of an arm, whatever it is made of.
+    """The devices behind the ports of an emulated arm.
 
     Attributes:
-        unit: of what is counted.
+        unit: what `count` counts.
     """
 
     unit: ClassVar[str]
@@ -34,33 +34,33 @@ class BenchArm(ABC):
     @property
     @abstractmethod
     def devices(self) -> Mapping[str, Device]:
-        """What is behind each port, by name of the bus."""
+        """Device behind each port, by name of the bus."""
 
     @property
     @abstractmethod
     def count(self) -> int:
-        """How many packets were understood, or lines were said, so far."""
+        """Number of packets understood, or lines sent, so far."""
 
     @abstractmethod
     def at_ports(self, ports: Mapping[str, str]) -> Any:
-        """The configuration with other ports, by name of the bus."""
+        """Return the configuration with other ports, given by name of the bus."""
 
     @abstractmethod
     def glitch(self, joint: str, is_wrong: bool) -> None:
-        """A joint's encoder begins or ends to be wrong."""
+        """Start or end an encoder error of one joint."""
 
     @abstractmethod
     def power_cycle(self, t: float) -> None:
-        """All lose their power and get it back at `t`."""
+        """Cut the power of the whole arm and restore it at `t`."""
 
 
 class DryRun:
-    """An arm as it is configured, each bus behind a port of its own. Ended with its with statement.
+    """An emulated arm as configured, each bus behind its own port. A context manager.
 
     Attributes:
-        arm: what is behind the ports.
-        config: the configuration with the bench's ports in the place of those that it names.
-        shells: by name of the bus.
+        arm: the devices behind the ports.
+        config: the configuration with its ports replaced by the emulator's.
+        shells: pseudo-terminals, by name of the bus.
     """
 
     def __init__(
@@ -71,11 +71,12 @@ class DryRun:
         faults: Sequence[AskedFault] = (),
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Nothing is there yet.
+        """Prepare the ports without opening them.
 
         Args:
-            links: by bus, the name of its port.
-            faults: those that happen now and then; the others are the arm's.
+            links: by bus, the path of its port.
+            faults: the recurring ones are played here; all others belong to the arm.
+            now: the clock [s].
         """
         self.arm, self._faults, self._now = arm, tuple(faults), now
         self._opened = ExitStack()
@@ -95,7 +96,7 @@ class DryRun:
         self._opened.close()
 
     def events(self) -> Iterator[Event]:
-        """What happens from now on because it was asked for: after how many seconds, what, and how to do it."""
+        """Yield the requested recurring events: delay [s], description, and the function that triggers it."""
         asked = [fault for fault in self._faults if fault.kind in NOW_AND_THEN]
         while asked:
             for fault in asked:

@@ -1,4 +1,4 @@
-"""What can go wrong with an answer on its way. (What goes wrong in a servo is done to it.)"""
+"""Faults of an answer in transit. (Faults of a servo are set on the servo.)"""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from .device import Fault, Reply
 
 
 def mute(reply: Reply, rng: Random) -> Reply:
-    """It is not sent."""
+    """Drop the answer."""
     del rng
     return replace(reply, data=b"")
 
 
 def late(longest_s: float) -> Fault:
-    """It comes later, by up to `longest_s`."""
+    """Return a fault that delays an answer by up to `longest_s`."""
     return lambda reply, rng: replace(reply, start=reply.start + rng.uniform(0.0, longest_s))
 
 
 def wrong_checksum(reply: Reply, rng: Random) -> Reply:
-    """One bit of its checksum is turned over."""
+    """Flip one bit of the checksum."""
     return replace(reply, data=reply.data[:-1] + bytes((reply.data[-1] ^ 1 << rng.randrange(8),)))
 
 
 def corrupt(most_bytes: int = 4) -> Fault:
-    """Up to so many of its bytes are others."""
+    """Return a fault that changes up to `most_bytes` bytes."""
 
     def fault(reply: Reply, rng: Random) -> Reply:
         data = bytearray(reply.data)
@@ -38,12 +38,12 @@ def corrupt(most_bytes: int = 4) -> Fault:
 
 
 def half(reply: Reply, rng: Random) -> Reply:
-    """It breaks off."""
+    """Truncate the answer."""
     return replace(reply, data=reply.data[: rng.randrange(1, len(reply.data))])
 
 
 def garbage(most_bytes: int = 12) -> Fault:
-    """Random bytes come before it or after it."""
+    """Return a fault that puts random bytes before or after the answer."""
 
     def fault(reply: Reply, rng: Random) -> Reply:
         noise = rng.randbytes(rng.randint(1, most_bytes))
@@ -53,23 +53,23 @@ def garbage(most_bytes: int = 12) -> Fault:
 
 
 class Planned:
-    """Faults of chosen servos, for their next so many answers."""
+    """Faults of chosen servos, each for a given number of answers."""
 
     def __init__(self, rng: Random | None = None) -> None:
-        """No faults yet."""
+        """Start without faults."""
         self._rng = Random(0) if rng is None else rng
         self._plan: dict[int, tuple[Fault, int | None]] = {}
 
     def add(self, id: int, fault: Fault, times: int | None = None) -> None:
-        """The servo's next so many answers suffer `fault`; None: all of them, until `clear`."""
+        """Apply `fault` to the servo's next `times` answers; None: to all of them, until `clear`."""
         self._plan[id] = (fault, times)
 
     def clear(self) -> None:
-        """No faults any more."""
+        """Remove all faults."""
         self._plan.clear()
 
     def __call__(self, reply: Reply) -> Reply:
-        """The answer as it arrives."""
+        """Return the answer as it arrives."""
         if reply.id not in self._plan:
             return reply
         fault, times = self._plan[reply.id]
@@ -82,24 +82,25 @@ class Planned:
 
 
 class Storm:
-    """Faults at random.
+    """Random faults.
 
     Attributes:
-        struck: how often each struck.
+        struck: how often each fault occurred.
     """
 
     def __init__(self, shares: Mapping[str, tuple[float, Fault]], rng: Random) -> None:
-        """Nothing struck yet.
+        """Start with all counts at zero.
 
         Args:
-            shares: by name, the probability that an answer suffers it, and the fault.
+            shares: by name, the probability that an answer is affected, and the fault.
+            rng: source of randomness.
         """
         self._shares, self._rng = dict(shares), rng
         self._total = sum(share for share, _ in self._shares.values())
         self.struck = dict.fromkeys(self._shares, 0)
 
     def __call__(self, reply: Reply) -> Reply:
-        """The answer as it arrives."""
+        """Return the answer as it arrives."""
         drawn = self._rng.random()
         if drawn >= self._total:
             return reply
@@ -112,7 +113,7 @@ class Storm:
 
 
 def storm(intensity: float, rng: Random, *others: Fault, longest_late_s: float = 0.05) -> Storm:
-    """All of them and `others` in equal shares; `intensity` is the probability that an answer suffers one."""
+    """Mix all faults and `others` in equal shares; `intensity` is the probability that an answer is affected."""
     faults = {
         "mute": mute,
         "late": late(longest_late_s),

@@ -1,4 +1,4 @@
-"""Where the joints of a bench go: along a path that was made before, or each to and fro by itself."""
+"""Motion of emulated joints: along a given path, or each swinging on its own."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from bodyschema.interfaces.records import FloatArray, frozen_array
 
 Angle = Callable[[float], float]
 
-SLOWEST_S = 20.0  # a swing and back
+SLOWEST_S = 20.0  # period of the slowest swing
 PHASE_RAD = 2.4  # between neighbours: the golden angle, so that no two joints move together
 WIDEST_RAD = 1.0
 SHARE_OF_RANGE = 0.35
 
 
 def played(path: FloatArray, rate_hz: float, begin_s: float) -> list[Angle]:
-    """For each joint its angle at a time: the path to its end and back, for ever.
+    """Return for each joint a function of time that plays the path forwards and backwards forever.
 
     Args:
         path: angles [rad], shape (n, d) with n > 1.
-        rate_hz: rows of it a second.
-        begin_s: when it begins [s].
+        rate_hz: rows per second.
+        begin_s: start time [s].
     """
     path = frozen_array(path)
     rows = np.arange(len(path), dtype=np.float64)
@@ -36,7 +36,7 @@ def played(path: FloatArray, rate_hz: float, begin_s: float) -> list[Angle]:
 
 
 def swinging(limits: Sequence[tuple[float, float]], begin_s: float) -> list[Angle]:
-    """For each joint a slow swing around the middle of its range [rad]."""
+    """Return for each joint a slow swing around the middle of its range [rad]."""
 
     def joint(place: int, lower: float, upper: float) -> Angle:
         bounded = math.isfinite(lower) and math.isfinite(upper)

@@ -1,4 +1,4 @@
-"""A device on a pseudo-terminal, which any program opens like a serial port."""
+"""Serve a device on a pseudo-terminal, which any program opens like a serial port."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from typing import Self
 from .device import Device, Reply, byte_s
 
 _BAUDS = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
-DEFAULT_BAUD = 38_400  # of a terminal that nobody has set
-LINE_SPEED = 5  # place of the output speed in termios.tcgetattr
-# <asm-generic/termbits.h>: the only call that tells any rate. A program may set its rate so that tcgetattr, which knows
-# the rates that have a name, tells none.
+DEFAULT_BAUD = 38_400  # of a terminal whose rate was never set
+LINE_SPEED = 5  # index of the output speed in termios.tcgetattr
+# <asm-generic/termbits.h>: the only call that returns any rate; tcgetattr knows only the standard rates.
 TCGETS2, TERMIOS2 = 0x802C542A, struct.Struct("=4I20s2I")
 
 
 class PtyShell:
-    """Serves a device on a pseudo-terminal, under a name that stays the same when it is unplugged and plugged in again.
+    """A device on a pseudo-terminal whose name stays the same when it is unplugged and plugged in again.
 
-    Answers take the time that they take on a wire of the rate at which the port was opened.
+    Answers take the time they would take on a wire at the baud rate of the opened port.
     """
 
     def __init__(self, device: Device, link: Path, now: Callable[[], float] = time.monotonic) -> None:
-        """Nothing is opened yet.
+        """Prepare the port without opening it.
 
         Args:
-            link: the port's name, a symbolic link.
-            now: the clock of the device; it has to run like the machine's.
+            device: the device to serve.
+            link: path of the port, a symbolic link.
+            now: the clock of the device; it has to run at the rate of the machine's clock.
         """
         self.device, self.link = device, link
         self._now = now
@@ -55,14 +55,14 @@ class PtyShell:
         self.unplug()
 
     def plug_in(self) -> None:
-        """The port is there."""
+        """Create the port."""
         if self._serving is None:
             self._serving = _Serving(self.device, self._now)
             self.link.unlink(missing_ok=True)
             self.link.symlink_to(self._serving.name)
 
     def unplug(self) -> None:
-        """The port is gone, also for who has it open. The servos keep their power."""
+        """Remove the port, also for a program that has it open. The servos keep their power."""
         if self._serving is not None:
             self.link.unlink(missing_ok=True)
             self._serving.stop()
@@ -70,11 +70,11 @@ class PtyShell:
 
 
 class _Serving:
-    """One life of the pseudo-terminal and the thread that serves it."""
+    """One pseudo-terminal, from plug-in to unplug, and the thread that serves it."""
 
     def __init__(self, device: Device, now: Callable[[], float]) -> None:
         self._device, self._now = device, now
-        # The other end is kept open: without anybody there, reading fails.
+        # The slave end stays open: without a reader on it, reading the master fails.
         self._master, self._slave = os.openpty()
         tty.setraw(self._master)
         tty.setraw(self._slave)
@@ -103,7 +103,7 @@ class _Serving:
             if self._device.speaks_at <= self._now():
                 self._bring(self._device.speak(self._now(), self._baud), self._baud)
             while self._due and self._due[0][0] <= self._now():
-                with suppress(BlockingIOError):  # nobody has read for long: what is said now is lost
+                with suppress(BlockingIOError):  # the buffer is full because no program reads: this packet is lost
                     os.write(self._master, heappop(self._due)[2])
 
     @property
@@ -125,9 +125,9 @@ class _Serving:
 
 
 def _line_speed(descriptor: int) -> int:
-    """The rate [bit/s] to which a terminal was set; 0 when nobody has."""
+    """Return the baud rate of a terminal [bit/s]; 0 if it was never set."""
     try:
         *_, speed = TERMIOS2.unpack(fcntl.ioctl(descriptor, TCGETS2, bytes(TERMIOS2.size)))
-    except OSError:  # a system that has no such call
+    except OSError:  # a system without this call
         return _BAUDS.get(termios.tcgetattr(descriptor)[LINE_SPEED], 0)
     return speed

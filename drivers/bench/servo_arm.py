@@ -1,4 +1,4 @@
-"""The servos that a robot.toml describes, on a bench."""
+"""Emulate the servos of a robot.toml."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from .dry_run import Angle, BenchArm
 
 GLITCH_TICKS = 700
 AT_THE_START = ("baud", "double", "torque")
-TWIN_RAD = 0.1  # where a second servo of one ID stands
+TWIN_RAD = 0.1  # shaft angle of a second servo with the same ID
 
 
 class BenchServo(AnyServo, Protocol):
-    """What is done to a servo on a bench."""
+    """An emulated servo that can be tampered with."""
 
     glitch_ticks: int
 
     def __setitem__(self, name: str, value: int) -> None:
-        """Put a number into a register as the servo itself does, past all locks."""
+        """Write a register as the servo itself does, bypassing all locks."""
         ...
 
     def fail(self, bits: int) -> None:
-        """Something is wrong with it, until it is rebooted."""
+        """Report a hardware error until the servo is rebooted."""
         ...
 
 
@@ -41,7 +41,7 @@ ConfigT = TypeVar("ConfigT", bound=ServosConfig[Any])
 
 
 class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
-    """Servos as they are configured, on one chain for each bus.
+    """Servos as configured, one chain per bus.
 
     Attributes:
         chains: by name of the bus.
@@ -62,13 +62,15 @@ class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
         seed: int = 0,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """The servos with their power on.
+        """Create the servos with their power on.
 
         Args:
-            config: checked.
-            angles: by joint, its angle at a time [rad].
-            return_delay_s: after how long all of them answer.
+            config: checked configuration.
+            angles: by joint, its angle as a function of time [rad].
+            faults: those to apply.
+            return_delay_s: return delay of all servos.
             seed: of the faults on the wire.
+            now: the clock [s].
         """
         self._config, self._return_delay_s, self._rng, self._now = config, return_delay_s, Random(seed), now
         self._servos: dict[str, ServoT] = {}
@@ -86,46 +88,46 @@ class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
 
     @abstractmethod
     def _servo(self, entry: ServoConfig, angle: Angle) -> ServoT:
-        """The servo of an entry, its shaft at `angle`."""
+        """Create the servo of an entry, its shaft at `angle`."""
 
     @abstractmethod
     def _chain(self, servos: Sequence[ServoT], faults: Faults) -> ServoChain[ServoT]:
-        """The servos of a bus."""
+        """Create the chain of a bus."""
 
     @abstractmethod
     def _change_rate(self, servo: ServoT) -> None:
-        """Let the servo listen at another rate."""
+        """Set the servo to another baud rate."""
 
     @property
     def devices(self) -> Mapping[str, ServoChain[ServoT]]:
-        """What is behind each port, by name of the bus."""
+        """Device behind each port, by name of the bus."""
         return self.chains
 
     @property
     def count(self) -> int:
-        """How many packets the servos understood."""
+        """Number of packets the servos understood."""
         return sum(chain.instructions for chain in self.chains.values())
 
     def servo(self, joint: str) -> ServoT:
-        """The servo of a joint."""
+        """Return the servo of a joint."""
         return self._servos[joint]
 
     def at_ports(self, ports: Mapping[str, str]) -> ConfigT:
-        """The configuration with other ports, by name of the bus."""
+        """Return the configuration with other ports, given by name of the bus."""
         buses = {name: msgspec.structs.replace(bus, port=ports[name]) for name, bus in self._config.buses.items()}
         return msgspec.structs.replace(self._config, buses=buses)
 
     def glitch(self, joint: str, is_wrong: bool) -> None:
-        """A joint's encoder begins or ends to be wrong."""
+        """Start or end an encoder error of one joint."""
         self._servos[joint].glitch_ticks = GLITCH_TICKS if is_wrong else 0
 
     def power_cycle(self, t: float) -> None:
-        """All lose their power and get it back at `t`."""
+        """Cut the power of all servos and restore it at `t`."""
         for chain in self.chains.values():
             chain.power_cycle(t)
 
     def _begin(self, kind: str, joint: str) -> None:
-        """What is another way from the beginning."""
+        """Apply a fault that is present from the start."""
         servo = self._servos[joint]
         if kind in self.errors:
             servo.fail(self.errors[kind])
@@ -139,7 +141,7 @@ class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
 
 
 def shaft(config: ServosConfig[Any], entry: ServoConfig, angle: Angle) -> Angle:
-    """The shaft's angle [rad], which is 0 in the middle of the servo's range, from that of the joint."""
+    """Convert the joint's angle to the shaft's angle [rad], which is 0 in the middle of the servo's range."""
     model = config.model_of(entry)
     zero = model.zero_ticks if entry.zero_ticks is None else entry.zero_ticks
     shift = (zero - model.zero_ticks) * model.rad_per_tick

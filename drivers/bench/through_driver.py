@@ -1,4 +1,4 @@
-"""A simulated arm's joints, read by a driver from a bench that stands where the simulation says."""
+"""Read a simulated arm's joints through a real driver and emulated servos."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from .dry_run import Angle
 
 ATTEMPTS = 5
 READ_S = 0.5
-# Bench and driver share a process, and perhaps the processor, with the simulation: answers may be as late as this.
+# Emulator, driver and simulation share a process and perhaps a core, so answers may be this late.
 LATENCY_MS = 40.0
 
 
 @dataclass(frozen=True)
 class Behind:
-    """A driver with its bench.
+    """An open driver and its emulator.
 
     Attributes:
-        driver: is open.
-        look: reads the joints of the bench as they are now; None when that did not work out.
+        driver: the open driver.
+        look: reads the emulated joints at their present angles; None when the reading failed.
     """
 
     driver: JointSource
@@ -38,17 +38,18 @@ OpenBench = Callable[[Mapping[str, Angle]], AbstractContextManager[Behind]]
 
 
 class ThroughDriver:
-    """A `JointSource`: each reading of another source is told to a bench, and read from it.
+    """A `JointSource` that passes each reading of another source through an emulator and a driver.
 
-    All that the driver does is done, down to the bytes. The other source's time stands still meanwhile, so its time
-    stamps are kept; what changes is the encoders' resolution.
+    The driver does all its work, down to the bytes. The other source's clock stands still meanwhile, so its time stamps
+    are kept. Only the encoder resolution changes the angles.
     """
 
     def __init__(self, source: JointSource, open_bench: OpenBench) -> None:
-        """Nothing is opened yet.
+        """Prepare without opening anything.
 
         Args:
-            source: gives the angles; its time runs only while it is read.
+            source: gives the angles; its clock advances only while it is read.
+            open_bench: creates the emulator and opens the driver.
         """
         self._source, self._open_bench = source, open_bench
         self._opened = ExitStack()
@@ -62,22 +63,22 @@ class ThroughDriver:
 
     @property
     def health(self) -> Sequence[str]:
-        """As of the driver; nothing before it is opened, which the first reading does."""
+        """Health messages of the driver; empty until the first reading opens it."""
         return self._of_driver("health", ())
 
     @property
     def servo_health(self) -> Sequence[ServoHealth]:
-        """As of the driver, where it reads servos."""
+        """Servo health as reported by the driver, if it reads servos."""
         return self._of_driver("servo_health", ())
 
     @property
     def bus_health(self) -> Mapping[str, BusHealth]:
-        """As of the driver, where it reads servos."""
+        """Bus health as reported by the driver, if it reads servos."""
         return self._of_driver("bus_health", {})
 
     @property
     def record(self) -> Sequence[Mapping[str, object]]:
-        """As of the driver, where it keeps one."""
+        """Raw record of the driver, if it keeps one."""
         return self._of_driver("record", ())
 
     def _of_driver(self, name: str, default: Any) -> Any:
@@ -94,12 +95,12 @@ class ThroughDriver:
         self._opened.close()
 
     def read(self, timeout_s: float) -> JointReading | None:
-        """The next reading; see `JointSource.read`. None also when the bench could not be read at its angles."""
+        """Return the next reading; see `JointSource.read`. Return None also when the emulator could not be read."""
         wanted = self._source.read(timeout_s)
         if wanted is None:
             return None
         self._q = wanted.q.tolist()
-        if self._behind is None:  # not before the first angles are known, or the arm would jump there
+        if self._behind is None:  # only once the first angles are known, or the arm would jump there
             angles = {name: self._angle(place) for place, name in enumerate(self.joints)}
             self._behind = self._opened.enter_context(self._open_bench(angles))
         for _ in range(ATTEMPTS):

@@ -1,4 +1,4 @@
-"""A device behind a port in virtual time: millions of transactions without a wait."""
+"""Run a device behind a port in virtual time: millions of transactions without waiting."""
 
 from __future__ import annotations
 
@@ -11,31 +11,31 @@ from .device import Device, Reply, byte_s
 
 
 class VirtualClock:
-    """A clock that stands still but when somebody waits."""
+    """A clock that advances only when a caller waits."""
 
     def __init__(self, start: float = 100.0) -> None:
         self._now = start
 
     def now(self) -> float:
-        """Virtual time [s]."""
+        """Return the virtual time [s]."""
         return self._now
 
     def utc(self) -> str:
-        """Virtual time since 2026, ISO 8601 in UTC."""
+        """Return the virtual time since 2026 in ISO 8601, UTC."""
         return (datetime(2026, 1, 1, tzinfo=UTC) + timedelta(seconds=self._now)).isoformat(timespec="milliseconds")
 
     def wait_until(self, t: float) -> None:
-        """Let the time be `t`, if it is not later already."""
+        """Advance the time to `t`, unless it is later already."""
         self._now = max(self._now, t)
 
 
 def at_once() -> float:
-    """No delay."""
+    """Return a delay of zero."""
     return 0.0
 
 
 class VirtualPort:
-    """What the driver needs of a serial port, with a device at its other end."""
+    """A serial port as the driver uses it, with a device at its other end."""
 
     def __init__(
         self,
@@ -46,11 +46,14 @@ class VirtualPort:
         outwards: Callable[[], float] = at_once,
         inwards: Callable[[], float] = at_once,
     ) -> None:
-        """An open port.
+        """Open the port.
 
         Args:
-            outwards: how long bytes need from the program to the wire [s], drawn anew for each packet.
-            inwards: how long from the wire to the program, drawn anew for each question, or what is said unasked.
+            device: the device at the other end.
+            clock: the virtual clock.
+            baud: bits per second.
+            outwards: returns the delay from the program to the wire [s], sampled for each packet.
+            inwards: returns the delay from the wire to the program [s], sampled for each request or unsolicited packet.
         """
         self.device = device
         self._clock, self._baud = clock, baud
@@ -64,7 +67,7 @@ class VirtualPort:
         return self._baud
 
     def close(self) -> None:
-        """Nothing arrives any more."""
+        """Discard everything in transit."""
         self._arriving.clear()
 
     def write(self, data: bytes) -> None:
@@ -72,7 +75,7 @@ class VirtualPort:
         self._bring(self.device.send(data, self._clock.now() + self._outwards(), self._baud))
 
     def receive(self, until: float) -> bytes:
-        """What has arrived, else what arrives next; nothing when that is not before `until`."""
+        """Return what has arrived, else what arrives next; empty when nothing arrives before `until`."""
         while self.device.speaks_at <= min(until, self._arriving[0][0] if self._arriving else math.inf):
             self._bring_in_order(self.device.speak(self.device.speaks_at, self._baud))
         if not self._arriving or self._arriving[0][0] > until:
@@ -82,12 +85,12 @@ class VirtualPort:
         return self._arrived()
 
     def flush(self) -> None:
-        """Forget what has arrived."""
+        """Discard what has arrived."""
         self._bring_in_order(self.device.speak(self._clock.now(), self._baud))
         self._arrived()
 
     def _bring_in_order(self, replies: list[Reply]) -> None:
-        """What a device says of itself is not answered, so each is held back by itself, but none overtakes another."""
+        """Queue unsolicited packets, each with its own delay, without letting one overtake another."""
         for reply in replies:
             end = reply.start + len(reply.data) * byte_s(self._baud)
             self._brought_s = max(self._brought_s, end + self._inwards())

@@ -1,3 +1,3 @@
-"""Dynamixel servos: the driver, and below `bench` a chain of them at the bytes."""
+"""Driver for Dynamixel servos, with an emulator in `bench`."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Question and answer on a bus of Dynamixel servos."""
+"""Request and answer on a bus of Dynamixel servos."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FAST_HEADER = 8  # bytes before the first servo's part
 
 
 def sync_request(layout: Layout, ids: Sequence[int], *, fast: bool) -> Request:
-    """Ask several servos of Protocol 2.0 for the block that tells their positions."""
+    """Ask several servos of Protocol 2.0 for the block that contains their positions."""
     block = layout.block
 
     def packet(size: int) -> bytes:
@@ -27,15 +27,15 @@ def sync_request(layout: Layout, ids: Sequence[int], *, fast: bool) -> Request:
 
 
 class Bus(ServoBus):
-    """Servos of Protocols 2.0 and 1.0 behind one port; knows the common answer to FAST_SYNC_READ."""
+    """Servos of Protocols 2.0 and 1.0 behind one port; supports the common answer to FAST_SYNC_READ."""
 
     @staticmethod
     def packets_of(protocol: int) -> Packets:
-        """How to speak the protocol."""
+        """Return the packet codec of the protocol."""
         return packets_of(protocol)
 
     def sync_write(self, register: Register, values: Mapping[int, int]) -> None:
-        """Write a register of servos of Protocol 2.0, by ID. Nobody answers: whoever needs to know has to ask."""
+        """Write a register of servos of Protocol 2.0, by ID. It is not acknowledged; read back if that matters."""
         data = {id: register.bytes(value) for id, value in values.items()}
         self.announce(PACKETS2.sync_write(register.address, register.size, data))
 

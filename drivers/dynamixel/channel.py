@@ -1,4 +1,4 @@
-"""What a Dynamixel servo tells of its position, and whether that can be."""
+"""Decode and check the position that a Dynamixel servo reports."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Channel(ServoChannel):
     """The answers of one servo since the bus was opened."""
 
     def __init__(self, servo: FittedServo) -> None:
-        """Nothing was answered yet."""
+        """Start without answers."""
         super().__init__(servo)
         self._clock = DeviceClock(TICK_S, TICKS)
 

@@ -29,8 +29,8 @@ class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         port: best one of /dev/serial/by-id, which stays the same when it is plugged in again.
         baud: as the servos are set [bit/s].
-        latency_ms: how long the adapter keeps bytes back; without this key the system is asked.
-        fast_sync_read: `auto` asks the servos once whether they know it.
+        latency_ms: how long the adapter holds bytes back; without this key the system's value is used.
+        fast_sync_read: `auto` tests once if the servos support it.
     """
 
     port: str
@@ -43,8 +43,8 @@ class DynamixelConfig(ServosConfig[BusConfig], frozen=True, forbid_unknown_field
     """The table [drivers.dynamixel]. MX-28 speaks Protocol 1.0, MX-28(2.0) speaks 2.0.
 
     Attributes:
-        zero_force: which joints bear the arm, once a person asks for it. Without this table none ever does.
-        gaze: which joints turn the cameras to the hand, once a person asks for it.
+        zero_force: joints that carry the arm's weight on request. Without this table none ever does.
+        gaze: joints that turn the cameras to the hand on request.
     """
 
     table: ClassVar[str] = "drivers.dynamixel"
@@ -55,7 +55,7 @@ class DynamixelConfig(ServosConfig[BusConfig], frozen=True, forbid_unknown_field
     gaze: GazeConfig | None = None
 
     def check(self, joints: Sequence[str], file: Path, text: str) -> None:
-        """ConfigError when servos, zero-force or gaze do not fit `joints` or each other; see `ServosConfig.check`."""
+        """Raise ConfigError if servos, zero-force or gaze do not fit `joints` or each other; see `ServosConfig`."""
         super().check(joints, file, text)
         for name, keys, what, remedy in self._powered_mistakes():
             line = line_of(text, (*self.table.split("."), name, *keys)) or line_of(text, (*self.table.split("."), name))

@@ -20,12 +20,12 @@ _TABLE = tuple(_remainder(byte) for byte in range(256))
 
 @cache
 def _table_of_words() -> tuple[int, ...]:
-    """Return the checksum of every two bytes: with these it takes half as many steps."""
+    """Return the checksum of every two bytes: this halves the number of steps."""
     return tuple((rest << 8 & 0xFF00) ^ _TABLE[rest >> 8 ^ low] for rest in _TABLE for low in range(256))
 
 
 def crc16(data: bytes | bytearray | memoryview, crc: int = 0) -> int:
-    """The checksum of `data`, which follows bytes whose checksum is `crc`."""
+    """Return the checksum of `data`, continued from `crc`, the checksum of the bytes before it."""
     table, words = _table_of_words(), len(data) // 2
     for word in unpack_from(f">{words}H", data):
         crc = table[crc ^ word]

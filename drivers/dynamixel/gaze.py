@@ -1,4 +1,4 @@
-"""Gaze: the head's servos turned to where they are told to look, slowly, within limits, or not at all."""
+"""Gaze: turn the head's servos to a target, slowly and within limits."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from .powered import PoweredJoints
 from .powered_config import GazeConfig
 
 POSITION_MODE = 3
-SPEED_MARGIN = 3.0  # a head that turns so much faster than it was told is not obeying
-STEP_BASE_S = 0.05  # a longer pause between two cycles moves the head no farther than this long
+SPEED_MARGIN = 3.0  # a head that moves this many times faster than commanded is out of control
+STEP_BASE_S = 0.05  # a longer pause between two cycles moves the head no farther than this one
 
 
 class Gaze(PoweredJoints):
-    """Turns the head towards what `aim` was told last; see `PoweredJoints`.
+    """Joints that turn the head towards the latest `aim`; see `PoweredJoints`.
 
     Attributes:
-        lower, upper: the limits of its joints [rad] (g,).
+        lower, upper: limits of the head's joints [rad] (g,).
     """
 
     name, goal = "gaze", "goal"
@@ -35,11 +35,13 @@ class Gaze(PoweredJoints):
     def __init__(
         self, gaze: GazeConfig, joints: Sequence[str], limits: Sequence[tuple[float, float]], clock: Clock
     ) -> None:
-        """Torque is off.
+        """Start with torque off.
 
         Args:
+            gaze: its table.
             joints: all, in the order of q.
-            limits: of all joints [rad]; the narrower of these and the table's hold.
+            limits: of all joints [rad]; the narrower of these and the table's apply.
+            clock: the clock.
         """
         self._head = [joint for joint in joints if joint in gaze.joints]
         count, speed = len(self._head), math.radians(gaze.max_speed_deg_s)
@@ -66,20 +68,20 @@ class Gaze(PoweredJoints):
 
     @property
     def head(self) -> tuple[str, ...]:
-        """Its joints, in the order of the angles that `aim` takes."""
+        """Names of the head's joints, in the order of the angles that `aim` takes."""
         return tuple(self._head)
 
     @property
     def pose(self) -> tuple[float, FloatArray] | None:
-        """Time [s] and angles of all joints [rad] (d,) of the newest reading while it is on; from any thread."""
+        """Time [s] and angles of all joints [rad] (d,) of the newest reading while on, else None; from any thread."""
         return self._pose if self.state == "on" else None
 
     def aim(self, t: float, angles: FloatArray) -> None:
-        """At `t` [s] the head's joints should stand at `angles` (g,) [rad]; from any thread."""
+        """Set the target angles (g,) [rad] of the head's joints at `t` [s]. May be called from any thread."""
         self._aim = (t, frozen_array(angles))
 
     def _prepare(self, servo: FittedServo) -> int:
-        """The goal is where it stands: it does not move when its torque goes on."""
+        """Return the present position as the goal, so that the joint does not move when its torque goes on."""
         if self._read(servo, "homing_offset") != 0:
             raise RequestError(
                 f"joint {servo.joint!r} (ID {servo.id}) has a Homing Offset: it may turn when its watchdog stops it. "
@@ -115,7 +117,7 @@ class Gaze(PoweredJoints):
         return [self._ticks(*each, samples) for each in zip(self._servos, command - here, strict=True)]
 
     def _next(self, now: float, command: FloatArray, dt: float) -> FloatArray:
-        """The next command: towards a fresh aim, and no faster than allowed; else the same."""
+        """Return the next command: towards a fresh target at the allowed speed, else unchanged."""
         if self._aim is None:
             return command
         t, angles = self._aim
@@ -136,7 +138,7 @@ class Gaze(PoweredJoints):
             )
 
     def _ticks(self, servo: FittedServo, ahead: float, samples: Mapping[str, Sample | None]) -> int:
-        """The register for a command that is `ahead` of the joint [rad]: as far from what the servo tells."""
+        """Return the goal register of a command `ahead` of the joint [rad], relative to the servo's position."""
         sample = samples[servo.joint]
         if sample is None:
             raise Drop("no reading")

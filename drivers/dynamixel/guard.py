@@ -1,4 +1,4 @@
-"""When torque has to go off, and which currents are never exceeded. Knows no bus: numbers in, numbers or `Drop` out."""
+"""Decide when torque must go off, and limit currents. Independent of any bus: numbers in, numbers or `Drop` out."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray, frozen_array
 
-SHORTEST_BASE_S = 0.02  # over which a speed is taken from positions: one tick is 4°/s at most
-CURRENT_SLACK, CURRENT_SLACK_A = 0.15, 0.05  # what a current may be over its limit: the servo's own regulation
-REFUSALS = 3  # so many goals in a row that a servo did not take
+SHORTEST_BASE_S = 0.02  # shortest interval for a speed from positions: one tick is 4°/s at most
+CURRENT_SLACK, CURRENT_SLACK_A = 0.15, 0.05  # allowance for the servo's own current regulation
+REFUSALS = 3  # consecutive goals that a servo ignored
 
 
 class Drop(Exception):
-    """Torque has to go off at once; the text says why and what to do."""
+    """Demand to switch torque off at once; the text says why and what to do."""
 
 
 @dataclass(frozen=True, slots=True)
 class GuardLimits:
-    """What is allowed.
+    """Limits that must not be exceeded.
 
     Attributes:
         joints: names, in the order of all arrays (n,).
         heartbeat_s: longest time between two checks.
-        doubtful_cycles: so many checks in a row without a motion are too many.
+        doubtful_cycles: torque goes off after this many consecutive checks without a reading.
         max_speed: of each joint [rad/s].
-        current_limit: of each joint [A]; infinite where it is not looked at.
-        overcurrent_s: a current over its limit for longer is too long.
+        current_limit: of each joint [A]; infinite where it is not monitored.
+        overcurrent_s: longest time that a current may exceed its limit.
         max_temperature_c: a servo at this or above is too hot.
     """
 
@@ -45,12 +45,14 @@ class GuardLimits:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """What one reading says of the joints that have torque, arrays (n,).
+    """One reading of the joints with torque, arrays (n,).
 
     Attributes:
         t: of the reading [s].
-        q: angles [rad]. velocity: as the servos tell it [rad/s]. current: measured [A], 0 where it is not.
-        alert: whether the servo says that something is wrong with it.
+        q: angles [rad].
+        velocity: as reported by the servos [rad/s].
+        current: measured [A], 0 where it is not.
+        alert: True for a servo that reports a fault.
     """
 
     t: float
@@ -62,13 +64,14 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class ServoState:
-    """What one servo's control table says while it has torque.
+    """Part of one servo's control table while it has torque.
 
     Attributes:
         has_torque: its torque is on.
-        trouble: what its hardware error says, in words; empty when all is well.
-        watchdog: Bus Watchdog: below 0 it has fired, 0 it is not armed.
+        trouble: its hardware error, in words; empty when there is none.
+        watchdog: Bus Watchdog: negative after it has fired, 0 while it is not armed.
         took_goal: its goal is the one that was sent last.
+        temperature_c: measured [°C].
     """
 
     has_torque: bool
@@ -79,13 +82,13 @@ class ServoState:
 
 
 class Guard:
-    """Watches joints with torque. Until `begin`, and after anything that must not be, every check raises `Drop`.
+    """Monitor of joints with torque. Before `begin`, and after any violation, every check raises `Drop`.
 
-    Nothing is forgiven by what comes later: only a new `begin` does that.
+    A violation is permanent: only a new `begin` clears it.
     """
 
     def __init__(self, limits: GuardLimits) -> None:
-        """Everything is refused as yet."""
+        """Start in the state that rejects everything."""
         self._limits = limits
         self._why: str | None = "it was not begun"
         self._checked_s = -math.inf
@@ -95,12 +98,12 @@ class Guard:
         self._over_since = [math.inf] * len(limits.joints)
 
     def begin(self, now: float) -> None:
-        """A person asked for it at `now` [s]."""
+        """Start monitoring on a user's request at `now` [s]."""
         self.__init__(self._limits)
         self._why, self._checked_s = None, now
 
     def check(self, now: float, motion: Motion | None) -> None:
-        """Once a cycle, at `now` [s]; None when the reading was doubtful. Raises Drop."""
+        """Check one cycle at `now` [s]; `motion` is None when the reading was rejected. Raise Drop on a violation."""
         try:
             self._check(now, motion)
         except Drop as drop:
@@ -108,7 +111,7 @@ class Guard:
             raise
 
     def check_servo(self, joint: str, state: ServoState) -> None:
-        """What a servo says of itself, now and then. Raises Drop."""
+        """Check the reported state of one servo, at intervals. Raise Drop on a violation."""
         try:
             self._check_servo(joint, state)
         except Drop as drop:
@@ -182,7 +185,7 @@ class Guard:
             raise Drop(f"joint {joint!r}: its servo heard nothing for too long and stopped. Look at the cable")
         if not state.has_torque or state.watchdog == 0:
             raise Drop(f"joint {joint!r}: its servo lost torque or its watchdog. Look at supply and cable")
-        # Written so that a temperature that is no number counts as too hot.
+        # Written so that NaN counts as too hot.
         if not state.temperature_c < self._limits.max_temperature_c:
             raise Drop(f"joint {joint!r}: its servo is at {state.temperature_c:.0f} °C. Let it cool down")
         self._refusals[joint] = 0 if state.took_goal else self._refusals.get(joint, 0) + 1
@@ -191,18 +194,19 @@ class Guard:
 
 
 class Currents:
-    """Currents that bear the arm: within their limits, and growing from nothing."""
+    """Currents that carry the arm: within their limits, ramped up from zero."""
 
     def __init__(
         self, joints: Sequence[str], torque_constant: FloatArray, current_limit: FloatArray, ramp_s: float, share: float
     ) -> None:
-        """Arrays (n,).
+        """Take arrays of shape (n,).
 
         Args:
+            joints: names.
             torque_constant: of each joint [N·m/A].
             current_limit: of each joint [A].
-            ramp_s: the currents grow for so long.
-            share: of the torque that is given, up to 1.
+            ramp_s: duration of the ramp.
+            share: of the torque that is applied, up to 1.
         """
         self._joints = tuple(joints)
         self._constant, self._limit = torque_constant, current_limit
@@ -211,15 +215,19 @@ class Currents:
         self.saturated: tuple[str, ...] = ()
 
     def begin(self, now: float) -> None:
-        """They grow from `now` on [s]."""
+        """Start the ramp at `now` [s]."""
         self._begin_s, self.saturated = now, ()
 
     def share(self, now: float) -> float:
-        """The part of the torque that is given at `now` [s]."""
+        """Return the share of the torque that is applied at `now` [s]."""
         return self._share * min(max((now - self._begin_s) / self._ramp_s, 0.0), 1.0)
 
     def at(self, now: float, torques: FloatArray) -> FloatArray:
-        """Currents [A] (n,) for the torques that hold the arm [N·m] (n,). Raises Drop when these are no numbers."""
+        """Return the currents [A] (n,) for the torques that hold the arm [N·m] (n,).
+
+        Raises:
+            Drop: the torques are not finite.
+        """
         if torques.shape != self._limit.shape or not np.isfinite(torques).all():
             raise Drop("the model gives no torque for where the arm is. Look at the URDF's masses and joint limits")
         wanted = self.share(now) * torques / self._constant

@@ -21,7 +21,7 @@ from .settings import settings_of
 
 
 def open_serial(config: BusConfig, clock: Clock) -> tuple[Port, float]:
-    """The open port of a bus, and the latency of its adapter [s]."""
+    """Open the port of a bus; return it and the latency of its adapter [s]."""
     latency_s = adapter_latency_s(config.port) if config.latency_ms is None else config.latency_ms * 1e-3
     port = SafePort(config.port, config.baud, latency_s=latency_s, now=clock.now)
     port.openPort()
@@ -42,7 +42,7 @@ DYNAMIXEL = Make(
 
 
 class DynamixelJoints(ServoJoints):
-    """Reads the positions of an arm of Dynamixel servos; see `ServoJoints`."""
+    """An arm of Dynamixel servos as a `JointSource`; see `ServoJoints`."""
 
     def __init__(
         self,
@@ -55,7 +55,7 @@ class DynamixelJoints(ServoJoints):
         open_port: OpenPort = open_serial,
         drives: Sequence[Drive] = (),
     ) -> None:
-        """Nothing is opened yet; arguments as of `ServoJoints`."""
+        """Prepare without opening anything; arguments as in `ServoJoints`."""
         super().__init__(
             DYNAMIXEL, config, joints, clock, open_port=open_port, limits=limits, last_pose=last_pose, drives=drives
         )

@@ -1,4 +1,4 @@
-"""The servos that are known: numbers, names, units, and where the registers that are used stand.
+"""Supported Dynamixel models: numbers, names, units, and addresses of the registers in use.
 
 Sources: ROBOTIS e-Manual, "Control Table of EEPROM Area" and "... of RAM Area" of each model (X, P, MX(2.0), MX, AX);
 model numbers, addresses and units of the newer ones agree with the control tables that dynamixel-sdk 4.1 carries
@@ -20,7 +20,7 @@ Series = Literal["X", "P", "MX", "AX"]
 
 
 def _layout2(torque: int, size: int) -> Layout:
-    """Protocol 2.0: the RAM area of the P series is that of the X series, 448 further on."""
+    """Return the layout of Protocol 2.0. The RAM area of the P series is that of the X series, shifted by 448."""
     places = {
         "model": Register(0, 2),
         "firmware": Register(6, 1),
@@ -151,7 +151,7 @@ MODELS: tuple[Model, ...] = (
 )
 BY_NAME: Mapping[str, Model] = MappingProxyType({model.name: model for model in MODELS})
 BY_NUMBER: Mapping[int, Model] = MappingProxyType({model.number: model for model in MODELS})
-# e-Manual, XL-320: ID at 3, torque at 24, position at 37, 2 bytes. It has no clock and no block that tells all at once.
+# e-Manual, XL-320: ID at 3, torque at 24, position at 37, 2 bytes. It has no clock and no block with all readings.
 UNSUPPORTED: Mapping[int, str] = MappingProxyType({350: "XL-320"})
 
 # Register values of the baud rate [bit/s].
@@ -160,14 +160,14 @@ TICK_S, TICKS = 1e-3, 32768  # Realtime Tick
 
 
 def baud_of(layout: Layout, value: int) -> int:
-    """The baud rate [bit/s] that a register's value means."""
+    """Return the baud rate [bit/s] of a register value."""
     if layout.protocol == 1:
         return round(2_000_000 / (value + 1))
     return BAUDS2[min(value, len(BAUDS2) - 1)]
 
 
 def baud_value(layout: Layout, baud: int) -> int:
-    """The register's value for a baud rate [bit/s]."""
+    """Return the register value of a baud rate [bit/s]."""
     if layout.protocol == 1:
         return round(2_000_000 / baud) - 1
     return BAUDS2.index(baud)

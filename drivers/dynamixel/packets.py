@@ -1,7 +1,7 @@
-"""Instruction packets, put together by dynamixel-sdk; status packets, taken apart strictly.
+"""Build instruction packets with dynamixel-sdk, and parse status packets strictly.
 
-The SDK's own reception is not used: it takes a late answer for that to the next question, drops error bytes and partial
-answers, and reads past garbage.
+The SDK's own reception is not used: it takes a late answer for the answer to the next request, drops error bytes and
+partial answers, and reads past garbage.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ PING, REBOOT = 1, 8
 
 
 class _Caught:
-    """In the place of a port: keeps what the SDK would send."""
+    """Stand-in for a port that captures what the SDK would send."""
 
     is_using = False
     packet = b""
 
     def clearPort(self) -> None:
-        """Nothing to clear."""
+        """Do nothing."""
 
     def writePort(self, packet: list[int]) -> int:
-        """Keep it."""
+        """Store the packet."""
         self.packet = bytes(packet)
         return len(packet)
 
     def setPacketTimeout(self, length: int) -> None:
-        """Nothing waits."""
+        """Do nothing."""
 
 
 class Packets2:
@@ -47,35 +47,35 @@ class Packets2:
 
     overhead, ping_size = 11, 3
     refusals, is_weak = 0x7F, False  # e-Manual, status packets
-    pinged_only = (  # the register is in the RAM area, where 2 stands after power-up
+    pinged_only = (  # the register is in the RAM area, which holds 2 after power-up
         "answers PING but no READ: its Status Return Level (68; P series 516) is 0 until its supply is switched off "
         "and on; else the cable is bad"
     )
     _sdk: Any = sdk.PacketHandler(2.0)
 
     def ping(self, id: int) -> bytes:
-        """PING."""
+        """Build PING."""
         return self._of(lambda port: self._sdk.txPacket(port, [0, 0, 0, 0, id, 3, 0, PING, 0, 0]))
 
     def reboot(self, id: int) -> bytes:
-        """REBOOT."""
+        """Build REBOOT."""
         return self._of(lambda port: self._sdk.txPacket(port, [0, 0, 0, 0, id, 3, 0, REBOOT, 0, 0]))
 
     def read(self, id: int, address: int, size: int) -> bytes:
-        """READ."""
+        """Build READ."""
         return self._of(lambda port: self._sdk.readTx(port, id, address, size))
 
     def write(self, id: int, address: int, data: bytes) -> bytes:
-        """WRITE."""
+        """Build WRITE."""
         packet = self._of(lambda port: self._sdk.writeTxOnly(port, id, address, len(data), list(data)))
         return _stuffed(packet) if len(packet) == len(data) + 12 else packet
 
     def sync_read(self, ids: Sequence[int], address: int, size: int, *, fast: bool) -> bytes:
-        """SYNC_READ, or FAST_SYNC_READ."""
+        """Build SYNC_READ or FAST_SYNC_READ."""
         return self._of(lambda port: self._sdk.syncReadTx(port, address, size, list(ids), len(ids), fast))
 
     def sync_write(self, address: int, size: int, data: Mapping[int, bytes]) -> bytes:
-        """SYNC_WRITE of `size` bytes to each ID. Nobody answers."""
+        """Build SYNC_WRITE of `size` bytes to each ID. It is not acknowledged."""
         params = [byte for id, bytes_ in data.items() for byte in (id, *bytes_)]
         packet = self._of(lambda port: self._sdk.syncWriteTxOnly(port, address, size, params, len(params)))
         return _stuffed(packet) if len(packet) == len(params) + 14 else packet
@@ -86,7 +86,7 @@ class Packets2:
         return port.packet
 
     def take(self, received: bytes | bytearray, at: int) -> Status | None:
-        """The status packet that begins at `at`; see `Packets.take`."""
+        """Return the status packet that begins at `at`; see `Packets.take`."""
         packet = self._complete(received, at)
         if packet is None:
             return None
@@ -96,7 +96,7 @@ class Packets2:
         return Status(packet[4], body[1], body[2:], len(packet))
 
     def take_fast(self, received: bytes | bytearray, at: int, count: int, size: int) -> tuple[Status, ...] | None:
-        """The common answer of `count` servos with `size` bytes each, which is not stuffed; as `take` otherwise."""
+        """Return the parts of the common answer of `count` servos, `size` data bytes each, unstuffed; see `take`."""
         packet = self._complete(received, at)
         if packet is None:
             return None
@@ -104,7 +104,7 @@ class Packets2:
         if packet[4] != BROADCAST or len(packet) != 8 + count * block:
             raise Garbled
         parts = [packet[8 + k * block : 8 + (k + 1) * block] for k in range(count)]
-        # A servo goes on with the checksum of what it heard: if two talked at once before it, the last one still fits.
+        # A servo continues the checksum of what it heard: after a collision the last one still fits.
         crc = crc16(packet[:8])
         for part in parts:
             crc = crc16(part[:-2], crc)
@@ -142,15 +142,15 @@ class Packets1:
     _sdk: Any = sdk.PacketHandler(1.0)
 
     def ping(self, id: int) -> bytes:
-        """PING."""
+        """Build PING."""
         return self._of(lambda port: self._sdk.txPacket(port, [0, 0, id, 2, PING, 0]))
 
     def read(self, id: int, address: int, size: int) -> bytes:
-        """READ."""
+        """Build READ."""
         return self._of(lambda port: self._sdk.readTx(port, id, address, size))
 
     def write(self, id: int, address: int, data: bytes) -> bytes:
-        """WRITE."""
+        """Build WRITE."""
         return self._of(lambda port: self._sdk.writeTxOnly(port, id, address, len(data), list(data)))
 
     def _of(self, send: Any) -> bytes:
@@ -159,7 +159,7 @@ class Packets1:
         return port.packet
 
     def take(self, received: bytes | bytearray, at: int) -> Status | None:
-        """The status packet that begins at `at`; see `Packets.take`."""
+        """Return the status packet that begins at `at`; see `Packets.take`."""
         return take_summed(received, at)
 
 
@@ -167,12 +167,12 @@ PACKETS2, PACKETS1 = Packets2(), Packets1()
 
 
 def packets_of(protocol: int) -> Packets:
-    """How to speak the protocol."""
+    """Return the packet codec of the protocol."""
     return PACKETS2 if protocol == 2 else PACKETS1
 
 
 def _stuffed(packet: bytes) -> bytes:
-    """With the stuffing that dynamixel-sdk 4.1 works out and then does not send."""
+    """Add the byte stuffing that dynamixel-sdk 4.1 computes but does not send."""
     body = packet[7:-2].replace(LOOKS_LIKE_HEADER, STUFFED)
     packet = packet[:5] + (len(body) + 2).to_bytes(2, "little") + body
     return packet + crc16(packet).to_bytes(2, "little")

@@ -1,4 +1,4 @@
-"""The ways in which Dynamixel servos are read."""
+"""Select the read methods for Dynamixel servos."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .config import BusConfig
 
 
 def ways_of(bus: Bus, servos: Sequence[FittedServo], config: BusConfig) -> list[list[Way]]:
-    """The ways of each group: one for all servos of Protocol 1.0, and one for each series of Protocol 2.0."""
+    """Return the read methods of each group: Protocol 1.0 as one, and each series of Protocol 2.0."""
     alone = [servo for servo in servos if servo.model.protocol == 1]
     series: dict[int, list[FittedServo]] = {}
     for servo in servos:

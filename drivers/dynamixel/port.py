@@ -1,4 +1,4 @@
-"""dynamixel-sdk's port, hardened: opened alone, on a monotonic clock, without spinning, and lost with a clear error."""
+"""A hardened dynamixel-sdk port: exclusive, on a monotonic clock, without spinning, lost with a clear error."""
 
 from __future__ import annotations
 
@@ -17,13 +17,16 @@ TIMEOUT_MARGIN_S = 2e-3
 
 
 class SafePort(sdk.PortHandler):
-    """An open port, for the driver and for whatever of dynamixel-sdk takes a PortHandler."""
+    """An open port, for the driver and for any part of dynamixel-sdk that takes a PortHandler."""
 
     def __init__(self, port: str, baud: int, *, latency_s: float, now: Callable[[], float] = time.monotonic) -> None:
-        """Not open yet: `openPort` raises SourceError where the original returns False.
+        """Prepare without opening it. `openPort` raises SourceError where the original returns False.
 
         Args:
-            latency_s: how long the adapter may keep bytes back.
+            port: path of the port.
+            baud: bits per second.
+            latency_s: longest time that the adapter holds bytes back.
+            now: the clock [s].
         """
         super().__init__(port)
         self.baudrate = baud
@@ -37,13 +40,13 @@ class SafePort(sdk.PortHandler):
 
     @property
     def line(self) -> SerialLine:
-        """The open port; ConnectionError when it is not."""
+        """The open port. Raises ConnectionError when it is not open."""
         if self._line is None:
             raise ConnectionError(f"{self.port_name} is not open")
         return self._line
 
     def setupPort(self, cflag_baud: int) -> Literal[True]:
-        """Open it at the rate, for this program alone."""
+        """Open the port exclusively at the given rate."""
         if self.is_open:
             self.closePort()
         self._line = SerialLine.open(self.port_name, cflag_baud, self._now)
@@ -54,18 +57,18 @@ class SafePort(sdk.PortHandler):
         return True
 
     def closePort(self) -> None:
-        """Give it free."""
+        """Release the port."""
         self.is_open = self.is_using = False
         if self._line is not None:
             self._line.close()
             self._line = None
 
     def clearPort(self) -> None:
-        """Forget what has arrived."""
+        """Discard what has arrived."""
         self.line.flush()
 
     def readPort(self, length: int) -> bytes:
-        """Up to `length` bytes; waits a moment for the first."""
+        """Return up to `length` bytes. Wait a moment for the first."""
         return self.line.device.read(length) if self.line.wait(self._now() + TIMEOUT_MARGIN_S) else b""
 
     def writePort(self, packet: bytes | list[int]) -> int:
@@ -74,11 +77,11 @@ class SafePort(sdk.PortHandler):
         return len(packet)
 
     def getCurrentTime(self) -> float:
-        """Monotonic time [ms]."""
+        """Return the monotonic time [ms]."""
         return self._now() * 1e3
 
     def setPacketTimeout(self, packet_length: int) -> None:
-        """The time-out of an answer of so many bytes, by this adapter's latency."""
+        """Set the time-out of an answer of `packet_length` bytes, from this adapter's latency."""
         self.packet_start_time = self.getCurrentTime()
         waiting_s = 2 * self._latency_s + TIMEOUT_MARGIN_S
         self.packet_timeout = self.tx_time_per_byte * packet_length + waiting_s * 1e3
@@ -88,13 +91,13 @@ class SafePort(sdk.PortHandler):
         self.line.write(data)
 
     def flush(self) -> None:
-        """Forget what has arrived."""
+        """Discard what has arrived."""
         self.line.flush()
 
     def close(self) -> None:
-        """Give it free."""
+        """Release the port."""
         self.closePort()
 
     def receive(self, until: float) -> bytes:
-        """What has arrived, else what arrives next; nothing when that is not before `until`."""
+        """Return what has arrived, else what arrives next; empty when nothing arrives before `until`."""
         return self.line.receive(until)

@@ -1,4 +1,4 @@
-"""Joints that may have torque while they are read: asked for, watched, and let go of whenever in doubt."""
+"""Joints that may have torque while they are read: on request, monitored, and released at any doubt."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from .powered_config import PoweredConfig
 
 log = logging.getLogger(__name__)
 
-LOOK_EVERY_S = 0.05  # at one servo's torque, health, watchdog and goal
+LOOK_EVERY_S = 0.05  # period of reading one servo's torque, health, watchdog and goal
 MISSED_LOOKS = 5
 ATTEMPTS = 3
 
@@ -36,10 +36,10 @@ State = Literal["off", "on", "dropped"]
 
 
 class PoweredJoints(ABC):
-    """Some joints of an arm that have torque from when a person asks for it until anything is not as it must be.
+    """Joints of an arm that have torque from a user's request until any check fails.
 
-    A `Drive`. Nothing but a new request switches torque on again. `ask` may be called from any thread, and so may the
-    properties; the rest belongs to the thread that reads.
+    A `Drive`. Only a new request switches torque on again. `ask` and the properties may be used from any thread; all
+    else belongs to the reading thread.
     """
 
     name: str
@@ -51,7 +51,7 @@ class PoweredJoints(ABC):
     """The register that it writes."""
 
     def __init__(self, config: PoweredConfig, joints: Sequence[str], guard: Guard, clock: Clock) -> None:
-        """Torque is off, and nothing was asked for."""
+        """Start with torque off and no request."""
         self._config, self._guard, self._clock = config, guard, clock
         self._joints = tuple(joints)
         self._requests: SimpleQueue[tuple[bool, Future[str]]] = SimpleQueue()
@@ -66,9 +66,9 @@ class PoweredJoints(ABC):
         self.state: State = "off"
 
     def ask(self, on: bool) -> Future[str]:
-        """Ask for torque, or for its end. The reading thread does it and says what it did, or why not (RequestError).
+        """Request torque on or off. The reading thread does it and returns what it did, or raises RequestError.
 
-        Whoever does not wait for the answer any longer has to cancel it, so that nothing begins unexpectedly.
+        A caller that stops waiting for the answer must cancel it, so that torque does not go on unexpectedly.
         """
         answer: Future[str] = Future()
         self._requests.put((on, answer))
@@ -81,7 +81,7 @@ class PoweredJoints(ABC):
 
     @property
     def complaints(self) -> tuple[str, ...]:
-        """What is wrong, and what to do."""
+        """Current problems, and what to do."""
         said = []
         if self._unsure:
             said.append(f"the torque of {', '.join(self._unsure)} could not be verified off: switch the supply off")
@@ -94,7 +94,7 @@ class PoweredJoints(ABC):
     # --- `Drive`, by the thread that reads
 
     def open(self, buses: Mapping[str, ServoBus], servos: Sequence[FittedServo]) -> None:
-        """See `Drive.open`."""
+        """Implement `Drive.open`."""
         self._buses = {name: bus for name, bus in buses.items() if isinstance(bus, Bus)}
         by_joint = {servo.joint: place for place, servo in enumerate(servos)}
         self._places = [by_joint[joint] for joint in self._joints]
@@ -105,11 +105,11 @@ class PoweredJoints(ABC):
                 log.warning("%s is not possible as yet: %s", self.name, self._wrong_mode(servo, servo.operating_mode))
 
     def step(self, reading: JointReading | None, samples: Mapping[str, Sample | None]) -> str | None:
-        """See `Drive.step`."""
+        """Implement `Drive.step`."""
         self._has_just_begun = False
         self._answer_requests()
         if self.state != "on" or self._has_just_begun:
-            return None  # the samples are older than the torque, with which a position may lose its turns
+            return None  # the samples predate the torque, with which a position may lose its turns
         try:
             now = self._clock.now()
             motion = self._motion(reading, samples)
@@ -127,7 +127,7 @@ class PoweredJoints(ABC):
         return None
 
     def release(self, why: str | None) -> None:
-        """See `Drive.release`."""
+        """Implement `Drive.release`."""
         while True:
             try:
                 _, answer = self._requests.get_nowait()
@@ -142,23 +142,27 @@ class PoweredJoints(ABC):
         elif self._end():
             log.error("%s", "; ".join(self.complaints))
 
-    # --- what differs
+    # --- differs by kind of drive
 
     @abstractmethod
     def _prepare(self, servo: FittedServo) -> int:
-        """Verify the servo's own limits; the goal with which its torque is safe to be switched on. RequestError."""
+        """Check the servo's own limits and return a goal with which its torque is safe to switch on.
+
+        Raises:
+            RequestError: the limits do not allow it.
+        """
 
     @abstractmethod
     def _begin(self, now: float) -> None:
-        """Torque is on since now."""
+        """Note that torque is on from `now`."""
 
     @abstractmethod
     def _goals(self, now: float, q: FloatArray, samples: Mapping[str, Sample | None]) -> list[int]:
-        """The goals' registers, joint by joint; q (d,) are the angles of the whole arm [rad]. Raises Drop."""
+        """Return the goal registers, joint by joint; q (d,) are the angles of the whole arm [rad]. Raise Drop."""
 
     @abstractmethod
     def _said_on(self) -> str:
-        """For whoever asked for it."""
+        """Return the message for the user who requested it."""
 
     # --- torque on
 
@@ -185,7 +189,7 @@ class PoweredJoints(ABC):
         return f"{self.name} is off, the torque of {', '.join(self._joints)} verified off"
 
     def _end(self) -> tuple[str, ...]:
-        """Torque off, as it was asked for; whose could not be verified."""
+        """Switch torque off on request; return the joints that could not be verified off."""
         unsure = self._let_go()
         self.state, self._why = "off", ""
         if not unsure:
@@ -214,14 +218,14 @@ class PoweredJoints(ABC):
         return self._said_on()
 
     def _prepared(self, servo: FittedServo) -> int:
-        """Its torque is off, its mode right, its goal harmless, its watchdog armed; the goal."""
+        """Check that torque is off and the mode right, set a safe goal and arm the watchdog; return the goal."""
         if self._read(servo, "torque") != 0:
             raise RequestError(f"joint {servo.joint!r} has torque already: another program moves it")
         mode = self._read(servo, "operating_mode")
         if mode != self.mode:
             raise RequestError(self._wrong_mode(servo, mode))
         goal = self._prepare(servo)
-        # After a change of mode the goal current is the largest there is (e-Manual, Operating Mode).
+        # After a change of mode the goal current is the highest possible (e-Manual, Operating Mode).
         for name, value in (("watchdog", 0), (self.goal, goal), ("watchdog", self._config.watchdog)):
             self._write(servo, name, value)
         return goal
@@ -241,8 +245,8 @@ class PoweredJoints(ABC):
         log.error("%s", "; ".join(self.complaints))
 
     def _let_go(self) -> tuple[str, ...]:
-        """Torque off: told to all at once, then verified one by one. Whose could not be verified."""
-        # Whatever fails with one servo, the others have to be told all the same.
+        """Switch torque off: all servos at once, then verify each. Return the joints that could not be verified."""
+        # A failure of one servo must not keep the others from being switched off.
         with suppress(Exception):
             self._write_all("torque", dict.fromkeys(self._joints, 0))
         unsure = []
@@ -306,7 +310,7 @@ class PoweredJoints(ABC):
     # --- registers
 
     def _write_all(self, name: str, values: Mapping[str, int]) -> None:
-        """By Sync Write: of each bus the servos of one series at the same time."""
+        """Write with Sync Write: the servos of one series on a bus at the same time."""
         groups: dict[tuple[str, Register], dict[int, int]] = {}
         for servo in self._servos:
             key = (servo.bus, servo.model.layout[name])
@@ -315,7 +319,7 @@ class PoweredJoints(ABC):
             self._buses[bus].sync_write(register, by_id)
 
     def _write(self, servo: FittedServo, name: str, value: int) -> None:
-        """Write a register and read it back; RequestError when it does not have the value then."""
+        """Write a register and read it back. Raise RequestError if the value differs."""
         register = servo.model.layout[name]
         found = None
         for _ in range(ATTEMPTS):
@@ -326,7 +330,7 @@ class PoweredJoints(ABC):
         raise RequestError(f"joint {servo.joint!r} (ID {servo.id}): {name} was set to {value} and is {found}")
 
     def _read(self, servo: FittedServo, name: str) -> int:
-        """A register's number; RequestError without an answer."""
+        """Return the value of a register. Raise RequestError without an answer."""
         bus, register = self._buses[servo.bus], servo.model.layout[name]
         exchange = None
         for _ in range(ATTEMPTS):

@@ -23,12 +23,13 @@ Mistake = tuple[tuple[str, ...], str, str]
 
 
 class FloatingJoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [drivers.dynamixel.zero_force.joints.<joint>]: a joint that bears its part of the arm.
+    """The table [drivers.dynamixel.zero_force.joints.<joint>]: a joint that carries its part of the arm's weight.
 
     Attributes:
-        current_limit_a: never more than this [A].
-        torque_constant: torque per current of its servo and what is between it and the joint [N·m/A]; without this
-            key the model's, where the manual's figures are known.
+        current_limit_a: upper limit of the current [A].
+        torque_constant: torque at the joint per current, including any gear [N·m/A]; without this key the model's
+            value,
+    if the manual's figures are known.
     """
 
     current_limit_a: Positive
@@ -36,13 +37,13 @@ class FloatingJoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PoweredConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What is common to both.
+    """Settings common to both.
 
     Attributes:
-        heartbeat_ms: a loop that comes round later than this drops to torque-off, and a servo that hears nothing
-            for so long stops by itself (Bus Watchdog, steps of 20 ms).
-        max_temperature_c: a hotter servo: torque off.
-        doubtful_cycles: so many readings in a row that cannot be believed: torque off.
+        heartbeat_ms: a control loop slower than this switches torque off, and a servo that hears nothing for this long
+            stops by itself (Bus Watchdog, steps of 20 ms).
+        max_temperature_c: torque goes off when a servo is hotter.
+        doubtful_cycles: torque goes off after this many consecutive rejected readings.
     """
 
     heartbeat_ms: Heartbeat = 100.0
@@ -51,24 +52,24 @@ class PoweredConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     @property
     def heartbeat_s(self) -> float:
-        """In seconds."""
+        """Heartbeat [s]."""
         return self.heartbeat_ms * 1e-3
 
     @property
     def watchdog(self) -> int:
-        """The register's value."""
+        """Value of the Bus Watchdog register."""
         return math.ceil(self.heartbeat_s / WATCHDOG_UNIT_S - 1e-9)
 
 
 class ZeroForceConfig(PoweredConfig, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [drivers.dynamixel.zero_force]: the servos bear the arm, so that a hand guides it without its weight.
+    """The table [drivers.dynamixel.zero_force]: the servos carry the arm's weight for hand guiding.
 
     Attributes:
-        joints: those that bear; the torque of the others stays off.
-        max_speed_deg_s: a joint that turns faster: torque off.
-        ramp_s: the currents grow for so long.
-        overcurrent_s: a current that is over the limit for so long: torque off.
-        share: of the arm's weight that is borne.
+        joints: those that carry the arm; the torque of the others stays off.
+        max_speed_deg_s: torque goes off when a joint turns faster.
+        ramp_s: duration of the ramp of the currents.
+        overcurrent_s: torque goes off when a current exceeds its limit for this long.
+        share: share of the arm's weight that is carried.
     """
 
     joints: Annotated[dict[str, FloatingJoint], Meta(min_length=1)]
@@ -78,12 +79,12 @@ class ZeroForceConfig(PoweredConfig, frozen=True, forbid_unknown_fields=True, kw
     share: Annotated[float, Meta(gt=0, le=1)] = 1.0
 
     def torque_constant_of(self, servo: ServoConfig) -> float:
-        """Of a joint's servo [N·m/A]; checked to be known."""
+        """Return the torque constant of a joint's servo [N·m/A]; checked to be known."""
         given = self.joints[servo.joint].torque_constant
         return given or torque_constant(servo.model) or math.nan
 
     def mistakes(self, servos: Sequence[ServoConfig], models: Mapping[str, Model]) -> Iterator[Mistake]:
-        """What is wrong with it for these servos, whose models are known."""
+        """Yield what is wrong with the table for these servos, whose models are known."""
         by_joint = {servo.joint: servo for servo in servos}
         for joint, table in self.joints.items():
             keys = ("joints", joint)
@@ -112,8 +113,8 @@ class GazeConfig(PoweredConfig, frozen=True, forbid_unknown_fields=True, kw_only
         joints: those of the head; each is also one of [robot] joints.
         limits_deg: by joint, narrower limits than the URDF's [°].
         max_speed_deg_s: of the head's joints.
-        stale_s: without a newer aim for so long, the head stands still.
-        blocked_s, blocked_deg: a head that is so far from where it should be for so long: torque off.
+        stale_s: without a newer target for this long, the head stands still.
+        blocked_s, blocked_deg: torque goes off when the head stays this far from its command for this long.
     """
 
     joints: Annotated[tuple[str, ...], Meta(min_length=1)]
@@ -124,7 +125,7 @@ class GazeConfig(PoweredConfig, frozen=True, forbid_unknown_fields=True, kw_only
     blocked_deg: Positive = 15.0
 
     def mistakes(self, servos: Sequence[ServoConfig], models: Mapping[str, Model]) -> Iterator[Mistake]:
-        """What is wrong with it for these servos, whose models are known."""
+        """Yield what is wrong with the table for these servos, whose models are known."""
         by_joint = {servo.joint: servo for servo in servos}
         for joint in self.joints:
             if joint not in by_joint:

@@ -1,4 +1,4 @@
-"""Finds Dynamixel servos of both protocols."""
+"""Scan for Dynamixel servos of both protocols."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .packets import BROADCAST, PACKETS2, Version
 
 LIKELY_FIRST = (1_000_000, 57_600, 2_000_000, 115_200, 3_000_000, 4_000_000, 9_600)
 FASTEST1 = 3_000_000  # of Protocol 1.0
-SLOT_S = 3e-3  # each servo of Protocol 2.0 waits so long for each ID before its own
+SLOT_S = 3e-3  # a servo of Protocol 2.0 waits this long for each ID below its own
 PING2 = 10  # bytes
 
 
@@ -33,9 +33,11 @@ PROTOCOL1, PROTOCOL2 = _kind(1), _kind(2)
 
 
 class Protocol2Scanner(PingScanner):
-    """At slow rates one question asks for all; when something comes that is not understood, each ID is asked by itself.
+    """Scanner of Protocol 2.0.
 
-    Where a packet takes less time than a servo's turn to answer that question, each ID is asked at once.
+    At slow rates a broadcast PING finds all servos. If an answer is garbled, each ID is asked by itself. At fast rates,
+    where a packet takes less time than a servo's slot to answer the broadcast, each ID is asked by itself from the
+    start.
     """
 
     def __init__(self) -> None:

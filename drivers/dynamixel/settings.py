@@ -1,7 +1,7 @@
-"""What may be changed in the EEPROM of Dynamixel servos.
+"""EEPROM settings of Dynamixel servos that can be changed.
 
 Sources: ROBOTIS e-Manual, "Control Table of EEPROM Area" of X, P, MX(2.0), MX and AX. Addresses agree with the control
-tables of dynamixel-sdk, which a test compares. What a model keeps within narrower bounds it refuses itself.
+tables of dynamixel-sdk, which a test compares. A model with narrower bounds rejects a value itself.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from bodyschema.drivers.servos.settings import BAUD, HOMING_OFFSET, ID, Setting
 from .models import LAYOUT_MX1, baud_value
 
 BAUDS2 = (9600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
-BAUDS1 = (9600, 57_600, 115_200, 1_000_000)  # the register knows others, which robot.toml does not
+BAUDS1 = (9600, 57_600, 115_200, 1_000_000)  # the register allows others that robot.toml does not
 MODES = {"velocity": 1, "position": 3, "extended": 4, "pwm": 16}
 CURRENT_MODES = {"current": 0, "current_position": 5}
 FARTHEST_OFFSET = 1_044_479  # 255 turns
-NEAR_OFFSET = 1024  # more is ignored in position mode
+NEAR_OFFSET = 1024  # a larger one is ignored in position mode
 LARGEST_ID = 252
 
 RENAMED = "set id in robot.toml"
@@ -28,7 +28,7 @@ OTHER_ZERO = "the joint's zero moves: pairs measured before do not fit those aft
 
 
 def settings_of(model: Model) -> Sequence[Setting]:
-    """The settings of a model, in the order of their addresses."""
+    """Return the settings of a model, in the order of their addresses."""
     found = _of_protocol1(model) if model.protocol == 1 else _of_protocol2(model)
     return sorted(found, key=lambda setting: setting.register.address)
 
@@ -87,7 +87,7 @@ def _of_protocol1(model: Model) -> Iterator[Setting]:
     yield Setting("min_voltage_limit", Register(12, 1), 50, 160, per_unit=0.1, unit="V")
     yield Setting("max_voltage_limit", Register(13, 1), 50, 160, per_unit=0.1, unit="V")
     yield Setting("max_torque", Register(14, 2), 0, 1023)
-    # With 0 the servo answers no question, and nobody could read back what was written.
+    # With 0 the servo answers no read, so the written value could not be verified.
     yield Setting("status_return", model.layout["status_return"], 1, 2)
     yield Setting("alarm_led", Register(17, 1), 0, 0x7F)
     if model.layout is LAYOUT_MX1:

@@ -1,9 +1,10 @@
-"""How much torque a servo gives for its current.
+"""Torque constants of Dynamixel models.
 
 Sources: ROBOTIS e-Manual, "Specifications" of each model (github.com/ROBOTIS-GIT/emanual: _data/dxl_x_info.yml, and
-_includes/common/compatible_dxl/compatible_x540.md for XD540): of the X and MX series stall torque and stall current at
-the recommended voltage, of the P series continuous torque and continuous current. XW540-H260 is made to order and has
-no published figures: its user gives the constant. With friction a real servo gives some tenths less at small currents.
+_includes/common/compatible_dxl/compatible_x540.md for XD540): for the X and MX series stall torque and stall current at
+the recommended voltage, for the P series continuous torque and continuous current. XW540-H260 is made to order and has
+no published figures: its user gives the constant. Because of friction a real servo gives some tenths less at small
+currents.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-# By model: torque [N·m] and the current [A] that belongs to it.
+# By model: torque [N·m] and the corresponding current [A].
 TORQUE_AT_CURRENT: Mapping[str, tuple[float, float]] = MappingProxyType(
     {
         "MX-64(2.0)": (6.0, 4.1),
@@ -52,7 +53,7 @@ TORQUE_AT_CURRENT: Mapping[str, tuple[float, float]] = MappingProxyType(
 
 
 def torque_constant(model: str) -> float | None:
-    """Torque per current of a model [N·m/A]; None where its manual's figures are not here."""
+    """Return the torque per current of a model [N·m/A]; None if its manual's figures are not listed."""
     if model not in TORQUE_AT_CURRENT:
         return None
     torque, current = TORQUE_AT_CURRENT[model]

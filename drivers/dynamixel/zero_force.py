@@ -1,4 +1,4 @@
-"""Zero-force: the servos' currents bear the arm, so that a hand guides it without its weight."""
+"""Zero-force mode: the servos' currents carry the arm, so that it can be guided by hand without its weight."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ HoldingTorques = Callable[[FloatArray], FloatArray]
 
 
 class ZeroForce(PoweredJoints):
-    """Bears the arm by current; see `PoweredJoints`. The torque of joints that are not configured stays off."""
+    """Joints that carry the arm by current; see `PoweredJoints`. The torque of other joints stays off."""
 
     name, goal = "zero_force", "goal_current"
     mode, mode_name = CURRENT_MODE, "current control"
@@ -39,12 +39,14 @@ class ZeroForce(PoweredJoints):
         torques: HoldingTorques,
         clock: Clock,
     ) -> None:
-        """Torque is off.
+        """Start with torque off.
 
         Args:
             config: the servos; checked.
             zero_force: its table.
             joints: all, in the order of q.
+            torques: returns the holding torques.
+            clock: the clock.
         """
         floating = [joint for joint in joints if joint in zero_force.joints]
         servos = {servo.joint: servo for servo in config.servos}
@@ -68,7 +70,7 @@ class ZeroForce(PoweredJoints):
 
     @property
     def complaints(self) -> tuple[str, ...]:
-        """What is wrong, and what to do."""
+        """Current problems, and what to do."""
         said = super().complaints
         if self.state == "on" and self._sinking:
             names = ", ".join(self._sinking)
@@ -102,7 +104,7 @@ class ZeroForce(PoweredJoints):
     def _torques_at(self, q: FloatArray) -> FloatArray:
         try:
             return np.asarray(self._torques(q), dtype=np.float64)[self._places]
-        except Exception as error:  # whatever it raises, nobody knows what bears the arm
+        except Exception as error:  # without a torque model the arm cannot be carried safely
             raise Drop(f"the model of the arm's weight failed: {error!r}") from error
 
     def _said_on(self) -> str:
@@ -113,5 +115,5 @@ class ZeroForce(PoweredJoints):
 
     @staticmethod
     def _ticks(servo: FittedServo, current: float) -> int:
-        """The register for a current [A] that turns the joint forward."""
+        """Return the register value of a current [A] that turns the joint forward."""
         return round(servo.direction * current / (servo.model.current_unit or math.nan))

@@ -1,3 +1,3 @@
-"""Feetech servos of the STS, SMS and SCS series: the driver, and below `bench` a chain of them at the bytes."""
+"""Driver for Feetech servos of the STS, SMS and SCS series, with an emulator in `bench`."""
 
 from __future__ import annotations

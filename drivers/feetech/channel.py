@@ -1,4 +1,4 @@
-"""What a Feetech servo tells of its position, and whether that can be."""
+"""Decode and check the position that a Feetech servo reports."""
 
 from __future__ import annotations
 

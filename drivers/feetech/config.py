@@ -23,8 +23,8 @@ class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         port: best one of /dev/serial/by-id, which stays the same when it is plugged in again.
         baud: as the servos are set [bit/s].
-        latency_ms: how long the adapter keeps bytes back; without this key the system is asked.
-        sync_read: `auto` asks the servos of the STS and SMS series once whether they know it.
+        latency_ms: how long the adapter holds bytes back; without this key the system's value is used.
+        sync_read: `auto` tests once if the servos of the STS and SMS series support it.
     """
 
     port: str

@@ -33,19 +33,19 @@ class Bus(ServoBus):
 
     @staticmethod
     def packets_of(protocol: int) -> Packets:
-        """How to speak to any series."""
+        """Return the packet codec, which is the same for all series."""
         del protocol
         return PACKETS
 
 
 def open_serial(config: BusConfig, clock: Clock) -> tuple[Port, float]:
-    """The open port of a bus, and the latency of its adapter [s]."""
+    """Open the port of a bus; return it and the latency of its adapter [s]."""
     latency_s = adapter_latency_s(config.port) if config.latency_ms is None else config.latency_ms * 1e-3
     return SerialLine.open(config.port, config.baud, clock.now), latency_s
 
 
 def ways_of(bus: ServoBus, servos: Sequence[FittedServo], config: BusConfig) -> list[list[Way]]:
-    """The ways of each group: one for the STS and SMS series, which know Sync Read, and one for the others."""
+    """Return the read methods of each group: the STS and SMS series, which support Sync Read, and the others."""
     together = [servo for servo in servos if servo.model.protocol == STS]
     if len(together) < 2 or config.sync_read != "auto":
         return [[_one_by_one(bus, servos)]]
@@ -74,7 +74,7 @@ FEETECH = Make(FeetechConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Channel, wa
 
 
 class FeetechJoints(ServoJoints):
-    """Reads the positions of an arm of Feetech servos whose torque is off; see `ServoJoints`."""
+    """An arm of Feetech servos with torque off as a `JointSource`; see `ServoJoints`."""
 
     def __init__(
         self,
@@ -86,5 +86,5 @@ class FeetechJoints(ServoJoints):
         last_pose: Sequence[float] | None = None,
         open_port: OpenPort = open_serial,
     ) -> None:
-        """Nothing is opened yet; arguments as of `ServoJoints`."""
+        """Prepare without opening anything; arguments as in `ServoJoints`."""
         super().__init__(FEETECH, config, joints, clock, open_port=open_port, limits=limits, last_pose=last_pose)

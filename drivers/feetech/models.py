@@ -1,8 +1,8 @@
-"""The servos that are known: numbers, names, units, and where the registers that are used stand.
+"""Supported Feetech models: numbers, names, units, and addresses of the registers in use.
 
 Sources: Feetech, "SMS/STS memory table" and "SCSCL memory table" (doc.feetech.cn), and SO-ARM's open tables of the same
 (huggingface/lerobot, motors/feetech/tables.py), with which addresses, model numbers and baud rates agree. STS and SMS
-are little endian, SCS is big endian; where a number has a sign, one bit tells it and the others the magnitude.
+are little endian, SCS is big endian. Signed numbers have a sign bit and a magnitude.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Order = Literal["little", "big"]
 
 
 def _registers(order: Order) -> dict[str, Register]:
-    """What both series have in common."""
+    """Return the registers common to both series."""
     return {
         "firmware": Register(0, 2, order="big"),  # major, minor
         "model": Register(3, 2, order=order),
@@ -88,7 +88,7 @@ BY_NUMBER: Mapping[int, Model] = MappingProxyType({model.number: model for model
 
 BAUDS = (1_000_000, 500_000, 250_000, 128_000, 115_200, 57_600, 38_400, 19_200)  # by the register's value [bit/s]
 
-# Status (65), which is the error byte of every answer too.
+# Status (65), which is also the error byte of every answer.
 HARDWARE_ERRORS: Mapping[int, str] = MappingProxyType(
     {
         0x01: "its supply voltage is out of range: check the supply and its cable",

@@ -1,4 +1,4 @@
-"""Instruction packets put together, status packets taken apart.
+"""Build instruction packets and parse status packets.
 
 Source: Feetech, "Communication protocol manual of the smart bus servos" (doc.feetech.cn).
 """
@@ -14,31 +14,31 @@ PING, READ, WRITE, SYNC_READ = 1, 2, 3, 0x82
 
 
 class FeetechPackets:
-    """The protocol of all series; they differ in the byte order of registers only."""
+    """The protocol of all series, which differ only in the byte order of registers."""
 
     overhead, ping_size = 6, 0
     refusals, is_weak = 0xC0, True  # no servo sets these two bits
-    # At any Response Status Level they answer READ.
+    # They answer READ at any Response Status Level.
     pinged_only = "answers PING but no READ: look at its cable and supply"
 
     def ping(self, id: int) -> bytes:
-        """PING."""
+        """Build PING."""
         return _packet(id, PING)
 
     def read(self, id: int, address: int, size: int) -> bytes:
-        """READ."""
+        """Build READ."""
         return _packet(id, READ, bytes((address, size)))
 
     def write(self, id: int, address: int, data: bytes) -> bytes:
-        """WRITE."""
+        """Build WRITE."""
         return _packet(id, WRITE, bytes((address,)) + data)
 
     def sync_read(self, ids: Sequence[int], address: int, size: int) -> bytes:
-        """SYNC_READ: all of `ids` answer, in this order."""
+        """Build SYNC_READ: all of `ids` answer, in this order."""
         return _packet(BROADCAST, SYNC_READ, bytes((address, size, *ids)))
 
     def take(self, received: bytes | bytearray, at: int) -> Status | None:
-        """The status packet that begins at `at`; see `Packets.take`."""
+        """Return the status packet that begins at `at`; see `Packets.take`."""
         return take_summed(received, at)
 
 

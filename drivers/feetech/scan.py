@@ -1,4 +1,4 @@
-"""What a scan has to know of Feetech servos."""
+"""Properties of Feetech servos that a scan needs."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What may be changed in the EEPROM of Feetech servos.
+"""EEPROM settings of Feetech servos that can be changed.
 
 Sources: Feetech, "SMS/STS memory table" and "SCSCL memory table" (doc.feetech.cn); addresses agree with SO-ARM's open
-tables (huggingface/lerobot, motors/feetech/tables.py). The servos refuse nothing: bounds are those of the tables.
+tables (huggingface/lerobot, motors/feetech/tables.py). The servos reject no value: the bounds are those of the tables.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ OTHER_ZERO = "the joint's zero moves: pairs measured before do not fit those aft
 
 
 def settings_of(model: Model) -> Sequence[Setting]:
-    """The settings of a model, in the order of their addresses."""
+    """Return the settings of a model, in the order of their addresses."""
     found = [*_common(model), *(_of_sts(model) if model.protocol == STS else ())]
     return sorted(found, key=lambda setting: setting.register.address)
 
@@ -35,7 +35,7 @@ def _common(model: Model) -> Iterator[Setting]:
     yield Setting(ID, layout["id"], 0, LARGEST_ID, follows=RENAMED)
     yield Setting(BAUD, layout["baud"], 0, 7, {str(b): place for place, b in enumerate(BAUDS)}, follows=OTHER_RATE)
     yield Setting("return_delay", layout["return_delay"], 0, 254, per_unit=2, unit="µs")
-    # 0: it answers no write, only questions.
+    # With 0 it answers reads but no writes.
     yield Setting("status_return", layout["status_return"], 0, 1)
     yield Setting("min_position_limit", Register(9, 2, order=order), 0, farthest)
     yield Setting("max_position_limit", Register(11, 2, order=order), 0, farthest)

@@ -1,3 +1,3 @@
-"""A ROS 2 robot over rmw_zenoh, without ROS: the driver, and below `bench` a robot at the bytes."""
+"""Driver for ROS 2 robots over rmw_zenoh, without a ROS installation, with an emulator in `bench`."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Common Data Representation, as ROS 2 messages have it on the wire (OMG DDSI-RTPS 2.5, 10.2; XCDR version 1)."""
+"""Common Data Representation, the encoding of ROS 2 messages (OMG DDSI-RTPS 2.5, 10.2; XCDR version 1)."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ import struct
 
 REPRESENTATIONS = {b"\x00\x00": ">", b"\x00\x01": "<"}  # CDR_BE, CDR_LE
 UINT32 = {order: struct.Struct(f"{order}I") for order in "<>"}
-ENCAPSULATION = 4  # bytes; positions are aligned to what follows them
+ENCAPSULATION = 4  # bytes; alignment is relative to the end of this header
 LARGEST_MESSAGE = 1 << 18
 
 
 class Malformed(Exception):
-    """These bytes are not the message that they should be."""
+    """Raised for bytes that are not the expected message."""
 
 
 class CdrReader:
-    """Reads one message front to back and believes no length before it has seen that so many bytes are there."""
+    """Reader of one message, front to back. It checks every length against the bytes that are left."""
 
     def __init__(self, data: bytes) -> None:
-        """A reader behind the encapsulation header.
+        """Start behind the encapsulation header.
 
         Raises:
-            Malformed: the header is none, of another representation, or the message is absurdly long.
+            Malformed: the header is invalid, the representation unsupported, or the message absurdly long.
         """
         if len(data) > LARGEST_MESSAGE:
             raise Malformed(f"{len(data)} bytes are more than a message of joints has")
@@ -35,26 +35,26 @@ class CdrReader:
         self._uint32 = UINT32[order].unpack_from
 
     def int32(self) -> int:
-        """A signed number of 4 bytes."""
+        """Read a signed 4-byte integer."""
         return int(self._numbers("i", 4, 1)[0])
 
     def uint32(self) -> int:
-        """An unsigned number of 4 bytes."""
-        begin = (self._at + 3) & ~3  # the encapsulation header has 4 bytes too
+        """Read an unsigned 4-byte integer."""
+        begin = (self._at + 3) & ~3  # the encapsulation header has 4 bytes too, so alignment is unaffected
         if begin + 4 > len(self._data):
             raise Malformed("the message ends too early")
         self._at = begin + 4
         return self._uint32(self._data, begin)[0]
 
     def count(self, smallest: int) -> int:
-        """The length of a sequence whose elements have `smallest` bytes at least."""
+        """Read the length of a sequence whose elements have at least `smallest` bytes."""
         count = self.uint32()
         if count * smallest > len(self._data) - self._at:
             raise Malformed(f"{count} elements are announced, {len(self._data) - self._at} bytes are left")
         return count
 
     def string(self) -> str:
-        """A text. Its length counts a zero byte at the end; an empty one may do without."""
+        """Read a string. Its length includes a terminating zero byte, which an empty string may lack."""
         size = self.count(1)
         if size == 0:
             return ""
@@ -68,16 +68,16 @@ class CdrReader:
             raise Malformed("a text is not UTF-8") from error
 
     def strings(self) -> tuple[str, ...]:
-        """A sequence of texts."""
+        """Read a sequence of strings."""
         return tuple([self.string() for _ in range(self.count(4))])
 
     def float64s(self) -> tuple[float, ...]:
-        """A sequence of numbers of 8 bytes."""
+        """Read a sequence of 8-byte floats."""
         count = self.count(8)
         return self._numbers("d", 8, count) if count else ()
 
     def end(self) -> None:
-        """Malformed when anything is left."""
+        """Raise Malformed if any bytes are left."""
         if self._at != len(self._data):
             raise Malformed(f"{len(self._data) - self._at} bytes after the end of the message")
 
@@ -90,45 +90,45 @@ class CdrReader:
 
 
 class CdrWriter:
-    """Writes one message, its padding zero."""
+    """Writer of one message, with zero padding."""
 
     def __init__(self, *, big_endian: bool = False) -> None:
-        """A message of which nothing but the encapsulation header is written."""
+        """Start with the encapsulation header."""
         self._order = ">" if big_endian else "<"
         self._data = bytearray(b"\x00\x00\x00\x00" if big_endian else b"\x00\x01\x00\x00")
 
     def int32(self, value: int) -> None:
-        """A signed number of 4 bytes."""
+        """Write a signed 4-byte integer."""
         self._numbers("i", 4, (value,))
 
     def uint32(self, value: int) -> None:
-        """An unsigned number of 4 bytes."""
+        """Write an unsigned 4-byte integer."""
         self._numbers("I", 4, (value,))
 
     def string(self, text: str) -> None:
-        """A text, with its zero byte."""
+        """Write a string with its terminating zero byte."""
         raw = text.encode() + b"\0"
         self.uint32(len(raw))
         self._data += raw
 
     def strings(self, texts: tuple[str, ...]) -> None:
-        """A sequence of texts."""
+        """Write a sequence of strings."""
         self.uint32(len(texts))
         for text in texts:
             self.string(text)
 
     def float64s(self, values: tuple[float, ...]) -> None:
-        """A sequence of numbers of 8 bytes."""
+        """Write a sequence of 8-byte floats."""
         self.uint32(len(values))
         if values:
             self.float64_array(values)
 
     def float64_array(self, values: tuple[float, ...]) -> None:
-        """Numbers of 8 bytes, of which both sides know how many there are."""
+        """Write an array of 8-byte floats of fixed length."""
         self._numbers("d", 8, values)
 
     def to_bytes(self) -> bytes:
-        """The message."""
+        """Return the message."""
         return bytes(self._data)
 
     def _numbers(self, kind: str, size: int, values: tuple[float, ...]) -> None:

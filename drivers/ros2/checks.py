@@ -1,4 +1,4 @@
-"""Whether a ROS 2 robot's joint states come, and how. Only listens."""
+"""Check that a ROS 2 robot's joint states arrive, and at what rate. Only listens."""
 
 from __future__ import annotations
 
@@ -29,11 +29,13 @@ def joint_state_checks(
     open_link: OpenLink = open_zenoh,
     read_s: float = READ_S,
 ) -> Iterator[Check]:
-    """Whether the router answers, all joints are told there, and how often. A session is opened for that.
+    """Yield checks of the router, of the joints and of their rate. Open a session for that.
 
     Args:
+        config: checked.
         joints, prismatic, open_link: as for `Ros2Joints`.
-        read_s: how long the rate is measured [s].
+        clock: the clock.
+        read_s: duration of the rate measurement [s].
     """
     try:
         with Ros2Joints(config, joints, clock, prismatic=prismatic, open_link=open_link) as robot:
@@ -54,7 +56,7 @@ def joint_state_checks(
 
 
 def _begins(robot: Ros2Joints, clock: Clock) -> bool:
-    """Whether a reading comes before the robot counts as silent."""
+    """Return True if a reading arrives before the robot counts as silent."""
     end = clock.now() + SILENT_AFTER_S + WAIT_S
     while clock.now() < end:
         if robot.read(WAIT_S) is not None:
@@ -63,7 +65,7 @@ def _begins(robot: Ros2Joints, clock: Clock) -> bool:
 
 
 def _parted(complaints: Sequence[str]) -> tuple[str, str]:
-    """What was found, and what to do, which a complaint says last."""
+    """Split a complaint into what was found and its last part, what to do."""
     if not complaints:
         return "too few joint states come", "let the robot's nodes publish more often"
     *said, mend = LAST_PART.split(complaints[0])
@@ -78,7 +80,7 @@ def _rate(rate_hz: float) -> Check:
 
 
 def _counted(robot: Ros2Joints) -> tuple[int, int]:
-    """Messages that gave nothing, and all that were sent, so far."""
+    """Return the number of unusable messages, and of all messages sent, so far."""
     return robot.lost + robot.refused.total(), robot.lost + robot.received
 
 

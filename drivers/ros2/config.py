@@ -22,12 +22,13 @@ ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws)/.+:[0-9]+|unixsock-stream/.+")
 
 
 class MarkerTopic(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [drivers.ros2.marker]: where the learner publishes where it expects the marker.
+    """The table [drivers.ros2.marker]: the topic where the learner publishes the predicted marker position.
 
     Attributes:
-        frame: what ROS calls the measurement frame, into which the positions are.
+        frame: name of the measurement frame in ROS, in which the positions are given.
+        topic: name of the topic.
         message: `point` is geometry_msgs/PointStamped, `pose` geometry_msgs/PoseWithCovarianceStamped.
-        rate_hz: not more often than this.
+        rate_hz: highest rate.
     """
 
     frame: str
@@ -43,12 +44,12 @@ class Ros2Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         router: where rmw_zenohd listens.
         domain: ROS_DOMAIN_ID of the robot.
         topic: the joint states.
-        names: what ROS calls a joint, by its name in [robot] joints; those not named have the same name.
-        max_delay_s: a message that came so much later than the quickest is not used.
-        max_gap_s: where several nodes publish the joints, positions between two messages are not used that are
-            farther apart.
-        max_speed_deg_s: no joint turns faster; a position that would need it is not believed.
-        max_speed_m_s: the same for joints that slide.
+        names: the name of a joint in ROS, by its name in [robot] joints; joints left out have the same name.
+        max_delay_s: a message is rejected if it arrives this much later than the fastest one.
+        max_gap_s: if several nodes publish the joints, no position is interpolated between two messages farther apart
+            than this.
+        max_speed_deg_s: fastest plausible motion of a joint; a position that would need more is rejected.
+        max_speed_m_s: the same for prismatic joints.
         marker: publish predictions.
     """
 
@@ -63,11 +64,11 @@ class Ros2Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     marker: MarkerTopic | None = None
 
     def ros_names(self, joints: Sequence[str]) -> tuple[str, ...]:
-        """What ROS calls `joints`."""
+        """Return the names of `joints` in ROS."""
         return tuple(self.names.get(joint, joint) for joint in joints)
 
     def check(self, joints: Sequence[str], file: Path, text: str) -> None:
-        """ConfigError when a name is none of `joints`, is given twice, or cannot be one."""
+        """Raise ConfigError for a name that is not one of `joints`, given twice, or invalid."""
         for keys, what, remedy in self._mistakes(joints):
             raise ConfigError(what, file=file, line=line_of(text, (*TABLE, *keys)), remedy=remedy)
 

@@ -26,24 +26,24 @@ log = logging.getLogger(__name__)
 
 SLACK_RAD, SLACK_M = 0.02, 2e-3
 SILENT_AFTER_S = 2.0
-RIVAL_AFTER_S = 1.0  # of silence of the node that told of a joint before, another one is believed
+RIVAL_AFTER_S = 1.0  # after this silence of the node that published a joint, another node is accepted
 SENDERS = 64
-NAMES = 256  # kept to tell which there are
+NAMES = 256  # upper bound of the names kept for messages
 
 Who = bytes | tuple[str, ...]
 
 
 class Ros2Joints:
-    """Reads sensor_msgs/JointState from a robot's router.
+    """Reader of sensor_msgs/JointState from a robot's router.
 
-    A reading is of one time: that of a message, with the other joints interpolated to it where several nodes publish
-    them. Whatever is doubtful is dropped and counted. When the router goes away, or a joint is suddenly somewhere
-    else, SourceLost is raised; a robot that says nothing is only waited for.
+    A reading refers to one time: that of a message. If several nodes publish the joints, the others are interpolated to
+    it. Doubtful messages are dropped and counted. SourceLost is raised when the router goes away or a joint jumps. A
+    silent robot is waited for.
 
     Attributes:
-        received: messages, since it was made.
+        received: number of messages since creation.
         refused: messages and readings that were not used, by reason.
-        lost: messages that never came, by the senders' own count.
+        lost: messages that never arrived, by the senders' own count.
         stamp_ns: the robot's own stamp of the newest reading [ns], or None before any.
     """
 
@@ -56,12 +56,14 @@ class Ros2Joints:
         prismatic: Sequence[bool] | None = None,
         open_link: OpenLink = open_zenoh,
     ) -> None:
-        """Nothing is opened yet.
+        """Prepare without opening anything.
 
         Args:
             config: checked; see `Ros2Config.check`.
             joints: in the order of q.
-            prismatic: which of them slide; by default none does.
+            clock: the clock.
+            prismatic: True for each prismatic joint; none by default.
+            open_link: opens the link to the router.
         """
         self._config, self._joints, self._clock, self._open_link = config, tuple(joints), clock, open_link
         self._wanted = config.ros_names(joints)
@@ -83,7 +85,7 @@ class Ros2Joints:
 
     @property
     def health(self) -> tuple[str, ...]:
-        """What is wrong, and what to do."""
+        """Current problems, and what to do."""
         return () if self._complaint is None else (self._complaint,)
 
     def __enter__(self) -> Self:
@@ -99,10 +101,10 @@ class Ros2Joints:
             self._link = None
 
     def read(self, timeout_s: float) -> JointReading | None:
-        """The next reading; see `JointSource.read`.
+        """Return the next reading; see `JointSource.read`.
 
         Raises:
-            SourceLost: the router is gone, or a joint is suddenly somewhere else.
+            SourceLost: the router is gone, or a joint jumped.
         """
         if self._link is None:
             raise SourceError("the robot's joint states are not open; use them in a with statement")
@@ -121,7 +123,7 @@ class Ros2Joints:
                 return None
 
     def _forget(self) -> None:
-        """Nothing that was heard before tells anything about what comes."""
+        """Reset everything that was learnt from earlier messages."""
         self._senders: dict[Who, Sender] = {}
         self._gates = Gates(self._fastest, self._slack)
         self._owners: list[tuple[Who, float] | None] = [None] * len(self._joints)
@@ -179,7 +181,7 @@ class Ros2Joints:
         return self._merging.put(told, sigma_s, message.header.stamp_ns, places, q) if verdict else None
 
     def _told(self, who: Who, message: JointState, places: Sequence[int], arrived: float) -> float | Refusal:
-        """When the message was true [s], or why it is not to be used."""
+        """Return the time of the message's positions [s], or why it cannot be used."""
         if any(self._belongs_to_another(place, who, arrived) for place in places):
             return Refusal.RIVAL
         if len(set(message.names)) < len(message.names):
@@ -222,7 +224,7 @@ class Ros2Joints:
             log.warning("a message of %s was not used (%s): %s", self._config.topic, detail, ADVICE[why])
 
     def _complain(self, link: Link) -> None:
-        """Say once why nothing comes."""
+        """Report once why there are no readings."""
         if self._complaint is not None or self._clock.now() - self._read_at < SILENT_AFTER_S:
             return
         missing = [self._wanted[place] for place in self._merging.missing()]

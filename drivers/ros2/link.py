@@ -1,4 +1,4 @@
-"""Where messages come from: a zenoh session with the robot's router."""
+"""Receive messages through a zenoh session with the robot's router."""
 
 from __future__ import annotations
 
@@ -17,19 +17,20 @@ from . import rmw
 from .config import Ros2Config
 from .messages import JOINT_STATE
 
-RETRY_S = 0.5  # a router that is not there is cheap to ask for
+RETRY_S = 0.5  # asking for an absent router is cheap
 WAITING = 4096  # messages: four seconds at 1 kHz
-LOOK_EVERY_S = 0.1  # whether the router is still there
+LOOK_EVERY_S = 0.1  # period of checking that the router is still there
 GRAPH_LIMIT_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """A message as it came.
+    """A received message.
 
     Attributes:
-        attached: what rmw_zenoh sends with it; empty where there is nothing.
-        arrived: when [s].
+        payload: its bytes.
+        attached: attachment of rmw_zenoh; empty without one.
+        arrived: time of arrival [s].
     """
 
     payload: bytes
@@ -42,24 +43,24 @@ class Link(Protocol):
 
     @property
     def overflowed(self) -> int:
-        """Messages that were thrown away because nobody took them."""
+        """Number of messages discarded because the queue was full."""
         ...
 
     @property
     def is_connected(self) -> bool:
-        """Whether the router is there."""
+        """True while the router is reachable."""
         ...
 
     def receive(self, until: float) -> Sample | None:
-        """The next message; None when none has come by `until` [s], or the router is gone."""
+        """Return the next message; None when none arrives by `until` [s], or the router is gone."""
         ...
 
     def tokens(self) -> Sequence[str]:
-        """The liveliness tokens of all publishers that are known."""
+        """Return the liveliness tokens of all known publishers."""
         ...
 
     def close(self) -> None:
-        """Nothing comes any more."""
+        """Close the link."""
         ...
 
 
@@ -67,7 +68,7 @@ OpenLink = Callable[[Ros2Config, Clock], Link]
 
 
 def open_session(router: str) -> zenoh.Session:
-    """A session with the router alone: it listens nowhere and looks for nobody.
+    """Open a session with this router only: it neither listens nor scouts.
 
     Raises:
         SourceLost: the router is not there.
@@ -93,29 +94,29 @@ def open_session(router: str) -> zenoh.Session:
 
 
 def is_connected(session: zenoh.Session) -> bool:
-    """Whether anybody is at the other end."""
+    """Return True if the session is connected to a router or peer."""
     return bool(session.info.routers_zid() or session.info.peers_zid())
 
 
 class ZenohLink:
-    """A subscription over zenoh. It has to be closed: an open one keeps the process from ending."""
+    """A subscription over zenoh. It must be closed: an open one keeps the process from ending."""
 
     def __init__(self, session: zenoh.Session, key: str, clock: Clock) -> None:
         """Subscribe to `key`; the session is closed with the link."""
         self._session, self._clock = session, clock
         self._waiting: queue.Queue[Sample] = queue.Queue(WAITING)
         self.overflowed = 0
-        # In zenoh's own thread: the time of arrival does not depend on when somebody reads.
+        # In zenoh's own thread, so that the time of arrival does not depend on the reader.
         handler = zenoh.handlers.Callback(self._take, indirect=False)
         self._subscriber = session.declare_subscriber(key, handler)
 
     @property
     def is_connected(self) -> bool:
-        """Whether the router is there."""
+        """True while the router is reachable."""
         return is_connected(self._session)
 
     def receive(self, until: float) -> Sample | None:
-        """The next message; None when none has come by `until` [s], or the router is gone."""
+        """Return the next message; None when none arrives by `until` [s], or the router is gone."""
         while True:
             left = until - self._clock.now()
             try:
@@ -125,12 +126,12 @@ class ZenohLink:
                     return None
 
     def tokens(self) -> Sequence[str]:
-        """The liveliness tokens of all publishers that are known."""
+        """Return the liveliness tokens of all known publishers."""
         replies = self._session.liveliness().get(rmw.publishers_key(), timeout=GRAPH_LIMIT_S)
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
     def close(self) -> None:
-        """Nothing comes any more."""
+        """Close the session."""
         self._session.close()
 
     def _take(self, sample: zenoh.Sample) -> None:
@@ -142,7 +143,7 @@ class ZenohLink:
 
 
 def open_zenoh(config: Ros2Config, clock: Clock) -> Link:
-    """The joint states of the configured robot, of whatever ROS 2 version: the type is told, its hash is not.
+    """Subscribe to the joint states of the configured robot. The type's hash is a wildcard, so any ROS 2 version works.
 
     Raises:
         SourceLost: the router is not there.

@@ -1,4 +1,4 @@
-"""The expected marker position as a ROS 2 topic."""
+"""Publish the predicted marker position as a ROS 2 topic."""
 
 from __future__ import annotations
 
@@ -19,19 +19,21 @@ from .link import open_session
 from .messages import POINT_STAMPED, POSE_WITH_COVARIANCE_STAMPED, Header, encode_point, encode_pose
 
 NODE = "bodyschema"
-# The marker is a ball without an orientation: any turn is as good, up to π about each axis, uniformly.
+# The marker is a ball without orientation: rotations up to π about each axis are equally likely.
 UNKNOWN_TURN_RAD2 = 3.289868  # π² / 3
 NO_TURN = (0.0, 0.0, 0.0, 1.0)
 
 
 class MarkerPublisher:
-    """Publishes as a node of rmw_zenoh would, which `ros2 topic list` shows. Goes on when the router comes back."""
+    """Publisher like a node of rmw_zenoh, visible in `ros2 topic list`. It resumes when the router comes back."""
 
     def __init__(self, config: Ros2Config, marker: MarkerTopic, *, wall_ns: Callable[[], int] = time.time_ns) -> None:
-        """Nothing is opened yet.
+        """Prepare without opening anything.
 
         Args:
-            wall_ns: time since 1970 [ns], which is told with each message.
+            config: the table [drivers.ros2].
+            marker: its table `marker`.
+            wall_ns: time since 1970 [ns], sent with each message.
         """
         self._config, self._marker, self._wall_ns = config, marker, wall_ns
         self._kind = POINT_STAMPED if marker.message == "point" else POSE_WITH_COVARIANCE_STAMPED
@@ -41,16 +43,16 @@ class MarkerPublisher:
 
     @property
     def period_s(self) -> float:
-        """No two positions are wanted closer together [s]."""
+        """Shortest time between two positions [s]."""
         return 1.0 / self._marker.rate_hz
 
     @property
     def has_sigma(self) -> bool:
-        """Whether the message tells how sure a position is."""
+        """True if the message carries the uncertainty of a position."""
         return self._marker.message == "pose"
 
     def __enter__(self) -> Self:
-        """SourceLost when the router is not there."""
+        """Open the topic. Raise SourceLost when the router is not there."""
         self._session = session = open_session(self._config.router)
         domain, topic, name = self._config.domain, self._marker.topic, str(session.info.zid())
         tokens = (
@@ -72,10 +74,10 @@ class MarkerPublisher:
             self._tokens.clear()
 
     def publish(self, stamp_ns: int, x: FloatArray, sigma: FloatArray) -> None:
-        """Say where the marker is.
+        """Publish the marker's position.
 
         Args:
-            stamp_ns: when, on the robot's clock [ns].
+            stamp_ns: its time on the robot's clock [ns].
             x: position in the measurement frame [m], shape (3,).
             sigma: its 1-sigma per axis [m], shape (3,); only a pose carries it.
         """

@@ -1,4 +1,4 @@
-"""Readings of all joints out of messages that tell of some each."""
+"""Merge messages that each contain some of the joints into readings of all joints."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ class Merged:
     """All joints at one time.
 
     Attributes:
-        t: the time [s]; of a message, never between two.
+        t: the time of a message [s], never between two messages.
         stamp_ns: that message's stamp.
         q: positions.
-        gap_s: the longest time between the two messages that a joint's position was taken from.
+        gap_s: the longest time between the two messages that a joint's position was interpolated from.
         sigma_s: the largest 1-sigma of their times.
     """
 
@@ -38,23 +38,23 @@ class _Point:
 
 
 class Merging:
-    """Keeps what is known of each joint since the last reading.
+    """Buffer of the positions of each joint since the last reading.
 
-    All joints are known up to the newest message of that one which was heard of least recently: that is the time of
-    the next reading, and the others are interpolated to it.
+    The next reading is at the time of the newest message of the joint that was updated least recently. The other joints
+    are interpolated to this time.
     """
 
     def __init__(self, joints: int) -> None:
-        """Nothing is known of so many joints."""
+        """Start with empty buffers for `joints` joints."""
         self._tracks: list[deque[_Point]] = [deque(maxlen=LONGEST) for _ in range(joints)]
         self._told = float("-inf")
 
     def missing(self) -> list[int]:
-        """The joints of which nothing has come."""
+        """Return the joints without any position so far."""
         return [place for place, track in enumerate(self._tracks) if not track]
 
     def put(self, t: float, sigma_s: float, stamp_ns: int, places: Sequence[int], q: Sequence[float]) -> Merged | None:
-        """Take positions `q` of the joints at `places`; the reading that they complete."""
+        """Add positions `q` of the joints at `places`; return the reading that they complete."""
         for place, value in zip(places, q, strict=True):
             track = self._tracks[place]
             if not track or t > track[-1].t:
@@ -74,9 +74,9 @@ class Merging:
 
 
 def _at(t: float, track: deque[_Point]) -> tuple[float, float] | None:
-    """A joint's position at `t`, and how far apart in time the two are that it is taken from; drops what is older.
+    """Return a joint's position at `t` and the time between the two it is interpolated from; drop older ones.
 
-    None when it was not known yet.
+    Return None when it was not known yet at `t`.
     """
     while len(track) > 1 and track[1].t <= t:
         track.popleft()

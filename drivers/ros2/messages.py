@@ -1,5 +1,4 @@
-"""The ROS 2 messages that are taken and given: sensor_msgs/JointState; geometry_msgs/PointStamped and
-PoseWithCovarianceStamped."""
+"""Encode and decode sensor_msgs/JointState, geometry_msgs/PointStamped and PoseWithCovarianceStamped."""
 
 from __future__ import annotations
 
@@ -55,7 +54,8 @@ class JointState:
     """sensor_msgs/JointState.
 
     Attributes:
-        positions: as many as names [rad], m for a prismatic joint; or none. So are the other two.
+        names: of the joints.
+        positions: one per name [rad], [m] for a prismatic joint; or none. The same holds for velocities and efforts.
         velocities: [rad/s] or [m/s].
         efforts: [N m] or [N].
     """
@@ -68,10 +68,10 @@ class JointState:
 
 
 def decode_joint_state(data: bytes) -> JointState:
-    """The message that `data` are, to the last byte.
+    """Decode a message that extends over all of `data`.
 
     Raises:
-        Malformed: they are none. Nothing is read beyond them, whatever lengths they pretend.
+        Malformed: not such a message. No length field makes it read beyond `data`.
     """
     reader = CdrReader(data)
     message = JointState(_header(reader), reader.strings(), reader.float64s(), reader.float64s(), reader.float64s())
@@ -83,7 +83,7 @@ def decode_joint_state(data: bytes) -> JointState:
 
 
 def encode_joint_state(message: JointState, *, big_endian: bool = False) -> bytes:
-    """The message's bytes."""
+    """Encode the message."""
     writer = CdrWriter(big_endian=big_endian)
     _write_header(writer, message.header)
     writer.strings(message.names)
@@ -93,7 +93,7 @@ def encode_joint_state(message: JointState, *, big_endian: bool = False) -> byte
 
 
 def encode_point(header: Header, x: tuple[float, ...]) -> bytes:
-    """geometry_msgs/PointStamped at `x` [m], 3 numbers."""
+    """Encode geometry_msgs/PointStamped at `x` [m], 3 numbers."""
     writer = CdrWriter()
     _write_header(writer, header)
     writer.float64_array(x)
@@ -103,12 +103,13 @@ def encode_point(header: Header, x: tuple[float, ...]) -> bytes:
 def encode_pose(
     header: Header, x: tuple[float, ...], quaternion: tuple[float, ...], covariance: tuple[float, ...]
 ) -> bytes:
-    """geometry_msgs/PoseWithCovarianceStamped.
+    """Encode geometry_msgs/PoseWithCovarianceStamped.
 
     Args:
+        header: of the message.
         x: position [m], 3 numbers.
         quaternion: orientation (x, y, z, w).
-        covariance: of position [m²] and turns about the fixed axes [rad²], 6 × 6 by rows.
+        covariance: of position [m²] and rotations about the fixed axes [rad²], 6 × 6 by rows.
     """
     writer = CdrWriter()
     _write_header(writer, header)

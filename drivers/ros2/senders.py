@@ -1,4 +1,4 @@
-"""Whether a message is to be believed, and when it was true."""
+"""Decide if a message is plausible, and at what time its positions were true."""
 
 from __future__ import annotations
 
@@ -10,38 +10,38 @@ from bodyschema.drivers.turns import SpeedGate
 
 from .stamps import StampClock
 
-ANEW_AFTER = 3  # stamps that all belong to another time
-ANEW_AFTER_S = 0.5  # for so long: the sender's clock was set
-STALL_S = 5.0  # unless they are late by no more than this: then rather the network was held up,
-ANEW_AFTER_STALL_S = 10.0  # and catches up within this
+ANEW_AFTER = 3  # consecutive stamps that all disagree with the clock
+ANEW_AFTER_S = 0.5  # for this long: the sender's clock was set
+STALL_S = 5.0  # if they are late by less, the network was probably held up
+ANEW_AFTER_STALL_S = 10.0  # and catches up within this time
 
 
 class Refusal(StrEnum):
-    """Why a message, or the reading that it would have completed, was not used."""
+    """Reason for not using a message, or the reading it would have completed."""
 
-    MALFORMED = "malformed"  # no sensor_msgs/JointState, or cut off, or too long
-    NO_POSITIONS = "no_positions"  # it tells of our joints, but not where they are
+    MALFORMED = "malformed"  # not a sensor_msgs/JointState, truncated, or too long
+    NO_POSITIONS = "no_positions"  # it names joints without positions
     TWICE = "twice"  # it names a joint twice
     NOT_FINITE = "not_finite"  # NaN or infinite
     NO_STAMP = "no_stamp"  # its stamp is zero
-    DUPLICATE = "duplicate"  # the stamp of the message before
+    DUPLICATE = "duplicate"  # the stamp of the previous message
     OUT_OF_ORDER = "out_of_order"  # an earlier stamp
-    DELAYED = "delayed"  # its stamp and its arrival do not fit together
-    TOO_FAST = "too_fast"  # a joint cannot have come there
+    DELAYED = "delayed"  # the stamp and the time of arrival do not fit together
+    TOO_FAST = "too_fast"  # the joint cannot have moved there in the time
     RIVAL = "rival"  # another node publishes the same joint
-    GAP = "gap"  # the joints come in several messages, too far apart in time
+    GAP = "gap"  # the joints are spread over messages too far apart in time
 
 
 class Sender:
-    """One node: its clock, and how far it has told of each joint.
+    """One node: its clock, and its newest stamp of each joint.
 
     Attributes:
-        heard: when its newest message came [s].
+        heard: arrival of its newest message [s].
         times_set: how often its clock was set to another time.
     """
 
     def __init__(self, max_delay_s: float) -> None:
-        """Nothing was heard of it yet; for `max_delay_s` see `StampClock`."""
+        """Start without a message; for `max_delay_s` see `StampClock`."""
         self.heard, self.times_set = -math.inf, 0
         self._max_delay_s = max_delay_s
         self._clock = StampClock(max_delay_s)
@@ -50,11 +50,11 @@ class Sender:
 
     @property
     def sigma_s(self) -> float:
-        """1-sigma of the last time told [s]."""
+        """1-sigma of the last returned time [s]."""
         return self._clock.sigma_s
 
     def time_of(self, stamp_ns: int, places: Sequence[int], arrived: float) -> float | Refusal:
-        """When the message was true [s] that tells of the joints at `places`, or why nothing tells that."""
+        """Return the time of a message with the joints at `places` [s], or why it is unknown."""
         self.heard = arrived
         if stamp_ns == 0:
             return Refusal.NO_STAMP
@@ -71,7 +71,7 @@ class Sender:
         return t
 
     def _astray_at(self, stamp_ns: int, arrived: float, refusal: Refusal) -> Refusal:
-        """When none but such messages come, all off by the same, the clock that stamps them was set: begin anew."""
+        """Restart the clock if only such messages arrive, all off by the same amount: the sender's clock was set."""
         off_s = self._clock.lateness_s(stamp_ns, arrived)
         if self._astray and abs(off_s - self._astray[0][1]) > self._max_delay_s:
             self._astray.clear()
@@ -84,21 +84,21 @@ class Sender:
 
 
 class Gates:
-    """Believes of each joint only where it can have come to; of the first two messages, where they agree."""
+    """Speed gates, one per joint; the first positions are confirmed by the next message."""
 
     def __init__(self, fastest: Sequence[float], slack: Sequence[float]) -> None:
-        """Gates that have seen nothing.
+        """Start without positions.
 
         Args:
-            fastest: how fast each joint is believed to move [rad/s], m/s where it slides.
-            slack: how far its position may be off besides [rad] or [m].
+            fastest: highest plausible speed of each joint [rad/s], [m/s] for a prismatic joint.
+            slack: additional tolerance of its position [rad] or [m].
         """
         self._limits = list(zip(fastest, slack, strict=True))
         self._gates: list[SpeedGate | None] = [None] * len(self._limits)
         self._confirmed = [False] * len(self._limits)
 
     def offer(self, t: float, places: Sequence[int], q: Sequence[float]) -> bool | None:
-        """Whether the joints at `places` can be at `q` at the time `t` [s]; None when it is too early to tell."""
+        """Return True if the joints at `places` can be at `q` at time `t` [s]; None when it is too early to tell."""
         verdicts = [self._offer(t, place, value) for place, value in zip(places, q, strict=True)]
         if False in verdicts:
             return False
@@ -106,7 +106,7 @@ class Gates:
 
     @property
     def jumped(self) -> bool:
-        """A joint is somewhere else from one message to the next, and stays there."""
+        """True if a joint moved elsewhere from one message to the next and stays there."""
         return any(gate is not None and gate.jumped for gate in self._gates)
 
     def _offer(self, t: float, place: int, q: float) -> bool | None:

@@ -1,4 +1,4 @@
-"""Why a robot says nothing, and what to do about it."""
+"""Explain why a robot's joint states are missing, and what to do about it."""
 
 from __future__ import annotations
 
@@ -34,13 +34,14 @@ def silence(
     refused: Counter[Refusal],
     tokens: Callable[[], Sequence[str]],
 ) -> str:
-    """A sentence about why there are no readings.
+    """Explain in one sentence why there are no readings.
 
     Args:
-        missing: joints, by their names in ROS, of which nothing has come.
-        names: those that did come, of whatever joints.
-        refused: what was not used, by reason.
-        tokens: asks for the publishers there are.
+        config: of the robot.
+        missing: joints, by their names in ROS, without any message.
+        names: all joint names received.
+        refused: number of unused messages, by reason.
+        tokens: returns the tokens of existing publishers.
     """
     if refused:
         why, count = refused.most_common(1)[0]

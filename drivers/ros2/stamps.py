@@ -1,4 +1,4 @@
-"""The clock of a publisher's stamps against the host's."""
+"""Map the clock of a publisher's stamps to the host's clock."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from bodyschema.drivers.device_clock import DeviceClock
 
 TICK_S = 1e-9
 TICKS = 1 << 62  # 146 years: stamps do not wrap
-EARLY_S = 2e-3  # by so much a message may be quicker than all before it
-WORST_DRIFT = 5e-3  # and by this share of the time since the last one
-SURE_AFTER = 3  # messages in a row that came too early: the others were late then, or the clock was set
-LATE_S = 5e-3  # when all are later than the first by so much,
-LATE_FOR_S = 1.0  # for so long, then the first's stamp was wrong
-LATELY = 51  # messages that tell how much the delays scatter
-QUICKEST_SIGMA_S = 0.5e-3  # what the quickest message took, nothing tells: on the loopback interface 0.2 ms
-STEADY = 0.5  # times go on at half speed at least while a quicker message shows that all came later than thought
+EARLY_S = 2e-3  # a message may be faster than all before by this much
+WORST_DRIFT = 5e-3  # plus this share of the time since the last one
+SURE_AFTER = 3  # consecutive early messages after which the others count as late, or the clock as set
+LATE_S = 5e-3  # if all are later than the first by this much
+LATE_FOR_S = 1.0  # for this long, then the first message's stamp was wrong
+LATELY = 51  # messages used to estimate the scatter of delays
+QUICKEST_SIGMA_S = 0.5e-3  # unobservable transit time of the fastest message: 0.2 ms on the loopback interface
+STEADY = 0.5  # times advance at half speed at least after a faster message shows that all others were late
 
 
 class StampClock:
-    """Tells on the host's clock when a message was stamped.
+    """Estimate of the host's time at which a message was stamped.
 
-    A message may take long, but never less than none: the quickest of all shows how far the clocks are apart, up to
-    what it took itself. That the two run at different rates is learnt on the way.
+    A message may take long, but its delay is never negative. The fastest of all shows the offset of the clocks, up to
+    its own delay. The ratio of the clock rates is estimated as well.
     """
 
     def __init__(self, max_delay_s: float) -> None:
-        """A clock of which nothing is known.
+        """Start without data.
 
         Args:
-            max_delay_s: a message that took so much longer than the quickest is refused.
+            max_delay_s: a message that took this much longer than the fastest is rejected.
         """
         self._max_delay_s = max_delay_s
         self._last: tuple[int, float] | None = None  # stamp and time
@@ -41,18 +41,18 @@ class StampClock:
         self._begin(0)
 
     def time_of(self, stamp_ns: int, arrived: float) -> float | None:
-        """The host's time [s] at `stamp_ns`, later than that of any stamp before.
+        """Return the host's time [s] at `stamp_ns`, later than that of any earlier stamp.
 
-        None when the stamp is of another time than the message.
+        Return None when stamp and arrival do not fit together.
 
         Args:
             stamp_ns: later than all before.
-            arrived: when the message came [s].
+            arrived: arrival of the message [s].
         """
         if self._is_early(stamp_ns, arrived) or self._is_late(stamp_ns, arrived):
             return None
-        # From the first stamp on, because a float of nanoseconds since 1970 is too coarse.
-        # Twice the delay: what is not late has to agree with all before, or the clock would begin anew with it.
+        # Relative to the first stamp, because a float of nanoseconds since 1970 is too coarse. Twice the delay:
+        # a message in time must agree with all before it, or the clock would restart with it.
         bounds = self._device.narrow(arrived - 2 * self._max_delay_s, arrived, stamp_ns - self._first_ns)
         if bounds is None:
             return None
@@ -67,24 +67,24 @@ class StampClock:
 
     @property
     def sigma_s(self) -> float:
-        """1-sigma of the last time told [s].
+        """1-sigma of the last returned time [s].
 
-        That of the delays' scatter, and of what the quickest message took: a message may take up to the longest
-        delay, so the quickest of n is expected to have taken that by n + 1.
+        It combines the scatter of the delays with the unknown delay of the fastest message. A delay is at most
+        `max_delay_s`, so the fastest of n messages is expected to have taken that divided by n + 1.
         """
         unseen_s = self._max_delay_s / (self._heard + 1)
         return math.hypot(QUICKEST_SIGMA_S, unseen_s, median(self._delays) if self._delays else 0.0)
 
     def lateness_s(self, stamp_ns: int, arrived: float) -> float:
-        """How much later a message came than the quickest would have; infinite before any."""
+        """Return how much later a message arrived than the fastest would have [s]; infinite before any."""
         if self._last is None:
             return math.inf
         return arrived - self._last[1] - (stamp_ns - self._last[0]) * TICK_S
 
     def _note_delay(self, delay_s: float, stamp_ns: int, arrived: float) -> None:
-        """Begin anew when, at the start, a first message whose stamp was wrong makes all others late.
+        """Restart if a first message with a wrong stamp makes all others late.
 
-        Later on, when all are late, the network is slow.
+        This is done at the start only. Later on, when all are late, the network is slow.
         """
         self._least_s = min(self._least_s, delay_s) if arrived > self._began else math.inf
         if arrived - self._began < LATE_FOR_S:
@@ -94,7 +94,7 @@ class StampClock:
             self._begin(stamp_ns)
 
     def _is_early(self, stamp_ns: int, arrived: float) -> bool:
-        """Whether the message came before it was stamped; one wrong stamp must not make all others late."""
+        """Return True if the message arrived before its stamp. A single wrong stamp must not make all others late."""
         if self._last is None:
             self._begin(stamp_ns)
             self._began = arrived

@@ -1,3 +1,3 @@
-"""Own encoders on a microcontroller that speaks lines of text: the driver, and below `bench` such a board."""
+"""Driver for custom encoders on a microcontroller that sends lines of text, with an emulator in `bench`."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What comes from a board: bytes cut into lines, lines judged by checksum, sequence and the board's clock."""
+"""Split a board's bytes into lines, and check them by checksum, sequence number and the board's clock."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from bodyschema.drivers.device_clock import StreamClock
 
 from .lines import LONGEST, SEQUENCES, STAMP_S, STAMPS, GarbledLine, Header, Reading, parse
 
-DOUBTS = 5  # so many lines in a row from another time: the board was restarted, or the program stood still
+DOUBTS = 5  # consecutive implausible lines: the board was restarted, or the program was suspended
 
 
 @dataclass
 class Counts:
-    """How the lines went.
+    """Number of lines by outcome.
 
     Attributes:
-        lines: intact readings in their order.
-        garbled: no intact lines.
+        lines: intact readings in order.
+        garbled: damaged lines.
         missing: by the gaps in the sequence.
-        out_of_order: came after a later one, or twice.
-        of_another_time: by the board's clock.
+        out_of_order: arrived after a later one, or twice.
+        of_another_time: rejected by the board's clock.
     """
 
     lines: int = 0
@@ -33,7 +33,7 @@ class Counts:
 
 @dataclass(frozen=True, slots=True)
 class Timed:
-    """A reading, when it was measured [s], and the 1-sigma of that [s]."""
+    """A reading, its time of measurement [s], and the 1-sigma of that time [s]."""
 
     t: float
     sigma: float
@@ -41,20 +41,20 @@ class Timed:
 
 
 class LineCutter:
-    """Cuts what arrives into lines, with the time at which each was begun at the latest."""
+    """Splitter of incoming bytes into lines, with the latest possible start time of each."""
 
     def __init__(self, byte_s: float) -> None:
-        """Nothing has arrived.
+        """Start with an empty buffer.
 
         Args:
-            byte_s: how long a byte takes on the wire [s].
+            byte_s: duration of a byte on the wire [s].
         """
         self._byte_s = byte_s
         self._rest = bytearray()
-        self._is_whole = False  # what is first heard may be the end of a line
+        self._is_whole = False  # the first bytes received may be the end of a line
 
     def cut(self, data: bytes, arrived: float) -> tuple[list[tuple[bytes, float]], int]:
-        """The lines that are complete with `data`, and how many were too long to be any."""
+        """Return the lines completed by `data`, and the number of overlong ones."""
         self._rest += data
         lines: list[tuple[bytes, float]] = []
         overlong = 0
@@ -74,16 +74,16 @@ class Board:
     """A board's lines since it was opened.
 
     Attributes:
-        header: what it says of itself, once it has.
-        counts: how its lines went.
-        restarted: it says so itself, or its clock does.
+        header: the board's header, once received.
+        counts: number of lines by outcome.
+        restarted: the board was restarted, by its header or its clock.
     """
 
     def __init__(self, byte_s: float, delay_s: float) -> None:
-        """Nothing was heard.
+        """Start without data.
 
         Args:
-            byte_s: how long a byte takes on the wire [s].
+            byte_s: duration of a byte on the wire [s].
             delay_s: from the measurement to the first byte on the wire [s].
         """
         self.header: Header | None = None
@@ -95,7 +95,7 @@ class Board:
         self._readings: deque[Timed] = deque()
 
     def hear(self, data: bytes, arrived: float) -> None:
-        """Take in what arrived by `arrived` [s]."""
+        """Process the bytes that arrived by `arrived` [s]."""
         lines, overlong = self._cutter.cut(data, arrived)
         self.counts.garbled += overlong
         for line, begun in lines:
@@ -111,11 +111,11 @@ class Board:
 
     @property
     def is_waiting(self) -> bool:
-        """Whether there are readings that were not given yet."""
+        """True if there are readings that were not returned yet."""
         return bool(self._readings)
 
     def next(self) -> Timed | None:
-        """The oldest reading that was not given yet."""
+        """Return the oldest reading that was not returned yet."""
         return self._readings.popleft() if self._readings else None
 
     def _introduce(self, header: Header) -> None:

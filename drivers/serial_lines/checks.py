@@ -1,4 +1,4 @@
-"""How a board's encoders are, and how its lines come. Writes nothing to it but the question for its header."""
+"""Check a board's encoders and the rate of its lines. Only the request for its header is written to it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MANY_TROUBLES = 0.01
 def encoder_checks(
     config: SerialLinesConfig, joints: Sequence[str], clock: Clock, *, read_s: float = READ_S
 ) -> Iterator[Check]:
-    """Whether the configured encoders are there, and how often they are read. The port is opened for that."""
+    """Yield checks of the configured encoders and of their reading rate. Open the port for that."""
     try:
         with SerialLineJoints(config, joints, clock) as encoders:
             yield Check("encoders", "ok", f"all {len(joints)} of robot.toml are in the board's header")

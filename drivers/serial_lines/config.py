@@ -26,7 +26,7 @@ class EncoderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         encoder: its name in the board's header; by default the joint's.
         direction: −1 where the joint counts against the encoder.
         zero_ticks: the encoder's position where the joint is at 0.
-        ticks_per_turn: what the header has to say; without this key it is believed.
+        ticks_per_turn: value expected in the header; without this key the header's value is used.
     """
 
     joint: str
@@ -46,11 +46,13 @@ class SerialLinesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
 
     Attributes:
         port: best one of /dev/serial/by-id, which stays the same when it is plugged in again.
+        encoders: one for each joint.
         baud: of the board's UART [bit/s].
-        native_usb: the microcontroller has USB itself, so that lines need no time on a wire.
+        native_usb: the microcontroller has USB itself, so that lines take no time on a wire.
         delay_ms: from the middle of a measurement to the first byte of its line on the wire.
-        max_speed_deg_s: no joint moves faster; a position that would need it is not believed.
-        max_move_deg: how far a joint may have been moved while the board was away, where only the nearest turn tells.
+        max_speed_deg_s: fastest plausible motion of a joint; a position that would need more is rejected.
+        max_move_deg: how far a joint may move while the board is disconnected, where only the nearest turn determines
+            it.
     """
 
     port: str
@@ -62,7 +64,7 @@ class SerialLinesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     max_move_deg: Annotated[float, Meta(gt=0, lt=180)] = 30.0
 
     def check(self, joints: Sequence[str], file: Path, text: str) -> None:
-        """ConfigError when the encoders are not one for each of `joints`."""
+        """Raise ConfigError unless each of `joints` has exactly one encoder."""
         for place, what, key, remedy in self._mistakes(joints):
             raise ConfigError(what, file=file, line=line_in_entry(text, f"{TABLE}.encoders", place, key), remedy=remedy)
         missing = [joint for joint in joints if joint not in {encoder.joint for encoder in self.encoders}]

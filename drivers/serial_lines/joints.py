@@ -1,4 +1,4 @@
-"""Own encoders as a `JointSource`."""
+"""Custom encoders as a `JointSource`."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from .lines import ASK_HEADER, Header
 log = logging.getLogger(__name__)
 
 BITS_PER_BYTE = 10
-HEADER_S = 4.0  # an Arduino starts anew when its port is opened, and takes two seconds
+HEADER_S = 4.0  # an Arduino restarts when its port is opened, which takes two seconds
 ASK_EVERY_S = 0.5
 ANCHOR_S = 2.0
 LARGEST_SIGMA_S = 5e-3  # of a reading's time
-LOST_AFTER_S = 0.25  # without a reading; within this no joint turns by half a turn unseen
+LOST_AFTER_S = 0.25  # without a reading; no joint makes half a turn unnoticed in this time
 FEW_ATTEMPTS = 3
 SLACK_TICKS_PART = 1000  # of a turn
 
@@ -37,17 +37,18 @@ OpenPort = Callable[[SerialLinesConfig, Clock], Port]
 
 
 def open_serial(config: SerialLinesConfig, clock: Clock) -> Port:
-    """The open port."""
+    """Open the port."""
     return SerialLine.open(config.port, config.baud, clock.now)
 
 
 @dataclass(frozen=True, slots=True)
 class Encoder:
-    """An encoder as the board announced it.
+    """An encoder as announced by the board.
 
     Attributes:
-        place: in the board's lines.
-        ticks_per_turn: after so many it tells the same again.
+        config: its entry in robot.toml.
+        place: its place in the board's lines.
+        ticks_per_turn: ticks after which the reading repeats.
     """
 
     config: EncoderConfig
@@ -61,35 +62,34 @@ class Encoder:
 
     @property
     def label(self) -> str:
-        """Its own name, for messages."""
+        """Name of the encoder, for messages."""
         return f"encoder {self.config.name!r}"
 
     @property
     def rad_per_tick(self) -> float:
-        """Exactly a turn by its ticks [rad]."""
+        """Angle per tick [rad]."""
         return 2 * math.pi / self.ticks_per_turn
 
     def angle(self, ticks: int) -> float:
-        """The joint's angle [rad] at a position with its turns [ticks]."""
+        """Return the joint angle [rad] at a position with its turns [ticks]."""
         return self.config.direction * (ticks - self.config.zero_ticks) * self.rad_per_tick
 
     def ticks(self, angle: float) -> float:
-        """The position [ticks] at a joint's angle [rad]."""
+        """Return the position [ticks] at a joint angle [rad]."""
         return self.config.zero_ticks + self.config.direction * angle / self.rad_per_tick
 
 
 class SerialLineJoints:
-    """Reads the encoders of a board that sends a line for each measurement.
+    """Reader of the encoders of a board that sends a line per measurement.
 
-    A reading is one intact line in its turn, at a time that the board's clock bears out, in which no joint is where it
-    cannot have come to. SourceLost is raised when nothing such comes for a quarter of a second, or when the board was
-    restarted: opened again, everything is compared with where the joints were.
+    A reading is an intact line in sequence, with a time confirmed by the board's clock, and with plausible positions of
+    all joints. SourceLost is raised when there is none for a quarter of a second, or when the board was restarted. When
+    it is opened again, all positions are compared with the last ones.
 
     Attributes:
-        encoders: as they were found at the last opening, in the order of the joints.
+        encoders: as found at the last opening, in the order of the joints.
         epoch: how often it was opened.
-        dropped: readings that were dropped though their lines were intact.
-        counts: how the lines went since the last opening.
+        dropped: readings that were dropped although their lines were intact.
     """
 
     def __init__(
@@ -102,13 +102,15 @@ class SerialLineJoints:
         last_pose: Sequence[float] | None = None,
         open_port: OpenPort = open_serial,
     ) -> None:
-        """Nothing is opened yet.
+        """Prepare without opening anything.
 
         Args:
             config: checked; see `SerialLinesConfig.check`.
             joints: in the order of q.
-            limits: of each joint [rad]: with less than a turn between them there is no doubt about the turn.
-            last_pose: where the joints were when they were read last [rad], shape (d,), to count turns from.
+            clock: the clock.
+            limits: of each joint [rad]; a range below one turn determines the turn.
+            last_pose: last joint angles [rad], shape (d,), from which turns are counted.
+            open_port: opens the port.
         """
         self._config, self._names, self._clock, self._open_port = config, tuple(joints), clock, open_port
         by_joint = {encoder.joint: encoder for encoder in config.encoders}
@@ -130,17 +132,17 @@ class SerialLineJoints:
 
     @property
     def counts(self) -> Counts:
-        """How the lines went since the last opening."""
+        """Number of lines by outcome since the last opening."""
         return self._board.counts
 
     @property
     def health(self) -> tuple[str, ...]:
-        """Which encoders fail, and what to do."""
+        """Failing encoders, and what to do."""
         return tuple(_complaint(joint) for joint in sorted(self._failing))
 
     @property
     def record(self) -> tuple[Mapping[str, object], ...]:
-        """What is to be kept with the data: each encoder's identity and settings."""
+        """Identity and settings of each encoder, to be stored with the data."""
         return tuple(
             {
                 "joint": encoder.joint,
@@ -155,11 +157,11 @@ class SerialLineJoints:
 
     @property
     def asks_for_turns(self) -> bool:
-        """Whether it cannot be opened because a joint lost its turn count."""
+        """True if it cannot be opened because a joint lost its turn count."""
         return self._turns.lost is not None
 
     def accept_turns(self) -> None:
-        """Take the turns nearest to where the joints were, at the next opening. From any thread."""
+        """Accept the turns nearest to the last pose at the next opening. May be called from any thread."""
         self._turns.accept()
 
     def __enter__(self) -> Self:
@@ -182,10 +184,10 @@ class SerialLineJoints:
             self._port = None
 
     def read(self, timeout_s: float) -> JointReading | None:
-        """The next reading; see `JointSource.read`.
+        """Return the next reading; see `JointSource.read`.
 
         Raises:
-            SourceLost: the port is gone, nothing intact comes any more, or the board was restarted.
+            SourceLost: the port is gone, no intact lines arrive, or the board was restarted.
         """
         if self._port is None:
             raise SourceError("the encoders are not open; use them in a with statement")
@@ -218,7 +220,7 @@ class SerialLineJoints:
         self._attempts = 0
 
     def _introduced(self, port: Port) -> Header:
-        """What the board says of itself, asked until it does."""
+        """Return the board's header. Request it until it arrives."""
         end, heard = self._clock.now() + HEADER_S, 0
         while self._clock.now() < end:
             port.write(ASK_HEADER)
@@ -233,7 +235,7 @@ class SerialLineJoints:
         raise SourceLost(f"the board on {self._config.port} {what}", retry_s=RETRY_S)
 
     def _found(self, header: Header) -> list[Encoder]:
-        """The encoders; SourceError with a table of all when one is not as it should be."""
+        """Return the encoders. Raise SourceError with a table of all if one differs from robot.toml."""
         rows, encoders = [("joint", "encoder", "expected", "found")], list[Encoder]()
         places = list(header.encoders)
         for config in self._wanted:
@@ -251,7 +253,7 @@ class SerialLineJoints:
         )
 
     def _anchor(self, port: Port) -> None:
-        """Find the turn that each joint is in, by two readings that agree; then wait until their times are known."""
+        """Find the turn of each joint from two consistent readings; wait until the times are accurate."""
         end, believed = self._clock.now() + ANCHOR_S, 0
         self._why = "no line"
         while self._clock.now() < end:
@@ -292,7 +294,7 @@ class SerialLineJoints:
             raise SourceLost(f"the encoders cannot be read: {self._why}", retry_s=RETRY_S)
 
     def _raw(self, timed: Timed) -> list[int] | None:
-        """The positions of the joints; None when an encoder has none."""
+        """Return the raw positions of the joints; None when an encoder has none."""
         ticks = [timed.reading.ticks[encoder.place] for encoder in self.encoders]
         self._note_failing({e.joint for e, tick in zip(self.encoders, ticks, strict=True) if tick is None})
         raw = [tick for tick in ticks if tick is not None]
@@ -318,7 +320,7 @@ class SerialLineJoints:
         return JointReading(timed.t, frozen_array(self._turns.keep(counts)), timed.sigma)
 
     def _is_sure(self, timed: Timed) -> bool:
-        """Whether its time is known well enough."""
+        """Return True if the time of the reading is accurate enough."""
         if timed.sigma > LARGEST_SIGMA_S:
             self._why = "lines that were held up, so that nothing tells their time"
             return False

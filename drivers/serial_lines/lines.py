@@ -1,7 +1,7 @@
-"""The lines that a board of encoders says, taken apart strictly. docs/hardware.md defines them.
+"""Parse the lines of an encoder board strictly. docs/hardware.md defines them.
 
-A line is ASCII, `content*CRC` and a line feed; CRC is that of the content, four upper-case hexadecimal digits.
-The header is `H,1,boot,n,name1,ticks1,...,nameN,ticksN`, a reading is `seq,t_us,a1,...,aN`.
+A line is ASCII, `content*CRC` and a line feed; CRC is that of the content, four upper-case hexadecimal digits. The
+header is `H,1,boot,n,name1,ticks1,...,nameN,ticksN`, a reading is `seq,t_us,a1,...,aN`.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ NO_VALUE = "-"
 
 
 class GarbledLine(Exception):
-    """This is no intact line."""
+    """Raised for a line that is not intact."""
 
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What a board says of itself.
+    """Header of a board.
 
     Attributes:
-        boot: drawn anew whenever it starts.
-        encoders: by name, after how many ticks each tells the same again.
+        boot: a new random number at each start.
+        encoders: by name, ticks after which the reading repeats.
     """
 
     boot: int
@@ -43,7 +43,7 @@ class Header:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What a board measured.
+    """A measurement of a board.
 
     Attributes:
         seq: one more than before, modulo 2^16.
@@ -67,7 +67,7 @@ _TABLE = tuple(_remainder(byte) for byte in range(256))
 
 
 def crc_ccitt(data: bytes) -> int:
-    """The checksum of a line's content."""
+    """Return the checksum of a line's content."""
     crc = INITIAL
     for byte in data:
         crc = ((crc << 8) & 0xFF00) ^ _TABLE[(crc >> 8) ^ byte]
@@ -75,13 +75,13 @@ def crc_ccitt(data: bytes) -> int:
 
 
 def with_checksum(content: str) -> bytes:
-    """The line of a content."""
+    """Build the line of a content."""
     data = content.encode("ascii")
     return data + f"*{crc_ccitt(data):04X}\n".encode("ascii")
 
 
 def parse(line: bytes) -> Header | Reading:
-    """A line without its line feed; GarbledLine when it is none."""
+    """Parse a line without its line feed. Raise GarbledLine if it is not intact."""
     found = _LINE.fullmatch(line)
     if found is None or crc_ccitt(found[1]) != int(found[2], 16):
         raise GarbledLine

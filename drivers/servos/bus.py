@@ -1,4 +1,4 @@
-"""Question and answer on one bus: what is not exactly the answer to this question, in time, is refused."""
+"""Request and answer on one bus. Anything that is not exactly the answer to the request, in time, is rejected."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from .packets import Garbled, Packets, Status
 from .port import Port
 
 BITS_PER_BYTE = 10
-SLOWEST_DELAY_S = 510e-6  # Return Delay Time at its largest
-HOST_MARGIN_S = 3e-3  # the operating system's part of an answer's delay
-TOO_EARLY = 0.9  # an answer within this share of its time on the wire is another question's
+SLOWEST_DELAY_S = 510e-6  # largest Return Delay Time
+HOST_MARGIN_S = 3e-3  # the operating system's share of an answer's delay
+TOO_EARLY = 0.9  # an answer within this share of its time on the wire belongs to another request
 LONGEST_NOISE_S = 0.25
 QUIET_S = 2e-3
-OWED_S = 0.06  # how late an answer may come: more than the 50 ms for which busy USB hosts were seen to hold bytes back
-ASKED_LATELY = 4  # questions whose number of bytes is not asked for again at once
+OWED_S = 0.06  # longest delay of a late answer: above the 50 ms for which busy USB hosts were seen to hold bytes back
+ASKED_LATELY = 4  # number of recent requests whose size is avoided
 MOST_SPARE = 10  # bytes: from the end of a reading's block to that of the documented registers of the X and P series
 
 Taken = TypeVar("Taken")
@@ -33,7 +33,7 @@ Take = Callable[[bytearray, int], Taken | None]
 
 
 class Trouble(StrEnum):
-    """What was wrong with an exchange."""
+    """Kinds of failed exchanges."""
 
     TIMEOUT = "no answer"
     GARBLED = "a garbled answer"
@@ -46,14 +46,14 @@ class Trouble(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A question, and who answers it.
+    """A request and the servos that answer it.
 
     Attributes:
-        packet: the bytes to send for so many bytes of data from each.
-        ids: who answers, in this order.
-        size: bytes of data that are wanted from each.
-        protocol: version of the make's protocol.
-        spare: how many bytes more it may ask for, to tell its answers from late ones to an earlier question.
+        packet: returns the bytes to send for a number of data bytes per servo.
+        ids: servos that answer, in this order.
+        size: data bytes wanted from each.
+        protocol: version of the vendor's protocol.
+        spare: how many extra bytes may be requested, to tell its answers from late ones to an earlier request.
         is_fast: all answer in one packet.
     """
 
@@ -67,7 +67,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """One servo's answer, between which times [s] it began to answer, and when it was asked [s]."""
+    """One servo's answer, the earliest and latest start of this answer [s], and the time of the request [s]."""
 
     status: Status
     earliest: float
@@ -77,7 +77,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Exchange:
-    """What came of a question: the answers up to the first trouble, or all of them."""
+    """Result of a request: the answers up to the first trouble, or all of them."""
 
     answers: tuple[Answer, ...]
     trouble: Trouble | None = None
@@ -86,45 +86,46 @@ class Exchange:
 
 @dataclass
 class Counts:
-    """How the exchanges of a bus went."""
+    """Number of exchanges and of troubles on a bus."""
 
     exchanges: int = 0
     troubles: dict[Trouble, int] = field(default_factory=dict)
 
     def add(self, trouble: Trouble | None) -> None:
-        """One more."""
+        """Count one exchange."""
         self.exchanges += 1
         if trouble is not None:
             self.troubles[trouble] = self.troubles.get(trouble, 0) + 1
 
 
 class Owed:
-    """Answers that did not come in time. Each may still come, and must not pass for the answer to a later question.
+    """Overdue answers. Each may still arrive, and must not pass for the answer to a later request.
 
-    An answer is known by its servo and its number of bytes. So a servo that owes one is asked for a byte more.
+    An answer is identified by its servo and its number of bytes. So a servo with an overdue answer is asked for a byte
+    more.
     """
 
     def __init__(self) -> None:
-        """Nothing is owed."""
+        """Start without overdue answers."""
         self._until: dict[tuple[int, int, int], float] = {}
 
     @property
     def protocols(self) -> set[int]:
-        """Versions of the protocol in which something is owed."""
+        """Versions of the protocol with overdue answers."""
         return {protocol for protocol, _, _ in self._until}
 
     def add(self, protocol: int, id: int, size: int, until: float) -> None:
-        """A servo's answer with so many bytes may come until then [s]."""
+        """Note that a servo's answer with `size` bytes may arrive until `until` [s]."""
         self._until[protocol, id, size] = until
 
     def take(self, protocol: int, status: Status) -> bool:
-        """Return True when this answer was owed; then it is owed no more."""
+        """Return True and forget the answer if it was overdue."""
         return self._until.pop((protocol, status.id, len(status.data)), None) is not None
 
     def size_for(self, request: Request, now: float, lately: Collection[int]) -> int | None:
-        """Return the smallest number of bytes to ask for that no owed answer of the same servos has.
+        """Return the smallest number of bytes to request that no overdue answer of the same servos has.
 
-        One that is not in `lately`, if there is one.
+        Prefer one that is not in `lately`. Return None if every size is taken.
         """
         if self._until:
             self._until = {answer: until for answer, until in self._until.items() if until > now}
@@ -134,7 +135,7 @@ class Owed:
         return next((size for size in chain([first], free) if size not in lately), first)
 
     def until(self, request: Request) -> float:
-        """Return when no answer that looks like one to `request` can come any more [s]."""
+        """Return the time after which no overdue answer can look like one to `request` [s]."""
         return max(self._alike(request, request.size))
 
     def _alike(self, request: Request, size: int) -> list[float]:
@@ -143,23 +144,26 @@ class Owed:
 
 
 class Bus(ABC):
-    """Servos behind one port. A late answer is never taken for that to a later question.
+    """Servos behind one port. A late answer is never taken for the answer to a later request.
 
-    A servo that did not answer in time is asked for another number of bytes from then on, until its answer can come no
-    more. Where only the number of bytes tells answers apart, none of five questions in a row asks for the same: an
-    answer that comes twice is not taken for that to one of the next. After bytes that cannot be understood the line has
-    to fall silent before the next question.
+    After a time-out a servo is asked for another number of bytes until its late answer can no longer arrive. Where only
+    the number of bytes distinguishes answers, no two of five consecutive requests use the same one: an answer that
+    arrives twice is not taken for the answer to one of the next. After unintelligible bytes the line has to be silent
+    before the next request.
 
     Attributes:
-        return_delay_s: by ID, how long each waits before it answers; unknown ones may need the longest time.
-        counts: how the exchanges went.
+        return_delay_s: return delay by ID; the longest delay is assumed for unknown ones.
+        counts: number of exchanges and of troubles.
     """
 
     def __init__(self, name: str, port: Port, clock: Clock, latency_s: float) -> None:
-        """A bus at an open port.
+        """Use an open port.
 
         Args:
-            latency_s: how long the adapter may keep bytes back.
+            name: of the bus.
+            port: open.
+            clock: the clock.
+            latency_s: longest time that the adapter holds bytes back.
         """
         self.name, self.return_delay_s, self.counts = name, dict[int, float](), Counts()
         self._port, self._clock, self._latency_s = port, clock, latency_s
@@ -172,19 +176,19 @@ class Bus(ABC):
     @staticmethod
     @abstractmethod
     def packets_of(protocol: int) -> Packets:
-        """How to speak a version of the protocol."""
+        """Return the packet codec of a version of the protocol."""
 
     def close(self) -> None:
-        """Give the port free."""
+        """Release the port."""
         self._port.close()
 
     def read_request(self, model: Model, id: int, register: Register) -> Request:
-        """Ask one servo for part of its control table."""
+        """Return a request of part of one servo's control table."""
         packets, spare = self.packets_of(model.protocol), spare_after(model.layout, register)
         return Request(lambda n: packets.read(id, register.address, n), (id,), register.size, model.protocol, spare)
 
     def is_weak(self, request: Request) -> bool:
-        """Return True when a wrong answer may pass the checksum, or a late one go unnoticed."""
+        """Return True if a wrong answer may pass the checksum, or a late one go unnoticed."""
         return self.packets_of(request.protocol).is_weak
 
     def write(self, model: Model, id: int, register: Register, data: bytes) -> Exchange:
@@ -192,17 +196,17 @@ class Bus(ABC):
         return self.tell(model.protocol, self.packets_of(model.protocol).write(id, register.address, data), id)
 
     def ping(self, model: Model, id: int) -> Exchange:
-        """Ask a servo whether it is there."""
+        """Ping a servo."""
         packets = self.packets_of(model.protocol)
         return self.ask(Request(lambda _: packets.ping(id), (id,), packets.ping_size, model.protocol))
 
     def ask(self, request: Request) -> Exchange:
-        """Send it and wait for its answers."""
+        """Send a request and wait for its answers."""
         self.send(request)
         return self.collect(request)
 
     def send(self, request: Request) -> None:
-        """Send it. Where its answers would look like late ones, wait first until those can come no more."""
+        """Send a request. If overdue answers could pass for its answers, wait first until they can no longer arrive."""
         is_weak = self.is_weak(request)
         lately = self._asked_lately.setdefault(request.ids, deque(maxlen=ASKED_LATELY)) if is_weak else ()
         size = self._owed.size_for(request, self._clock.now(), lately)
@@ -218,7 +222,7 @@ class Bus(ABC):
         self._port.write(packet)
 
     def collect(self, request: Request) -> Exchange:
-        """Wait for the answers to what was sent last."""
+        """Wait for the answers to the last request."""
         exchange = self._collect(request)
         self.counts.add(exchange.trouble)
         if exchange.trouble not in (None, Trouble.TIMEOUT):
@@ -226,21 +230,21 @@ class Bus(ABC):
         return exchange
 
     def tell(self, protocol: int, packet: bytes, id: int) -> Exchange:
-        """Send an instruction that is answered without data, or, as its status return level says, not at all."""
+        """Send an instruction that is answered without data, or not at all, depending on the status return level."""
         return self.ask(Request(lambda _: packet, (id,), 0, protocol))
 
     def announce(self, packet: bytes) -> None:
-        """Send an instruction that nobody answers. The next question comes after it on the wire."""
+        """Send an instruction without an answer. The next request follows it on the wire."""
         self._free_s = max(self._clock.now(), self._free_s) + len(packet) * self._byte_s
         self._port.write(packet)
 
     def listen(self, until: float) -> bool:
-        """Wait; False when something came that was not owed: what came before is not to be trusted."""
+        """Wait until `until`. Return False if other than overdue bytes arrived: distrust earlier answers then."""
         received, at = bytearray(), 0
         while data := self._port.receive(until):
             received += data
             at += self._owed_size(received, at)
-            if self._clock.now() >= until:  # where noise comes without end, something is always there
+            if self._clock.now() >= until:  # with endless noise there is always something to receive
                 break
         if at == len(received):
             return True
@@ -260,7 +264,7 @@ class Bus(ABC):
             pass
 
     def _owed_size(self, received: bytearray, at: int) -> int:
-        """Return how many bytes from `at` on are answers that were owed. Then they are owed no more."""
+        """Return how many bytes from `at` on are overdue answers, and forget these."""
         begun, found = at, True
         while found:
             found = False
@@ -272,14 +276,14 @@ class Bus(ABC):
         return at - begun
 
     def _deadline(self, request: Request) -> float:
-        """Return when all answers are there: after their time on the wire, and what adapter and system may add."""
+        """Return the deadline of all answers: their time on the wire, and the delays of adapter and system."""
         overhead = self.packets_of(request.protocol).overhead
         wire = self._question_size + len(request.ids) * (overhead + self._asked_size)
         delays = sum(self.return_delay_s.get(id, SLOWEST_DELAY_S) for id in request.ids)
         return self._sent + wire * self._byte_s + delays + 2 * self._latency_s + HOST_MARGIN_S
 
     def _collect(self, request: Request) -> Exchange:
-        """Hear the servos to the last, also where one is missing. Only answers before that one count."""
+        """Receive the answers of all servos, even if one is missing. Only answers before the missing one count."""
         take, inbox = self.packets_of(request.protocol).take, self._inbox(request)
         answers, missing, waiting = list[Answer](), list[int](), list(request.ids)
         expected_s, trouble = self._sent + self._question_size * self._byte_s, None
@@ -306,7 +310,7 @@ class Bus(ABC):
         return Exchange(tuple(answers), trouble, next(iter(culprits), None))
 
     def _next(self, inbox: Inbox, take: Take[Taken]) -> tuple[Taken | None, Trouble | None]:
-        """Return the next answer that is not an owed one, or why there is none."""
+        """Return the next answer that is not overdue, or why there is none."""
         try:
             while True:
                 late = self._owed_size(inbox.received, inbox.at)
@@ -336,7 +340,10 @@ class Bus(ABC):
         return None
 
     def _timed(self, request: Request, status: Status, earliest: float, inbox: Inbox, at: int) -> Answer:
-        """When the packet at `at` was begun: all that came with it and after it was on the wire by the arrival."""
+        """Return the answer with bounds of its start.
+
+        The latest start follows from the bytes that came with or after it: all were on the wire before the arrival.
+        """
         latest = inbox.arrived - (len(inbox.received) - at) * self._byte_s
         wanted = Status(status.id, status.error, status.data[: request.size], status.size)
         return Answer(wanted, min(earliest, latest), latest, self._sent)
@@ -346,13 +353,13 @@ class Bus(ABC):
 
 
 class Inbox:
-    """What has come in answer to a question.
+    """Bytes received in answer to a request.
 
     Attributes:
-        received: all of it.
-        at: so many bytes of it are understood.
-        late: so many of those were answers to earlier questions.
-        arrived: when the last of it came [s].
+        received: all of them.
+        at: number of bytes parsed.
+        late: number of those in answers to earlier requests.
+        arrived: time of the last arrival [s].
     """
 
     def __init__(self, port: Port, clock: Clock, deadline: float) -> None:
@@ -363,18 +370,18 @@ class Inbox:
 
     @property
     def own(self) -> int:
-        """Bytes that are understood and answer this question."""
+        """Parsed bytes that answer this request."""
         return self.at - self.late
 
     def fill(self) -> bool:
-        """Wait for more; False when nothing comes in time."""
+        """Wait for more. Return False when nothing arrives in time."""
         data = self._port.receive(self._deadline)
         self.received += data
         self.arrived = self._clock.now()
         return bool(data)
 
     def silence(self) -> Trouble:
-        """What it means that nothing more comes."""
+        """Return the trouble that it means if nothing more arrives."""
         return Trouble.GARBLED if len(self.received) > self.at else Trouble.TIMEOUT
 
 

@@ -1,4 +1,4 @@
-"""One servo's answers, judged: is this its position, of now?"""
+"""Check one servo's answers: is this its present position?"""
 
 from __future__ import annotations
 
@@ -12,26 +12,27 @@ from statistics import median
 from .bus import Answer
 from .handshake import FittedServo
 
-# A position this far off its course is asked for again: rounding alone, of three positions, makes two ticks.
+# A position this far off the extrapolated one is requested again. Rounding of three positions alone makes two ticks.
 SURPRISE_RAD, SURPRISE_TICKS = math.radians(0.35), 2.0
-LATELY = 51  # readings that tell what is usual
+LATELY = 51  # readings that define the usual uncertainty
 HELD_UP_S = 0.3e-3
-SHORTEST_S = 1e-3  # between two samples that make a trend
-VOLTAGE_STEP, TEMPERATURE_STEP = 15, 3  # these change slowly: 0.1 V, K
+SHORTEST_S = 1e-3  # shortest interval between two samples for a speed
+VOLTAGE_STEP, TEMPERATURE_STEP = 15, 3  # largest plausible changes, which are slow: 0.1 V, K
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """What a servo told.
+    """A servo's decoded answer.
 
     Attributes:
-        question: the bus, and when it was asked there [s]; answers to one question have the same.
-        expected: when it was so if nothing was held up [s].
-        earliest, latest: between these times it was so [s].
-        ticks: its position as it tells it.
-        velocity: [rad/s], counted as the servo counts.
+        question: the bus, and the time of the request; the same for all answers to one request.
+        expected: time of the sample if nothing was delayed [s].
+        earliest, latest: bounds of the time of the sample [s].
+        ticks: position as reported.
+        velocity: [rad/s], in the servo's own direction.
         current: [A], or None where it is not measured.
-        alert: something is wrong with the servo; the position is right nevertheless.
+        moving: the servo reports motion.
+        alert: the servo reports a fault; its position is valid nevertheless.
     """
 
     question: tuple[str, float]
@@ -46,7 +47,7 @@ class Sample:
 
     @property
     def middle(self) -> float:
-        """The middle of the time in which it was so [s]."""
+        """Middle of the possible time of the sample [s]."""
         return (self.earliest + self.latest) / 2
 
 
@@ -54,14 +55,14 @@ class Channel(ABC):
     """The answers of one servo since the bus was opened.
 
     Attributes:
-        servo: who it is.
-        newest: the last sample that was believed.
-        doubts: how many in a row were not.
-        surprising: the newest is not where the two before it led to.
+        servo: the servo.
+        newest: the last accepted sample.
+        doubts: number of consecutive rejected answers.
+        surprising: the newest sample deviates from the trend of the two before it.
     """
 
     def __init__(self, servo: FittedServo) -> None:
-        """Nothing was answered yet."""
+        """Start without answers."""
         self.servo = servo
         self.newest: Sample | None = None
         self.doubts = 0
@@ -72,7 +73,7 @@ class Channel(ABC):
         self._supply: tuple[int, int] | None = None
 
     def take(self, answer: Answer) -> Sample | None:
-        """What the answer says; None when it cannot be what this servo tells at this time."""
+        """Decode an answer; return None when it cannot be from this servo at this time."""
         sample = self._sample(answer)
         if sample is None:
             self.doubts += 1
@@ -82,24 +83,24 @@ class Channel(ABC):
         return sample
 
     def question(self, answer: Answer) -> tuple[str, float]:
-        """Return to which question it answers."""
+        """Return the key of the request that it answers."""
         return self.servo.bus, answer.asked
 
     @abstractmethod
     def _sample(self, answer: Answer) -> Sample | None:
-        """What the answer says, if that is possible."""
+        """Decode an answer; return None if it is implausible."""
 
     def agrees(self, first: Sample, second: Sample) -> bool:
-        """Whether a joint goes from one sample to the next as fast as it moved before both.
+        """Return True if the joint's motion between two samples matches its earlier speed.
 
-        A joint that is only then set going has gone on by too few ticks to tell; a wrong answer is off by more, as
-        it surprised.
+        A joint that just begins to move has moved by too few ticks to tell. A wrong answer deviates by more, since it
+        was surprising.
         """
         moved = self._speed * (second.middle - first.middle)
         return abs(self._step(second.ticks - first.ticks) - moved) <= self._off_course
 
     def _compare(self, sample: Sample) -> None:
-        """Whether it goes on from where the last ones led: time, ticks and ticks per second of them."""
+        """Update the trend, and note if the sample deviates from it."""
         t = sample.middle
         if self._trend is None:
             self._trend = (t, sample.ticks, 0.0)
@@ -126,10 +127,10 @@ class Channel(ABC):
 
 
 def middle(samples: Sequence[Sample]) -> tuple[float, float]:
-    """The middle of the time in which the positions were taken [s], and by how much it may be wrong at most [s].
+    """Return the middle of the time in which the positions were taken [s], and its largest possible error [s].
 
-    Of those who answer to one question only this can have been held up: the servos answer as the wire goes on. So one
-    delay, which is in the bounds of all, moves them all. Each question has a delay of its own.
+    The answers to one request can only be delayed together, since the servos answer in the pace of the wire. So one
+    delay, within the bounds of all, shifts them all. Each request has its own delay.
     """
     total = unsure = 0.0
     for question in {sample.question for sample in samples}:
@@ -146,14 +147,14 @@ def middle(samples: Sequence[Sample]) -> tuple[float, float]:
 
 
 class Punctuality:
-    """Tells readings that were held up so long that their time is not known as well as that of most."""
+    """Detector of readings that were delayed so much that their time is less certain than usual."""
 
     def __init__(self) -> None:
-        """No reading yet."""
+        """Start without readings."""
         self._unsure: deque[float] = deque(maxlen=LATELY)
 
     def is_usual(self, unsure: float) -> bool:
-        """Whether a reading's time is known about as well as usual, which this one takes part in."""
+        """Return True if a reading's time is about as certain as usual, and include it in the median."""
         self._unsure.append(unsure)
         usual = median(self._unsure)
         return unsure <= max(usual + HELD_UP_S, 2 * usual)

@@ -1,4 +1,4 @@
-"""How an arm's servos are, and how fast they can be read. Writes nothing: torque stays as it is."""
+"""Check an arm's servos and the reading rate they allow. Writes nothing: torque stays as it is."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .make import Make
 from .plan import Plan
 
 READ_S = 1.0
-IDENTIFY_S = 1.0  # then who was not asked yet is not asked any more
+IDENTIFY_S = 1.0  # servos not yet asked by then are not asked any more
 FEW_PER_S = 100.0
 MANY_TROUBLES = 0.01
 LONGEST_DELAY_S = 50e-6
@@ -32,7 +32,7 @@ FAST_BAUD = 1_000_000
 def servo_checks(
     make: Make, config: ServosConfig[Any], clock: Clock, open_port: OpenPort, *, read_s: float = READ_S
 ) -> Iterator[Check]:
-    """Who is there, how they are, and how fast they are read. The ports are opened for that."""
+    """Yield checks of presence, health and reading rate of the servos. Open the ports for that."""
     with ExitStack() as stack:
         buses: dict[str, Bus] = {}
         try:
@@ -110,7 +110,7 @@ def _pace(
     clock: Clock,
     read_s: float,
 ) -> Iterator[Check]:
-    """Read for a while, as fast as it goes."""
+    """Read at the highest rate for a while."""
     plans = {
         name: Plan(bus, make.ways(bus, [s for s in servos if s.bus == name], config.buses[name]))
         for name, bus in buses.items()

@@ -1,4 +1,4 @@
-"""What moves joints in the loop that reads them."""
+"""Interface of components that move joints from within the reading loop."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from .handshake import FittedServo
 
 
 class Drive(Protocol):
-    """Moves some joints of an arm, or lets go of them. Called by the thread that reads, but for `complaints`.
+    """A component that moves or releases joints of an arm. Called by the reading thread, except `complaints`.
 
-    Torque is off when it is opened. It never raises because something went wrong with a servo: it lets go.
+    Torque is off when it is opened. A servo fault never raises an exception: the joints are released.
     """
 
     @property
@@ -25,20 +25,20 @@ class Drive(Protocol):
 
     @property
     def complaints(self) -> tuple[str, ...]:
-        """What is wrong, and what to do; from any thread."""
+        """Current problems, and what to do; from any thread."""
         ...
 
     def open(self, buses: Mapping[str, Bus], servos: Sequence[FittedServo]) -> None:
-        """The servos were found, with their torque verified off; in the order of the joints."""
+        """Accept the servos that were found, with torque verified off, in the order of the joints."""
         ...
 
     def step(self, reading: JointReading | None, samples: Mapping[str, Sample | None]) -> str | None:
-        """Once each cycle, after the question: the reading, None when it was doubtful, and the newest samples.
+        """Run once each cycle, after the request, with the reading (None when it was rejected) and the newest samples.
 
-        Why it had to let go in this cycle, which is reason for the other drives to let go too; else None.
+        Return why the joints had to be released in this cycle, so that the other drives release theirs too; else None.
         """
         ...
 
     def release(self, why: str | None) -> None:
-        """Torque off, verified on every joint as far as the bus allows; None when that is the orderly end."""
+        """Switch torque off and verify it on every joint as far as the bus allows. `why` is None at the regular end."""
         ...

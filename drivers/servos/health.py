@@ -1,4 +1,4 @@
-"""How servos and buses are, as far as they told."""
+"""Reported state of servos and buses."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from .model import Model, Register
 
 log = logging.getLogger(__name__)
 
-VOLT_PER_UNIT = 0.1  # of all series of all makes; temperatures are told in °C
+VOLT_PER_UNIT = 0.1  # for all series of all vendors; temperatures are in °C
 
 
 @dataclass(frozen=True, slots=True)
 class ServoHealth:
-    """One servo.
+    """State of one servo.
 
     Attributes:
-        homing_offset, drive_mode: as it keeps them.
-        voltage_v, temperature_c: as it told last; None before it did.
+        homing_offset, drive_mode: as stored in its EEPROM.
+        voltage_v, temperature_c: last reported; None before.
         current_a: None where it is not measured.
         troubles: what is wrong with it, and what to do.
     """
@@ -41,12 +41,12 @@ class ServoHealth:
 
 @dataclass(frozen=True, slots=True)
 class BusHealth:
-    """One bus since the start.
+    """Statistics of one bus since the start.
 
     Attributes:
-        exchanges: questions that were asked.
-        troubles: those that were not answered as they should be, by what was wrong.
-        way: with which questions its servos are read; empty before the first opening.
+        exchanges: number of requests.
+        troubles: number of failed requests, by kind of failure.
+        way: read method of its servos; empty before the first opening.
     """
 
     exchanges: int
@@ -55,17 +55,17 @@ class BusHealth:
 
 
 class Health:
-    """What the servos of an arm told of themselves.
+    """State of the servos of an arm.
 
     Attributes:
         away: names of the buses whose ports cannot be opened.
     """
 
     def __init__(self, errors: Mapping[int, str]) -> None:
-        """Nothing was told yet.
+        """Start without reports.
 
         Args:
-            errors: what each bit of the hardware error means, and what to do.
+            errors: meaning and remedy of each bit of the hardware error.
         """
         self._errors = errors
         self._alerts: dict[str, int] = {}
@@ -75,15 +75,15 @@ class Health:
 
     @property
     def complaints(self) -> tuple[str, ...]:
-        """What is wrong with servos, and what to do."""
+        """Current problems of servos, and what to do."""
         return tuple(f"joint {joint!r}: {'; '.join(self._reasons(bits))}" for joint, bits in list(self._alerts.items()))
 
     def knows_supply(self, joint: str) -> bool:
-        """Whether it has told its voltage and temperature."""
+        """Return True if the voltage and temperature of the joint's servo are known."""
         return joint in self._supplies
 
     def note_alert(self, joint: str, bits: int) -> None:
-        """Bits of a servo's hardware error; what is new is logged."""
+        """Update the hardware error bits of a servo, and log changes."""
         if self._alerts.get(joint, 0) == bits:
             return
         if bits:
@@ -94,21 +94,21 @@ class Health:
             log.info("joint %r is well again", joint)
 
     def note_supply(self, joint: str, model: Model, data: bytes) -> None:
-        """What stands in the registers of `supply_of`."""
+        """Update voltage and temperature from the registers of `supply_of`."""
         first = supply_of(model).address
         voltage = VOLT_PER_UNIT * model.layout.value("voltage", data, first)
         self._supplies[joint] = (voltage, float(model.layout.value("temperature", data, first)))
 
     def note_found(self, findings: Iterable[Finding]) -> None:
-        """Who was found at an opening, and who was not."""
+        """Note which servos were found at an opening, and which were not."""
         self._absent = {finding.config.joint: finding.found for finding in findings if finding.servo is None}
 
     def note_silent(self, joint: str, trouble: str) -> None:
-        """A servo does not answer when it is asked alone."""
+        """Note that a servo does not answer when it is asked alone."""
         self._absent[joint] = trouble
 
     def of(self, servo: FittedServo, sample: Sample | None, lost: str | None) -> ServoHealth:
-        """How a servo is; `lost` is the joint that lost its turn count."""
+        """Return the state of a servo; `lost` is the joint that lost its turn count."""
         joint = servo.joint
         voltage, temperature = self._supplies.get(joint, (None, None))
         troubles = self._reasons(self._alerts.get(joint, 0))
@@ -128,6 +128,6 @@ class Health:
 
 
 def supply_of(model: Model) -> Register:
-    """Where a model tells voltage and temperature, in one piece."""
+    """Return the register range with voltage and temperature of a model."""
     voltage, temperature = model.layout["voltage"], model.layout["temperature"]
     return Register(voltage.address, temperature.end - voltage.address)

@@ -1,4 +1,4 @@
-"""Servos looked at one after the other, between readings: torque, what is wrong with them, their supply."""
+"""Inspect servos one by one between readings: torque, faults and supply."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from .handshake import FittedServo
 from .health import Health, supply_of
 
 EVERY_S = 0.1  # one servo in turn
-SUPPLY_EVERY = 11  # so many looks: voltage and temperature of that one too
+SUPPLY_EVERY = 11  # every 11th inspection reads voltage and temperature too
 
 
 class Inspection:
-    """Verifies that torque is where it shall be, and notes how the servos are."""
+    """Inspector of the torque state and the health of servos."""
 
     def __init__(
         self,
@@ -27,16 +27,16 @@ class Inspection:
         drives: Sequence[Drive],
         clock: Clock,
     ) -> None:
-        """Of `servos`, on `buses` that are open; `health` is told, and `drives` may hold some of them."""
+        """Inspect `servos` on the open `buses`; update `health`. The `drives` may hold some of them."""
         self._buses, self._servos, self._health, self._drives = buses, servos, health, drives
         self._clock, self._next_s = clock, clock.now()
         self._looked = 0
 
     def go_on(self) -> None:
-        """Look at the next servo, if it is time.
+        """Inspect the next servo, if it is time.
 
         Raises:
-            SourceLost: its torque is on, and none of ours switched it on.
+            SourceLost: its torque is on, and none of our drives switched it on.
         """
         if self._clock.now() < self._next_s:
             return
@@ -52,7 +52,7 @@ class Inspection:
             self._ask_supply(servo)
 
     def first_silent(self) -> str | None:
-        """The first servo that does not answer when it is asked alone, and what came instead; None: all answer."""
+        """Return the first servo that does not answer when it is asked alone, and the trouble; None if all answer."""
         for servo in self._servos:
             trouble = self._ask_state(servo).trouble
             if trouble is not None:
@@ -88,7 +88,7 @@ class Inspection:
 
 
 def _state_in(servo: FittedServo, exchange: Exchange) -> tuple[int, int]:
-    """Return whether torque is on, and the bits of what is wrong."""
+    """Return the torque flag and the hardware error bits."""
     status, layout = exchange.answers[0].status, servo.model.layout
     has_register = "hardware_error" in layout
     bits = layout.value("hardware_error", status.data, layout.state.address) if has_register else status.error

@@ -1,4 +1,4 @@
-"""An arm of servos as a `JointSource`, whatever their make."""
+"""An arm of bus servos of any vendor as a `JointSource`."""
 
 from __future__ import annotations
 
@@ -30,30 +30,30 @@ from .port import Port
 
 log = logging.getLogger(__name__)
 
-LOST_AFTER_S = 0.25  # without a reading; within this no joint turns by half a turn unseen
-FEW_POLLS = 3  # so many have to fail besides: the program itself may have been held up
-DOUBTS = 5  # so many answers in a row that cannot be: the servo was restarted
+LOST_AFTER_S = 0.25  # without a reading; no joint makes half a turn unnoticed in this time
+FEW_POLLS = 3  # this many must fail as well: the program itself may have been delayed
+DOUBTS = 5  # consecutive implausible answers after which the servo was restarted
 ANCHOR_POLLS = 50
 SLACK_TICKS = 3
-IMPROVE_EVERY_S = 10.0  # an attempt in vain costs a reading or two
-GOLDEN = 0.618034  # multiples of it, modulo 1, are spread most evenly
+IMPROVE_EVERY_S = 10.0  # a failed attempt costs a reading or two
+GOLDEN = 0.618034  # its multiples, modulo 1, are spread most evenly
 
 OpenPort = Callable[[Any, Clock], tuple[Port, float]]
 """Opens the port of a bus; with the latency of its adapter [s]."""
 
 
 class ServoJoints:
-    """Reads the positions of an arm whose torque is off, but for what `drives` hold.
+    """Reader of the positions of an arm with torque off, except for joints held by `drives`.
 
-    A reading is made of intact answers of all servos to the same questions, each from the time at which it was asked,
-    each where the joint can have come to. Whatever is doubtful is dropped, and the line has to fall silent before the
-    next question. When nothing comes for a quarter of a second, or a servo was restarted, or its torque is on,
-    SourceLost is raised: opened again, everything is verified anew, and compared with where the joints were.
+    A reading consists of intact answers of all servos to the same requests, with plausible times and positions.
+    Anything doubtful is dropped, and the line has to be silent before the next request. SourceLost is raised when there
+    is no reading for a quarter of a second, when a servo was restarted, or when its torque is on. When it is opened
+    again, everything is verified again, and the positions are compared with the last ones.
 
     Attributes:
-        servos: as they were found at the last opening, in the order of the joints.
-        epoch: how often it was opened. Positions of different epochs hang together by the comparison only.
-        dropped: readings that were dropped.
+        servos: as found at the last opening, in the order of the joints.
+        epoch: how often it was opened. Only this comparison connects positions of different epochs.
+        dropped: number of dropped readings.
     """
 
     def __init__(
@@ -68,14 +68,17 @@ class ServoJoints:
         last_pose: Sequence[float] | None = None,
         drives: Sequence[Drive] = (),
     ) -> None:
-        """Nothing is opened yet.
+        """Prepare without opening anything.
 
         Args:
+            make: the vendor.
             config: checked; see `ServosConfig.check`.
             joints: in the order of q.
-            limits: of each joint [rad]: with less than a turn between them there is no doubt about the turn.
-            last_pose: where the joints were when they were read last [rad], shape (d,), to count turns from.
-            drives: what may move joints once it is asked to; without any, torque stays off.
+            clock: the clock.
+            open_port: opens the port of a bus.
+            limits: of each joint [rad]; a range below one turn determines the turn.
+            last_pose: last joint angles [rad], shape (d,), from which turns are counted.
+            drives: may move joints on request; without any, torque stays off.
         """
         self._drives = tuple(drives)
         self._make, self._config, self._names, self._clock = make, config, tuple(joints), clock
@@ -104,25 +107,25 @@ class ServoJoints:
 
     @property
     def drives(self) -> tuple[Drive, ...]:
-        """What may move its joints."""
+        """Drives that may move its joints."""
         return self._drives
 
     @property
     def health(self) -> tuple[str, ...]:
-        """What is wrong with servos, and what to do."""
+        """Current problems of servos, and what to do."""
         of_drives = (text for drive in self._drives for text in drive.complaints)
         return (*self._health.complaints, *self._slow, *of_drives)
 
     @property
     def servo_health(self) -> tuple[ServoHealth, ...]:
-        """How each servo is; empty before the first opening. From any thread."""
+        """State of each servo; empty before the first opening. From any thread."""
         samples = self.samples
         lost = self._turns.lost
         return tuple(self._health.of(servo, samples.get(servo.joint), lost) for servo in list(self.servos))
 
     @property
     def bus_health(self) -> Mapping[str, BusHealth]:
-        """By name how each bus went since the start. From any thread."""
+        """Statistics of each bus since the start, by name. From any thread."""
         return {
             name: BusHealth(counts.exchanges, {str(t): n for t, n in list(counts.troubles.items())}, self._way(name))
             for name, counts in self._counts.items()
@@ -130,21 +133,21 @@ class ServoJoints:
 
     @property
     def samples(self) -> Mapping[str, Sample | None]:
-        """The newest believed answer for each joint, also of those whose neighbours did not answer."""
+        """The newest accepted answer of each joint, even if other joints did not answer."""
         return {channel.servo.joint: channel.newest for channel in list(self._channels)}
 
     @property
     def asks_for_turns(self) -> bool:
-        """Whether it cannot be opened because a joint lost its turn count."""
+        """True if it cannot be opened because a joint lost its turn count."""
         return self._turns.lost is not None
 
     def accept_turns(self) -> None:
-        """Take the turns nearest to where the joints were, at the next opening. From any thread."""
+        """Accept the turns nearest to the last pose at the next opening. May be called from any thread."""
         self._turns.accept()
 
     @property
     def record(self) -> tuple[Mapping[str, object], ...]:
-        """What is to be kept with the data: each servo's identity and settings."""
+        """Identity and settings of each servo, to be stored with the data."""
         return tuple(servo.record() for servo in self.servos)
 
     def __enter__(self) -> Self:
@@ -175,22 +178,22 @@ class ServoJoints:
         self._opened.close()
 
     def read(self, timeout_s: float) -> JointReading | None:
-        """The next reading; see `JointSource.read`.
+        """Return the next reading; see `JointSource.read`.
 
         Raises:
-            SourceLost: a port is gone, a servo does not answer any more, was restarted, or its torque is on.
+            SourceLost: a port is gone, or a servo no longer answers, was restarted, or has torque.
         """
         if not self._is_open:
             raise SourceError("the servos are not open; use them in a with statement")
         try:
             return self._read_until(self._clock.now() + timeout_s)
-        except BaseException as error:  # whatever ends the reading, nobody would look after the torque
+        except BaseException as error:  # after any exception the torque would not be monitored any more
             self._is_lost = isinstance(error, SourceLost)
             self._release(f"the servos cannot be read any more: {error}")
             raise
 
     def temperature_c(self, joint: str) -> float | None:
-        """How hot a joint's servo says it is, asked now; None without an answer. For the thread that reads."""
+        """Read the temperature of a joint's servo; None without an answer. For the reading thread only."""
         servo = self.servos[self._names.index(joint)]
         bus, register = self._buses[servo.bus], servo.model.layout["temperature"]
         exchange = bus.ask(bus.read_request(servo.model, servo.id, register))
@@ -243,7 +246,7 @@ class ServoJoints:
         self._why = "no answer"
 
     def _anchor(self) -> None:
-        """Find the turn that each joint is in: two readings that agree."""
+        """Find the turn of each joint from two consistent readings."""
         believed = 0
         for _ in range(ANCHOR_POLLS):
             samples = self._ask_all()
@@ -271,7 +274,7 @@ class ServoJoints:
             log.warning("the torque of %s was on and was switched off", ", ".join(switched))
 
     def _restore(self) -> None:
-        if not self._config.restore_torque or self._is_lost:  # who was lost is opened again, in somebody's hands
+        if not self._config.restore_torque or self._is_lost:  # a lost arm is reopened, perhaps held by hand
             return
         for servo in self.servos:
             if servo.joint in self._had_torque:
@@ -279,7 +282,7 @@ class ServoJoints:
                     restore_torque(self._buses[servo.bus], servo)
 
     def _release(self, why: str | None) -> None:
-        with ExitStack() as stack:  # each, though one should fail
+        with ExitStack() as stack:  # release each, even if one fails
             for drive in self._drives:
                 stack.callback(drive.release, why)
 
@@ -300,7 +303,7 @@ class ServoJoints:
         return reading
 
     def _improve(self) -> None:
-        """Come back to a quicker way of reading, now and then, while nothing is held that would have to wait."""
+        """Try a faster read method at intervals, but not while a drive holds joints."""
         if self._clock.now() < self._improve_s or any(drive.holding for drive in self._drives):
             return
         self._improve_s = self._clock.now() + IMPROVE_EVERY_S
@@ -316,13 +319,16 @@ class ServoJoints:
         return [f"bus {name}: {complaint}" for name, plan in self._plans.items() for complaint in plan.complaints]
 
     def _following_poll(self) -> float:
-        """When to ask next: not always at the same phase of the servos' ticks, which would tell nothing new of them."""
+        """Return the time of the next request.
+
+        Its phase relative to the servos' ticks varies, to refine the clock offset.
+        """
         self._polls += 1
         before, after = (self._polls - 1) * GOLDEN % 1, self._polls * GOLDEN % 1
         return max(self._next_poll + 1 / self._config.rate_hz + (after - before) * self._make.tick_s, self._clock.now())
 
     def _ask_all(self) -> list[Sample] | None:
-        """A sample of each joint; None when one is missing or doubtful. All buses are asked at the same time."""
+        """Ask all buses at the same time and return a sample of each joint; None when one is missing or doubtful."""
         samples: dict[int, Sample] = {}
         for questions in zip_longest(*(plan.requests for plan in self._plans.values())):
             asked = [(bus, q) for bus, q in zip(self._buses.values(), questions, strict=True) if q is not None]
@@ -365,7 +371,7 @@ class ServoJoints:
         t, unsure = middle(samples)
         if not self._punctuality.is_usual(unsure):
             self._why = "an answer that was held up"
-            self._believed_s = self._clock.now()  # they are all there
+            self._believed_s = self._clock.now()  # the servos are all there
             return None
         counts = self._turns.continued([sample.ticks for sample in samples])
         refused = self._gate.offer(t, counts)
@@ -392,7 +398,7 @@ class ServoJoints:
             raise SourceLost(f"joint {servo.joint!r} (ID {servo.id}) was restarted", retry_s=RETRY_S)
 
     def _wait_until(self, t: float) -> bool:
-        """Wait; False when a servo talked though it was not asked."""
+        """Wait. Return False when a servo sent bytes without being asked."""
         if t <= self._clock.now():
             return True
         bus, *_ = self._buses.values()

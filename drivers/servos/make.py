@@ -1,4 +1,4 @@
-"""A make of servos: all that the common driver has to know of it."""
+"""Properties of a servo vendor that the common driver needs."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from .settings import Setting
 
 @dataclass(frozen=True, slots=True)
 class Make:
-    """A make of servos.
+    """A servo vendor.
 
     Attributes:
         table: its table in robot.toml.
         models: by number.
-        errors: what each bit of the hardware error means, and what to do.
-        bus: a bus of its protocols.
-        channel: one servo's answers.
-        ways: of each group of servos of a bus, how it can be read, the quickest first.
-        settings: what a command may change in a model's EEPROM.
-        homing_sign: 1 where the homing offset is added to what the sensor tells, −1 where it is taken off.
-        tick_s: of the clock with which its servos stamp what they measure [s]; 0 without one.
+        errors: meaning and remedy of each bit of the hardware error.
+        bus: class of its buses.
+        channel: creates the decoder of one servo's answers.
+        ways: returns the read methods of each group of servos on a bus, the fastest first.
+        settings: returns the EEPROM settings of a model that a command may change.
+        homing_sign: 1 where the homing offset is added to the sensor's value, −1 where it is subtracted.
+        tick_s: tick of the clock with which servos stamp their measurements [s]; 0 without one.
     """
 
     table: str

@@ -1,4 +1,4 @@
-"""How a model of servo is described."""
+"""Description of a servo model."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Literal
 
 @dataclass(frozen=True, slots=True)
 class Register:
-    """Some bytes of a control table.
+    """A byte range of a control table.
 
     Attributes:
         signed: two's complement.
-        sign_bit: the bit that tells the sign where the rest is the magnitude.
-        order: of the bytes.
+        sign_bit: index of the sign bit, if the other bits are the magnitude.
+        order: byte order.
     """
 
     address: int
@@ -24,7 +24,7 @@ class Register:
     order: Literal["little", "big"] = "little"
 
     def value(self, data: bytes) -> int:
-        """The number in the register's bytes."""
+        """Return the number in the register's bytes."""
         number = int.from_bytes(data, self.order, signed=self.signed)
         if self.sign_bit is None:
             return number
@@ -32,13 +32,13 @@ class Register:
         return -magnitude if number >> self.sign_bit & 1 else magnitude
 
     def bytes(self, value: int) -> bytes:
-        """The register's bytes for a number."""
+        """Return the register's bytes for a number."""
         if self.sign_bit is not None:
             value = abs(value) | (1 << self.sign_bit if value < 0 else 0)
         return value.to_bytes(self.size, self.order, signed=self.signed)
 
     def words(self, table: bytes) -> str:
-        """The register's bytes in a control table from its beginning, each as a number, as versions are written."""
+        """Return the register's bytes in a control table, given from its start, as a dotted version number."""
         return ".".join(map(str, table[self.address : self.end]))
 
     @property
@@ -49,15 +49,15 @@ class Register:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Where a series keeps what.
+    """Register addresses of a series.
 
     Attributes:
-        protocol: the version of its make's protocol.
+        protocol: version of the vendor's protocol.
         registers: by name; the same names in all series.
-        block: what one reading asks for: the position, and what tells whether to believe it.
-        state: begins with torque; has hardware_error in it where that is a register and not the error byte.
-        ram: address of the first register that is lost with the power and never locked.
-        size: bytes of the control table.
+        block: range of one reading: the position and the values that validate it.
+        state: range that begins with torque and includes hardware_error, if that is a register and not the error byte.
+        ram: address of the first register that is volatile and never locked.
+        size: of the control table [bytes].
     """
 
     protocol: int
@@ -74,7 +74,7 @@ class Layout:
         return name in self.registers
 
     def value(self, name: str, data: bytes, address: int = 0) -> int:
-        """The number in a register; `data` is what stands from `address` on. 0 where there is no such register."""
+        """Return the number in a register, or 0 if there is no such register; `data` begins at `address`."""
         if name not in self.registers:
             return 0
         register = self.registers[name]
@@ -83,14 +83,18 @@ class Layout:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """One kind of servo.
+    """One model of servo.
 
     Attributes:
-        rad_per_tick: exactly a turn, or the sensed part of it, by its number of ticks [rad].
-        ticks_per_turn: None where the sensor does not turn on.
+        number: its model number.
+        name: as its maker writes it.
+        series: the series it belongs to.
+        layout: its register addresses.
+        rad_per_tick: a turn, or the measured range, divided by its number of ticks [rad].
+        ticks_per_turn: None for a sensor that does not wrap.
         zero_ticks: the position that its manual calls 0°, in the middle of the range.
         velocity_unit: of the register [rad/s].
-        current_unit: of the register [A]; None where there is no such sensor (the register then shows the load).
+        current_unit: of the register [A]; None without such a sensor (the register then shows the load).
     """
 
     number: int
@@ -105,10 +109,10 @@ class Model:
 
     @property
     def protocol(self) -> int:
-        """The version of its make's protocol that it speaks."""
+        """Version of the vendor's protocol that it speaks."""
         return self.layout.protocol
 
 
 def no_driver(name: str) -> str:
-    """What to say of a model that is known, and that no driver reads."""
+    """Return the message for a known model without a driver."""
     return f"no driver reads an {name}: its control table is not that of other servos. Take another model"

@@ -1,4 +1,4 @@
-"""What a bus needs of a protocol: instructions put together, status packets taken apart."""
+"""Interface of a packet codec: build instructions, parse status packets."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Protocol
 
 
 class Garbled(Exception):
-    """These bytes are no intact status packet."""
+    """Raised for bytes that are not an intact status packet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,10 +15,10 @@ class Status:
     """A servo's answer.
 
     Attributes:
-        id: who says that it is from them.
-        error: the error byte as it came.
+        id: the sender's ID as received.
+        error: the error byte as received.
         data: without stuffing.
-        size: bytes on the wire.
+        size: on the wire [bytes].
     """
 
     id: int
@@ -28,14 +28,14 @@ class Status:
 
 
 class Packets(Protocol):
-    """One version of a make's protocol.
+    """One version of a vendor's protocol.
 
     Attributes:
-        overhead: bytes of a status packet besides its data.
-        ping_size: bytes of data in the answer to PING.
-        refusals: bits of the error byte with which a servo refuses the question; the others tell of its health.
-        is_weak: the checksum lets one in 256 wrong answers through, and no servo's clock tells of late ones.
-        pinged_only: what is to be said of a servo that answers PING but no READ.
+        overhead: size of a status packet without its data [bytes].
+        ping_size: data bytes in the answer to PING.
+        refusals: bits of the error byte with which a servo rejects the request; the others report its health.
+        is_weak: the checksum lets one in 256 wrong answers through, and no servo clock reveals late ones.
+        pinged_only: message for a servo that answers PING but no READ.
     """
 
     overhead: int
@@ -45,19 +45,19 @@ class Packets(Protocol):
     pinged_only: str
 
     def ping(self, id: int) -> bytes:
-        """PING."""
+        """Build PING."""
         ...
 
     def read(self, id: int, address: int, size: int) -> bytes:
-        """READ."""
+        """Build READ."""
         ...
 
     def write(self, id: int, address: int, data: bytes) -> bytes:
-        """WRITE."""
+        """Build WRITE."""
         ...
 
     def take(self, received: bytes | bytearray, at: int) -> Status | None:
-        """The status packet that begins at `at`; None when it is not complete. Raises Garbled when there is none."""
+        """Return the status packet that begins at `at`; None when it is incomplete. Raise Garbled if there is none."""
         ...
 
 
@@ -65,7 +65,7 @@ HEADER, LARGEST_ID = b"\xff\xff", 0xFD
 
 
 def take_summed(received: bytes | bytearray, at: int) -> Status | None:
-    """As `Packets.take`, of the older protocols: two bytes 0xFF, ID, length, error, data, inverted sum."""
+    """Implement `Packets.take` for the older protocols: two bytes 0xFF, ID, length, error, data, inverted sum."""
     head = bytes(received[at : at + 4])
     if not HEADER.startswith(head[:2]) or (len(head) > 2 and head[2] > LARGEST_ID):
         raise Garbled

@@ -1,4 +1,4 @@
-"""With which questions the positions of a bus are read."""
+"""Select the requests with which the positions of a bus are read."""
 
 from __future__ import annotations
 
@@ -7,18 +7,17 @@ from dataclasses import dataclass
 
 from .bus import Bus, Request
 
-ATTEMPTS = 5  # where one servo of six loses every twentieth answer, all five fail for one in 700 openings
+ATTEMPTS = 5  # if one of six servos loses every twentieth answer, all five fail in one of 700 openings
 
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """One way to read a group of servos.
+    """One method of reading a group of servos.
 
     Attributes:
-        name: for people.
-        requests: its questions.
-        complaint: what is wrong when the group does not answer to it, though all its servos should; None: some do not
-            know it.
+        name: for messages.
+        requests: its requests.
+        complaint: what is wrong when the group fails to answer, though all its servos support it; None: some may not.
     """
 
     name: str
@@ -27,35 +26,36 @@ class Way:
 
 
 class Plan:
-    """The way in which each group of servos of a bus is read: the quickest that all of the group answer to."""
+    """The fastest read method that works, for each group of servos of a bus."""
 
     def __init__(self, bus: Bus, groups: Sequence[Sequence[Way]]) -> None:
-        """Try each group's ways, several times each, but for the last, which is taken as it is.
+        """Try each group's methods several times each. The last one is taken without a try.
 
         Args:
-            groups: of each the ways, the quickest first.
+            bus: the bus.
+            groups: the methods of each group, the fastest first.
         """
         self._bus, self._groups = bus, groups
         self._taken = [self._first_answered(ways, ATTEMPTS) for ways in groups]
 
     @property
     def requests(self) -> list[Request]:
-        """The questions of one reading."""
+        """The requests of one reading."""
         return [request for way in self._ways for request in way.requests]
 
     @property
     def name(self) -> str:
-        """The ways that are taken, for people."""
+        """Names of the methods in use."""
         return ", ".join(dict.fromkeys(way.name for way in self._ways))
 
     @property
     def complaints(self) -> list[str]:
-        """What is wrong where a slower way is taken than the servos know."""
+        """Problems of groups that are read with a slower method than they support."""
         slower = [way for ways, taken in zip(self._groups, self._taken, strict=True) for way in ways[:taken]]
         return [way.complaint for way in slower if way.complaint is not None]
 
     def improve(self) -> bool:
-        """Try the quicker ways of each group once; return True when one is taken from now on."""
+        """Try the faster methods of each group once. Return True if one is used from now on."""
         before = self._taken
         pairs = zip(self._groups, self._taken, strict=True)
         self._taken = [self._first_answered(ways[: taken + 1], 1) for ways, taken in pairs]

@@ -1,4 +1,4 @@
-"""What a bus needs of a serial port."""
+"""Interface of a serial port as a bus uses it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Protocol
 
 
 class Port(Protocol):
-    """An open serial port; `bodyschema.drivers.serial_line.SerialLine`, or a bench's."""
+    """An open serial port: `bodyschema.drivers.serial_line.SerialLine`, or an emulated one."""
 
     @property
     def baud(self) -> int:
@@ -14,17 +14,17 @@ class Port(Protocol):
         ...
 
     def write(self, data: bytes) -> None:
-        """Send `data`; BusLost when the port is gone."""
+        """Send `data`. Raise BusLost when the port is gone."""
         ...
 
     def receive(self, until: float) -> bytes:
-        """What has arrived, else what arrives next; nothing when that is not before `until` on the clock."""
+        """Return what has arrived, else what arrives next; empty when nothing arrives before `until` on the clock."""
         ...
 
     def flush(self) -> None:
-        """Forget what has arrived."""
+        """Discard what has arrived."""
         ...
 
     def close(self) -> None:
-        """Give it free."""
+        """Release the port."""
         ...

@@ -1,4 +1,4 @@
-"""Finds servos at whatever rate: asks each ID, and who answers what it is and how it is. Writes to no register."""
+"""Scan for servos by asking each ID, then read identity and state of those that answer. Writes to no register."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from .model import Model, Register, no_driver
 from .packets import Garbled, Packets, Status
 
 IDS = range(253)
-HOST_S = 5e-3  # the operating system's part of an answer's delay
-APART_S = 1e-3  # between two questions at least
+HOST_S = 5e-3  # the operating system's share of an answer's delay
+APART_S = 1e-3  # shortest time between two requests
 ATTEMPTS = 5
 VOLT_PER_UNIT = 0.1
-OVERHEAD_OF_PING = 6  # bytes of the question in the older protocols
+OVERHEAD_OF_PING = 6  # bytes of the request in the older protocols
 
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A make of servos, or those of its servos that speak one version of its protocol.
+    """A servo vendor, or its servos with one version of its protocol.
 
     Attributes:
         name: in words.
         bauds: rates that robot.toml can name [bit/s].
-        version: of its make's protocol.
+        version: of the vendor's protocol.
         models: by number.
-        errors: what each bit of the hardware error means, and what to do.
-        bus: a bus of its protocols.
-        unsupported: names by number of models that no driver reads, since their control table is another one.
+        errors: meaning and remedy of each bit of the hardware error.
+        bus: class of its buses.
+        unsupported: names by number of models without a driver, because their control table differs.
     """
 
     name: str
@@ -44,11 +44,11 @@ class Kind:
 
     @property
     def packets(self) -> Packets:
-        """How to speak to it."""
+        """The packet codec."""
         return self.bus.packets_of(self.version)
 
     def told(self, head: bytes, id: int) -> Identity | None:
-        """Who the servo of this ID is by the beginning of its control table; None when it is none of this kind."""
+        """Identify the servo by the start of its control table; None when it is not of this kind."""
         layouts = {model.layout.protocol: model.layout for model in self.models.values()}
         of_id = [layout for layout in layouts.values() if layout.value("id", head) == id]
         for layout in of_id:
@@ -62,7 +62,7 @@ class Kind:
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Who a servo says that it is; `model` is None when it is not known."""
+    """Identity of a servo; `model` is None when it is unknown."""
 
     kind: Kind
     model: Model | None
@@ -71,37 +71,37 @@ class Identity:
 
 
 class PingScanner:
-    """Finds servos of kinds whose PING is the same, to the bytes (a `Scanner`).
+    """Scanner for servos of kinds whose PING is identical (a `Scanner`).
 
-    Each ID is asked. The questions do not wait for the answers, which carry an ID; where something comes that cannot be
-    understood, each is asked by itself. What kind it is, the beginning of its control table tells.
+    Each ID is asked. The requests do not wait for the answers, which carry an ID. If an answer is unintelligible, each
+    ID is asked by itself. The start of the control table identifies the kind.
     """
 
     def __init__(self, *kinds: Kind, question: int = OVERHEAD_OF_PING) -> None:
-        """For `kinds`, whose PING has `question` bytes."""
+        """Scan for `kinds`, whose PING has `question` bytes."""
         self._kinds, self._packets = kinds, kinds[0].packets
         self._ping_sizes = (question, self._packets.overhead + self._packets.ping_size)
 
     @property
     def protocol(self) -> str:
-        """Its name."""
+        """Names of the protocols."""
         return " and ".join(kind.name for kind in self._kinds)
 
     @property
     def bauds(self) -> Sequence[int]:
-        """Rates that robot.toml can name for one of them, the likely ones first [bit/s]."""
+        """Baud rates that robot.toml can name for one of them, likely ones first [bit/s]."""
         return tuple(dict.fromkeys(baud for kind in self._kinds for baud in kind.bauds))
 
     def scan(self, name: str, port: ScannedPort, clock: Clock, latency_s: float) -> Iterator[FoundServo]:
-        """The servos on the port; see `Scanner.scan`."""
+        """Yield the servos on the port; see `Scanner.scan`."""
         ids = set(self._ids(port, clock, latency_s))
-        if ids:  # where there is one there may be others, and an answer may be lost
+        if ids:  # where there is one there may be others whose answers were lost
             ids.update(self._ids(port, clock, latency_s))
         for id in sorted(ids):
             yield self._found(name, port, clock, latency_s, id)
 
     def _ids(self, port: ScannedPort, clock: Clock, latency_s: float) -> list[int]:
-        """Who answers when each is asked. An ID whose answers are not understood counts when it is asked again."""
+        """Return the IDs that answer. An ID with unintelligible answers counts if it answers again when asked alone."""
         port.flush()
         spacing = self._spacing_s(port.baud)
         received = b""
@@ -115,11 +115,11 @@ class PingScanner:
         return sorted(ids if is_clean else ids | self._unclear(port, clock, latency_s, ids))
 
     def _spacing_s(self, baud: int) -> float:
-        """Time between two questions, so that the answer to the first is over."""
+        """Return the time between two requests [s], so that the answer to the first has ended."""
         return max(sum(self._ping_sizes) * BITS_PER_BYTE / baud + SLOWEST_DELAY_S, APART_S)
 
     def _unclear(self, port: ScannedPort, clock: Clock, latency_s: float, known: set[int]) -> set[int]:
-        """Who answers something, asked one after the other."""
+        """Return the IDs that answer anything, asked one by one."""
         wait_s = sum(self._ping_sizes) * BITS_PER_BYTE / port.baud + SLOWEST_DELAY_S + 2 * latency_s + HOST_S
         found = set[int]()
         for id in IDS:
@@ -132,7 +132,7 @@ class PingScanner:
         return found
 
     def _statuses(self, received: bytes) -> tuple[list[Status], bool]:
-        """The answers in what was heard, and whether there was nothing else."""
+        """Return the answers in the received bytes, and True if there was nothing else."""
         statuses: list[Status] = []
         at, is_clean = 0, True
         while at < len(received):
@@ -148,7 +148,7 @@ class PingScanner:
         return statuses, is_clean
 
     def _found(self, name: str, port: ScannedPort, clock: Clock, latency_s: float, id: int) -> FoundServo:
-        """The servo with what it tells of itself."""
+        """Return the servo with its identity and state."""
         kind = self._kinds[0]
         servo, bus = FoundServo(name, port.baud, self.protocol, id), kind.bus(name, port, clock, latency_s)
         head = _asked(bus, kind, id, self._head)
@@ -171,12 +171,12 @@ class PingScanner:
 
     @property
     def _head(self) -> Register:
-        """The part of the control table that tells who it is."""
+        """The part of the control table that identifies the servo."""
         layouts = [model.layout for kind in self._kinds for model in kind.models.values()]
         return Register(0, max(layout[name].end for layout in layouts for name in ("model", "firmware", "id")))
 
     def _identity(self, head: bytes, id: int) -> Identity | None:
-        """Of several kinds that it may be, the one that has such a model."""
+        """Return the identity from the first kind that knows the model, else from the first possible kind."""
         told = [identity for kind in self._kinds if (identity := kind.told(head, id)) is not None]
         known = [identity for identity in told if identity.model is not None]
         return next(iter([*known, *told]), None)
@@ -186,7 +186,7 @@ def _with_state(bus: Bus, servo: FoundServo, kind: Kind, model: Model) -> FoundS
     layout = model.layout
     first, last = layout["torque"].address, layout["temperature"].end
     told = _asked(bus, kind, servo.id, Register(first, last - first))
-    if told.trouble is not None:  # two of one model say the same until they are asked for what differs
+    if told.trouble is not None:  # two servos of one model give the same answers until registers that differ are read
         return replace(servo, is_double=True, troubles=(DOUBLE,))
     status = told.answers[0].status
     has_register = "hardware_error" in layout
@@ -210,7 +210,7 @@ def _asked(bus: Bus, kind: Kind, id: int, register: Register) -> Exchange:
         exchange = bus.ask(request)
         if exchange.trouble is None:
             break
-        if exchange.trouble is not Trouble.TIMEOUT:  # what a busy machine has read late belongs to an earlier question
+        if exchange.trouble is not Trouble.TIMEOUT:  # on a busy machine bytes read late belong to an earlier request
             bus.settle()
     return exchange
 
@@ -220,7 +220,7 @@ UNKNOWN = "a model that no driver knows"
 
 
 def heard(port: ScannedPort, clock: Clock, end: float, enough: int | None = None) -> bytes:
-    """What comes until `end`; with `enough` only until there are so many bytes."""
+    """Return what arrives until `end`; with `enough` stop after this many bytes."""
     received = b""
     while clock.now() < end and (enough is None or len(received) < enough):
         received += port.receive(end)

@@ -1,4 +1,4 @@
-"""What a command may change in a servo's EEPROM."""
+"""EEPROM settings of a servo that a command may change."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ ID, BAUD, HOMING_OFFSET = "id", "baud", "homing_offset"
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """A number that a servo keeps without power.
+    """A number in a servo's EEPROM.
 
     Attributes:
-        lowest, highest: what it may be.
-        words: names of values. Where there are some, no other value is one.
-        per_unit, unit: what one of it means, for people; no unit: it is a mere number.
-        follows: what a change of it means for an arm that is calibrated.
+        name: for commands.
+        register: where it is stored.
+        lowest, highest: its bounds.
+        words: named values. If there are any, no other value is allowed.
+        per_unit, unit: value and unit of one count, for display; no unit: a plain number.
+        follows: consequence of a change for a calibrated arm.
     """
 
     name: str
@@ -34,10 +36,10 @@ class Setting:
     follows: str = ""
 
     def value(self, text: str) -> int:
-        """What the user wrote, as a number.
+        """Parse the user's value.
 
         Raises:
-            ConfigError: it is none, or out of range.
+            ConfigError: not a value of this setting, or out of range.
         """
         if text in self.words:
             return self.words[text]
@@ -53,7 +55,7 @@ class Setting:
         return value
 
     def shown(self, value: int) -> str:
-        """A value for people, as "250 (500 µs)"."""
+        """Format a value for display, as "250 (500 µs)"."""
         word = next((word for word, known in self.words.items() if known == value), "")
         if self.name == BAUD:
             return f"{int(word):,} bit/s" if word else f"{value} (unknown rate)"
@@ -63,7 +65,7 @@ class Setting:
 
     @property
     def range(self) -> str:
-        """What may be given, in words."""
+        """Allowed values, in words."""
         if self.name == BAUD:
             return f"Give one of {', '.join(self.words)}"
         if self.words:
@@ -72,7 +74,7 @@ class Setting:
 
 
 def setting_called(name: str, settings: Mapping[str, Setting], model: str) -> Setting:
-    """The one of that name; ConfigError when the model's EEPROM has none that may be written."""
+    """Return the setting of that name. Raise ConfigError when the model's EEPROM has none that may be written."""
     if name not in settings:
         what = f"{model} has no setting {name!r} that may be written"
         raise ConfigError(what, remedy=did_you_mean(name, settings))

@@ -1,4 +1,4 @@
-"""The Dynamixel servos that a robot.toml describes, on a bench."""
+"""Emulate the Dynamixel servos of a robot.toml."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ OTHER_BAUD = {57600: 1_000_000}  # any other rate: 57600
 
 
 class DynamixelArm(ServoArm[Servo, DynamixelConfig]):
-    """Dynamixel servos as they are configured; see `ServoArm`.
+    """Dynamixel servos as configured; see `ServoArm`.
 
-    Joints of the gaze stand where they would be at the beginning, and go where their servos turn them.
+    Joints of the gaze begin at their start position and follow their servos.
     """
 
     kinds, errors = KINDS, ERRORS
@@ -47,7 +47,7 @@ class DynamixelArm(ServoArm[Servo, DynamixelConfig]):
     def _begin(self, kind: str, joint: str) -> None:
         servo = self.servo(joint)
         if kind == "torque":
-            servo["goal"] = servo.position(self._now())  # it holds where it is
+            servo["goal"] = servo.position(self._now())  # it holds its present position
         super()._begin(kind, joint)
 
     def _change_rate(self, servo: Servo) -> None:

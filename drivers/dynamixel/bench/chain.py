@@ -1,4 +1,4 @@
-"""Servos on one wire: bytes in, bytes with times out."""
+"""Emulated Dynamixel servos on one wire: bytes in, timed bytes out."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .servo import Servo
 
 __all__ = ["Chain", "no_faults"]
 
-PING_SLOT_S = 3e-3  # in answer to a broadcast PING each ID has its time
+PING_SLOT_S = 3e-3  # each ID has its time slot to answer a broadcast PING
 
 
 class Chain(ServoChain[Servo]):
@@ -127,12 +127,12 @@ class Chain(ServoChain[Servo]):
         return self._in_one(servos, [(id, address, size) for id in instruction.params[4:]], t)
 
     def _in_one(self, servos: list[Servo], parts: list[tuple[int, int, int]], t: float) -> list[Reply]:
-        """The common answer of servos, of ID, address and size each."""
+        """Return the common answer of servos, given ID, address and size of each."""
         packet = fast_header([size for _, _, size in parts])
         start = now = t
         for place, (id, address, size) in enumerate(parts):
             there = [s for s in servos if s.id == id and s.fast and s["status_return"] > 0]
-            if not there:  # whoever comes after a missing one does not know that it is its turn
+            if not there:  # a servo behind a missing one does not know when its turn comes
                 return [Reply(parts[0][0], start, packet)] if place else []
             if place == 0:
                 start = t + there[0].return_delay_s
@@ -168,13 +168,13 @@ _ONLY2 = (Code.SYNC_READ, Code.FAST_SYNC_READ, Code.FAST_BULK_READ, Code.BULK_WR
 
 
 def _bulk_parts(params: bytes) -> list[tuple[int, int, int]]:
-    """ID, address and size of each servo that a BULK_READ of Protocol 2.0 asks."""
+    """Return ID, address and size of each servo addressed by a BULK_READ of Protocol 2.0."""
     parts = (params[k : k + 5] for k in range(0, len(params) - 4, 5))
     return [(part[0], _number(part[1:3]), _number(part[3:5])) for part in parts]
 
 
 def _is_for(instruction: Instruction, id: int) -> bool:
-    """Whether it is for this servo: to its ID, to all, or to a list that it is in."""
+    """Return True if the instruction addresses this servo: by its ID, by broadcast, or in a list."""
     if instruction.id != BROADCAST or instruction.code not in _LISTS:
         return instruction.id in (id, BROADCAST)
     wide, params = instruction.protocol, instruction.params

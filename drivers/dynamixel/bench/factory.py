@@ -1,8 +1,8 @@
-"""What stands in the control table of a new servo.
+"""Control table contents of a new Dynamixel servo.
 
 Source: ROBOTIS e-Manual, "Control Table of EEPROM Area" and "... of RAM Area" of AX-12A, MX-12W, MX-28, MX-28(2.0),
 MX-64(2.0), XL330-M077 and -M288, XC330-M288 and -T288, XL430-W250, XM430-W210 and -W350, XM540-W270, PH42-020-S300 and
-PH54-200-S500. Other models have the values of the one of these that is most like them.
+PH54-200-S500. Other models have the values of the most similar of these.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ Values = tuple[tuple[int, int, int], ...]
 
 @dataclass(frozen=True, slots=True)
 class Factory2:
-    """Values of Protocol 2.0, as the registers count; those of the X430 by default.
+    """Register values of Protocol 2.0; those of the X430 by default.
 
     Attributes:
         positions: limits [ticks]; None: a turn around the middle.
         ports: number of external ports.
         gains: I and P of the velocity, D, I and P of the position.
-        supply: what it is made for [0.1 V].
+        supply: rated supply voltage [0.1 V].
     """
 
     threshold: int = 10
@@ -41,7 +41,7 @@ class Factory2:
     supply: int = 120
 
     def values(self, model: Model) -> Values:
-        """All of them."""
+        """Return address, size and value of all registers."""
         half = (model.ticks_per_turn or 0) // 2
         lowest, highest = self.positions or (model.zero_ticks - half, model.zero_ticks + half)
         first_gain = model.layout["torque"].address + 12
@@ -67,7 +67,7 @@ class Factory2:
 
 
 _P = {"threshold": 20, "voltages": (150, 350), "pwm": 2009, "ports": 4, "supply": 240}
-# The first of the names with which a model's begins counts.
+# The first entry that a model's name starts with applies.
 FACTORY2 = {
     "XM430-W210": Factory2(velocity=330),
     "XM540": Factory2(current=2047, velocity=128, ports=3),
@@ -117,7 +117,7 @@ FACTORY2 = {
         velocity=2920,
         positions=(-303_454, 303_454),
         shutdown=58,
-        gains=(0, 0, 0, 0, 0),  # not told
+        gains=(0, 0, 0, 0, 0),  # not documented
     ),
     "PH54": Factory2(
         **_P,
@@ -141,14 +141,14 @@ FACTORY1: dict[str, Values] = {
 
 
 def factory_values(model: Model) -> Values:
-    """Return what differs from 0 in the control table of a new servo of this model."""
+    """Return the nonzero registers of a new servo of this model."""
     if model.protocol == 1:
         return next(values for name, values in FACTORY1.items() if model.name.startswith(name))
     return next(factory for name, factory in FACTORY2.items() if model.name.startswith(name)).values(model)
 
 
 def indirect_blocks(model: Model) -> tuple[tuple[int, int, int], ...]:
-    """Return the blocks of Indirect Addresses and Indirect Data: where both begin, and how many there are."""
+    """Return address of Indirect Address, address of Indirect Data and count, for each block."""
     if model.protocol == 1:
         return ()
     if model.layout is LAYOUT_P:

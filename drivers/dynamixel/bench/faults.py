@@ -1,4 +1,4 @@
-"""What can go wrong with an answer on its way, of Dynamixel servos; see `bodyschema.drivers.bench.faults`."""
+"""Faults of a Dynamixel answer in transit; see `bodyschema.drivers.bench.faults`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .frames import HEADER2
 
 
 def swapped(reply: Reply, rng: Random) -> Reply:
-    """It carries another ID, with a checksum that fits."""
+    """Replace the ID by another one, with a matching checksum."""
     other = (reply.id + rng.choice((-1, 1))) % 253
     data = bytearray(reply.data)
     if data[:4] == HEADER2:
@@ -27,5 +27,5 @@ def swapped(reply: Reply, rng: Random) -> Reply:
 
 
 def storm(intensity: float, rng: Random, longest_late_s: float = 0.05) -> Storm:
-    """All of them in equal shares; `intensity` is the probability that an answer suffers one."""
+    """Mix all faults in equal shares; `intensity` is the probability that an answer is affected."""
     return faults.storm(intensity, rng, swapped, longest_late_s=longest_late_s)

@@ -1,4 +1,4 @@
-"""What runs over the wire: instruction packets taken apart, status packets put together."""
+"""Parse instruction packets and build status packets."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Code(IntEnum):
 
 
 class Error(IntEnum):
-    """What a status packet of Protocol 2.0 complains of."""
+    """Error numbers in a status packet of Protocol 2.0."""
 
     NONE = 0
     RESULT = 1
@@ -49,7 +49,7 @@ class Error(IntEnum):
 
 
 ALERT = 0x80
-ERRORS1 = {Error.INSTRUCTION: 0x40, Error.CRC: 0x10}  # the rest is 0x08, out of range, in Protocol 1.0
+ERRORS1 = {Error.INSTRUCTION: 0x40, Error.CRC: 0x10}  # in Protocol 1.0 all others are 0x08, out of range
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class Instruction:
     Attributes:
         params: without stuffing.
         intact: the checksum is right.
-        end: bytes of the stream up to its last.
+        end: offset in the stream just behind its last byte.
     """
 
     protocol: Protocol
@@ -71,7 +71,7 @@ class Instruction:
 
 
 def instructions_in(stream: bytearray) -> tuple[list[Instruction], int]:
-    """All complete instruction packets in `stream`, and how many of its bytes need not be seen again."""
+    """Return all complete instruction packets in `stream`, and the number of bytes consumed."""
     found: list[Instruction] = []
     at = 0
     while True:
@@ -92,7 +92,7 @@ def instructions_in(stream: bytearray) -> tuple[list[Instruction], int]:
 
 
 def _size(stream: bytearray, at: int) -> int | None:
-    """Bytes of the packet that begins at `at`: 0 when none does, None when that cannot be told yet."""
+    """Return the size of the packet that begins at `at` [bytes]: 0 if none does, None if more bytes are needed."""
     head = stream[at : at + 7]
     if len(head) < 4:
         return None
@@ -116,7 +116,7 @@ def _instruction(packet: bytes, end: int) -> Instruction:
 
 
 def status_packet(protocol: int, id: int, error: int, params: bytes) -> bytes:
-    """A servo's answer."""
+    """Build a servo's answer."""
     if protocol == 1:
         body = bytes((id, len(params) + 2, error)) + params
         return HEADER1 + body + bytes((~sum(body) & 0xFF,))
@@ -127,12 +127,12 @@ def status_packet(protocol: int, id: int, error: int, params: bytes) -> bytes:
 
 
 def fast_header(sizes: Sequence[int]) -> bytes:
-    """How the common answer to FAST_SYNC_READ and FAST_BULK_READ begins, of servos that give so many bytes each."""
+    """Build the start of the answer to FAST_SYNC_READ and FAST_BULK_READ; `sizes` are the data bytes per servo."""
     length = 1 + sum(size + 4 for size in sizes)
     return HEADER2 + bytes((BROADCAST,)) + length.to_bytes(2, "little") + bytes((STATUS,))
 
 
 def fast_block(before: bytes, id: int, error: int, params: bytes) -> bytes:
-    """One servo's part of it, with the checksum of all that is on the wire by then; not stuffed."""
+    """Build one servo's part of it, unstuffed, with the checksum of everything on the wire so far."""
     block = bytes((error, id)) + params
     return block + crc16(before + block).to_bytes(2, "little")

@@ -1,4 +1,4 @@
-"""One servo: its control table, and the rules by which it changes."""
+"""Emulate one Dynamixel servo: its control table and the rules by which it changes."""
 
 from __future__ import annotations
 
@@ -56,16 +56,16 @@ RAM_OF_FACTORY = ("status_return", "temperature")
 
 
 class Servo:
-    """A servo on a bench.
+    """An emulated servo.
 
-    The shaft is wherever `angle` says. What the servo does about it, `motor_current` and `held_at` tell: an `angle`
-    that follows these moves as a real arm would.
+    The shaft angle is given by `angle`. The servo's action on the shaft is reported by `motor_current` and `held_at`:
+    an `angle` that follows these moves as a real arm would.
 
     Attributes:
-        model: what it is.
-        glitch_ticks: the encoder is wrong by this.
-        excess_a: it draws so much more than it regulates [A].
-        fast: it knows FAST_SYNC_READ.
+        model: its model.
+        glitch_ticks: error of the encoder [ticks].
+        excess_a: current drawn above the regulated one [A].
+        fast: it supports FAST_SYNC_READ.
     """
 
     def __init__(
@@ -79,11 +79,16 @@ class Servo:
         booted_s: float = 0.0,
         fast: bool = True,
     ) -> None:
-        """A servo as it leaves the factory, but for the arguments.
+        """Create a servo with factory settings, except for the arguments.
 
         Args:
-            angle: where its shaft is at a time [s]: [rad], 0 in the middle of its range, any number of turns.
-            booted_s: when it got its power.
+            model: its model.
+            id: on the bus.
+            angle: shaft angle [rad] as a function of time [s]; 0 in the middle of its range, any number of turns.
+            baud: bits per second.
+            return_delay_s: delay between instruction and answer.
+            booted_s: time of power-up.
+            fast: it supports FAST_SYNC_READ.
         """
         self.model, self.fast = model, fast
         self.glitch_ticks, self.excess_a = 0, 0.0
@@ -106,39 +111,39 @@ class Servo:
         self._fold(booted_s)
 
     def __getitem__(self, name: str) -> int:
-        """The number in a register."""
+        """Return the value of a register."""
         address, end, signed = self._places[name]
         if end == address + 1 and not signed:
             return self._memory[address]
         return int.from_bytes(self._memory[address:end], "little", signed=signed)
 
     def __setitem__(self, name: str, value: int) -> None:
-        """Put a number into a register as the servo itself does, past all locks."""
+        """Write a register as the servo itself does, bypassing all locks."""
         address, end, signed = self._places[name]
         self._memory[address:end] = value.to_bytes(end - address, "little", signed=signed)
 
     @property
     def id(self) -> int:
-        """Its number on the bus."""
+        """ID on the bus."""
         return self["id"]
 
     @property
     def baud(self) -> int:
-        """The rate at which it listens [bit/s]."""
+        """Baud rate of the servo [bit/s]."""
         return baud_of(self.model.layout, self["baud"])
 
     @property
     def return_delay_s(self) -> float:
-        """How long it waits before it answers."""
+        """Delay between instruction and answer [s]."""
         return self["return_delay"] * TICKS_PER_REPLY_DELAY_US * 1e-6
 
     @property
     def hardware_error(self) -> int:
-        """Bits of what is wrong with it."""
+        """Hardware error bits."""
         return self._error1 if self.model.protocol == 1 else self["hardware_error"]
 
     def fail(self, bits: int) -> None:
-        """Something is wrong with it, until it is rebooted; torque goes off where `shutdown` says so."""
+        """Report a hardware error until the servo is rebooted. Torque goes off if `shutdown` includes it."""
         if self.model.protocol == 1:
             self._error1 |= bits
         else:
@@ -147,16 +152,16 @@ class Servo:
             self["torque"] = 0
 
     def angle(self, t: float) -> float:
-        """Where its shaft is at `t` [rad]."""
+        """Return the shaft angle at `t` [rad]."""
         return self._angle(t)
 
     def hear(self, t: float) -> None:
-        """An instruction for it was on the wire at `t`."""
+        """Note that an instruction for the servo arrived at `t`."""
         self._look_at_watchdog(t)
         self._heard_s = t
 
     def motor_current(self, t: float) -> float:
-        """The current that it regulates at `t` [A], positive where it turns the shaft forward; 0 in other modes."""
+        """Return the regulated motor current at `t` [A], positive if it turns the shaft forward; 0 in other modes."""
         self._look_at_watchdog(t)
         unit = self.model.current_unit
         if unit is None or not self["torque"] or self["watchdog"] == FIRED:
@@ -166,7 +171,7 @@ class Servo:
         return (-1 if self._is_reversed else 1) * self["goal_current"] * unit
 
     def held_at(self, t: float) -> float | None:
-        """The shaft's angle to which it turns and where it stays [rad]; None where it holds nothing."""
+        """Return the shaft angle that the servo moves to and holds [rad]; None if it holds nothing."""
         self._look_at_watchdog(t)
         if not self["torque"] or not self._is_in_position_mode:
             return None
@@ -176,9 +181,9 @@ class Servo:
         return ((-ticks if self._is_reversed else ticks) - self.model.zero_ticks) * self.model.rad_per_tick
 
     def _look_at_watchdog(self, t: float) -> None:
-        """Without an instruction for long enough it stops, and takes no goal any more (e-Manual, Bus Watchdog).
+        """Stop the servo if no instruction arrived for too long (e-Manual, Bus Watchdog).
 
-        In current control it is free then, in position control it stays where it is.
+        It accepts no further goals. In current control the shaft is free then, in position control it is held in place.
         """
         if self.model.protocol == 1 or not self["torque"] or self["watchdog"] <= 0:
             return
@@ -187,7 +192,7 @@ class Servo:
             self["watchdog"] = FIRED
 
     def count(self, t: float) -> int:
-        """What its encoder counts at `t`, turns included, since ever."""
+        """Return the encoder's absolute count at `t`, including turns."""
         model = self.model
         ticks = round(self._angle(t) / model.rad_per_tick) + model.zero_ticks
         if model.ticks_per_turn is None:
@@ -195,7 +200,7 @@ class Servo:
         return -ticks if self._is_reversed else ticks
 
     def position(self, t: float) -> int:
-        """Present Position at `t` [ticks]."""
+        """Return Present Position at `t` [ticks]."""
         counted = self.count(t) + self.glitch_ticks
         if self.model.protocol == 1:
             turn = self.model.ticks_per_turn
@@ -203,7 +208,7 @@ class Servo:
         return counted - self._base + self["homing_offset"]
 
     def read(self, address: int, size: int, t: float) -> tuple[Error, bytes]:
-        """Bytes of the control table at `t`."""
+        """Read bytes of the control table at `t`."""
         if address + size > len(self._memory) or size == 0:
             return Error.ACCESS, b""
         block, places = self.model.layout.block, self.places(address, size)
@@ -212,7 +217,7 @@ class Servo:
         return Error.NONE, bytes(self._memory[place] for place in places)
 
     def places(self, address: int, size: int) -> list[int]:
-        """Return the addresses that are meant: those of Indirect Data are where their Indirect Address points."""
+        """Return the effective addresses: those of Indirect Data are where their Indirect Address points."""
         places = list(range(address, address + size))
         if address + size <= self._first_indirect:
             return places
@@ -222,7 +227,7 @@ class Servo:
         return places
 
     def write(self, address: int, data: bytes, t: float) -> Error:
-        """Change bytes of the control table, where that is allowed."""
+        """Write bytes of the control table where that is allowed."""
         for begin, part in self._runs(address, data):
             error = self._write(begin, part, t)
             if error is not Error.NONE:
@@ -230,7 +235,7 @@ class Servo:
         return Error.NONE if data else Error.ACCESS
 
     def _runs(self, address: int, data: bytes) -> list[tuple[int, bytes]]:
-        """Return the bytes in pieces that are meant for addresses one after the other."""
+        """Split the bytes into runs of consecutive effective addresses."""
         places = self.places(address, len(data))
         begins = [k for k in range(len(places)) if k == 0 or places[k] != places[k - 1] + 1]
         return [(places[k], data[k:end]) for k, end in zip(begins, [*begins[1:], len(data)], strict=True)]
@@ -240,7 +245,7 @@ class Servo:
         if error is not Error.NONE:
             return error
         had_torque, mode = self["torque"], self._mode
-        self._angle(t)  # up to now the shaft has moved by what was there
+        self._angle(t)  # up to now the shaft has moved by the old values
         self._memory[address : address + len(data)] = data
         if self._mode != mode and "current_limit" in self.model.layout:
             self["goal_current"] = self["current_limit"]  # e-Manual, Operating Mode
@@ -249,14 +254,14 @@ class Servo:
         return Error.NONE
 
     def register_write(self, address: int, data: bytes) -> Error:
-        """Keep a write for ACTION."""
+        """Store a write for ACTION."""
         error = self._refusal(address, data)
         if error is Error.NONE:
             self._registered = (address, data)
         return error
 
     def action(self, t: float) -> Error:
-        """Do the write that was kept."""
+        """Execute the stored write."""
         if self._registered is None:
             return Error.RESULT
         address, data = self._registered
@@ -264,7 +269,7 @@ class Servo:
         return self.write(address, data, t)
 
     def reboot(self, t: float) -> None:
-        """As by a power cycle: what stands in RAM is lost, and so is the number of turns."""
+        """Restart as after a power cycle: RAM contents and the number of turns are lost."""
         fresh = bytearray(len(self._memory))
         fresh[: self.model.layout.ram] = self._memory[: self.model.layout.ram]
         self._memory = fresh
@@ -280,7 +285,7 @@ class Servo:
         self._fold(t)
 
     def factory_reset(self, option: int, t: float) -> Error:
-        """0xFF: everything; 1: all but the ID; 2: all but ID and baud rate."""
+        """Restore factory values: 0xFF: all; 1: all but the ID; 2: all but ID and baud rate."""
         if option not in (0xFF, 1, 2):
             return Error.RANGE
         kept = {1: ("id",), 2: ("id", "baud")}.get(option, ())
@@ -292,7 +297,7 @@ class Servo:
         return Error.NONE
 
     def clear_turns(self, t: float) -> Error:
-        """CLEAR: the position is within one turn again; refused while torque is on."""
+        """Execute CLEAR: reduce the position to one turn. Refused while torque is on."""
         if self["torque"]:
             return Error.ACCESS
         self._fold(t)
@@ -324,13 +329,13 @@ class Servo:
             self[name] = value
 
     def _put_factory_values(self, begin: int) -> None:
-        """Put what stands in a new servo from an address on."""
+        """Write the factory values from an address on."""
         for address, size, value in factory_values(self.model):
             if address >= begin:
                 self._memory[address : address + size] = value.to_bytes(size, "little", signed=value < 0)
 
     def _point_indirect(self) -> None:
-        """Each Indirect Address points at its own Indirect Data."""
+        """Point each Indirect Address at its own Indirect Data."""
         for data, pointer in self._indirect.items():
             self._memory[pointer : pointer + 2] = data.to_bytes(2, "little")
 
@@ -342,7 +347,7 @@ class Servo:
         self._base = math.floor((self.count(t) - lowest) / turn) * turn
 
     def _sense(self, t: float) -> None:
-        """Put what is measured at `t` into the control table."""
+        """Write the measured values at `t` into the control table."""
         rad_s = (self._angle(t) - self._angle(t - VELOCITY_STEP_S)) / VELOCITY_STEP_S
         velocity = round(rad_s / self.model.velocity_unit)
         if self.model.protocol == 1:
@@ -387,7 +392,7 @@ class Servo:
         return self._refusal2(written) if self.model.protocol == 2 else Error.NONE
 
     def _refusal2(self, written: Mapping[str, int]) -> Error:
-        """What Protocol 2.0's servos do not take."""
+        """Return the error with which servos of Protocol 2.0 reject a write."""
         if self["watchdog"] == FIRED and any(name in written for name in GOALS):
             return Error.RANGE
         modes = MODES_WITHOUT if self.model.current_unit is None else MODES_WITH_CURRENT

@@ -1,4 +1,4 @@
-"""The Feetech servos that a robot.toml describes, on a bench."""
+"""Emulate the Feetech servos of a robot.toml."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ OTHER_BAUD = {500_000: 1_000_000}  # any other rate: 500000
 
 
 class FeetechArm(ServoArm[Servo, FeetechConfig]):
-    """Feetech servos as they are configured; see `ServoArm`."""
+    """Feetech servos as configured; see `ServoArm`."""
 
     kinds, errors = KINDS, ERRORS
 

@@ -1,4 +1,4 @@
-"""Feetech servos on one wire: bytes in, bytes with times out."""
+"""Emulated Feetech servos on one wire: bytes in, timed bytes out."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from bodyschema.drivers.bench.device import Reply, Sampling
 from .frames import BROADCAST, Code, Instruction, instructions_in, status_packet
 from .servo import Servo
 
-# Less than the 3 ms for which scan_port of huggingface/lerobot waits for each ID besides the bytes, more than the
+# Shorter than the 3 ms per ID, besides the bytes, that scan_port of huggingface/lerobot waits, and longer than the
 # longest return delay.
 PING_GAP_S = 1e-3
 
 
 class Chain(ServoChain[Servo]):
-    """Feetech servos on one half-duplex wire; see `ServoChain`. What is not intact is not answered."""
+    """Feetech servos on one half-duplex wire; see `ServoChain`. A damaged instruction is not answered."""
 
     overhead = 6
 
@@ -49,7 +49,10 @@ class Chain(ServoChain[Servo]):
         return self._together(there, t, lambda servo, now: self._obey(servo, instruction, now), instruction.code)
 
     def _pinged(self, servos: list[Servo], t: float) -> list[Reply]:
-        """Answers to a PING for all: those of the SCS series talk at once, of the others each ID has its time."""
+        """Return the answers to a broadcast PING.
+
+        Servos of the SCS series answer at once; of the others each ID has its time slot.
+        """
         at_once = [servo for servo in servos if not servo.knows_sync_read]
         groups = [[servo for servo in servos if servo.knows_sync_read and servo.id == id] for id in range(BROADCAST)]
         slot_s = self.overhead * self._byte_s + PING_GAP_S

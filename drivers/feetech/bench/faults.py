@@ -1,4 +1,4 @@
-"""What can go wrong with an answer on its way, of Feetech servos; see `bodyschema.drivers.bench.faults`."""
+"""Faults of a Feetech answer in transit; see `bodyschema.drivers.bench.faults`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bodyschema.drivers.bench.device import Reply
 
 
 def swapped(reply: Reply, rng: Random) -> Reply:
-    """It carries another ID, with a checksum that fits."""
+    """Replace the ID by another one, with a matching checksum."""
     data = bytearray(reply.data)
     data[2] = (reply.id + rng.choice((-1, 1))) % 253
     data[-1] = ~sum(data[2:-1]) & 0xFF
@@ -18,5 +18,5 @@ def swapped(reply: Reply, rng: Random) -> Reply:
 
 
 def storm(intensity: float, rng: Random, longest_late_s: float = 0.05) -> faults.Storm:
-    """All of them in equal shares; `intensity` is the probability that an answer suffers one."""
+    """Mix all faults in equal shares; `intensity` is the probability that an answer is affected."""
     return faults.storm(intensity, rng, swapped, longest_late_s=longest_late_s)

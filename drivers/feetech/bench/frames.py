@@ -1,4 +1,4 @@
-"""What runs over the wire: instruction packets taken apart, status packets put together."""
+"""Parse instruction packets and build status packets."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Instruction:
     """One packet from the host.
 
     Attributes:
-        end: bytes of the stream up to its last.
+        end: offset in the stream just behind its last byte.
     """
 
     id: int
@@ -37,7 +37,7 @@ class Instruction:
 
 
 def instructions_in(stream: bytearray) -> tuple[list[Instruction], int]:
-    """All intact instruction packets in `stream`, and how many of its bytes need not be seen again."""
+    """Return all intact instruction packets in `stream`, and the number of bytes consumed."""
     found: list[Instruction] = []
     at = 0
     while True:
@@ -62,6 +62,6 @@ def instructions_in(stream: bytearray) -> tuple[list[Instruction], int]:
 
 
 def status_packet(id: int, error: int, params: bytes) -> bytes:
-    """A servo's answer."""
+    """Build a servo's answer."""
     body = bytes((id, len(params) + 2, error)) + params
     return HEADER + body + bytes((~sum(body) & 0xFF,))

@@ -1,4 +1,4 @@
-"""One Feetech servo: its control table, and the rules by which it changes."""
+"""Emulate one Feetech servo: its control table and the rules by which it changes."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ Angle = Callable[[float], float]
 
 VELOCITY_STEP_S = 0.01
 RETURN_DELAY_UNIT_US = 2
-CALIBRATE = 128  # written to the torque register: where it is, is the middle of its range from now on
+CALIBRATE = 128  # written to the torque register: makes the present position the middle of the range
 FACTORY = {"firmware": 0x030A, "baud": 0, "id": 1, "return_delay": 250, "status_return": 1}
 RAM_OF_FACTORY = {"lock": 1, "voltage": 74, "temperature": 31}
-# What else stands in the EEPROM of a new servo: address, bytes, number.
-# Sources: Feetech, "SMS/STS memory table"; gains and protection current as huggingface/lerobot calls the defaults
-# (robots/so_follower); limits of voltage as Mickael-Roger/python-st3215 tells of the 7.4 V variant.
+# Other EEPROM values of a new servo: address, bytes, number. Sources: Feetech, "SMS/STS memory table"; gains and
+# protection current: defaults named by huggingface/lerobot (robots/so_follower); voltage limits:
+# Mickael-Roger/python-st3215 for the 7.4 V variant.
 FACTORY_STS = (
     (9, 2, 0),  # position limits [ticks]
     (11, 2, 4095),
@@ -55,19 +55,19 @@ FACTORY_SCS = (
     (26, 1, 2),
     (27, 1, 2),
 )
-MAX_TORQUE, TORQUE_LIMIT = 16, 48  # the second takes over the first one's two bytes with the power
+MAX_TORQUE, TORQUE_LIMIT = 16, 48  # at power-up the two bytes of the first are copied to the second
 READ_ONLY = ("firmware", "model", "position", "velocity", "load", "voltage", "temperature", "status", "moving")
 LARGEST_SPEED = 3400  # [ticks/s]
 
 
 class Servo:
-    """A servo on a bench.
+    """An emulated servo.
 
-    Torque holds nothing here: the shaft is wherever `angle` says.
+    Torque has no effect on the shaft, whose angle is given by `angle`.
 
     Attributes:
-        model: what it is.
-        glitch_ticks: the encoder is wrong by this.
+        model: its model.
+        glitch_ticks: error of the encoder [ticks].
         knows_sync_read: it answers SYNC_READ.
     """
 
@@ -81,11 +81,15 @@ class Servo:
         return_delay_s: float = 500e-6,
         multi_turn: bool = False,
     ) -> None:
-        """A servo as it leaves the factory, but for the arguments.
+        """Create a servo with factory settings, except for the arguments.
 
         Args:
-            angle: where its shaft is at a time [s]: [rad], 0 in the middle of its range, any number of turns.
-            multi_turn: it counts its turns, until it loses its power.
+            model: its model.
+            id: on the bus.
+            angle: shaft angle [rad] as a function of time [s]; 0 in the middle of its range, any number of turns.
+            baud: bits per second.
+            return_delay_s: delay between instruction and answer.
+            multi_turn: it counts turns until it loses power.
         """
         self.model, self.knows_sync_read = model, model.protocol != SCS
         self.glitch_ticks = 0
@@ -102,43 +106,43 @@ class Servo:
         self._power_up()
 
     def __getitem__(self, name: str) -> int:
-        """The number in a register."""
+        """Return the value of a register."""
         register = self.model.layout.registers.get(name)
         return 0 if register is None else register.value(bytes(self._memory[register.address : register.end]))
 
     def __setitem__(self, name: str, value: int) -> None:
-        """Put a number into a register as the servo itself does, past all locks, for good."""
+        """Write a register permanently, as the servo itself does, bypassing all locks."""
         register = self.model.layout[name]
         self._memory[register.address : register.end] = register.bytes(value)
         self._saved = bytes(self._memory[: self.model.layout.ram])
 
     @property
     def id(self) -> int:
-        """Its number on the bus."""
+        """ID on the bus."""
         return self["id"]
 
     @property
     def baud(self) -> int:
-        """The rate at which it listens [bit/s]."""
+        """Baud rate of the servo [bit/s]."""
         return BAUDS[min(self["baud"], len(BAUDS) - 1)]
 
     @property
     def return_delay_s(self) -> float:
-        """How long it waits before it answers."""
+        """Delay between instruction and answer [s]."""
         return self["return_delay"] * RETURN_DELAY_UNIT_US * 1e-6
 
     def angle(self, t: float) -> float:
-        """Where its shaft is at `t` [rad]."""
+        """Return the shaft angle at `t` [rad]."""
         return self._angle(t)
 
     def fail(self, bits: int) -> None:
-        """Something is wrong with it, until it is rebooted; torque goes off where `unloading` says so."""
+        """Report a hardware error until the servo is rebooted. Torque goes off if `unloading` includes it."""
         self["status"] |= bits
         if bits & self["unloading"]:
             self["torque"] = 0
 
     def reboot(self, t: float) -> None:
-        """As by a power cycle: RAM, what was written to a locked EEPROM, and the number of turns are lost."""
+        """Restart as after a power cycle: RAM, writes to a locked EEPROM, and the number of turns are lost."""
         ram = self.model.layout.ram
         self._memory[:] = self._saved + bytes(len(self._memory) - ram)
         for name, value in RAM_OF_FACTORY.items():
@@ -148,21 +152,21 @@ class Servo:
         self._base = math.floor(self._count(t) / (self.model.ticks_per_turn or 1))
 
     def position(self, t: float) -> int:
-        """Present Position at `t` [ticks]."""
+        """Return Present Position at `t` [ticks]."""
         counted, turn = self._count(t) + self.glitch_ticks, self.model.ticks_per_turn
         if turn is None:
             return min(max(counted, 0), 1023)
         return counted - self._base * turn if self._multi_turn else counted % turn
 
     def read(self, address: int, size: int, t: float) -> bytes | None:
-        """Bytes of the control table at `t`; None where there are none."""
+        """Read bytes of the control table at `t`; None if the address range is invalid."""
         if size == 0 or address + size > len(self._memory):
             return None
         self._sense(t)
         return bytes(self._memory[address : address + size])
 
     def write(self, address: int, data: bytes, t: float) -> None:
-        """Change bytes of the control table; what is read-only stays as it is."""
+        """Write bytes of the control table; read-only registers keep their values."""
         layout = self.model.layout
         fixed = {place for name in READ_ONLY for place in range(layout[name].address, layout[name].end)}
         for place, byte in enumerate(data, address):
@@ -174,17 +178,17 @@ class Servo:
             self._calibrate(t)
 
     def register_write(self, address: int, data: bytes) -> None:
-        """Keep a write for ACTION."""
+        """Store a write for ACTION."""
         self._registered = (address, data)
 
     def action(self, t: float) -> None:
-        """Do the write that was kept."""
+        """Execute the stored write."""
         if self._registered is not None:
             self.write(*self._registered, t)
         self._registered = None
 
     def factory_reset(self, t: float) -> None:
-        """All but the ID as it left the factory."""
+        """Restore all factory values except the ID."""
         id = self.id
         self._set_factory_values()
         self["id"] = id
@@ -212,7 +216,7 @@ class Servo:
         return ticks - self["homing_offset"]
 
     def _sense(self, t: float) -> None:
-        """Put what is measured at `t` into the control table."""
+        """Write the measured values at `t` into the control table."""
         layout = self.model.layout
         rad_s = (self._angle(t) - self._angle(t - VELOCITY_STEP_S)) / VELOCITY_STEP_S
         velocity = round(rad_s / self.model.velocity_unit)

@@ -1,6 +1,6 @@
-"""A ROS 2 robot at the bytes: what rmw_zenoh would put on the wire, with faults on demand.
+"""Emulator of a ROS 2 robot at the byte level: the messages of rmw_zenoh, with fault injection.
 
-In virtual time behind a `Link`, or over zenoh with this process as the robot's router.
+It runs in virtual time behind a `Link`, or over zenoh with this process as the robot's router.
 """
 
 from __future__ import annotations

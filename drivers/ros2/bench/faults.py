@@ -1,4 +1,4 @@
-"""What can be wrong with a message of joint states."""
+"""Faults of joint state messages."""
 
 from __future__ import annotations
 
@@ -9,39 +9,42 @@ from random import Random
 
 from bodyschema.drivers.ros2.messages import NANO, Header, JointState, encode_joint_state
 
-# How a node's message becomes bytes; None when it is not sent.
+# Encodes a node's message; None when it is not sent.
 Send = Callable[[JointState], bytes | None]
 
 
 class Fault(StrEnum):
-    """A way to spoil a message."""
+    """A way to corrupt a message."""
 
     GARBAGE = "garbage"  # random bytes
     TRUNCATED = "truncated"
-    BIT = "bit"  # one bit of it is another
-    WORD = "word"  # four bytes are a large number, where a length is perhaps
+    BIT = "bit"  # one bit is flipped
+    WORD = "word"  # four bytes become a large number, possibly in place of a length
     SWAPPED_NAMES = "swapped_names"
     MISSING_JOINT = "missing_joint"
     NAN = "nan"
-    REPEATED = "repeated"  # the stamp of the message before
-    CLOCK_JUMP = "clock_jump"  # its stamp is seconds off
+    REPEATED = "repeated"  # the stamp of the previous message
+    CLOCK_JUMP = "clock_jump"  # the stamp is seconds off
     SILENCE = "silence"  # it is not sent
 
 
-# Those that change what an intact message says. The bytes tell of none of them.
+# Faults of the content of a well-formed message. They do not show in the encoding.
 OF_THE_NODE = (Fault.SWAPPED_NAMES, Fault.MISSING_JOINT, Fault.NAN, Fault.REPEATED, Fault.CLOCK_JUMP)
 
 
 def intact(message: JointState) -> bytes:
-    """No fault."""
+    """Encode a message without a fault."""
     return encode_joint_state(message)
 
 
 def spoilt(fault: Fault, message: JointState, before_ns: int, rng: Random) -> bytes | None:
-    """The message's bytes with a fault; None for silence.
+    """Encode a message with a fault; return None for silence.
 
     Args:
-        before_ns: stamp of the message before.
+        fault: to apply.
+        message: the intact one.
+        before_ns: stamp of the previous message.
+        rng: source of randomness.
     """
     if fault is Fault.SILENCE:
         return None
@@ -79,18 +82,20 @@ def _misled(fault: Fault, message: JointState, before_ns: int, rng: Random) -> J
 
 
 class Planned:
-    """Spoils the next message as it is told, or a share of all.
+    """Encoder that corrupts the next message on request, or a random share of all.
 
     Attributes:
-        next: how the next message is spoilt; then none is until it is told again.
-        given: how many were spoilt in each way.
+        next: fault of the next message; reset to None once it is applied.
+        given: number of applied faults, by kind.
     """
 
     def __init__(self, rng: Random, *, share: float = 0.0, kinds: tuple[Fault, ...] = tuple(Fault)) -> None:
-        """No message is spoilt yet.
+        """Start without any corrupted message.
 
         Args:
-            share: of the messages that are spoilt at random, in one of the ways `kinds`.
+            rng: source of randomness.
+            share: share of the messages that are corrupted at random.
+            kinds: faults to choose from.
         """
         self._rng, self._share, self._kinds = rng, share, kinds
         self._before_ns = 0
@@ -98,7 +103,7 @@ class Planned:
         self.given: dict[Fault, int] = {}
 
     def __call__(self, message: JointState) -> bytes | None:
-        """The message's bytes, spoilt or not."""
+        """Encode the message, corrupted or not."""
         fault, self.next = self.next, None
         if fault is None and self._rng.random() < self._share:
             fault = self._rng.choice(self._kinds)

@@ -1,4 +1,4 @@
-"""A node that publishes the states of some joints."""
+"""Emulate a node that publishes the states of some joints."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ EPOCH_NS = 1_780_000_000 * NANO
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """A message on the wire."""
+    """An encoded message."""
 
     payload: bytes
     attached: bytes
 
 
 class Node:
-    """What it publishes at any time.
+    """An emulated node.
 
     Attributes:
         names: of its joints.
-        period_s: between two messages.
-        set_by_s: how much its clock was set forwards since the start [s].
+        period_s: time between two messages.
+        set_by_s: how far its clock was set forwards since the start [s].
     """
 
     def __init__(
         self, paths: Mapping[str, Path], rate_hz: float, *, name: str = "robot", drift: float = 0.0, send: Send = intact
     ) -> None:
-        """A node that has said nothing.
+        """Create a node that has not published yet.
 
         Args:
-            paths: the position of each joint [rad] or [m] at any time [s].
-            rate_hz: how often it publishes.
-            name: tells its gid from other nodes'.
+            paths: the position of each joint [rad] or [m] as a function of time [s].
+            rate_hz: messages per second.
+            name: makes its gid differ from other nodes'.
             drift: how much faster its clock runs than ours.
-            send: makes bytes of each message, spoilt ones perhaps.
+            send: encodes each message, corrupted or not.
         """
         self.names, self.period_s, self.set_by_s = tuple(paths), 1.0 / rate_hz, 0.0
         self._paths, self._rate, self._send = dict(paths), 1.0 + drift, send
@@ -50,11 +50,11 @@ class Node:
         self._sequence = 0
 
     def stamp_ns(self, t: float) -> int:
-        """What its clock shows at `t` [s]."""
+        """Return its clock's time at `t` [s]."""
         return EPOCH_NS + round((t * self._rate + self.set_by_s) * NANO)
 
     def at(self, t: float) -> Sent | None:
-        """The message that it publishes at `t` [s]; None when it is silent."""
+        """Return the message that it publishes at `t` [s]; None when it is silent."""
         stamp_ns = self.stamp_ns(t)
         positions = tuple(path(t) for path in self._paths.values())
         still = (0.0,) * len(positions)

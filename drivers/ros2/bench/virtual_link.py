@@ -1,4 +1,4 @@
-"""Nodes at the other end of a link in virtual time: an hour of messages in seconds, and no wait."""
+"""Emulate nodes at the other end of a link in virtual time: an hour of messages in seconds, without waiting."""
 
 from __future__ import annotations
 
@@ -13,32 +13,34 @@ from .node import Node, Sent
 
 
 class Waiting(Clock, Protocol):
-    """A clock that stands still but when somebody waits."""
+    """A clock that advances only when a caller waits."""
 
     def wait_until(self, t: float) -> None:
-        """Let the time be `t`, if it is not later already."""
+        """Advance the time to `t`, unless it is later already."""
         ...
 
 
 def at_once() -> float:
-    """No delay."""
+    """Return a delay of zero."""
     return 0.0
 
 
 class VirtualLink:
-    """What nodes publish from now on.
+    """A link that delivers the messages that nodes publish from now on.
 
     Attributes:
-        is_connected: the router is there; when not, nothing arrives.
-        overflowed: never anything.
+        is_connected: True while the router is reachable; otherwise nothing arrives.
+        overflowed: always 0.
         known: liveliness tokens of publishers.
     """
 
     def __init__(self, nodes: Sequence[Node], clock: Waiting, *, delay: Callable[[], float] = at_once) -> None:
-        """A link on which nothing was sent yet.
+        """Create a link on which nothing was sent yet.
 
         Args:
-            delay: how long a message is under way [s], drawn anew for each; none overtakes another of its node.
+            nodes: at the other end.
+            clock: the virtual clock.
+            delay: returns the transit time of a message [s], sampled for each; messages of one node keep their order.
         """
         self.is_connected, self.overflowed = True, 0
         self.known: list[str] = []
@@ -50,7 +52,7 @@ class VirtualLink:
         self._arrived = [0.0] * len(self._nodes)
 
     def receive(self, until: float) -> Sample | None:
-        """The message that arrives next; None when none does by `until` [s], or the router is gone."""
+        """Return the next message; None when none arrives by `until` [s], or the router is unreachable."""
         while self.is_connected:
             first = self._arriving[0][0] if self._arriving else until
             if self._due and self._due[0][0] <= min(first, until):
@@ -65,11 +67,11 @@ class VirtualLink:
         return None
 
     def tokens(self) -> Sequence[str]:
-        """The liveliness tokens of publishers."""
+        """Return the liveliness tokens of publishers."""
         return self.known
 
     def close(self) -> None:
-        """Nothing arrives any more."""
+        """Discard everything in transit."""
         self._arriving.clear()
 
     def _publish(self) -> None:

@@ -1,4 +1,4 @@
-"""A robot over zenoh: one session that is router and node, in real time."""
+"""Emulate a robot over zenoh in real time: one session is router and node."""
 
 from __future__ import annotations
 
@@ -18,17 +18,20 @@ from .node import Node
 
 
 class ZenohRobot:
-    """Publishes nodes' joint states as rmw_zenoh would; the process that holds it is the router too.
+    """Publisher of nodes' joint states, as rmw_zenoh would send them; its process is the router too.
 
     Attributes:
-        published: messages so far.
+        published: number of messages so far.
     """
 
     def __init__(self, nodes: Sequence[Node], listen: str, *, domain: int = 0, topic: str = "/joint_states") -> None:
-        """Nothing is opened yet.
+        """Prepare without opening anything.
 
         Args:
-            listen: where the router listens, like tcp/127.0.0.1:7447.
+            nodes: to publish.
+            listen: endpoint of the router, such as tcp/127.0.0.1:7447.
+            domain: ROS_DOMAIN_ID.
+            topic: of the joint states.
         """
         self._nodes, self._listen, self._domain, self._topic = list(nodes), listen, domain, topic
         self._session: zenoh.Session | None = None
@@ -53,7 +56,7 @@ class ZenohRobot:
         token = rmw.publisher_token(self._domain, str(session.info.zid()), "bench", self._topic, JOINT_STATE)
         self._token = session.liveliness().declare_token(token)
         key = rmw.topic_key(self._domain, self._topic, JOINT_STATE)
-        # rmw_zenoh drops what a slow reader cannot take, and so would a robot.
+        # Like a robot with rmw_zenoh, drop what a slow reader cannot take.
         self._publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
         return self
 
@@ -70,19 +73,19 @@ class ZenohRobot:
 
     @property
     def is_heard(self) -> bool:
-        """Whether anybody subscribes."""
-        status: Any = self._publisher.matching_status  # zenoh's stub calls it a bool, which it is not
+        """True if there is a subscriber."""
+        status: Any = self._publisher.matching_status  # zenoh's stub wrongly declares it as bool
         return bool(status.matching)
 
     def publish(self, node: Node, t: float) -> None:
-        """Let a node publish what is true at `t` [s]."""
+        """Publish a node's message of time `t` [s]."""
         sent = node.at(t)
         if sent is not None:
             self._publisher.put(sent.payload, attachment=sent.attached)
             self.published += 1
 
     def start(self) -> None:
-        """Let all nodes publish, each at its rate, until the end."""
+        """Publish the messages of all nodes, each at its rate, until the end."""
         self._threads = [threading.Thread(target=self._run, args=(node,), name="bench") for node in self._nodes]
         for thread in self._threads:
             thread.start()

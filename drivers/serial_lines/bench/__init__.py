@@ -1,3 +1,3 @@
-"""A board of encoders at the bytes, below any driver: for tests, and to try a configuration without an arm."""
+"""Emulator of an encoder board at the byte level, for tests and for trying a configuration without an arm."""
 
 from __future__ import annotations

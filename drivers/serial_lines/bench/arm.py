@@ -1,4 +1,4 @@
-"""The encoders that a robot.toml describes, on a board on a bench."""
+"""Emulate the encoders of a robot.toml on one board."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from .board import EncoderBoard
 
 KINDS = FaultKinds(ON_THE_WIRE, ("sensor", "glitch"))
 BUS = "board"
-TICKS_PER_TURN = 4096  # where robot.toml does not say
+TICKS_PER_TURN = 4096  # default if robot.toml gives none
 GLITCH_TICKS = 700
 RATE_HZ = 200.0
 
 
 class EncoderArm(BenchArm):
-    """Encoders as they are configured, on one board."""
+    """Encoders as configured, on one board."""
 
     unit: ClassVar[str] = "lines said"
 
@@ -38,16 +38,19 @@ class EncoderArm(BenchArm):
         rate_hz: float = RATE_HZ,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """A board with its power on.
+        """Create a board with its power on.
 
         Args:
             config: checked.
-            angles: by joint, its angle at a time [rad].
+            angles: by joint, its angle as a function of time [rad].
+            faults: to apply.
             seed: of the faults on the wire.
+            rate_hz: lines per second.
+            now: the clock [s].
         """
         self._config, rng = config, Random(seed)
         self._names = {encoder.joint: encoder.name for encoder in config.encoders}
-        wire = WireFaults.asked(faults, KINDS, dict.fromkeys(self._names, 0), rng)  # one line tells of all
+        wire = WireFaults.asked(faults, KINDS, dict.fromkeys(self._names, 0), rng)  # one line contains all encoders
         encoders = {
             encoder.name: (_ticks(encoder), _shaft(encoder, angles[encoder.joint])) for encoder in config.encoders
         }
@@ -56,24 +59,24 @@ class EncoderArm(BenchArm):
 
     @property
     def devices(self) -> Mapping[str, EncoderBoard]:
-        """What is behind the port."""
+        """Device behind the port."""
         return {BUS: self._board}
 
     @property
     def count(self) -> int:
-        """How many lines were said."""
+        """Number of lines sent."""
         return self._board.lines
 
     def at_ports(self, ports: Mapping[str, str]) -> SerialLinesConfig:
-        """The configuration with another port."""
+        """Return the configuration with another port."""
         return msgspec.structs.replace(self._config, port=ports[BUS])
 
     def glitch(self, joint: str, is_wrong: bool) -> None:
-        """A joint's encoder begins or ends to be wrong."""
+        """Start or end an encoder error of one joint."""
         self._board.glitch_ticks[self._names[joint]] = GLITCH_TICKS if is_wrong else 0
 
     def power_cycle(self, t: float) -> None:
-        """The board loses its power and has it back at `t`."""
+        """Cut the power of the board and restore it at `t`."""
         self._board.reboot(t)
 
 
@@ -82,6 +85,6 @@ def _ticks(encoder: EncoderConfig) -> int:
 
 
 def _shaft(encoder: EncoderConfig, angle: Angle) -> Angle:
-    """The shaft's angle [rad], which is 0 at the raw position 0, from that of the joint."""
+    """Convert the joint's angle to the shaft's angle [rad], which is 0 at the raw position 0."""
     zero = encoder.zero_ticks * 2 * math.pi / _ticks(encoder)
     return lambda t: encoder.direction * angle(t) + zero

@@ -1,4 +1,4 @@
-"""A microcontroller with encoders, which says a line for each measurement."""
+"""Emulate a microcontroller with encoders that sends a line per measurement."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ Angle = Callable[[float], float]
 
 
 class EncoderBoard:
-    """Encoders on a bench.
+    """An emulated board of encoders.
 
     Attributes:
-        faults: what happens to the lines; their id is 0.
+        encoders: by name, ticks per turn and shaft angle.
+        faults: applied to the lines; their id is 0.
         failing: encoders whose sensor has no value.
-        glitch_ticks: by name, by how much an encoder is wrong.
-        lines: how many were said.
+        glitch_ticks: error of an encoder [ticks], by name.
+        lines: number of lines sent.
     """
 
     def __init__(
@@ -32,12 +33,16 @@ class EncoderBoard:
         drift: float = 0.0,
         faults: Faults = no_faults,
     ) -> None:
-        """A board with its power on.
+        """Create a board with its power on.
 
         Args:
-            encoders: by name, ticks of a turn, and where the shaft is at a time [s]: [rad], 0 at the raw position 0.
-            begun_s: when it got its power.
-            drift: by how much its clock is too fast.
+            encoders: by name, ticks per turn, and shaft angle as a function of time [s]: [rad], 0 at the raw position
+                0.
+            rate_hz: lines per second.
+            begun_s: time of power-up.
+            boot: its boot number.
+            drift: how much its clock is too fast.
+            faults: applied to the lines.
         """
         self.encoders, self.faults = dict(encoders), faults
         self.failing: set[str] = set()
@@ -48,27 +53,27 @@ class EncoderBoard:
 
     @property
     def speaks_at(self) -> float:
-        """When the next line is begun [s]."""
+        """Start of the next line [s]."""
         return self._next_s
 
     def reboot(self, t: float) -> None:
-        """It loses its power and has it back at `t`."""
+        """Cut the power and restore it at `t`."""
         self._start(t, (self._boot * 25_173 + 13_849) % SEQUENCES)
 
     def send(self, data: bytes, t: float, baud: int) -> list[Reply]:
-        """The host's `data`; a question mark asks for the header, which comes before the next line."""
+        """Receive the host's `data`; a question mark requests the header, which comes with the next line."""
         del t, baud
         if b"?" in data:
             self._owes_header = True
         return []
 
     def speak(self, until: float, baud: int) -> list[Reply]:
-        """The lines that it begins by `until`."""
+        """Return the lines that begin by `until`."""
         replies: list[Reply] = []
         while self._next_s <= until:
             said = self._said(self._next_s)
             replies.append(self.faults(Reply(0, self._next_s, said)))
-            self._next_s += max(self._period_s, len(said) * byte_s(baud))  # it measures when the last line is out
+            self._next_s += max(self._period_s, len(said) * byte_s(baud))  # it measures once the last line is sent
         return [reply for reply in replies if reply.data]
 
     def _start(self, t: float, boot: int) -> None:

@@ -1,4 +1,4 @@
-"""Encoders that talk of themselves, listened to all the time: no line waits while nobody wants to know."""
+"""Read encoders continuously in a thread, so that no line waits in a buffer."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ READ_S = 0.1
 
 
 class Listener:
-    """Reads an open source in a thread of its own, and keeps the newest reading."""
+    """Thread that reads an open source and keeps the newest reading."""
 
     def __init__(self, source: JointSource) -> None:
-        """Nothing is read yet."""
+        """Start without a reading."""
         self._source = source
         self._newest: JointReading | None = None
         self._error: BodyschemaError | None = None
@@ -35,10 +35,10 @@ class Listener:
         self._thread.join()
 
     def after(self, t: float, timeout_s: float) -> JointReading | None:
-        """The first reading that was measured after `t` [s]; None when none came in time.
+        """Return the first reading measured after `t` [s]; None when there is none in time.
 
         Raises:
-            BodyschemaError: the one with which reading ended.
+            BodyschemaError: the error that ended the reading.
         """
         with self._told:
             self._told.wait_for(lambda: self._error is not None or self._is_after(t), timeout_s)
