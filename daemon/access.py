@@ -51,7 +51,7 @@ ROLES = tuple(field.name for field in msgspec.structs.fields(Names))
 
 @dataclass(frozen=True, slots=True)
 class Subjects:
-    """How connecting clients are identified.
+    """Identification of connecting clients.
 
     Attributes:
         by_user: by the user name that the password belongs to; otherwise by the common name of the certificate.

@@ -15,7 +15,7 @@ AT_ONCE = 500
 
 @dataclass(frozen=True, slots=True)
 class Keep:
-    """What a store keeps.
+    """Limits of the pairs that a store keeps.
 
     Attributes:
         days: maximum age; None: any.
