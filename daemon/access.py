@@ -101,7 +101,7 @@ def access_control(names_of_robot: Mapping[str, Names], subjects: Subjects) -> d
     """Return zenoh's table `access_control`: deny everything except what the roles do under their robots' keys.
 
     Args:
-        names_of_robot: by the robot's name, or `*` for every robot.
+        names_of_robot: names per role, by the robot's name, or `*` for every robot.
     """
     rules: list[dict[str, Any]] = []
     owners: list[dict[str, Any]] = []

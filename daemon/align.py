@@ -1,4 +1,4 @@
-"""Joint angles at the time of a frame."""
+"""Interpolate joint angles at the time of a frame."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.records import FloatArray, JointReading, Reason, frozen_array
 
 CAPACITY = 8192
-ROUNDING_S = 1e-9  # times of day-long clocks, subtracted
+ROUNDING_S = 1e-9  # rounding error of time differences on day-long clocks
 
 
 def joint_difference(q: FloatArray, other: FloatArray, prismatic: NDArray[np.bool_]) -> FloatArray:

@@ -10,7 +10,7 @@ from .status import UNDECIDED, Change
 
 log = logging.getLogger(__name__)
 
-# Causes less probable than this are not reported.
+# Kinds less probable than this are not reported.
 _TOLD = 0.01
 
 

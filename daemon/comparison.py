@@ -65,7 +65,7 @@ class LeftOut(msgspec.Struct, frozen=True):
     """Rows that were not compared.
 
     Attributes:
-        first, second: how many of each recording have no row of the same joint angles in the other.
+        first, second: number of rows of each recording without a match in the other.
         first_row: number of the first such row of the first recording; None if there is none.
         second_row: the same for the second.
         joint, by: for a first such row, the joint that differs most from the row of the same number in the other

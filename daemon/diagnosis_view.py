@@ -46,7 +46,7 @@ def view(diagnosis: DiagnosisFile, remedies: Sequence[str], *, timed: bool) -> G
 
     Args:
         remedies: what to do about the causes.
-        timed: the recording has times.
+        timed: True if the recording has times.
     """
     head, style = _HEADS[diagnosis.verdict]
     parts: list[RenderableType] = [Text.assemble((f" {head} ", style), "  ", (_sentence(diagnosis), "bold"))]

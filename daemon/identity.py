@@ -22,7 +22,7 @@ class TlsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         ca: certificate of the authority that signed all certificates.
-        certificate, key: this machine's or person's own; needed to listen, and to connect without a password.
+        certificate, key: those of this machine or person; needed to listen, and to connect without a password.
     """
 
     ca: str

@@ -51,8 +51,8 @@ class Wiggle:
     """Encoder readings and marker fixes, each with its own time stamp.
 
     Attributes:
-        t_joints, q: of the encoders [s] (n,), [rad or m] (n, d).
-        t_marker, x: of the marker [s] (m,), [m] (m, 3).
+        t_joints, q: times and angles of the encoders [s] (n,), [rad or m] (n, d).
+        t_marker, x: times and positions of the marker [s] (m,), [m] (m, 3).
     """
 
     t_joints: FloatArray

@@ -3,7 +3,7 @@
 | topic | schema | content |
 | --- | --- | --- |
 | /pair | bodyschema.Row | every column of the row under its own name, exactly |
-| /marker | foxglove.PoseInFrame | the marker, for the 3-D panel; unturned where no orientation was recorded |
+| /marker | foxglove.PoseInFrame | the marker, for the 3-D panel; unrotated where no orientation was recorded |
 
 Metadata `bodyschema` has the joints and the number of rows; `devices/1`, `devices/500` … of each joint what it was read
 with from that pair on: servo, firmware, homing offset and so on, as JSON.

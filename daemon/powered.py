@@ -9,7 +9,7 @@ from bodyschema.interfaces.errors import ConfigError, RequestError
 
 from .sources import Powered
 
-ANSWER_S = 1.5  # a query waits for 2 s
+ANSWER_S = 1.5  # less than the 2 s that a query waits
 
 
 def find_powered(drives: Iterable[object], name: str, file: Path) -> Powered:

@@ -37,7 +37,7 @@ def as_typed(text: str, arguments: Sequence[str] | None = None) -> str:
     """Return `text` with this command line's --robot added to each bodyschema command, in backticks or on its own line.
 
     Args:
-        arguments: of the command line; by default of this process.
+        arguments: arguments of the command line; by default those of this process.
     """
     robot = given_robot(sys.argv[1:] if arguments is None else arguments)
     if robot is None:

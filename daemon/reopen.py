@@ -36,7 +36,7 @@ class Reopening(Generic[R_co]):
 
     Attributes:
         trouble: the problem with the source, or None.
-        losses: how often it was lost.
+        losses: number of times it was lost.
     """
 
     def __init__(

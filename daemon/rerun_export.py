@@ -37,7 +37,7 @@ def write_rerun(recording: Recording, file: Path, _devices: Sequence[Devices] = 
     """
     rr = _rerun(file)
     try:
-        file.touch()  # its own error names the file
+        file.touch()  # this error names the file; rerun's does not
         stream = rr.RecordingStream("bodyschema")
         stream.save(file)
     except RuntimeError as error:

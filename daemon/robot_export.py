@@ -70,7 +70,7 @@ class Row:
     Attributes:
         model: its name.
         rms_mm, mean_mm: RMS and mean of the distances to the measured positions.
-        gain_percent: by how much the RMS is smaller than the nominal model's; None for that one.
+        gain_percent: reduction of the RMS relative to the nominal model; None for that one.
     """
 
     model: str

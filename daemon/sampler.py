@@ -134,7 +134,7 @@ class Sampler:
         """Sample until `stop`, or with `exit_at_end` until the sources end.
 
         Raises:
-            StoreError: the store is damaged; the pair was not published either, and none came after it.
+            StoreError: the store is damaged; the pair was not published, and no pair followed.
             SourceError: a source could not be opened at the start.
         """
         self._service.tell("opening encoders and cameras")

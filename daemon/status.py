@@ -225,7 +225,7 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
         pairs: number of pairs learnt online, each once.
         last_seq: sequence number of the newest of them.
         replayed: replay steps since the start.
-        pairs_since_change: pairs since the last change, or since the beginning.
+        pairs_since_change: pairs since the last change, or since the start.
         answering: the model that answers queries.
         prequential_m: error on new pairs, by model: mean distance [m] between the measurement, its noise included, and
             the prediction made before the pair was learnt; over the same pairs for all models.

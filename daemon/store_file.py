@@ -1,4 +1,4 @@
-"""The file of a pair store: one writer, and errors that say what to do."""
+"""The file of a pair store: one writer, and errors with a remedy."""
 
 from __future__ import annotations
 

@@ -97,7 +97,7 @@ class Supervisor:
         self._stopping = True
 
     def run(self) -> None:
-        """Tend the children until `stop`.
+        """Keep the children running until `stop`.
 
         Raises:
             BodyschemaError: one of them refused to start; the others were ended.

@@ -28,7 +28,7 @@ class Tags:
         shape: single tags, or one body of them.
         ids: numbers of the tags as in 0-5,9; None: as many as the shape has, from 0 on.
         side_mm: side of the black squares.
-        columns, rows, fold_deg: of a plate.
+        columns, rows, fold_deg: columns, rows and fold angle [°] of a plate.
     """
 
     shape: ShapeName = "tags"

@@ -25,7 +25,7 @@ class ToolJump:
 
     Attributes:
         row: the first row with the other tool, counted from 1.
-        distance_m: how far apart the two tools hold the marker.
+        distance_m: distance between the marker positions of the two tools.
     """
 
     row: int

@@ -1,4 +1,4 @@
-"""The udev rules for the serial ports of servos and encoders."""
+"""Install udev rules for the serial ports of servos and encoders."""
 
 from __future__ import annotations
 

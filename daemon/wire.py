@@ -236,7 +236,7 @@ def position(name: str, values: Sequence[float]) -> FloatArray:
     """Return a requested position, shape (3,) [m].
 
     Raises:
-        RequestError: a number is not finite, or so large that it is not in metres.
+        RequestError: a number is not finite, or too large to be in metres.
     """
     x = np.array(values, dtype=np.float64)
     if not np.isfinite(x).all():

@@ -41,7 +41,7 @@ def udev(
     """Install udev rules: servo adapters can be opened, and send data without delay. Shows the rules, asks, then writes
     them.
 
-    Needs: the right to write to /etc/udev/rules.d, by sudo.
+    Needs: permission to write to /etc/udev/rules.d, by sudo.
 
     Next: plug the adapter in again; `bodyschema doctor`.
     """
@@ -98,7 +98,7 @@ def service(
     in /var/lib/bodyschema/ROBOT unless robot.toml names another folder. For several robots, one learner serves them
     all; their samplers are installed on the robots' machines.
 
-    Needs: robot.toml that `bodyschema run` works with, and the right to write to /etc/systemd/system, by sudo.
+    Needs: robot.toml that works with `bodyschema run`, and permission to write to /etc/systemd/system, by sudo.
 
     Next: the `systemctl enable --now` that it prints; docs/operation.md describes logs, upgrades and backups.
     """
@@ -152,7 +152,7 @@ def router(
 ) -> None:
     """Install a systemd unit: the zenoh router from boot on, restarted on failure, sandboxed.
 
-    Needs: router.toml that `bodyschema router` works with, keys that --user can read, and the right to write to
+    Needs: router.toml that works with `bodyschema router`, keys that --user can read, and permission to write to
     /etc/systemd/system, by sudo.
 
     Next: the `systemctl enable --now` that it prints; `bodyschema doctor` on the machines that connect.

@@ -39,7 +39,7 @@ class _Size:
 
 
 def fig7(run: Run, *, online: int = 600, cycles: int = 2_200, held_out: int = 400, onward: int = 200) -> Experiment:
-    """Run the paper's rule and other models from a crude estimate, on a guided walk as tracked and as simulated."""
+    """Run the paper's rule and other models from a crude estimate, on a tracked guided walk and on simulated walks."""
     size = _Size(online, cycles, held_out, onward)
     chain = arm(6)
     crude = crude_estimate(run.rng, chain)
