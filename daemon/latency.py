@@ -195,7 +195,7 @@ class _Fit:
         return x - A @ weights
 
     def whitened(self, lag: float) -> _Fit:
-        """Return the same fit, positions whitened by the noise covariance (larger in depth) of the one at `lag`."""
+        """Return the same fit with positions whitened by the covariance of the residual at `lag` (larger in depth)."""
         return replace(self, x=self.x @ _whitening(self.residual(lag)).T)
 
     def cost(self, lag: float, keep: NDArray[np.bool_] | slice = slice(None)) -> float:
@@ -219,7 +219,7 @@ class _RigidFit:
         """Place the chain by the smooth function's positions.
 
         Raises:
-            DegenerateDataError: the positions do not determine its place.
+            DegenerateDataError: the positions do not determine its pose.
         """
         placed = align(
             smooth.chain, smooth.wiggle.angles(smooth.t - lag), smooth.x, pose_known=False, marker_known=False
@@ -255,7 +255,7 @@ class _RigidFit:
         return self.fitted(lag, keep)[1] @ self.white.T
 
     def whitened(self, lag: float) -> _RigidFit:
-        """Return the same fit, residuals whitened by the noise covariance (larger in depth) of that at `lag`."""
+        """Return the same fit with residuals whitened by their covariance at `lag` (larger in depth)."""
         start, left = self.fitted(lag, steps=SETTLING)
         return replace(self, start=start, white=_whitening(left))
 

@@ -38,8 +38,7 @@ def udev(
     uninstall: Annotated[bool, flag("Remove the rules.")] = False,
     root: Root = Path("/"),
 ) -> None:
-    """Install udev rules: servo adapters can be opened, and send data without delay. Shows the rules, asks, then writes
-    them.
+    """Install udev rules that let you open servo adapters and reduce their latency. Shows them and asks first.
 
     Needs: permission to write to /etc/udev/rules.d, by sudo.
 

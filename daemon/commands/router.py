@@ -17,8 +17,7 @@ def router(
     zenohd: Annotated[bool, flag("Print the configuration for zenoh's own zenohd, and end.")] = False,
     verbose: Annotated[bool, flag("Log more.")] = False,
 ) -> None:
-    """Run the zenoh router that connects several machines: clients connect by TLS, and each may do what its role
-    permits.
+    """Run the zenoh router that connects several machines, with TLS and roles for sampler, learner and viewers.
 
     Ends with SIGTERM or Ctrl-C. docs/security.md describes how to create certificates; deploy/ has example files;
     `bodyschema install router` runs it as a systemd service.
