@@ -1,7 +1,7 @@
-"""Who may do what over zenoh: roles, and the rules of zenoh's access control that enforce them.
+"""Roles over zenoh, and the access-control rules that enforce them.
 
-The rules stand where connections come in: at the router, or at a process that listens beyond its own machine. What no
-rule allows is dropped there, before it reaches a process.
+The rules apply where connections come in: at the router, or at a process that listens beyond its own machine. A message
+that no rule allows is dropped there, before it reaches a process.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import msgspec
 from .keys import Keys
 
 EVERY_ROBOT = "*"
-# Cache and announcements of advanced publications stand beside their key, hidden from wild cards.
+# The cache and the announcements of advanced publications use keys next to the published key, hidden from wild cards.
 CACHE = "@adv/**"
 
 Deed = Literal["says", "hears", "asks", "answers", "shows", "watches"]
-# What each deed needs: messages from whoever does it, and messages to it.
+# For each action: the messages sent by the client that performs it, and the messages sent to that client.
 _MESSAGES: dict[Deed, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "says": (("put", "delete"), ("declare_subscriber",)),
     "hears": (("declare_subscriber",), ("put", "delete")),
@@ -31,13 +31,13 @@ _MESSAGES: dict[Deed, tuple[tuple[str, ...], tuple[str, ...]]] = {
 
 
 class Names(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Who has which role: common names of certificates, or names of users where passwords are asked for.
+    """Names per role: common names of certificates, or user names where passwords are required.
 
     Attributes:
-        viewer: asks for predictions, pairs, the model and states, and hears pairs and states.
+        viewer: asks for predictions, pairs, the model and states, and receives pairs and states.
         operator: a viewer who may give commands, and change the simulated robot's tool.
         sampler: the process of that name: publishes pairs, answers from its store.
-        learner: the process of that name: hears pairs, answers predictions.
+        learner: the process of that name: receives pairs, answers predictions.
     """
 
     viewer: tuple[str, ...] = ()
@@ -51,25 +51,25 @@ ROLES = tuple(field.name for field in msgspec.structs.fields(Names))
 
 @dataclass(frozen=True, slots=True)
 class Subjects:
-    """How those who connect are told apart.
+    """Identification of connecting clients.
 
     Attributes:
-        by_user: by the name that a password was given for; else by their certificates' common names.
+        by_user: by the user name that the password belongs to; otherwise by the common name of the certificate.
     """
 
     by_user: bool
 
     def of(self, names: tuple[str, ...]) -> dict[str, list[str]]:
-        """The subjects of these names, as zenoh's configuration has them."""
+        """Return the subjects of these names in the form of zenoh's configuration."""
         return {"usernames" if self.by_user else "cert_common_names": list(names)}
 
 
 def deeds(role: str, keys: Keys) -> dict[Deed, tuple[str, ...]]:
-    """The keys under which the role may do each deed."""
+    """Return the keys under which the role may perform each action."""
     pair, cache = keys.pair, f"{keys.pair}/{CACHE}"
     states, alive = (keys.status("sampler"), keys.status("learner")), (keys.alive("sampler"), keys.alive("learner"))
     questions = (keys.predict, keys.jacobian, keys.ik, keys.model)
-    # Where a role speaks of both processes, so may wild cards: status/*, alive/*.
+    # A role that covers both processes may also use wild cards: status/*, alive/*.
     views: dict[Deed, tuple[str, ...]] = {
         "hears": (pair, keys.status("*")),
         "asks": (*questions, keys.pairs, keys.status("*"), pair, cache),
@@ -98,10 +98,10 @@ def deeds(role: str, keys: Keys) -> dict[Deed, tuple[str, ...]]:
 
 
 def access_control(names_of_robot: Mapping[str, Names], subjects: Subjects) -> dict[str, Any]:
-    """zenoh's table `access_control`: everything is denied but what the roles do under their robots' keys.
+    """Return zenoh's table `access_control`: deny everything except what the roles do under their robots' keys.
 
     Args:
-        names_of_robot: by the robot's name, or `*` for every robot.
+        names_of_robot: names per role, by the robot's name, or `*` for every robot.
     """
     rules: list[dict[str, Any]] = []
     owners: list[dict[str, Any]] = []

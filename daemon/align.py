@@ -1,4 +1,4 @@
-"""Joint angles at the time of a frame."""
+"""Interpolate joint angles at the time of a frame."""
 
 from __future__ import annotations
 
@@ -12,21 +12,22 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.records import FloatArray, JointReading, Reason, frozen_array
 
 CAPACITY = 8192
-ROUNDING_S = 1e-9  # times of day-long clocks, subtracted
+ROUNDING_S = 1e-9  # rounding error of time differences on day-long clocks
 
 
 def joint_difference(q: FloatArray, other: FloatArray, prismatic: NDArray[np.bool_]) -> FloatArray:
-    """`q` − `other`, shape (d,) [rad or m]; a revolute joint counts the shorter way round, as encoders wrap at ±π."""
+    """Return `q` − `other`, shape (d,) [rad or m]; revolute joints go the shorter way round: encoders wrap at ±π."""
     difference = q - other
     return np.where(prismatic, difference, np.remainder(difference + np.pi, 2 * np.pi) - np.pi)
 
 
 class JointBuffer:
-    """Recent joint readings, put in by the encoders' thread and asked for by the frames' thread.
+    """Recent joint readings, written by the encoders' thread and read by the frames' thread.
 
-    Both sides come in strictly increasing time. Readings before the frame that was asked for last are forgotten.
-    When the buffer is full `put` waits for room, because a recording can be read faster than its frames are stored;
-    of live encoders it forgets the oldest, because who reads them may bear the arm and can wait for nobody.
+    Both sides come in strictly increasing time. Readings before the last requested frame are forgotten. When the buffer
+    is full, `put` waits for room, because a recording can be read faster than its frames are stored. With live encoders
+    it forgets the oldest reading instead, because the thread that reads them may also hold up the arm and must not
+    block.
 
     Attributes:
         max_gap_s: readings around a frame may be this far apart [s].
@@ -41,14 +42,14 @@ class JointBuffer:
         live: bool = False,
         kept_s: float = 0.0,
     ) -> None:
-        """An empty buffer.
+        """Start with an empty buffer.
 
         Args:
             prismatic: which joints are prismatic, shape (d,).
             max_gap_s: readings around a frame may be this far apart [s].
             capacity: number of readings that are kept at most.
             live: `put` never waits.
-            kept_s: readings of so long before the frame are not forgotten yet [s].
+            kept_s: readings up to this long before the frame are kept [s].
         """
         self._prismatic = prismatic
         self.max_gap_s = max_gap_s
@@ -60,7 +61,7 @@ class JointBuffer:
         self._closed = False
 
     def put(self, reading: JointReading) -> None:
-        """Add the newest reading; waits while the buffer is full and not live, does nothing once it is closed."""
+        """Add the newest reading. Wait while the buffer is full and not live; do nothing once it is closed."""
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self._live or len(self._readings) < self._capacity)
             if self._closed:
@@ -70,18 +71,18 @@ class JointBuffer:
             self._changed.notify_all()
 
     def silence(self) -> None:
-        """No reading is to be expected for now: the encoders are lost or through. The next `put` ends the silence."""
+        """Expect no readings for now: the encoders are lost or at their end. The next `put` resets this."""
         with self._changed:
             self._expecting = False
             self._changed.notify_all()
 
     def forget_before(self, t: float) -> None:
-        """No frame before `t` will be asked for: keep the last reading `kept_s` before it, and what follows."""
+        """Forget readings that no frame at or after `t` needs: those before the last one `kept_s` before `t`."""
         with self._changed:
             self._forget_before(t)
 
     def make_room(self) -> None:
-        """Forget the older half of a full buffer: no frame has come for so long that none will ask for it."""
+        """Forget the older half of a full buffer; no frame has come for so long that none will need it."""
         with self._changed:
             if len(self._readings) >= self._capacity:
                 for _ in range(self._capacity // 2):
@@ -89,17 +90,17 @@ class JointBuffer:
                 self._changed.notify_all()
 
     def close(self) -> None:
-        """Let go of everybody who waits."""
+        """Close the buffer and release all waiting threads."""
         with self._changed:
             self._closed = True
             self._expecting = False
             self._changed.notify_all()
 
     def at(self, t: float, timeout_s: float) -> FloatArray | Reason:
-        """Joint angles at time `t`, shape (d,), interpolated linearly between the readings around it.
+        """Return the joint angles at time `t`, shape (d,), interpolated linearly between the readings around it.
 
-        Waits up to `timeout_s` for a reading at or after `t`. NO_JOINTS when there is none on one side of `t`,
-        STALE when the two are farther apart than `max_gap_s`.
+        Waits up to `timeout_s` for a reading at or after `t`. Returns NO_JOINTS if there is no reading on one side of
+        `t`, and STALE if the two are farther apart than `max_gap_s`.
         """
         self.forget_before(t)
         with self._changed:
@@ -116,9 +117,9 @@ class JointBuffer:
         return frozen_array(before.q + fraction * joint_difference(after.q, before.q, self._prismatic))
 
     def slack(self, t: float) -> FloatArray:
-        """How far the joints move while the times of the readings around `t` are uncertain, shape (d,) [rad or m].
+        """Return how far the joints move within the time uncertainty of the readings around `t`, shape (d,) [rad or m].
 
-        For a `t` at which `at` gave angles.
+        Call it only for a `t` at which `at` returned angles.
         """
         with self._changed:
             before, after = self._around(t)
@@ -126,10 +127,10 @@ class JointBuffer:
         return frozen_array(sigma_s / apart_s * joint_difference(after.q, before.q, self._prismatic))
 
     def moved(self, t: float, during_s: float, timeout_s: float) -> FloatArray | Reason:
-        """How far the joints move within `during_s` of time `t`, shape (d,) [rad or m]; a reason as of `at`.
+        """Return how far the joints move within `during_s` of time `t`, shape (d,) [rad or m], or a reason like `at`.
 
-        The mean over both sides, so that a step of an encoder counts half. Where `during_s` is longer than `kept_s`,
-        by the speed within that.
+        It is the mean over both sides, so that an encoder step counts half. Where `during_s` is longer than `kept_s`,
+        the speed within `kept_s` is extrapolated.
         """
         span_s = min(during_s, self._kept_s)
         before = self.at(t - span_s, timeout_s)
@@ -149,7 +150,7 @@ class JointBuffer:
         self._changed.notify_all()
 
     def _around(self, t: float) -> tuple[JointReading, JointReading]:
-        """The last reading at or before `t`, and the one after it."""
+        """Return the last reading at or before `t`, and the one after it."""
         for before, after in pairwise(self._readings):
             if after.t > t:
                 return before, after

@@ -1,4 +1,4 @@
-"""What the learner answers: predictions, Jacobians, inverse kinematics and the model, from its present snapshot."""
+"""Answer the learner's queries (predictions, Jacobians, inverse kinematics, the model) from its current snapshot."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ class Answers:
     def __init__(
         self, learning: Learning, robot: RobotDescription, age_s: Callable[[str | None], float | None]
     ) -> None:
-        """Answer from what `learning` has learnt.
+        """Answer from the state of `learning`.
 
         Args:
-            age_s: how old what was learnt is [s], given when the newest pair of it was stored (`PairFeed.age_s`).
+            age_s: age of the model [s], given the time at which its newest pair was stored (`PairFeed.age_s`).
         """
         self._learning, self._robot, self._age_s = learning, robot, age_s
         self._joints = robot.joints
         self._inverse: tuple[LearntModel, InverseKinematics] | None = None
 
     def predict(self, request: Request) -> bytes:
-        """Positions, 1-sigma and support; RequestError for a bad request, or before there is a model."""
+        """Return positions, 1-sigma and support. Raise RequestError for a bad request, or before there is a model."""
         q = joint_angles(decode(request.payload, JointsRequest, request.encoding), self._joints)
         snapshot = self._learning.snapshot
         prediction = snapshot.predict(q)
@@ -55,14 +55,14 @@ class Answers:
         return encode(reply, request.encoding)
 
     def jacobian(self, request: Request) -> bytes:
-        """Jacobians dx/dq; RequestError as for `predict`."""
+        """Return the Jacobians dx/dq. Raise RequestError as `predict` does."""
         q = joint_angles(decode(request.payload, JointsRequest, request.encoding), self._joints)
         snapshot = self._learning.snapshot
         jacobians = snapshot.require_model().jacobian(q)
         return encode(JacobianReply(jacobians.tolist(), snapshot.digest, snapshot.pairs), request.encoding)
 
     def ik(self, request: Request) -> bytes:
-        """Joint angles that put the marker where it is wanted; RequestError as for `predict`."""
+        """Return joint angles that put the marker at the requested position. Raise RequestError as `predict` does."""
         wanted = decode(request.payload, IkRequest, request.encoding)
         x = position("x", wanted.x)
         start = None if wanted.start is None else joint_vector("start", wanted.start, self._joints)
@@ -90,7 +90,10 @@ class Answers:
         return encode(reply, request.encoding)
 
     def _inverse_of(self, model: LearntModel) -> InverseKinematics:
-        """The solver for this model; the last one is kept, since building it costs as much as several answers."""
+        """Return the solver for this model.
+
+        The last one is cached, since building it costs as much as several answers.
+        """
         kept = self._inverse
         if kept is None or kept[0] is not model:
             kept = model, InverseKinematics(model, self._robot.lower, self._robot.upper)
@@ -98,7 +101,7 @@ class Answers:
         return kept[1]
 
     def model(self, _request: Request) -> bytes:
-        """The best KB-Map as one self-describing file; its metadata say of which robot, and which model answers."""
+        """Return the best KB-Map as one self-describing file; its metadata name the robot and the answering model."""
         snapshot = self._learning.snapshot
         kbmap = snapshot.require_map()
         texts = {"robot": self._robot.name, "joints": " ".join(self._joints), "pairs": str(snapshot.pairs)}

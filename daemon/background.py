@@ -1,4 +1,4 @@
-"""The low-priority work of one or several learners in one thread, in turns and within a share of a processor."""
+"""Low-priority work of one or several learners in one thread, in turns and within a share of a processor."""
 
 from __future__ import annotations
 
@@ -20,31 +20,31 @@ IDLE_S = 0.02
 SOLVE_WHEN_IDLE_S = 0.5
 RESTART_S = 1.0
 NICENESS = 10
-# Whoever waits for a lock gets it between two pieces.
+# A thread that waits for a lock gets it between two pieces of work.
 BREATH_S = 1e-4
 
 
 class Worker(Protocol):
-    """Whose work it is."""
+    """Source of the background work."""
 
     def work(self) -> bool:
-        """One small piece of it; False when there is none. SolverLostError: the solver has lost its pairs."""
+        """Do one small piece of work; return False if there is none. SolverLostError: the solver has lost its pairs."""
         ...
 
     def restart_solver(self) -> None:
-        """Give the solver its pairs again."""
+        """Send the solver its pairs again."""
         ...
 
     def solve_soon(self) -> None:
-        """Nothing was left to do for a while."""
+        """Request a solution: there has been no other work for a while."""
         ...
 
 
 class Background:
-    """Works for all until `stop` is set; a piece for each in turn, so that none waits for another's backlog.
+    """Work for all until `stop` is set, one piece for each in turn, so that none waits for another's backlog.
 
     Args:
-        share: of one processor's time, at most; 1 sets no limit.
+        share: share of one processor's time, at most; 1 sets no limit.
     """
 
     def __init__(
@@ -55,13 +55,13 @@ class Background:
         self._idle_since = [clock.now()] * len(workers)
 
     def run(self) -> None:
-        """Work, at low priority; within a share of a processor at the usual one.
+        """Run the work: at low priority, or at normal priority within a share of a processor.
 
-        On a busy machine a thread of low priority may be kept waiting while it holds Python's interpreter, and all
-        others of its process wait with it.
+        On a busy machine a low-priority thread may be preempted while it holds Python's interpreter lock, and all other
+        threads of the process then wait with it.
         """
         if self._rest == 0.0:
-            with contextlib.suppress(OSError):  # niceness is a courtesy: without it answers are a little later
+            with contextlib.suppress(OSError):  # niceness is optional: without it answers are slightly later
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
         while not self._stop.is_set():
             self._service.beat("background")
@@ -80,7 +80,7 @@ class Background:
                 self._solve_what_rests()
 
     def _round(self) -> bool:
-        """A piece for each; whether there was any."""
+        """Do one piece for each; return True if there was any."""
         worked = [worker.work() for worker in self._workers]
         for place, busy in enumerate(worked):
             if busy:

@@ -1,7 +1,7 @@
-"""A robot in one file: its pairs, what was learnt of them, its description; and back again.
+"""Back up a robot (its pairs, learnt state and description) into one file, and read such files.
 
-A ZIP archive. `manifest.json` says what is in it, with a checksum of each file; `state/` has the store and the
-checkpoint, `robot/` robot.toml and the files that it names.
+The file is a ZIP archive. `manifest.json` lists the contents with a checksum of each file; `state/` has the store and
+the checkpoint, `robot/` has robot.toml and the files that it names.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ SCHEMA = 1
 MANIFEST = "manifest.json"
 STATE, ROBOT = "state", "robot"
 STORE, CHECKPOINT, ROBOT_TOML = f"{STATE}/pairs.sqlite", f"{STATE}/learner.ckpt", f"{ROBOT}/robot.toml"
-# Of files that lie outside robot.toml's folder, which is not restored into other folders.
+# Prefix for files outside robot.toml's folder; they are not restored into other folders.
 ELSEWHERE = "elsewhere"
-# By its keys in robot.toml, how a file that it names may end.
+# Permitted file endings, by the robot.toml key that names the file.
 NAMED_FILES = {
     ("robot", "urdf"): (".urdf", ".xml"),
     ("vision", "cameras", "calibration"): (".toml",),
     ("unexplained", "model"): (".kbmap",),
 }
 CHUNK, CHECKSUM_BYTES = 2**20, 32
-# What zipfile raises of bytes that are not an archive; RuntimeError where a bit says that it is encrypted.
+# Exceptions that zipfile raises for bytes that are not an archive; RuntimeError if the encryption bit is set.
 NOT_AN_ARCHIVE = (
     OSError, EOFError, RuntimeError, ValueError, LookupError, struct.error, zlib.error, zipfile.BadZipFile
 )  # fmt: skip
@@ -55,7 +55,7 @@ class BackupError(BodyschemaError):
 
 
 class Entry(msgspec.Struct, frozen=True):
-    """A file in a backup: its size in bytes and its BLAKE2b, and where it was."""
+    """A file in a backup: its size in bytes, its BLAKE2b checksum, and its original location."""
 
     size: int
     blake2b: str
@@ -63,13 +63,13 @@ class Entry(msgspec.Struct, frozen=True):
 
 
 class Manifest(msgspec.Struct, frozen=True, kw_only=True):
-    """What a backup is of.
+    """Contents of a backup.
 
     Attributes:
         store: identity of the pair store.
-        pairs: how many pairs there are, up to the number `last_seq`.
+        pairs: number of pairs, up to the sequence number `last_seq`.
         files: by name in the archive.
-        unreadable: how many pairs between the oldest and the newest could not be read, and are not in it.
+        unreadable: number of pairs between the oldest and the newest that could not be read and are missing.
     """
 
     robot: Name
@@ -84,15 +84,15 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def write_backup(config: Config, file: Path, *, utc: str, version: str, replace: bool = False) -> Manifest:
-    """Write a backup of a robot into `file`, also while it samples and learns.
+    """Write a backup of a robot into `file`; works while it samples and learns.
 
-    The checkpoint is read before the store is: it never knows a pair that the store does not.
+    The checkpoint is read before the store, so it never contains a pair that the store lacks.
 
     Args:
-        replace: a file that is there may be replaced, once the new one is whole.
+        replace: an existing file may be replaced, once the new one is complete.
 
     Raises:
-        BackupError: it is there already, or cannot be written.
+        BackupError: the file exists already, or cannot be written.
         StoreError: there is no store, or it is damaged.
     """
     if file.exists() and not replace:
@@ -125,13 +125,13 @@ def write_backup(config: Config, file: Path, *, utc: str, version: str, replace:
 
 
 def copy_store(store: Path, copy: Path, joints: Sequence[str]) -> Audit:
-    """Copy the store as it is at one moment into one file, without what cannot be read; also while a sampler writes it.
+    """Copy a snapshot of the store into one file, without unreadable rows; works while a sampler writes it.
 
     Args:
-        joints: for a store that lost theirs.
+        joints: joint names for a store that lost its own.
 
     Raises:
-        StoreError: there is no store, nothing of it can be read, or the disk is full.
+        StoreError: there is no store, nothing in it can be read, or the disk is full.
     """
     require_store(store)
     with (
@@ -149,10 +149,10 @@ def copy_store(store: Path, copy: Path, joints: Sequence[str]) -> Audit:
 
 
 class Backup:
-    """A backup that was opened and found whole. Use as a context manager."""
+    """A backup that was opened and verified. Use as a context manager."""
 
     def __init__(self, file: Path) -> None:
-        """Nothing is opened yet."""
+        """Prepare without opening anything."""
         self.file = file
         self._archive: zipfile.ZipFile | None = None
         self._manifest: Manifest | None = None
@@ -173,18 +173,18 @@ class Backup:
 
     @property
     def manifest(self) -> Manifest:
-        """What it is of."""
+        """Contents of the backup."""
         if self._manifest is None:
             raise BackupError(f"{self.file} is not open; use it in a with statement")
         return self._manifest
 
     def has(self, name: str, file: Path) -> bool:
-        """Whether `file` is, byte by byte, what the backup has under this name."""
+        """Return True if `file` equals, byte by byte, the backup's file of this name."""
         entry = self.manifest.files[name]
         return file.exists() and _entry(file, file).blake2b == entry.blake2b
 
     def extract(self, name: str, target: Path) -> None:
-        """Write one of its files to `target`, which is new, and whole and on the disk afterwards.
+        """Write one of the backup's files to the new file `target`; on return it is complete and synced to disk.
 
         Raises:
             BackupError: the archive has changed since it was opened.
@@ -207,7 +207,7 @@ class Backup:
         return self._archive
 
     def _checked(self, archive: zipfile.ZipFile) -> Manifest:
-        """The manifest, when every file is there as it says, and no other."""
+        """Return the manifest after checking that exactly the files it lists are there."""
         infos = archive.infolist()
         names = {info.filename for info in infos}
         sizes = {info.filename: info.file_size for info in infos}
@@ -238,10 +238,10 @@ class Backup:
         return manifest
 
     def _copied(self, source: IO[bytes], size: int, write: Callable[[bytes], object] = len) -> str:
-        """Give at most one byte more than `size` to `write`: an archive can unpack to more than the disk holds.
+        """Pass at most one byte more than `size` to `write`: an archive can unpack to more than the disk holds.
 
         Returns:
-            Their checksum.
+            Checksum of these bytes.
         """
         digest, left = hashlib.blake2b(digest_size=CHECKSUM_BYTES), size + 1
         while left > 0:
@@ -256,7 +256,7 @@ class Backup:
 
     @contextmanager
     def _explained(self) -> Iterator[None]:
-        """What zipfile raises of a file that is not an archive, or of one that is not whole, as BackupErrors."""
+        """Convert zipfile's exceptions about an invalid or incomplete archive into BackupErrors."""
         try:
             yield
         except FileNotFoundError as error:
@@ -292,16 +292,16 @@ def description_files(tables: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _description(config: Config) -> dict[str, Path]:
-    """robot.toml and the files that it names, by their names in the archive."""
+    """Return robot.toml and the files that it names, by their names in the archive."""
     home, (tables, _) = config.file.absolute().parent, read_toml(config.file)
     return {ROBOT_TOML: config.file} | {name: home / file for name, file in description_files(tables).items()}
 
 
 def _inside(name: str, endings: tuple[str, ...]) -> str:
-    """Return a file's name as robot.toml has it where it can be put back there; else one elsewhere.
+    """Return the archive name of a file: relative to robot.toml where it can be restored there, else under `ELSEWHERE`.
 
-    It can where it stays in robot.toml's folder, is not hidden (`.git/hooks/…`), and ends as files of its kind do: no
-    program takes it for something to run.
+    A file can be restored if it lies in robot.toml's folder, is not hidden (`.git/hooks/…`), and has an ending usual
+    for its kind, so that no program would execute it.
     """
     path = PurePosixPath(os.path.normpath(name))
     plain = not path.is_absolute() and not any(part.startswith(".") for part in path.parts)
@@ -312,7 +312,7 @@ def _inside(name: str, endings: tuple[str, ...]) -> str:
 
 
 def _write_archive(file: Path, manifest: Manifest, contents: Mapping[str, Path]) -> None:
-    # It may hold passwords of robot.toml.
+    # The file may contain passwords from robot.toml.
     descriptor = os.open(file, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
     with os.fdopen(descriptor, "w+b") as stream:
         with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:

@@ -1,4 +1,4 @@
-"""A bench that runs until it is told to stop."""
+"""Run emulated servos until asked to stop."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ FAULTS: Mapping[str, str] = MappingProxyType(
 
 
 class BenchRun:
-    """The servos of a robot.toml behind a port, with a robot.toml that names it.
+    """The emulated servos of a robot.toml behind a port, with a robot.toml that names this port.
 
     Attributes:
-        stopping: whether it was told to stop.
+        stopping: True once a stop was requested.
     """
 
     def __init__(
@@ -55,10 +55,10 @@ class BenchRun:
         seed: int = 0,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Nothing is made yet.
+        """Store the settings; nothing is created yet.
 
         Raises:
-            ConfigError: robot.toml has no servos, a fault is none, or the port's name is taken.
+            ConfigError: robot.toml has no servos, a fault does not exist, or the port's name is taken.
         """
         self._config, self._port, self._now = config, port, now
         self._motion = Motion(dict.fromkeys(config.robot.joints, _still), "standing still")
@@ -73,7 +73,7 @@ class BenchRun:
         self.stopping = False
 
     def prepare(self, tell: Callable[[float], None]) -> None:
-        """Make the motion; `tell` is called with the share that is done."""
+        """Compute the motion; `tell` is called with the completed share."""
         self._motion = bench_motion(self._config, tell)
         self._bench = self._make(self._motion)
 
@@ -94,20 +94,20 @@ class BenchRun:
 
     @property
     def count(self) -> int:
-        """How many packets were understood, or lines were said."""
+        """Number of packets understood, or of lines sent."""
         return self._bench.arm.count
 
     @property
     def unit(self) -> str:
-        """Of what is counted."""
+        """Unit of `count`."""
         return self._bench.arm.unit
 
     def stop(self) -> None:
-        """Come to an end. Only sets a flag: a signal handler may call it."""
+        """Request the end. Only sets a flag: a signal handler may call it."""
         self.stopping = True
 
     def due(self) -> Iterator[str]:
-        """Do what is due, and say it."""
+        """Perform the actions that are due, and yield a message for each."""
         while self._next is not None and self._now() >= self._next[0]:
             at, said, act = self._next
             act()
@@ -115,7 +115,7 @@ class BenchRun:
             yield said
 
     def introduction(self) -> Iterator[str]:
-        """What is there, and what to type in another terminal."""
+        """Yield what is emulated, and what to type in another terminal."""
         config, file = self._config, self.robot_file
         for words in bench_ports(self._bench):
             yield f"{config.robot.name}: {words}"

@@ -1,6 +1,6 @@
-"""The one place where the daemon touches zenoh: sessions that are always closed, handlers that always answer.
+"""Access to zenoh for the daemon: sessions that are always closed, handlers that always answer.
 
-A Python callback that is never undeclared keeps the process from exiting, so every session here lives in a `with`.
+A Python callback that is never undeclared keeps the process from exiting, so every session here is used in a `with`.
 """
 
 from __future__ import annotations
@@ -29,24 +29,24 @@ from .wire import JSON, MSGPACK, ErrorReply, decode, encode
 log = logging.getLogger(__name__)
 
 LEASE_MS = 2000
-FIRST_TRY_MS = 100  # how long opening waits for a peer that is not there; trying goes on in the background
+FIRST_TRY_MS = 100  # how long opening waits for an absent peer; connecting goes on in the background
 OPEN_TIMEOUT_S = 5.0
-# What clients call a payload when nobody told them: taken for JSON.
+# Default encodings of clients that set none; treated as JSON.
 PLAIN = ("zenoh/", "text/")
 RETRY_MS = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
-# What is put together from fragments: the largest model with its orientation for a client, pairs for a process.
+# Limits of messages that zenoh reassembles: the largest model with orientation for a client, pairs for a process.
 LARGEST_REPLY_BYTES, LARGEST_MESSAGE_BYTES = 2**26, 2**23
 LONGEST_ERROR = 2000  # characters
-REFUSALS = 1000  # that wait to be told; beyond them a query ends without an answer
+REFUSALS = 1000  # refusals waiting to be sent; beyond them a query ends without an answer
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One query, taken apart.
+    """One query, decoded.
 
     Attributes:
-        parameters: what stands after the `?` of the key.
-        encoding: JSON or MSGPACK, which the reply has to use too.
+        parameters: the part of the key after the `?`.
+        encoding: JSON or MSGPACK; the reply has to use the same.
     """
 
     parameters: dict[str, str]
@@ -56,14 +56,14 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """One answer, taken apart: `error` says what was wrong with the request, or is None."""
+    """One answer, decoded: `error` says what was wrong with the request, or is None."""
 
     payload: bytes
     error: str | None
 
 
 class Bus:
-    """A zenoh session of ours.
+    """A zenoh session of this process.
 
     Use as a context manager; leaving it undeclares everything and ends the handler threads.
     """
@@ -77,18 +77,18 @@ class Bus:
         settings: Mapping[str, Any] | None = None,
         open_timeout_s: float = OPEN_TIMEOUT_S,
     ) -> None:
-        """A session that listens on `listen` and, when there is somebody, talks to `connect`.
+        """Open a session that listens on `listen` and connects to `connect` when a process listens there.
 
         Args:
-            client: connect at once or fail; otherwise go on trying in the background.
-            settings: more of zenoh's configuration, as `Config.zenoh_settings` has it for a process.
-            open_timeout_s: how long who takes the connection may need to speak zenoh.
+            client: connect at once or fail; otherwise keep trying in the background.
+            settings: further zenoh configuration, as returned by `Config.zenoh_settings` for a process.
+            open_timeout_s: time allowed for the process that accepts the connection to speak zenoh.
         """
         self._listen, self._client, self._settings = listen, client, dict(settings or {})
         self._route = Route((connect,)) if isinstance(connect, str) else connect
         self._open_timeout_s = open_timeout_s
         self._session: zenoh.Session | None = None
-        self._declared: list[object] = []  # a token that nobody holds is undeclared
+        self._declared: list[object] = []  # a token without a reference is undeclared
         self._receptions: list[Reception[zenoh.Query]] = []
         self._threads: list[threading.Thread] = []
         self._refusals: queue.Queue[tuple[zenoh.Query, str] | None] = queue.Queue(REFUSALS)
@@ -110,7 +110,7 @@ class Bus:
             self._end_threads()
 
     def publisher(self, key: str, *, cache: int = 0) -> Callable[[bytes], None]:
-        """A function that publishes JSON under `key`; with `cache`, late subscribers can ask for the last so many."""
+        """Return a function that publishes JSON under `key`; late subscribers can ask for the last `cache` messages."""
         if not cache:
             plain = self._open.declare_publisher(key, encoding=zenoh.Encoding(JSON))
             return plain.put
@@ -124,11 +124,11 @@ class Bus:
         return advanced.put
 
     def subscribe(self, key: str, handler: Callable[[bytes], None], *, quick: bool = False) -> None:
-        """Call `handler` with the payload of every publication under `key`, in a thread of the session's own.
+        """Call `handler` with the payload of every publication under `key`, in a thread of the session.
 
         Args:
-            quick: it does no more than to put the payload somewhere. Then no thread of its own is started for it: each
-                more that wants Python's interpreter with every message costs all others time.
+            quick: the handler only stores the payload. It then gets no thread of its own: each further thread that
+                needs the interpreter for every message slows all others.
         """
 
         def receive(sample: zenoh.Sample) -> None:
@@ -141,10 +141,10 @@ class Bus:
         self._declared.append(self._open.declare_subscriber(key, received))
 
     def answer(self, key: str, handler: Callable[[Request], bytes], *, encoding: str | None = None) -> None:
-        """Answer queries under `key`; what `handler` raises goes back as an error reply.
+        """Answer queries under `key`; exceptions of `handler` are returned as error replies.
 
         Args:
-            encoding: of the answers; None: the one that the request has.
+            encoding: encoding of the answers; None: that of the request.
         """
 
         reception: Reception[zenoh.Query] = Reception()
@@ -159,16 +159,16 @@ class Bus:
             self._start(self._refuse)
         self._receptions.append(reception)
         self._start(lambda: self._answer(key, reception, handler, encoding))
-        # In zenoh's own thread, which only puts the query where it waits.
+        # Runs in zenoh's own thread, which only queues the query.
         received = zenoh.handlers.Callback(receive, indirect=False)
         self._declared.append(self._open.declare_queryable(key, received, complete=True))
 
     def token(self, key: str) -> None:
-        """Be alive under `key` until the session ends."""
+        """Declare a liveliness token under `key` until the session ends."""
         self._declared.append(self._open.liveliness().declare_token(key))
 
     def watch(self, key: str, changed: Callable[[bool], None]) -> None:
-        """Call `changed` with True when somebody comes alive under `key`, and False when he is gone."""
+        """Call `changed` with True when a token under `key` appears, and False when it disappears."""
 
         def receive(sample: zenoh.Sample) -> None:
             changed(sample.kind == zenoh.SampleKind.PUT)
@@ -176,25 +176,25 @@ class Bus:
         self._declared.append(self._open.liveliness().declare_subscriber(key, receive, history=True))
 
     def alive(self, key: str, *, timeout_s: float = 2.0) -> list[str]:
-        """The keys under which somebody is alive that match this one, and which this session does not watch too.
+        """Return the live keys that match this one, except those that this session also watches.
 
-        zenoh answers from what a watch of the same session has heard so far, which may be nothing yet.
+        zenoh answers from what a watch of the same session has received so far, which may still be nothing.
         """
         replies = self._open.liveliness().get(key, timeout=timeout_s)
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
     def ask(self, key: str, payload: bytes = b"", *, encoding: str = JSON, timeout_s: float = 5.0) -> list[Reply]:
-        """All replies to a query; none when nobody answers under `key`."""
+        """Return all replies to a query; an empty list if there is no answer under `key`."""
         source = zenoh.SourceInfo(self._open.id, 0)
         said = zenoh.Encoding(encoding)
         replies = self._open.get(key, payload=payload, encoding=said, timeout=timeout_s, source_info=source)
         return [_taken_apart(reply) for reply in replies]
 
     def ask_one(self, key: str, payload: bytes = b"", *, encoding: str = JSON, timeout_s: float = 5.0) -> bytes:
-        """The one reply to a query.
+        """Return the one reply to a query.
 
         Raises:
-            BusError: nobody answers under this key, or not in time.
+            BusError: there is no answer under this key, or not in time.
             RequestError: the request was refused.
         """
         replies = self.ask(key, payload, encoding=encoding, timeout_s=timeout_s)
@@ -241,7 +241,7 @@ class Bus:
 
     @property
     def _lasting_mode(self) -> str:
-        """A peer that is linked to a process and to the router hears everything twice; routers know of each other."""
+        """Mode of a long-lived session; a peer linked to a process and to the router would receive everything twice."""
         return "router" if self._route is not None and len(self._route.endpoints) > 1 else "peer"
 
     def _explain(self, message: str) -> str:
@@ -261,7 +261,7 @@ class Bus:
         thread.start()
 
     def _end_threads(self) -> None:
-        """After the session was closed: nothing comes any more."""
+        """End the handler threads after the session was closed and nothing more can arrive."""
         for reception in self._receptions:
             reception.close()
         if self._threads:
@@ -278,11 +278,11 @@ class Bus:
             query.drop()
 
     def _refuse(self) -> None:
-        """Tell those who ask too much; in a thread of its own, for one who does not listen keeps it waiting."""
+        """Refuse queries beyond the limits, in a thread of its own: a client that does not listen blocks it."""
         while (refused := self._refusals.get()) is not None:
-            with contextlib.suppress(zenoh.ZError), refused[0]:  # an ended session answers nobody
+            with contextlib.suppress(zenoh.ZError), refused[0]:  # a closed session cannot answer
                 _reply_error(*refused)
-            del refused  # a query that is held is not yet answered
+            del refused  # a query that is referenced is not yet answered
 
     def _answer(
         self,
@@ -293,12 +293,12 @@ class Bus:
     ) -> None:
         while (taken := reception.take()) is not None:
             query, refused = taken
-            with contextlib.suppress(zenoh.ZError), query:  # an ended session answers nobody
+            with contextlib.suppress(zenoh.ZError), query:  # a closed session cannot answer
                 if refused is None:
                     self._reply(key, query, handler, encoding)
                 else:
                     _reply_error(query, str(refused))
-            del query, taken  # a query that is held is not yet answered
+            del query, taken  # a query that is referenced is not yet answered
 
     def _reply(
         self, key: str, query: zenoh.Query, handler: Callable[[Request], bytes], answer_encoding: str | None
@@ -321,31 +321,31 @@ class Bus:
 
 
 def _encodings(query: zenoh.Query) -> tuple[str, str]:
-    """What the query's encoding is called, and which of ours an answer has."""
+    """Return the name of the query's encoding, and which of ours an answer uses."""
     asked = str(query.encoding) if query.encoding is not None else JSON
     return asked, MSGPACK if asked.startswith(MSGPACK) else JSON
 
 
 def _reply_error(query: zenoh.Query, text: str) -> None:
     _, encoding = _encodings(query)
-    shortened = text if len(text) <= LONGEST_ERROR else f"{text[:LONGEST_ERROR]}..."  # it may quote the request
+    shortened = text if len(text) <= LONGEST_ERROR else f"{text[:LONGEST_ERROR]}..."  # may quote the request
     query.reply_err(encode(ErrorReply(shortened), encoding), encoding=zenoh.Encoding(encoding))
 
 
 def _source(query: zenoh.Query) -> str:
-    """Which session asks, where it says so."""
+    """Return the id of the querying session, if the query has one."""
     return "" if query.source_info is None else str(query.source_info.source_id.zid)
 
 
 @contextmanager
 def client(route: str | Route, open_timeout_s: float = OPEN_TIMEOUT_S) -> Iterator[Bus]:
-    """A short-lived session to a process; BusError when there is none."""
+    """Open a short-lived session to a process. BusError if it cannot be reached."""
     with Bus(connect=route, client=True, open_timeout_s=open_timeout_s) as bus:
         yield bus
 
 
 def is_alive(endpoint: str | Route, token: str, *, open_timeout_s: float = OPEN_TIMEOUT_S) -> bool:
-    """Whether somebody listens on `endpoint` and has declared the liveliness token."""
+    """Return True if a process listens on `endpoint` and has declared the liveliness token."""
     try:
         with client(endpoint, open_timeout_s) as bus:
             return bool(bus.alive(token))

@@ -1,4 +1,4 @@
-"""What changed last, for the log and for the status."""
+"""Report the last detected change in the log and in the status."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from .status import UNDECIDED, Change
 
 log = logging.getLogger(__name__)
 
-# What is less probable need not be told.
+# Kinds less probable than this are not reported.
 _TOLD = 0.01
 
 
 class Changes:
-    """Tells the learner's changes to the log, in the names of the robot. Not to be used by two threads at once.
+    """Logs the learner's changes, in the robot's names. Not thread-safe.
 
     Args:
-        joints: their names.
-        change: the last one that need not be told any more; None: there was none.
+        joints: joint names.
+        change: the last change that was already reported; None: there was none.
     """
 
     def __init__(self, joints: Sequence[str], change: ChangeRecord | None = None) -> None:
         self._joints, self._told = tuple(joints), change
 
     def note(self, change: ChangeRecord | None, *, rolled_back: bool = False) -> None:
-        """Log what is new of the last change: that it was noticed, what it was found to be, that it is undone."""
+        """Log what is new about the last change: its detection, its cause, its rollback."""
         was, self._told = self._told, change
         if rolled_back:
             log.info("rolled back to the model before %s", "the change" if was is None else f"pair {was.first_seq}")
@@ -36,7 +36,7 @@ class Changes:
             log.info("the change at pair %d is %s", change.first_seq, self._name(change))
 
     def status(self, change: ChangeRecord | None, *, can_roll_back: bool) -> Change | None:
-        """The change for the status; None: there was none."""
+        """Return the change for the status; None: there was none."""
         if change is None:
             return None
         return Change(

@@ -1,6 +1,6 @@
-"""The learner's state on disk: one file, replaced as a whole, so that a kill leaves the old one or the new one.
+"""Store the learner's state on disk in one file, replaced atomically: a kill leaves either the old or the new file.
 
-The one before is kept beside it, for the day when a disk gives back something else than was written.
+The previous checkpoint is kept next to it, in case the disk corrupts the newest one.
 
 Layout, all little-endian:
 
@@ -37,7 +37,7 @@ MAGIC = b"BSCKPT\r\n"
 VERSION = 3
 _PREFIX = struct.Struct("<8sII")
 _CHECKSUM_BYTES = 16
-# The largest that there can be, with the exact map of 2187 nodes and the state before a change, has 200 MB.
+# Upper bound: with the exact map of 2187 nodes and the state before a change, a checkpoint has 200 MB.
 LARGEST_BYTES = 2**29
 
 
@@ -58,10 +58,10 @@ class _Header(msgspec.Struct, frozen=True):
 
 
 def write_checkpoint(file: Path, state: LearningState, *, robot: str, utc: str) -> None:
-    """Replace the checkpoint `file` by `state`; what it was stays as the previous one.
+    """Replace the checkpoint `file` by `state`; the old one is kept as the previous checkpoint.
 
     Raises:
-        CheckpointError: the disk is full or read-only, or the state is no use; the old checkpoint is still there.
+        CheckpointError: the disk is full or read-only, or the state is unusable; the old checkpoint is still there.
     """
     poisoned = state.poisoned()
     if poisoned is not None:
@@ -81,10 +81,10 @@ def write_checkpoint(file: Path, state: LearningState, *, robot: str, utc: str) 
 
 
 def read_checkpoint(file: Path, *, robot: str) -> LearningState | None:
-    """The state in `file`; None when there is no such file.
+    """Return the state in `file`; None if there is no such file.
 
     Raises:
-        CheckpointError: it cannot be read, is damaged, or belongs to another robot.
+        CheckpointError: the file cannot be read, is damaged, or belongs to another robot.
     """
     if not os.path.lexists(file):
         return None
@@ -103,10 +103,10 @@ def read_checkpoint(file: Path, *, robot: str) -> LearningState | None:
 
 
 def checkpoint_bytes(file: Path) -> bytes:
-    """Return what is in the file.
+    """Return the contents of the file.
 
     Raises:
-        CheckpointError: it cannot be read, is larger than a checkpoint can be, or is a device.
+        CheckpointError: the file cannot be read, is larger than a checkpoint can be, or is a device.
     """
     try:
         return read_at_most(file, LARGEST_BYTES)
@@ -115,12 +115,12 @@ def checkpoint_bytes(file: Path) -> bytes:
 
 
 def generations(file: Path) -> tuple[Path, Path]:
-    """Where the checkpoint is looked for: `file`, and the one before it."""
+    """Return the paths where a checkpoint is looked for: `file`, and its predecessor."""
     return file, file.with_name(file.name + ".previous")
 
 
 def set_aside(file: Path) -> Path:
-    """Rename a checkpoint that is of no use, so that it is kept and not in the way; the new path."""
+    """Rename an unusable checkpoint so that it is kept but no longer in the way; return the new path."""
     aside = unused_name(file, "unusable")
     try:
         file.rename(aside)
@@ -158,7 +158,7 @@ def _decode(file: Path, data: bytes) -> tuple[_Header, memoryview]:
 
 
 def _keep_previous(file: Path) -> None:
-    """Give the present checkpoint a second name, so that it never lacks its own."""
+    """Give the current checkpoint a second name first, so that its own name always exists."""
     if not file.exists():
         return
     previous = generations(file)[1]

@@ -1,4 +1,4 @@
-"""The command `bodyschema`. Commands are imported when they run, so that `--help` answers at once."""
+"""The command `bodyschema`. Commands are imported when they run, so that `--help` is fast."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ COMMANDS = {name: summary for group in GROUPS.values() for name, summary in grou
 _SECTIONS = {title: cyclopts.Group(title, sort_key=place) for place, title in enumerate(GROUPS)}
 
 
-# Each paragraph is one line: the terminal's width breaks it.
+# Each paragraph is one line: the terminal's width wraps it.
 _HELP = """Calibrate a robot arm by moving it by hand in front of a camera.
 
 Joint encoders and a stereo camera give samples. A learner turns them into the forward kinematics that the camera \
@@ -74,11 +74,11 @@ New here? Type: bodyschema demo. Each command's --help says what it needs and wh
 
 
 def command_line(called: str | None = None) -> cyclopts.App:
-    """The command line.
+    """Return the command line.
 
     Args:
-        called: the command whose own page may be asked for. A summary given here is all that such a page would show,
-            so this command is registered without one and shows what its function says of itself.
+        called: the command whose own help page may be requested. A summary given here would replace that page, so this
+            command is registered without one and shows its function's docstring.
     """
     line = cyclopts.App(
         name="bodyschema",
@@ -103,16 +103,16 @@ def _version() -> str:
 
 app = command_line()
 
-# A learner with two neighbours opens 26 files, one of fifty robots 200. Libraries abort where they get none.
+# A learner with two neighbours opens 26 files, one of fifty robots 200. Libraries abort when they cannot open more.
 FEWEST_FILES, ENOUGH_FILES = 64, 1024
 RAISE_LIMIT = "`ulimit -n 1024` in the shell, or LimitNOFILE=1024 in the unit, allows more"
 
 
 def allow_enough_files() -> None:
-    """Raise this process's limit of open files to `ENOUGH_FILES`, as far as it may.
+    """Raise this process's limit of open files to `ENOUGH_FILES`, as far as the system permits.
 
     Raises:
-        ConfigError: it may open fewer than `FEWEST_FILES`.
+        ConfigError: the process may open fewer than `FEWEST_FILES`.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     allowed = ENOUGH_FILES if hard == resource.RLIM_INFINITY else min(hard, ENOUGH_FILES)
@@ -128,10 +128,10 @@ def _fail(error: BodyschemaError) -> NoReturn:
 
 
 def main() -> None:
-    """Run the command line; errors of ours become one line and exit code 1."""
-    # Threads of BLAS spin on the small matrices of tracker and learner, and take twice the time.
+    """Run the command line; known errors become one line and exit code 1."""
+    # BLAS threads spin on the small matrices of tracker and learner and double the time.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # OpenCV would take 3 GiB for what a few kilobytes of PNG call an image; the largest cameras have 100 megapixels.
+    # OpenCV would allocate 3 GiB for a malicious PNG of a few kilobytes; the largest cameras have 100 megapixels.
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**27))
     end_with_parent()
     arguments = sys.argv[1:]
@@ -147,7 +147,7 @@ def main() -> None:
         _fail(missing)
     except KeyboardInterrupt:
         sys.exit(130)
-    except BrokenPipeError:  # whoever read our output has had enough, as `head` has
+    except BrokenPipeError:  # the reader of our output has closed it, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except OSError as error:

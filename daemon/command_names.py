@@ -1,4 +1,4 @@
-"""The commands that a process can be told, and whose they are."""
+"""Names of the commands that the sampler and the learner accept."""
 
 from __future__ import annotations
 

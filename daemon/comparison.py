@@ -1,4 +1,4 @@
-"""Two recordings of the same joint angles: how far apart their positions are."""
+"""Compare two recordings of the same joint angles: distances between their positions."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from bodyschema.interfaces.errors import RecordingError
 from bodyschema.interfaces.recording import Recording
 from bodyschema.interfaces.records import FloatArray
 
-# Rows whose joints differ by more are not of the same joint angles [rad, m].
+# Rows whose joints differ by more are not at the same joint angles [rad, m].
 SAME_ANGLES = 1e-6
 WORST = 5
-# So few points leave a rigid alignment nothing to misfit.
+# A rigid alignment of fewer points leaves no residual.
 _FEWEST_ALIGNED = 4
 
 
@@ -32,18 +32,18 @@ class Distances(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, apart: FloatArray) -> Distances:
-        """Of differences (n, 3) [m]."""
+        """Return the figures of differences (n, 3) [m]."""
         distance = 1e3 * np.linalg.norm(apart, axis=1)
         rms = math.sqrt(float(np.mean(distance**2)))
         return cls(float(distance.mean()), rms, float(np.median(distance)), float(distance.max()))
 
 
 class Aligned(msgspec.Struct, frozen=True):
-    """What is left once the second recording is turned and shifted as a whole onto the first.
+    """Distances after the second recording is rigidly aligned with the first.
 
     Attributes:
-        distances: what is left.
-        shift_mm, turn_deg: how far it was moved at its middle, and turned.
+        distances: distances after alignment.
+        shift_mm, turn_deg: translation at its centroid, and rotation.
     """
 
     distances: Distances
@@ -52,7 +52,7 @@ class Aligned(msgspec.Struct, frozen=True):
 
 
 class WorstRow(msgspec.Struct, frozen=True):
-    """A row that is farthest apart: numbers of the rows, from 1, and the second minus the first position."""
+    """A row with the largest distance: row numbers, from 1, and the second minus the first position."""
 
     row: int
     other_row: int
@@ -65,11 +65,11 @@ class LeftOut(msgspec.Struct, frozen=True):
     """Rows that were not compared.
 
     Attributes:
-        first, second: how many of each recording have no row of the same joint angles in the other.
-        first_row: number of the first such row of the first recording; None where there is none.
-        second_row: the same of the second.
-        joint, by: of a first such row, the joint that differs most from the other's row of that number, and by how
-            much [rad, m].
+        first, second: number of rows of each recording without a match in the other.
+        first_row: number of the first such row of the first recording; None if there is none.
+        second_row: the same for the second.
+        joint, by: for a first such row, the joint that differs most from the row of the same number in the other
+            recording, and the difference [rad, m].
     """
 
     first: int
@@ -81,11 +81,11 @@ class LeftOut(msgspec.Struct, frozen=True):
 
 
 class ComparisonReport(msgspec.Struct, frozen=True, kw_only=True):
-    """How far the positions of two recordings are apart, the second minus the first.
+    """Distances between the positions of two recordings; differences are the second minus the first.
 
     Attributes:
-        rows, other_rows: of each recording.
-        compared: rows of the same joint angles in both.
+        rows, other_rows: number of rows of each recording.
+        compared: number of rows at the same joint angles in both.
         axis_mean_mm, axis_rms_mm: per coordinate.
         aligned: None with too few rows.
     """
@@ -106,17 +106,17 @@ class ComparisonReport(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class _Match:
-    """Indices of the rows that belong together, (m,) each."""
+    """Indices of matching rows, (m,) each."""
 
     first: NDArray[np.int64]
     second: NDArray[np.int64]
 
 
 def compared(first: Recording, second: Recording, names: tuple[str, str]) -> ComparisonReport:
-    """The comparison of two recordings, called `names`.
+    """Return the comparison of two recordings, named `names`.
 
     Raises:
-        RecordingError: they are of other joints, or have no row in common.
+        RecordingError: they have different joints, or no row in common.
     """
     if set(first.joints) != set(second.joints):
         only = ", ".join(sorted(set(first.joints) ^ set(second.joints)))
@@ -154,7 +154,7 @@ def compared(first: Recording, second: Recording, names: tuple[str, str]) -> Com
 
 
 def _matched(q: FloatArray, other: FloatArray) -> _Match:
-    """Row by row where the numbers of rows agree; else each row and the nearest that is left in the other."""
+    """Match row by row where the row counts agree; otherwise each row with the nearest unmatched one of the other."""
     if len(q) == len(other):
         rows = np.flatnonzero(np.abs(q - other).max(axis=1) <= SAME_ANGLES)
         return _Match(rows, rows)
@@ -197,9 +197,9 @@ def _aligned(x: FloatArray, other: FloatArray) -> Aligned | None:
 
 
 def laid_on(x: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The positions `other` (n, 3) turned and shifted as a whole onto `x` (n, 3), and the turn (3, 3).
+    """Return the positions `other` (n, 3) rigidly aligned with `x` (n, 3), and the rotation (3, 3).
 
-    By the least squares of Kabsch 1976.
+    By least squares (Kabsch 1976).
     """
     middle, other_middle = x.mean(axis=0), other.mean(axis=0)
     U, _, Vt = np.linalg.svd((other - other_middle).T @ (x - middle))

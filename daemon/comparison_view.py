@@ -1,4 +1,4 @@
-"""How far two recordings are apart, for a terminal of 80 columns."""
+"""Show the comparison of two recordings in a terminal of 80 columns."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .screen import mm
 
 
 def view(report: ComparisonReport) -> Group:
-    """What was compared, the figures, the worst rows."""
+    """Return a view of what was compared, the figures and the worst rows."""
     figures = _table("", "mean", "RMS", "median", "max")
     figures.add_row(Text("distance [mm]"), *_row(report.distances))
     if report.aligned is not None:
@@ -32,7 +32,7 @@ def view(report: ComparisonReport) -> Group:
 
 
 def sentences(report: ComparisonReport) -> list[str]:
-    """What was compared, in words, the result first."""
+    """Return the comparison as sentences, the result first."""
     distances, left = report.distances, report.left_out
     said = [
         f"{report.second} is {mm(distances.mean_mm / 1e3)} from {report.first} on average, "

@@ -1,4 +1,4 @@
-"""What the joints were read with, and what it means for the pairs when that changes."""
+"""Record which devices read the joints, and report how a change of them affects the pairs."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ IN_ROBOT_TOML = ("zero_ticks", "direction")
 
 @runtime_checkable
 class KeepsRecord(Protocol):
-    """Encoders that can say what they are; see `bodyschema.drivers.servos.joints.ServoJoints`."""
+    """Encoders that can identify themselves; see `bodyschema.drivers.servos.joints.ServoJoints`."""
 
     @property
     def record(self) -> Sequence[Device]:
-        """Of each joint: `joint`, and what is told apart by name; empty as long as nobody was asked."""
+        """For each joint: `joint`, and its identifying properties by name; empty until the devices were queried."""
         ...
 
 
 class DeviceWatch:
-    """Keeps in the store what the joints are read with, and sees it change.
+    """Records in the store which devices read the joints, and detects changes.
 
     Attributes:
-        changes: what is other than it was for the pairs before, with what to do.
+        changes: differences from the devices of earlier pairs, with remedies.
     """
 
     def __init__(self, joints: JointSource, store: PairStore, wall: Clock) -> None:
-        """Nothing was asked yet.
+        """Store the settings; nothing is queried yet.
 
         Args:
-            joints: looked at when they keep a record.
+            joints: queried if they keep a record.
             store: open.
         """
         self._joints = joints if isinstance(joints, KeepsRecord) else None
@@ -51,11 +51,11 @@ class DeviceWatch:
         self.changes: list[str] = []
 
     def note_again(self) -> None:
-        """A new session has begun: it has a record of its own."""
+        """Start again for a new session, which has its own record."""
         self._kept = ()
 
     def look(self) -> bool:
-        """Keep the record when it is new; True when pairs from now on are others than those before."""
+        """Store the record if it is new; return True if pairs from now on differ from earlier ones."""
         record = () if self._joints is None else self._joints.record
         if not record or record == self._kept:
             return False
@@ -69,7 +69,7 @@ class DeviceWatch:
 
 
 def differences(before: Sequence[Device], now: Sequence[Device]) -> list[str]:
-    """What makes measurements with `now` others than those with `before`: sentences with what to do."""
+    """Return sentences on what makes measurements with `now` differ from those with `before`, with remedies."""
     then = {device["joint"]: device for device in before}
     return [said for device in now if device["joint"] in then for said in _said(then[device["joint"]], device)]
 

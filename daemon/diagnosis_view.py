@@ -1,4 +1,4 @@
-"""What a diagnosis found, for a terminal of 80 columns."""
+"""Show the results of a diagnosis in a terminal of 80 columns."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bodyschema.diagnosis.numbers import chance, mm, numbers_of, percent, place,
 from bodyschema.diagnosis.result import Cause, DiagnosisFile, Errors, Indistinguishable, Verdict
 from bodyschema.diagnosis.words import beside_geometry, made_to, modelled
 
-# So many hypotheses that were rejected are shown.
+# Number of rejected hypotheses shown.
 NEAREST = 6
 _HEADS: dict[Verdict, tuple[str, str]] = {
     "explained": ("EXPLAINED", "bold white on dark_green"),
@@ -36,17 +36,17 @@ _ERRORS = (
     ("extended", "with what was found"),
     ("noise_floor", "noise alone"),
 )
-# What says nothing new where it is the same as another.
+# Rows that are omitted when equal to another row.
 _SAME_AS = {"aligned": "nominal", "extended": "aligned"}
 _BAR = 24
 
 
 def view(diagnosis: DiagnosisFile, remedies: Sequence[str], *, timed: bool) -> Group:
-    """The verdict, errors before and after, causes, what was rejected, what to do.
+    """Return a view of the verdict, errors before and after, causes, rejected hypotheses and remedies.
 
     Args:
         remedies: what to do about the causes.
-        timed: whether the recording has times.
+        timed: True if the recording has times.
     """
     head, style = _HEADS[diagnosis.verdict]
     parts: list[RenderableType] = [Text.assemble((f" {head} ", style), "  ", (_sentence(diagnosis), "bold"))]
@@ -75,7 +75,7 @@ def view(diagnosis: DiagnosisFile, remedies: Sequence[str], *, timed: bool) -> G
 
 
 def unexplained(diagnosis: DiagnosisFile) -> str:
-    """What no effect fits, as a sentence."""
+    """Return a sentence on the residual that no effect explains."""
     left = diagnosis.unexplained
     return (
         f"About {mm(left.rms_mm)} mm (RMS) is left that has structure and fits no known effect; it depends on "
@@ -85,7 +85,7 @@ def unexplained(diagnosis: DiagnosisFile) -> str:
 
 
 def rival_lines(cause: Cause) -> list[str]:
-    """What a cause could be instead, a sentence each."""
+    """Return one sentence for each alternative explanation of a cause."""
     return [_rival(cause, rival) for rival in cause.rivals]
 
 
@@ -115,7 +115,7 @@ def _errors(diagnosis: DiagnosisFile) -> Table:
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("")
     rms, mean = diagnosis.rms_mm, diagnosis.mean_mm
-    # Far off in its nominal place, an arm would leave no room for the rest.
+    # The nominal error may be so large that its bar would leave no room for the others.
     longest = max(rms.aligned, rms.extended, rms.noise_floor or 0.0, 1e-12)
     for name, label in _ERRORS:
         value = _of(rms, name)

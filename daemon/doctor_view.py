@@ -1,4 +1,4 @@
-"""The doctor's checks on a terminal of 80 columns."""
+"""Show the doctor's checks in a terminal of 80 columns."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ INDENT = "    "
 
 
 def show(console: Console, checks: Sequence[Check]) -> None:
-    """Print a line for each, under it the command that mends it, and the sum."""
+    """Print a line for each check, below it the command that fixes it, and the summary."""
     for check in checks:
         line = Table.grid(padding=(0, 1))
         line.add_column(no_wrap=True)
@@ -24,7 +24,7 @@ def show(console: Console, checks: Sequence[Check]) -> None:
         line.add_column(overflow="fold")
         line.add_row(MARKS[check.state], Text(check.subject), Text(as_typed(check.said)))
         console.print(line)
-        if check.mend:  # not wrapped by us, so that it can be copied
+        if check.mend:  # not wrapped here, so that it can be copied
             console.print(Text(f"{INDENT}{as_typed(check.mend)}", "bold"), soft_wrap=True)
     console.print(_sum(checks))
 

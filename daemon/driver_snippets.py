@@ -1,4 +1,4 @@
-"""What was found in the terms of drivers: ros2_control, kinematics.yaml of Universal Robots, servo zeros in ticks."""
+"""Express the results in drivers' terms: ros2_control, Universal Robots' kinematics.yaml, servo zeros in ticks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bodyschema.interfaces.rpy import rpy_of
 
 from .config import Config
 
-# Of ur_description, from the base outwards: the joint's name without a prefix, and what kinematics.yaml calls its link.
+# ur_description, from the base outwards: the joint's name without prefix, and its link's name in kinematics.yaml.
 _UR = {
     "shoulder_pan_joint": "shoulder",
     "shoulder_lift_joint": "upper_arm",
@@ -24,20 +24,20 @@ _UR = {
     "wrist_2_joint": "wrist_2",
     "wrist_3_joint": "wrist_3",
 }
-# 1 where a servo adds its Homing Offset to what its sensor tells, -1 where it takes it off.
+# 1 if a servo adds its Homing Offset to the sensor reading, -1 if it subtracts it.
 _HOMING_SIGN = {"dynamixel": 1, "feetech": -1}
 _ONCE = "Correct a zero in one place only: a driver that has it, and extended.toml beside it, count it twice."
 
 
 def write_snippets(simulation: Simulation, file: Path, heading: str) -> list[str]:
-    """Write what drivers can hold of the simulation to `file`, as text for a person to copy from.
+    """Write the part of the simulation that drivers can represent to `file`, as text to copy from.
 
     Returns:
-        Sentences on what no driver holds.
+        Sentences on what no driver can represent.
 
     Raises:
-        ConfigError: robot.toml has a table that cannot be.
-        OSError: it cannot be written.
+        ConfigError: robot.toml has an invalid table.
+        OSError: the file cannot be written.
     """
     errors = ArmErrors.of(simulation)
     with_ratios = {name: joint for name, joint in errors.joints.items() if joint.offset or name in joint.ratios}
@@ -74,7 +74,7 @@ def _ros2_control(joints: dict[str, JointErrors]) -> str:
 
 
 def _servos(simulation: Simulation, joints: dict[str, JointErrors]) -> Iterator[str]:
-    """Zeros in ticks, where robot.toml says which servos there are."""
+    """Yield zeros in ticks, where robot.toml names the servos."""
     drivers = Config.load(simulation.robot.file).tables.drivers
     for make, sign in _HOMING_SIGN.items():
         table = getattr(drivers, make)
@@ -96,7 +96,7 @@ def _servos(simulation: Simulation, joints: dict[str, JointErrors]) -> Iterator[
 
 
 def _kinematics(errors: ArmErrors) -> Iterator[str]:
-    """Universal Robots' own file, for arms whose joints are called as in ur_description."""
+    """Yield Universal Robots' own file, for arms whose joints are called as in ur_description."""
     robot = errors.simulation.robot
     found = {name: link for name in robot.joints for end, link in _UR.items() if name.endswith(end)}
     if list(found.values()) != list(_UR.values()):

@@ -1,4 +1,4 @@
-"""The wiring of `bodyschema servos`: which servos are meant, and the bench at which their EEPROM is changed."""
+"""Wiring of `bodyschema servos`: the selected servos, and the editor that changes their EEPROM."""
 
 from __future__ import annotations
 
@@ -50,16 +50,16 @@ __all__ = [
     "workbench_of",
 ]
 
-STRANGER = "-"  # in the place of a joint's name
+STRANGER = "-"  # instead of a joint's name
 TABLES = {"dynamixel": (DYNAMIXEL, DynamixelConfig), "feetech": (FEETECH, FeetechConfig)}
 
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """A servo that is meant, before it was asked anything.
+    """A selected servo, before it is queried.
 
     Attributes:
-        table: its make's table in [drivers].
+        table: its vendor's table in [drivers].
     """
 
     table: str
@@ -70,7 +70,7 @@ class Wanted:
 
 
 def configured(config: Config, joints: Sequence[str], bus: str | None) -> list[Wanted]:
-    """The servos of robot.toml that move `joints`, or all of a bus; with neither all.
+    """Return the servos of robot.toml that move `joints`, or all of a bus; all servos if neither is given.
 
     Raises:
         ConfigError: there are none, or no such joint or bus.
@@ -95,12 +95,12 @@ def configured(config: Config, joints: Sequence[str], bus: str | None) -> list[W
 
 
 def bauds_of(table: str) -> Sequence[int]:
-    """The rates that robot.toml can name for a make [bit/s]."""
+    """Return the baud rates that robot.toml accepts for a vendor [bit/s]."""
     return get_args(DynamixelBaud if table == "dynamixel" else FeetechBaud)
 
 
 def stranger(port: str, baud: int, id: int) -> Wanted:
-    """The servo of that ID, which no robot.toml knows, of whatever make; SourceError when none answers."""
+    """Return the servo of that ID, of any vendor, that robot.toml does not name. SourceError if there is no answer."""
     for table in [table for table in TABLES if baud in bauds_of(table)]:
         with workbench_of(table) as workbench:
             model = workbench.model_at(workbench.bus(port, baud), id)
@@ -113,14 +113,14 @@ def stranger(port: str, baud: int, id: int) -> Wanted:
 
 
 def workbench_of(table: str) -> Workbench:
-    """The bench for servos of a make."""
+    """Return the EEPROM editor for servos of a vendor."""
     clock = SystemClock()
     openers = {"dynamixel": _open_dynamixel, "feetech": _open_feetech}
     return Workbench(TABLES[table][0], clock, lambda port, baud: openers[table](port, baud, clock))
 
 
 def entry_of(joint: str, id: int, model: Model) -> ServoConfig:
-    """A servo as robot.toml would have it."""
+    """Return a servo as a robot.toml entry."""
     return ServoConfig(joint, id, model.name)
 
 
@@ -133,12 +133,12 @@ def _open_feetech(port: str, baud: int, clock: SystemClock) -> tuple[Port, float
 
 
 def settings_by_name(workbench: Workbench, model: Model) -> Mapping[str, Setting]:
-    """What may be written to a model."""
+    """Return the writable settings of a model."""
     return {setting.name: setting for setting in workbench.make.settings(model)}
 
 
 def model_called(table: str, name: str) -> Model:
-    """The model of a make; ConfigError when this version does not know it."""
+    """Return the model of a vendor. ConfigError if this version does not know it."""
     models = TABLES[table][1].models if table in TABLES else {}
     if name not in models:
         raise ConfigError(f"unknown model {name!r} of {table}", remedy=did_you_mean(name, models))

@@ -1,4 +1,4 @@
-"""How good predictions are on pairs that were not learnt."""
+"""Measure prediction errors on held-out pairs."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ BLOCKS = 10
 
 
 class EvaluationError(BodyschemaError):
-    """There is too little in a recording to learn from one part of it and judge by the other."""
+    """A recording is too short to train on one part of it and test on the other."""
 
 
 @dataclass(frozen=True, slots=True)
 class Split:
-    """Which rows are held out.
+    """Selection of held-out rows.
 
     Attributes:
-        held_out: shape (n,); the others are for learning.
-        blocks: how many of the `BLOCKS` contiguous blocks they are.
+        held_out: mask, shape (n,); the other rows are for training.
+        blocks: number of held-out blocks, of the `BLOCKS` contiguous ones.
     """
 
     held_out: NDArray[np.bool_]
@@ -34,13 +34,13 @@ class Split:
 
 
 def split_blocks(rows: int, share: float) -> Split:
-    """Contiguous blocks of rows to hold out, evenly spread: neighbouring pairs are not independent.
+    """Select evenly spread contiguous blocks of rows to hold out, since neighbouring pairs are not independent.
 
-    The rows are cut into `BLOCKS` blocks of equal length (to one row), of which the nearest whole number to
-    `share` is held out, at least one; with 3 of 10 these are the second, the sixth and the ninth.
+    The rows are split into `BLOCKS` blocks of equal length (to one row). The nearest whole number to `share` of them is
+    held out, at least one; with 3 of 10 these are the second, the sixth and the ninth.
 
     Raises:
-        EvaluationError: `share` leaves nothing to learn from or to judge by, or there are fewer rows than blocks.
+        EvaluationError: `share` leaves nothing for training or for testing, or there are fewer rows than blocks.
     """
     if not 0 < share < 1:
         raise EvaluationError(f"the held-out share {share:g} is not between 0 and 1; 0.3 is usual")
@@ -65,7 +65,7 @@ class ErrorFigures:
 
     @classmethod
     def of(cls, predicted: FloatArray, measured: FloatArray) -> ErrorFigures:
-        """Figures for predicted and measured positions, each shape (n, 3) [m]."""
+        """Return the figures for predicted and measured positions, each shape (n, 3) [m]."""
         distances = np.linalg.norm(predicted - measured, axis=1)
         return cls(
             pairs=len(distances),
@@ -78,7 +78,7 @@ class ErrorFigures:
 
 
 def aligned_chain(robot: RobotDescription, learnt: Recording) -> RigidChain:
-    """The nominal chain with what robot.toml calls not known fitted to `learnt`: the honest "before".
+    """Return the nominal chain with the unknowns of robot.toml fitted to `learnt`: the fair baseline.
 
     Raises:
         EvaluationError: the pairs do not determine it.
@@ -99,11 +99,11 @@ def aligned_chain(robot: RobotDescription, learnt: Recording) -> RigidChain:
 def coverage(
     predicted: FloatArray, measured: FloatArray, sigma: FloatArray, noise_sigma: FloatArray | float = 0.0
 ) -> float:
-    """Share of coordinates whose error lies within 1-sigma; 0.68 when the claim is right and errors are Gaussian.
+    """Return the share of coordinates whose error is within 1-sigma; 0.68 if sigma is right and errors are Gaussian.
 
     Args:
         predicted, measured: positions, shape (n, 3) [m].
-        sigma: 1-sigma claimed for the predictions, shape (n, 3) [m].
-        noise_sigma: 1-sigma of the measurements [m], which the claim does not include.
+        sigma: predicted 1-sigma, shape (n, 3) [m].
+        noise_sigma: 1-sigma of the measurements [m], which `sigma` does not include.
     """
     return float(np.mean(np.abs(predicted - measured) <= np.hypot(sigma, noise_sigma)))

@@ -1,4 +1,4 @@
-"""Where the marker is expected now, told to whoever listens on a topic."""
+"""Publish on a topic where the marker is expected now."""
 
 from __future__ import annotations
 
@@ -21,21 +21,22 @@ RETRY_S = 1.0
 
 
 class ExpectedMarker:
-    """Follows the encoders, and publishes what the present model says of them.
+    """Follows the encoders, and publishes the current model's prediction for them.
 
-    Nothing is published while there is no model, nor, where listeners are not told how sure it is, where no data was.
+    Nothing is published before there is a model. For subscribers that receive no sigma, nothing is published outside
+    the support of the data either.
 
     Attributes:
-        published: positions so far.
+        published: number of positions so far.
     """
 
     def __init__(
         self, joints: StampedJoints, topic: MarkerTopic, snapshot: Callable[[], Snapshot], clock: Clock
     ) -> None:
-        """Nothing is opened yet.
+        """Store the settings; nothing is opened yet.
 
         Args:
-            snapshot: the model that answers at present.
+            snapshot: returns the current model.
         """
         self._joints, self._topic, self._snapshot, self._clock = joints, topic, snapshot, clock
         self._stop = threading.Event()
@@ -44,7 +45,7 @@ class ExpectedMarker:
 
     @contextmanager
     def publishing(self) -> Iterator[None]:
-        """Publish from here to the end of the with statement; a robot that is not there is waited for."""
+        """Publish from here to the end of the with statement; wait for a robot that is not there yet."""
         thread = threading.Thread(target=self._run, name="expected_marker")
         thread.start()
         try:
@@ -54,7 +55,7 @@ class ExpectedMarker:
             thread.join()
 
     def take(self, reading: JointReading) -> None:
-        """Publish what is expected at this reading, when it is time to."""
+        """Publish the expected position at this reading, if one is due."""
         if self._clock.now() < self._due or self._joints.stamp_ns is None:
             return
         try:

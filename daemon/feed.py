@@ -1,4 +1,4 @@
-"""The learner's pairs, each once and in order: what is published, and from the sampler's history what was missed."""
+"""Feed pairs to the learner, each once and in order: published pairs, and missed ones from the sampler's history."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ log = logging.getLogger(__name__)
 
 WAITING = 1024
 RETRY_S = 1.0
-# Health tells of a learner that is so many pairs behind: more than come in two or three seconds.
+# Health reports a learner that is this many pairs behind: more than arrive in two or three seconds.
 BEHIND = 100
 
 History = Callable[[int], Page]
 
 
 class _Stamp(msgspec.Struct, frozen=True):
-    """What is read of a published pair to know how far the store goes."""
+    """The fields of a published pair that show how far the store goes."""
 
     store: str
     seq: int
@@ -37,7 +37,7 @@ class _Stamp(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class _Stored:
-    """The newest pair that is known to be stored, and when the learner heard of it [s]."""
+    """The newest pair that is known to be stored, and when the learner received that information [s]."""
 
     seq: int
     utc: str
@@ -45,29 +45,23 @@ class _Stored:
 
 
 class PairFeed:
-    """Feeds a `Learning`. `offer` and `wake` may be called from any thread, `step` from one.
-
-    A pair is published after the sampler has stored it, so whatever does not follow the last pair directly (a gap, a
-    restart, a full queue) is simply asked for: history is the one way to recover.
-
-    Attributes:
-        lock: held while pairs are being learnt; whoever resets the learner takes it.
-    """
+    """Feeds a `Learning`. `offer` and `wake` may be called from any thread, `step` from one only."""
 
     def __init__(
         self, learning: Learning, history: History, clock: Clock, beat: Callable[[], None] = lambda: None
     ) -> None:
-        """Go on after the pairs that `learning` has.
+        """Continue after the pairs that `learning` has.
 
         Args:
-            history: stored pairs from a sequence number on, as many as fit into a reply; BusError when nobody answers.
-            beat: is called with each pair that was learnt, and each time that history was asked.
+            history: returns stored pairs from a sequence number on, as many as fit into a reply; BusError when there is
+                no answer.
+            beat: called for each learnt pair, and after each history request.
         """
         self.lock = threading.Lock()
         self._learning, self._history, self._clock, self._beat = learning, history, clock, beat
         self._joints = learning.nominal.joints
         self._waiting: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
-        # Set by any thread: something was not put into the queue. The rest is `step`'s own.
+        # Set by any thread: an item was not queued. All else belongs to `step`.
         self._missed = True
         self._behind, self._paused = False, False
         self._retry_at = 0.0
@@ -78,25 +72,25 @@ class PairFeed:
 
     @property
     def problem(self) -> str | None:
-        """Why pairs that come are not learnt, or None."""
+        """Reason why arriving pairs are not learnt, or None."""
         return self._problem
 
     @property
     def refused(self) -> str | None:
-        """What was wrong with the pair that was refused last, or None."""
+        """Reason why the last refused pair was refused, or None."""
         return self._refused
 
     @property
     def behind(self) -> int:
-        """How many pairs are known to be stored and are not learnt yet."""
+        """Number of pairs known to be stored and not learnt yet."""
         newest = self._look_ahead()
         return 0 if newest is None else max(newest.seq - self._cursor, 0)
 
     def age_s(self, utc: str | None) -> float | None:
-        """Return how old what was learnt up to a pair stored at `utc` is [s], counted from the newest stored pair.
+        """Return the age [s] of a model whose newest pair was stored at `utc`, relative to the newest stored pair.
 
-        That is the time from this pair to the newest that is known to be stored, by the sampler's clock, and the time
-        since the learner heard of that one, by its own. None before any pair.
+        The age is the time from this pair to the newest one known to be stored, by the sampler's clock, plus the time
+        since the learner heard of the latter, by its own clock. None before any pair.
         """
         newest = self._look_ahead()
         if utc is None or newest is None:
@@ -105,11 +99,11 @@ class PairFeed:
 
     @property
     def paused(self) -> bool:
-        """Whether pairs are left to history for now."""
+        """True while pairs are left to history."""
         return self._paused
 
     def offer(self, payload: bytes) -> None:
-        """A published pair."""
+        """Take a published pair."""
         self._published = payload, self._clock.now()
         if self._waiting.qsize() < WAITING:
             self._waiting.put(payload)
@@ -117,7 +111,7 @@ class PairFeed:
             self._missed = True
 
     def wake(self) -> None:
-        """The sampler has come (back): see what was missed."""
+        """Note that the sampler is (back) online: check for missed pairs."""
         self._missed = True
         self._waiting.put(None)
 
@@ -126,12 +120,12 @@ class PairFeed:
         self._paused = True
 
     def resume(self) -> None:
-        """Take pairs again, those missed first."""
+        """Take pairs again, starting with the missed ones."""
         self._paused = False
         self.wake()
 
     def restart(self) -> None:
-        """Go on after the pairs that the learner has; call it when they have changed, holding `lock`."""
+        """Continue after the pairs that the learner has; call this when they have changed, holding `lock`."""
         counters = self._learning.counters
         self._store, self._cursor = counters.store, counters.last_seq
         self._published = self._newest = None
@@ -140,11 +134,14 @@ class PairFeed:
 
     @property
     def foreign_store(self) -> str | None:
-        """The store that pairs come from although the learner learnt from another one; None when all is well."""
+        """Identity of the store that pairs arrive from although the learner learnt from another one.
+
+        None if they agree.
+        """
         return self._foreign
 
     def step(self, timeout_s: float) -> None:
-        """Take what has been offered, or wait for it; catch up when something is missing."""
+        """Process the offered pairs, or wait for one; catch up if some are missing."""
         try:
             payload = self._waiting.get(timeout=timeout_s)
         except queue.Empty:
@@ -177,7 +174,7 @@ class PairFeed:
                 self._behind = True
 
     def _catch_up(self) -> None:
-        """Ask for all pairs after the last one, page by page."""
+        """Request all pairs after the last one, page by page."""
         while not self._paused:
             self._beat()
             begin = self._cursor + 1
@@ -195,7 +192,7 @@ class PairFeed:
                     return
 
     def _end_of(self, reply: Page) -> bool:
-        """Learn a page of history; True when there is nothing more to ask for."""
+        """Learn a page of history; return True if there is nothing more to request."""
         if self._store not in (None, reply.store):
             self._meet_foreign(reply.store)
             self._behind = False
@@ -219,7 +216,7 @@ class PairFeed:
         return not self._behind
 
     def _look_ahead(self) -> _Stored | None:
-        """The newest stored pair that is known of; the last publication is looked at when it is asked for."""
+        """Return the newest stored pair that is known; the last publication is decoded only when this is called."""
         published, newest = self._published, self._newest
         if published is None:
             return newest
@@ -233,7 +230,7 @@ class PairFeed:
         return _Stored(stamp.seq, stamp.utc, heard_at)
 
     def _note_stored(self, reply: Page) -> None:
-        """Note the newest stored pair of a page of history; where the store goes on after the page, ask for it."""
+        """Note the newest stored pair of a page of history; request it if the store extends beyond the page."""
         known = self._look_ahead()
         if self._store not in (None, reply.store) or (known is not None and known.seq >= reply.last_seq):
             return
@@ -247,7 +244,7 @@ class PairFeed:
         self._newest = _Stored(reply.last_seq, utc, self._clock.now())
 
     def _pass_over(self, missing: int) -> None:
-        """Go on where the sampler has no such pairs: it numbers without gaps, so it had them once."""
+        """Continue after pairs that the sampler no longer has; it numbers without gaps, so they existed once."""
         if missing > 0:
             log.warning(
                 "the sampler has no pairs %d to %d any more: they were deleted ([daemon] keep_days, keep_mb) or its "
@@ -281,7 +278,7 @@ class PairFeed:
 
 
 def _seconds(begin: str, end: str) -> float:
-    """Return the time from one moment in ISO 8601 to another [s]; 0 where it is before, or one of them is none."""
+    """Return the time from `begin` to `end`, in ISO 8601 [s]; 0 if it is negative or one of them is invalid."""
     try:
         return max((datetime.fromisoformat(end) - datetime.fromisoformat(begin)).total_seconds(), 0.0)
     except (ValueError, TypeError):

@@ -1,4 +1,4 @@
-"""What people want to know of a learner: where camera and tool are, whether there is enough data, and what is wrong."""
+"""Findings about a learner for its user: camera and tool pose, sufficiency of the data, and problems."""
 
 from __future__ import annotations
 
@@ -22,33 +22,30 @@ from .status import ChainCalibration, JointZero, LearntFigure, Outlook
 
 log = logging.getLogger(__name__)
 
-# Finding them takes at most one part in so many of the background thread's time, which the robots share, and comes no
-# more often than this.
+# Findings take at most 1/SHARE of the background thread's time, which the robots share, and recur no more often.
 SHARE = 10.0
 EVERY_S = 1.0
 
 
 class FindingTurns:
-    """Keeps what all who share the background's thread find within `SHARE` of its time. For that thread alone.
+    """Limits all users of the background thread together to `SHARE` of its time. For that thread alone.
 
     Attributes:
-        due_at: when the next of them may.
+        due_at: time of the next permitted finding.
     """
 
     def __init__(self) -> None:
         self.due_at = -math.inf
 
     def took(self, begin: float, seconds: float) -> None:
-        """One of them has found something, from `begin` on."""
+        """Note that one finding took `seconds` from `begin` on."""
         self.due_at = begin + SHARE * seconds
 
 
 class Findings:
-    """Finds calibration and outlook anew when there is a new chain, or another model answers.
+    """Computes calibration and outlook whenever there is a new chain, or another model answers.
 
-    For the background thread alone.
-
-    What was found may be read by any thread.
+    Only the background thread may call it. Any thread may read the results.
     """
 
     def __init__(
@@ -59,11 +56,11 @@ class Findings:
         robots: int = 1,
         turns: FindingTurns | None = None,
     ) -> None:
-        """Nothing is found yet.
+        """Start without findings.
 
         Args:
-            robots: so many share the background's thread.
-            turns: theirs.
+            robots: number of robots that share the background thread.
+            turns: their common time limit.
         """
         self._learning, self._robot, self._clock = learning, robot, clock
         self._turns = turns or FindingTurns()
@@ -75,23 +72,23 @@ class Findings:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Why the pairs may not be of this robot: columns exchanged, joints that count the other way."""
+        """Reasons to suspect that the pairs are of another robot: exchanged columns, reversed joints."""
         return self._doubts
 
     @property
     def calibration(self) -> ChainCalibration | None:
-        """Where camera and tool are and the joints' zeros; None before the first solution with the present tool."""
+        """Pose of camera and tool, and joint offsets; None before the first solution with the present tool."""
         return self._found[0] if self._learning.belief is not None else None
 
     @property
     def outlook(self) -> Outlook | None:
-        """What further pairs would gain; None while no solution with the present tool answers."""
+        """Expected gain of further pairs; None until a solution with the present tool answers."""
         answers = self._learning.belief is not None and self._learning.snapshot.answering in SOLVED
         return self._found[1] if answers else None
 
     @property
     def at_rest(self) -> bool:
-        """Whether what was found rests on the chain and the model that there are now."""
+        """True if the findings are up to date with the current chain and model."""
         return self._found_of == self._present
 
     @property
@@ -99,11 +96,11 @@ class Findings:
         return self._learning.belief, self._learning.snapshot.answering
 
     def renew(self) -> None:
-        """Find all again if what they rest on has changed, and it is time to."""
+        """Compute all findings again if their inputs have changed and the time limit permits."""
         self._check()
         begin, present = self._clock.now(), self._present
         if present[0] is None:
-            self._found_of, self._found = present, (None, None)  # what was found was of another tool
+            self._found_of, self._found = present, (None, None)  # the findings belong to another tool
             return
         if present == self._found_of or begin < max(self._due_at, self._turns.due_at):
             return
@@ -121,7 +118,7 @@ class Findings:
         self._due_at = begin + max(self._parts * seconds, EVERY_S)
 
     def _check(self) -> None:
-        """Look at the pairs with the present tool when there are enough, and whenever they have doubled."""
+        """Check the pairs with the present tool once there are enough, and again whenever their number has doubled."""
         begin, count = self._clock.now(), self._learning.counters.since_change
         if count < self._checked:
             self._checked, self._doubts = 0, ()
@@ -140,7 +137,7 @@ def _found(robot: RobotDescription, known: Known) -> tuple[ChainCalibration, Out
 
 
 def calibrated(robot: RobotDescription, known: Known, scatter: Scatter) -> ChainCalibration:
-    """The chain in the terms of robot.toml."""
+    """Return the chain in the terms of robot.toml."""
     found, workmanship = figures(robot, known)
     numbers = [
         LearntFigure(*(float(part) for part in parts))
@@ -165,12 +162,12 @@ def calibrated(robot: RobotDescription, known: Known, scatter: Scatter) -> Chain
 
 
 def figures(robot: RobotDescription, known: Known) -> tuple[ChainFigures, tuple[float, float] | None]:
-    """The figures, and how well the arm seems to be made: 1-sigma of an axis' tilt [rad] and its shift [m].
+    """Return the figures, and the estimated manufacturing tolerances: 1-sigma of axis tilt [rad] and axis shift [m].
 
-    None where the pairs do not tell.
+    The tolerances are None where the pairs do not determine them.
 
-    With the tolerances that the learner begins with a tilted axis could be any zero. How well the arm is made, the
-    pairs tell, but seldom beyond doubt: figures that have names are those of all the probable workmanships.
+    With the learner's initial tolerances, an axis tilt could be mistaken for any joint offset. The pairs determine the
+    tolerances, but seldom sharply, so the figures average over all probable tolerances.
     """
     wide = known.tolerances
     made = [(wide.axes, wide.points)]

@@ -1,4 +1,4 @@
-"""Calibration and outlook of the learner's status, for a terminal of 80 columns."""
+"""Show calibration and outlook of the learner's status in a terminal of 80 columns."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _DEG = math.degrees(1.0)
 
 
 def outlook_lines(outlook: Outlook | None) -> list[str]:
-    """Whether there is enough data, in at most two lines."""
+    """Return at most two lines on whether there is enough data."""
     if outlook is None:
         return ["not known yet"]
     pairs = outlook.further_pairs[-1]
@@ -30,7 +30,7 @@ def outlook_lines(outlook: Outlook | None) -> list[str]:
 
 
 def outlook_sentence(outlook: Outlook) -> str:
-    """The same in words."""
+    """Return the outlook as a sentence."""
     best = "no other motion gains more"
     if _other_is_better(outlook):
         best = f"{outlook.best_motion} gains most: {_gain(outlook, outlook.best_motion_m)}"
@@ -41,7 +41,7 @@ def outlook_sentence(outlook: Outlook) -> str:
 
 
 def calibration_table(calibration: ChainCalibration, slides: Collection[str] = ()) -> Group:
-    """Where camera and tool are and the joints' zeros, against robot.toml.
+    """Return a table of camera and tool pose and joint offsets, compared with robot.toml.
 
     Args:
         slides: names of the prismatic joints.
@@ -86,7 +86,7 @@ def _other_is_better(outlook: Outlook) -> bool:
 
 
 def _gain(outlook: Outlook, after_m: list[float]) -> str:
-    """The share of the error that the most of the further pairs would take off."""
+    """Return the share of the error that the largest number of further pairs would remove."""
     return f"{max(1.0 - after_m[-1] / outlook.error_m, 0.0):.0%}" if outlook.error_m else "0%"
 
 
@@ -104,6 +104,6 @@ def _zero(zero: JointZero, *, slides: bool) -> str:
 
 
 def _rounded(value: float, half_width: float) -> str:
-    """With two digits of the half width."""
+    """Round to the place of the second digit of the half width."""
     digits = min(max(1 - math.floor(math.log10(max(half_width, 1e-9))), 0), 4)
     return f"{round(value, digits) + 0.0:+.{digits}f} ± {half_width:.{digits}f}"

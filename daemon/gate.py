@@ -1,4 +1,4 @@
-"""Which measurements become pairs, and which segment they belong to."""
+"""Decide which measurements become pairs, and which segment they belong to."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bodyschema.interfaces.records import FloatArray, Pair, Reason
 from .align import joint_difference
 from .config import DaemonConfig
 
-# So many fixes in a row that agree with each other, but not with what was believed before, are believed.
+# This many consecutive fixes that agree with each other, but not with the previous position, are accepted.
 CONFIRMATIONS = 3
 
 
@@ -30,22 +30,22 @@ class _Fix(NamedTuple):
 
 
 class Gate:
-    """Accepts a measurement whose joint-space step from the last pair is neither too small nor doubtful.
+    """Accepts a measurement if its joint-space step from the last pair is neither too small nor implausible.
 
     A step is the Euclidean norm over all joints in degrees; prismatic joints count with `metres_per_degree`. A step
-    below `min_step_deg` has to wait, also across a restart or a gap, so that an arm at rest fills no store. A step
-    above `max_step_deg`, a pause longer than `segment_gap_s`, a `break_segment` and a marker that jumped start a new
-    segment.
+    below `min_step_deg` is not a pair, also across a restart or a gap, so that an arm at rest does not fill the store.
+    A step above `max_step_deg`, a pause longer than `segment_gap_s`, a `break_segment` and a marker that jumped start a
+    new segment.
 
-    A marker that came faster than `max_marker_speed_m_s` from its last believed place is refused. It is believed
-    again when `CONFIRMATIONS` fixes in a row agree with each other (another tool is in the hand), or when it could
-    have come there in the time since, or after `segment_gap_s`.
+    A marker that moved faster than `max_marker_speed_m_s` from its last accepted position is refused. It is accepted
+    again after `CONFIRMATIONS` consecutive fixes that agree with each other (a tool change), when it could have moved
+    there in the elapsed time, or after `segment_gap_s`.
 
-    With `any_step` neither step nor speed is checked: poses of a static recording have no path between them.
+    With `any_step`, neither step nor speed is checked: a static recording has no path between its poses.
     """
 
     def __init__(self, rules: DaemonConfig, prismatic: NDArray[np.bool_], last: Pair | None = None) -> None:
-        """A gate that has seen nothing since `last`, the newest pair in the store.
+        """Start after `last`, the newest pair in the store.
 
         Args:
             prismatic: which joints are prismatic, shape (d,).
@@ -61,7 +61,7 @@ class Gate:
         self._suspects = 0
 
     def follow(self, rules: DaemonConfig) -> None:
-        """Go by these rules from now on; the segment goes on."""
+        """Apply these rules from now on; the segment continues."""
         self._rules = rules
         self._degrees_per_unit = np.where(self._prismatic, 1 / rules.metres_per_degree, 180 / np.pi)
 
@@ -71,12 +71,12 @@ class Gate:
         return self._segment
 
     def break_segment(self) -> None:
-        """The next pair starts a new segment, wherever it is."""
+        """Start a new segment with the next pair, regardless of its step."""
         self._broken = True
         self._believed = None
 
     def offer(self, t: float, q: FloatArray, x: FloatArray) -> Accepted | Reason:
-        """Whether the joint angles `q` [rad or m], shape (d,), and the marker at `x` [m], shape (3,), make a pair.
+        """Return the segment if joint angles `q` [rad or m] (d,) and marker `x` [m] (3,) make a pair, else the reason.
 
         Args:
             t: time of the measurement [s], later than all before.
@@ -94,7 +94,7 @@ class Gate:
         return Accepted(self._segment)
 
     def is_too_fast(self, moved: FloatArray) -> bool:
-        """Whether joints that moved by `moved` [rad or m], (d,), while the time is uncertain make no pair."""
+        """Return True if joints that moved by `moved` [rad or m], (d,), within the time uncertainty make no pair."""
         return float(np.linalg.norm(moved * self._degrees_per_unit)) > self._rules.max_time_error_deg
 
     def _step_deg(self, q: FloatArray) -> float:

@@ -1,4 +1,4 @@
-"""Where the head should look: at the hand, by the learnt model when it is good there, else by the drawn one."""
+"""Aim the head at the hand, by the learnt model where it is accurate there, otherwise by the nominal one."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from .wire import JointsRequest, PredictReply, decode, encode
 log = logging.getLogger(__name__)
 
 PERIOD_S = 0.04
-GAIN = 0.5  # of a step towards the middle; the head follows with a delay
-GOOD_M = 0.02  # a learnt model that is less sure of the hand is not asked
+GAIN = 0.5  # fraction of a step towards the centre; the head follows with a delay
+GOOD_M = 0.02  # a learnt model with a larger uncertainty at the hand is not used
 ASK_AGAIN_S = 1.0
-PREDICT_S = 0.2  # what the head waits for the learner
+PREDICT_S = 0.2  # how long the head waits for the learner
 
 Predict = Callable[[bytes], bytes]
 """Asks the learner: a `JointsRequest`, and its `PredictReply`; BusError or RequestError without an answer."""
 
 
 class HandModel:
-    """Where the hand is in the measurement frame, by the best model at hand.
+    """Hand position in the measurement frame, by the best available model.
 
     Attributes:
-        source: learnt or nominal: which one told last.
+        source: learnt or nominal: the model used last.
     """
 
     def __init__(self, robot: RobotDescription, predict: Predict, clock: Clock) -> None:
@@ -48,7 +48,7 @@ class HandModel:
         self.source = "nominal"
 
     def positions(self, q: FloatArray) -> FloatArray:
-        """Of the marker (n, 3) [m] at q (n, d) [rad], all by one model. The first row decides by which."""
+        """Return marker positions (n, 3) [m] at q (n, d) [rad], all by one model, which the first row selects."""
         learnt = self._learnt(q) if self._clock.now() >= self._ask_s else None
         source = "nominal" if learnt is None else "learnt"
         if source != self.source:
@@ -68,10 +68,10 @@ class HandModel:
 
 
 class GazeLoop:
-    """Tells the head where to look, in a thread of its own. When that fails the head stands still: its aim is stale."""
+    """Aims the head, in a thread of its own. If that fails the head stands still, as its target is stale."""
 
     def __init__(self, robot: RobotDescription, head: Head, model: HandModel) -> None:
-        """Not begun yet.
+        """Store the settings; nothing is started yet.
 
         Raises:
             ConfigError: [camera] describes no stereo pair.
@@ -98,7 +98,7 @@ class GazeLoop:
         self._thread.join()
 
     def look(self) -> None:
-        """Tell the head once, if there is a newer reading."""
+        """Aim the head once, if there is a newer reading."""
         pose = self._head.pose
         if pose is None or pose[0] <= self._told_s:
             return
@@ -115,7 +115,7 @@ class GazeLoop:
 
 
 def gaze_of(robot: RobotDescription, sources: Sources, bus: Bus, wall: Clock) -> GazeLoop | None:
-    """What turns the head of a robot that has one, with its cameras as they were calibrated."""
+    """Return the gaze loop of a robot that has a head, with its cameras as calibrated; None if it has none."""
     if sources.head is None:
         return None
     key = Keys(robot.name).predict

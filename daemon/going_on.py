@@ -1,4 +1,4 @@
-"""Where a learner goes on: from its checkpoint, else from the one before it, else from nothing."""
+"""Restore a learner from its newest checkpoint, else from the previous one, else start without data."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from kbmaps import KBMapsError
 
 log = logging.getLogger(__name__)
 
-# What a checkpoint raises whose checksum is right and whose parts are not.
+# Exceptions of a checkpoint whose checksum is right but whose contents do not fit.
 DOES_NOT_FIT = (ArithmeticError, LookupError, TypeError, ValueError)
 
 
 def go_on(new: Callable[[], Learning], checkpoint: Path, robot: str) -> tuple[Learning, str | None]:
-    """A learner that goes on from the newest checkpoint that is of use.
+    """Restore the learner from the newest usable checkpoint.
 
     Args:
-        new: makes a learner that knows nothing.
-        checkpoint: the newest; what is of no use is kept beside it under another name.
+        new: creates a learner without data.
+        checkpoint: the newest; an unusable one is kept next to it under another name.
 
     Returns:
-        The learner, and what was wrong, if anything was.
+        The learner, and a message about what was wrong, or None.
 
     Raises:
-        CheckpointError: a checkpoint of no use cannot be moved aside.
+        CheckpointError: an unusable checkpoint cannot be moved aside.
     """
     said: list[str] = []
     for file in generations(checkpoint):

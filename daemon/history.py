@@ -1,4 +1,4 @@
-"""The stored pairs over zenoh: answered by the sampler, read by the learner."""
+"""Stored pairs over zenoh: answered by the sampler, read by the learner."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _LARGEST_SEQ = 2**62
 
 @dataclass(frozen=True, slots=True)
 class Unreadable:
-    """A stored pair that is none, `why` says what is wrong with it."""
+    """An invalid stored pair; `why` is the reason."""
 
     seq: int
     why: str
@@ -28,7 +28,7 @@ class Unreadable:
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """A `PairsReply` in which one pair that is none spoils no other."""
+    """A `PairsReply` in which one invalid pair does not spoil the others."""
 
     store: str
     last_seq: int
@@ -46,10 +46,10 @@ class _Numbered(msgspec.Struct, frozen=True):
 
 
 def read_page(payload: bytes) -> Page:
-    """The page in a reply of the sampler, JSON.
+    """Return the page in a JSON reply of the sampler.
 
     Raises:
-        RequestError: it is none, or has a pair without a number.
+        RequestError: it is not a page, or has a pair without a number.
     """
     page = decode(payload, _RawPage)
     return Page(page.store, page.last_seq, [_read(bytes(raw)) for raw in page.pairs])
@@ -64,7 +64,7 @@ def _read(raw: bytes) -> PairMessage | Unreadable:
 
 
 def answer_pairs(reader: PairReader, request: Request) -> bytes:
-    """`pairs?from=SEQ;to=SEQ`: at most `LARGEST_REPLY` stored pairs in order, both bounds inclusive and optional.
+    """Answer `pairs?from=SEQ;to=SEQ` with at most `LARGEST_REPLY` stored pairs, bounds inclusive and optional.
 
     Raises:
         RequestError: an unknown parameter, or one that is not a sequence number.
@@ -76,7 +76,7 @@ def answer_pairs(reader: PairReader, request: Request) -> bytes:
     to = _sequence_number(request, "to", _LARGEST_SEQ)
     if to < first:
         raise RequestError(f"from={first} is after to={to}")
-    # The newest number is read after the pairs: a reader that sees it knows that nothing before it is missing.
+    # Read the newest number after the pairs: a client that sees it knows that nothing before it is missing.
     pairs = reader.read(first, to, LARGEST_REPLY)
     reply = PairsReply(reader.identity, reader.last_seq(), [pair_to_wire(pair) for pair in pairs])
     return encode(reply, request.encoding)

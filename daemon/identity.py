@@ -1,4 +1,4 @@
-"""What a machine shows those it connects to, and what it asks of those who connect: TLS, certificates, passwords."""
+"""Credentials of a machine and its requirements for connecting clients: TLS, certificates, passwords."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ READ_BY_OTHERS = stat.S_IROTH
 
 
 class TlsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A table `tls`; files in PEM, relative to the file that names them.
+    """A table `tls`; PEM files, relative to the file that names them.
 
     Attributes:
-        ca: certificate of the authority that signed everybody's.
-        certificate, key: this machine's or person's own; needed to listen, and to connect without a password.
+        ca: certificate of the authority that signed all certificates.
+        certificate, key: those of this machine or person; needed to listen, and to connect without a password.
     """
 
     ca: str
@@ -31,7 +31,7 @@ class TlsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class LoginConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A table `login`: the name and the password in the place of a certificate of one's own.
+    """A table `login`: name and password in place of a client certificate.
 
     Attributes:
         password_file: its first line is the password; relative to the file that names it.
@@ -43,10 +43,10 @@ class LoginConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Identity:
-    """Who this is, and how it knows others.
+    """Credentials of this machine, and how it identifies others.
 
     Attributes:
-        users_file: a line `user:password` for each who may connect; None: those who connect show certificates.
+        users_file: a line `user:password` for each permitted user; None: clients present certificates.
     """
 
     ca: Path
@@ -58,10 +58,10 @@ class Identity:
 
     @classmethod
     def of(cls, tls: TlsConfig, login: LoginConfig | None, users_file: str | None, folder: Path) -> Identity:
-        """From the tables of a file in `folder`.
+        """Read the tables of a file in `folder`.
 
         Raises:
-            ConfigError: a certificate without its key, a file that is not there, or a secret that everybody can read.
+            ConfigError: a certificate lacks its key, a file is missing, or a secret is readable by other users.
         """
         if (tls.certificate is None) != (tls.key is None):
             raise ConfigError("tls names a certificate or a key", remedy="Name both: each is useless alone")
@@ -80,17 +80,17 @@ class Identity:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """All that it is read from."""
+        """All files that it was read from."""
         named = (self.ca, self.certificate, self.key, self.password_file, self.users_file)
         return tuple(path for path in named if path is not None)
 
     @property
     def by_user(self) -> bool:
-        """Whether those who connect give passwords and not certificates."""
+        """True if clients authenticate with passwords instead of certificates."""
         return self.users_file is not None
 
     def settings(self) -> dict[str, Any]:
-        """zenoh's configuration of links and of users.
+        """Return zenoh's configuration of links and users.
 
         Raises:
             ConfigError: the password cannot be read.
@@ -117,7 +117,7 @@ class Identity:
 
 @dataclass(frozen=True)
 class Route:
-    """Where a process is found, and as whom.
+    """Endpoints of a process, and the credentials to use.
 
     Attributes:
         endpoints: tried in this order.
@@ -128,7 +128,7 @@ class Route:
 
     @property
     def secured(self) -> bool:
-        """Whether the last of the endpoints asks who comes."""
+        """True if the last endpoint requires authentication."""
         return self.endpoints[-1].startswith(SECURE)
 
     def __str__(self) -> str:
@@ -136,12 +136,12 @@ class Route:
 
 
 def host_of(endpoint: str) -> str:
-    """The host in a zenoh endpoint, without the brackets of IPv6."""
+    """Return the host in a zenoh endpoint, without the brackets of IPv6."""
     return endpoint.partition("/")[2].partition("?")[0].partition("#")[0].rpartition(":")[0].strip("[]")
 
 
 def is_local(endpoint: str) -> bool:
-    """Whether only this machine reaches the endpoint."""
+    """Return True if only this machine can reach the endpoint."""
     if endpoint.startswith("unixsock-stream/"):
         return True
     host = host_of(endpoint)

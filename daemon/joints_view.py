@@ -1,4 +1,4 @@
-"""The joints of an arm on a terminal of 80 columns."""
+"""Show the joints of an arm in a terminal of 80 columns."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ HINT = "Move one joint at a time. It went the other way? Correct "
 
 
 def screen(seen: Seen) -> RenderableType:
-    """A row for each joint, then what was moved last and what is wrong."""
+    """Return a row for each joint, then the joint moved last and any problems."""
     table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
     table.add_column("joint", no_wrap=True, max_width=18)
     for heading in ("ID", "angle", "°/s", "mA", "°C"):
@@ -34,7 +34,7 @@ def screen(seen: Seen) -> RenderableType:
 
 
 def as_json(seen: Seen) -> str:
-    """One line of JSON."""
+    """Return one line of JSON."""
     return msgspec.json.encode(seen).decode()
 
 

@@ -1,4 +1,4 @@
-"""An arm's joints while somebody moves them: where they are, where they were, and what the URDF says of it."""
+"""Watch an arm's joints while a person moves them: positions, ranges, and the motion that the URDF predicts."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ TEMPERATURE_EVERY_S = 0.5  # one servo in turn
 MOVED_RAD = math.radians(3.0)
 STILL_RAD = math.radians(0.5)
 STILL_S = 1.0
-BEYOND = 0.01  # [rad or m]: a stop that gives, an encoder's resolution
-SEEN_M = 0.01  # a marker that moved less shows no sign
+BEYOND = 0.01  # [rad or m]: elasticity of a stop, resolution of an encoder
+SEEN_M = 0.01  # a marker that moved less shows no direction
 WORDS = (("forward", "back"), ("left", "right"), ("up", "down"))  # REP 103: x, y, z
 
 
 class Sample(Protocol):
-    """What a servo told; see `drivers.dynamixel.channel.Sample`."""
+    """A servo's sample; see `drivers.dynamixel.channel.Sample`."""
 
     @property
     def velocity(self) -> float: ...
@@ -43,7 +43,7 @@ class Sample(Protocol):
 
 
 class Fitted(Protocol):
-    """A servo as it was found; see `bodyschema.drivers.servos.handshake.FittedServo`."""
+    """An identified servo; see `bodyschema.drivers.servos.handshake.FittedServo`."""
 
     @property
     def id(self) -> int: ...
@@ -52,7 +52,10 @@ class Fitted(Protocol):
 
 
 class EncoderJoints(JointSource, Protocol):
-    """A real arm's joints, which know how they are; see `bodyschema.drivers.serial_lines.joints.SerialLineJoints`."""
+    """A real arm's encoders, which report their health.
+
+    See `bodyschema.drivers.serial_lines.joints.SerialLineJoints`.
+    """
 
     @property
     def health(self) -> tuple[str, ...]: ...
@@ -73,15 +76,15 @@ class ServoJoints(EncoderJoints, Protocol):
 
 
 class JointState(msgspec.Struct, frozen=True):
-    """One joint now.
+    """Current state of one joint.
 
     Attributes:
-        id: of its servo; None where there is none.
-        angle: [rad], as q of the pairs would be.
-        velocity: [rad/s]. current: [A], None where it is not measured. temperature_c: None as long as not known.
-        low, high: where it has been since the beginning [rad].
+        id: ID of its servo; None if it has none.
+        angle: [rad], as in q of the pairs.
+        velocity: [rad/s]. current: [A], None where it is not measured. temperature_c: None until known.
+        low, high: range since the start [rad].
         lower, upper: the URDF's limits [rad].
-        within_limits: whether it has always been within them; a wrong sign or zero shows here.
+        within_limits: True if it has always been within them; a wrong sign or zero shows here.
     """
 
     joint: str
@@ -98,18 +101,18 @@ class JointState(msgspec.Struct, frozen=True):
 
     @property
     def range(self) -> JointRange:
-        """What it has covered of its limits."""
+        """The part of its limits that it has covered."""
         return JointRange(self.low, self.high, self.lower, self.upper)
 
 
 class Seen(msgspec.Struct, frozen=True):
-    """The arm now.
+    """Current state of the arm.
 
     Attributes:
-        moved: which joint was moved last, and where the URDF says the marker went by it; empty before that.
-        health: what is wrong with servos.
-        trouble: why nothing is read at present, or None.
-        signs_in: where signs and zeros of the joints are set.
+        moved: the joint moved last, and the marker motion predicted by the URDF; empty before that.
+        health: problems of the servos.
+        trouble: reason why nothing can be read at present, or None.
+        signs_in: where the signs and zeros of the joints are set.
     """
 
     joints: tuple[JointState, ...]
@@ -120,10 +123,10 @@ class Seen(msgspec.Struct, frozen=True):
 
 
 class JointsWatch:
-    """Reads an arm, and keeps what it has seen."""
+    """Reads an arm, and keeps the ranges seen so far."""
 
     def __init__(self, config: Config, source: EncoderJoints, clock: Clock) -> None:
-        """Nothing is opened yet."""
+        """Store the settings; nothing is opened yet."""
         self._robot, self._source, self._clock = config.robot, source, clock
         self._servos = source if isinstance(source, ServoJoints) else None
         drivers = config.tables.drivers
@@ -147,7 +150,7 @@ class JointsWatch:
         self._opened.close()
 
     def look(self) -> Seen | None:
-        """Read once, and say how things are; None as long as not all is known."""
+        """Read once and return the state; None until all joints are known."""
         reading = self._reading.read(READ_S)
         if reading is not None:
             self._low = reading.q if self._q is None else np.minimum(self._low, reading.q)
@@ -160,11 +163,11 @@ class JointsWatch:
         return self._seen(self._q) if self._q is not None and has_all else None
 
     def look_all_over(self) -> Seen | None:
-        """As `look`, so often that each servo was asked how it is."""
+        """Call `look` until each servo was queried for its health."""
         return [self.look() for _ in self._robot.joints][-1]
 
     def know_temperatures(self) -> None:
-        """Ask all for their temperatures."""
+        """Query all temperatures."""
         if self._servos is not None:
             for joint in self._temperatures:
                 self._temperatures[joint] = self._servos.temperature_c(joint)
@@ -204,7 +207,7 @@ class JointsWatch:
 
 
 def signs_in(*, is_ros2: bool, is_plugin: bool) -> str:
-    """Return where signs and zeros of the joints are set, for people."""
+    """Return where the signs and zeros of the joints are set, for messages."""
     if is_ros2:
         return "[drivers.ros2.names] or the URDF: ROS 2 gives the angles with their signs and zeros"
     if is_plugin:
@@ -213,21 +216,21 @@ def signs_in(*, is_ros2: bool, is_plugin: bool) -> str:
 
 
 class Speeds:
-    """How fast joints move whose encoders do not tell.
+    """Velocities of joints whose encoders do not report them.
 
     Attributes:
         v: over the last tenth of a second or more [rad/s], shape (d,).
-        are_known: the joints were looked at for so long.
+        are_known: True once the joints were observed long enough.
     """
 
     def __init__(self, d: int) -> None:
-        """Nothing has moved yet."""
+        """Start at rest."""
         self.v: FloatArray = np.zeros(d)
         self.are_known = False
         self._t, self._q = -math.inf, self.v
 
     def take(self, t: float, q: FloatArray) -> None:
-        """The joints are at `q` (d,) [rad] at `t` [s]."""
+        """Add the joint angles `q` (d,) [rad] at `t` [s]."""
         passed = t - self._t
         if passed < SPEED_OVER_S:
             return
@@ -243,21 +246,21 @@ class _Rest:
 
 
 class SignCheck:
-    """Tells where the URDF says that the marker went when one joint was moved, for who moved it to compare.
+    """Predicts by the URDF where the marker went when one joint was moved, for the user to compare.
 
     Attributes:
-        said: that in words, of the joint that was moved last; empty before.
+        said: the prediction in words, for the joint moved last; empty before.
     """
 
     def __init__(self, robot: RobotDescription) -> None:
-        """Nothing has moved yet."""
+        """Start at rest."""
         self._robot, self._chain = robot, _from_parent(robot)
         self._begin: FloatArray | None = None
         self._rest: _Rest | None = None
         self.said = ""
 
     def take(self, t: float, q: FloatArray) -> None:
-        """The joints are at `q` (d,) [rad] at the time `t` [s]."""
+        """Add the joint angles `q` (d,) [rad] at `t` [s]."""
         if self._begin is None:
             self._begin = q
         if self._rest is None or np.abs(q - self._rest.q).max() > STILL_RAD:
@@ -266,7 +269,7 @@ class SignCheck:
         place = int(np.abs(moved).argmax())
         if abs(moved[place]) > MOVED_RAD:
             self.said = self._sentence(place, self._begin, float(moved[place]))
-        if t - self._rest.t > STILL_S:  # it stands: what comes next is another move
+        if t - self._rest.t > STILL_S:  # at rest: what follows is another move
             self._begin = q
 
     def _sentence(self, place: int, begin: FloatArray, moved: float) -> str:
@@ -284,7 +287,7 @@ class SignCheck:
 
 
 def _from_parent(robot: RobotDescription) -> RigidChain:
-    """From the link that carries the cameras to the marker."""
+    """Return the chain from the link that carries the cameras to the marker."""
     section = robot.robot
     return chain_between(
         robot.tree,

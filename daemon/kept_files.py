@@ -1,4 +1,4 @@
-"""Files that are kept beside the one that takes their place, and names that a power cut cannot undo."""
+"""Keep replaced files next to their replacements, and make renames durable."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def unused_name(file: Path, why: str) -> Path:
-    """Return where `file` can be kept: beside it, as `pairs.sqlite.damaged-1` for the first that is damaged."""
+    """Return a free name next to `file`, such as `pairs.sqlite.damaged-1` for the first damaged one."""
     number = 1
     while os.path.lexists(name := file.with_name(f"{file.name}.{why}-{number}")):
         number += 1
@@ -15,7 +15,7 @@ def unused_name(file: Path, why: str) -> Path:
 
 
 def sync_folder(folder: Path) -> None:
-    """Have the names in a folder on the disk. Without this, a power cut may undo a renaming."""
+    """Sync a folder's entries to disk. Without this, a power cut may undo a rename."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)

@@ -46,7 +46,7 @@ class Keys:
 
     @property
     def simulation(self) -> str:
-        """The simulated world: its truth and its tool; there only with --sim, and nothing that learns asks it."""
+        """The simulated world: its ground truth and its tool; only with --sim, and never used for learning."""
         return self._key("simulation")
 
     def status(self, process: str) -> str:

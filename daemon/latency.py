@@ -1,8 +1,9 @@
-"""How long before its time stamp an image was taken, from encoders and marker while the arm was moved.
+"""Estimate the latency of camera time stamps from encoder and marker readings of a moving arm.
 
-The marker is where the joint angles at the middle of the exposure bring it. Among all shifts in time the true one lets
-the positions follow most closely from the angles. A smooth function of the angles tells the shift roughly, for any arm.
-The nominal chain, fitted with its tolerances, tells it more precisely, as it is less free to follow a wrong shift.
+The marker is at the position that belongs to the joint angles at the middle of the exposure. With the correct time
+shift, the positions follow most closely from the angles. A smooth function of the angles gives the shift roughly, for
+any arm. The nominal chain, fitted within its tolerances, gives it more precisely, because it has less freedom to follow
+a wrong shift.
 """
 
 from __future__ import annotations
@@ -21,37 +22,37 @@ from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.records import FloatArray, frozen_array
 from kbmaps import ChainParameters, ChainTolerances, DegenerateDataError, RigidChain, align
 
-EARLIEST_S, LATEST_S = -0.05, 0.25  # that is looked for
+EARLIEST_S, LATEST_S = -0.05, 0.25  # search range
 STEP_S = 0.004
 FEWEST_FIXES = 60
 BLOCKS = 10
-RIVAL = 1.15  # a second minimum whose residual is less than this many times the best one's
-APART_S = 0.03  # from the first
-SMALL = 1e-3  # of the largest motion: a direction in which nothing moved
+RIVAL = 1.15  # a second minimum is a rival if its residual is below this multiple of the best one's
+APART_S = 0.03  # minimum distance of a rival
+SMALL = 1e-3  # relative to the largest motion: a direction without motion
 RIDGE = 1e-6
 FINER = 8
 LARGEST_SIGMA_S = 0.0025
 SHORTEST_S = 3.0
-LEAST_TURN_RAD, LEAST_SLIDE_M = np.radians(1.0), 0.005  # of the joint that moves most
-FOLLOWS = 4.0  # RMS motion of the marker, over what of it does not go with the joints
+LEAST_TURN_RAD, LEAST_SLIDE_M = np.radians(1.0), 0.005  # required of the joint that moves most
+FOLLOWS = 4.0  # required ratio of the marker's RMS motion to its part that does not follow the joints
 LITTLE_M = 0.01
-SETTLING = 5  # steps to where the chain is loosely fitted; from there two are enough
-# How an arm differs from its URDF, where the pairs do not tell: it only has to hold what they do not show.
+SETTLING = 5  # steps to reach the loosely fitted chain; from there two are enough
+# Prior deviations of an arm from its URDF; they only constrain what the pairs do not determine.
 LOOSE = ChainTolerances(axes=0.02, points=0.005, zeros=0.1, tool=0.1, base_rotation=0.5, base_translation=0.5)
-REFINED_S = 0.024  # on both sides of what the smooth function says
+REFINED_S = 0.024  # on both sides of the smooth function's estimate
 
 
 class LatencyError(BodyschemaError):
-    """The motion does not tell the latency."""
+    """The motion does not determine the latency."""
 
 
 @dataclass(frozen=True)
 class Wiggle:
-    """Readings and fixes as they came, each with its own time stamp.
+    """Encoder readings and marker fixes, each with its own time stamp.
 
     Attributes:
-        t_joints, q: of the encoders [s] (n,), [rad or m] (n, d).
-        t_marker, x: of the marker [s] (m,), [m] (m, 3).
+        t_joints, q: times and angles of the encoders [s] (n,), [rad or m] (n, d).
+        t_marker, x: times and positions of the marker [s] (m,), [m] (m, 3).
     """
 
     t_joints: FloatArray
@@ -64,33 +65,32 @@ class Wiggle:
             object.__setattr__(self, name, frozen_array(getattr(self, name)))
 
     def with_stamps_later(self, by_s: float) -> Wiggle:
-        """The same with the marker's time stamps later by so much [s]."""
+        """Return the same data with the marker's time stamps `by_s` later [s]."""
         return replace(self, t_marker=self.t_marker + by_s)
 
     def angles(self, t: FloatArray) -> FloatArray:
-        """Joint angles at times (m,), shape (m, d).
+        """Return the joint angles at times (m,), shape (m, d).
 
-        By a cubic B-spline that has the readings for coefficients, not through them. Between two readings a straight
-        line has half the noise that it has at one: of all latencies those would fit best that bring the images between
-        readings. The spline's noise is nearly the same everywhere, and as it weighs before and after alike, it is not
-        late.
+        A cubic B-spline has the readings as coefficients; it does not pass through them. Linear interpolation has half
+        the noise variance midway between two readings, so it would favour latencies that put the images between
+        readings. The spline's noise is nearly the same everywhere, and its symmetric weights introduce no delay.
         """
         return self._spline(np.interp(t, *self._places))
 
     @cached_property
     def _spline(self) -> BSpline:
-        """Of the angles, over the readings' numbers."""
+        """Spline of the angles, over the readings' indices."""
         return _smooth(self.q)
 
     @cached_property
     def _places(self) -> tuple[FloatArray, FloatArray]:
-        """Times [s], and the readings' numbers at these."""
+        """Times [s], and the indices of the readings at them."""
         numbers = np.linspace(0.0, len(self.q) - 1.0, FINER * (len(self.q) - 1) + 1)
         return np.asarray(_smooth(self.t_joints)(numbers), dtype=np.float64), numbers
 
 
 def _smooth(values: FloatArray) -> BSpline:
-    """The uniform cubic B-spline with these coefficients; the first and the last one count on beyond the ends."""
+    """Return the uniform cubic B-spline with these coefficients, extended by the first and the last one."""
     edge = np.repeat(values[[0, -1]], 2, axis=0)
     padded = np.concatenate([edge[:2], values, edge[2:]])
     return BSpline(np.arange(len(padded) + 4) - 4.0, padded, 3)
@@ -98,12 +98,12 @@ def _smooth(values: FloatArray) -> BSpline:
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """What was found.
+    """Result of the estimate.
 
     Attributes:
         latency_s: from the exposure's middle to the time stamp, with its 1-sigma sigma_s [s].
-        fixes: how many positions it was found with.
-        residual_m: RMS distance of these from where the angles bring the marker.
+        fixes: number of positions used.
+        residual_m: RMS distance of these from the positions that the angles predict.
         speed_m_s: RMS speed of the marker.
     """
 
@@ -115,10 +115,10 @@ class Latency:
 
 
 def latency_of(wiggle: Wiggle, chain: RigidChain) -> Latency:
-    """The latency of the marker's time stamps against the encoders'.
+    """Estimate the latency of the marker's time stamps relative to the encoders'.
 
     Args:
-        chain: roughly the arm; only the curvature of its map matters.
+        chain: approximate chain; only the curvature of its map matters.
 
     Raises:
         LatencyError: too few fixes, too little motion, or motion that repeats itself.
@@ -146,14 +146,14 @@ def latency_of(wiggle: Wiggle, chain: RigidChain) -> Latency:
 
 @dataclass(frozen=True)
 class _Fit:
-    """The smooth function's terms, and the positions to be explained: those whose angles are known at every lag."""
+    """The terms of the smooth function, and the positions to fit: those whose angles are known at every lag."""
 
     wiggle: Wiggle
     chain: RigidChain
     t: FloatArray
     x: FloatArray
     centre: FloatArray
-    axes: FloatArray  # (d, k): the joints' motion along its principal directions, each scaled to 1
+    axes: FloatArray  # (d, k): principal directions of the joints' motion, each scaled to 1
 
     @classmethod
     def of(cls, wiggle: Wiggle, chain: RigidChain) -> _Fit:
@@ -170,16 +170,16 @@ class _Fit:
 
     @property
     def unknowns(self) -> int:
-        """How many numbers are fitted."""
+        """Number of fitted parameters."""
         return 3 * self.terms(0.0).shape[1]
 
     @property
     def motion_m(self) -> float:
-        """RMS distance of the positions from their middle."""
+        """RMS distance of the positions from their mean."""
         return math.sqrt(float(np.mean(np.sum((self.x - self.x.mean(axis=0)) ** 2, axis=1))))
 
     def terms(self, lag: float) -> FloatArray:
-        """The nominal position, and a polynomial of second degree in the angles, at all fixes: (m, p)."""
+        """Return the nominal position, and a polynomial of second degree in the angles, at all fixes: (m, p)."""
         q = self.wiggle.angles(self.t - lag)
         u = (q - self.centre) @ self.axes
         rows, columns = np.triu_indices(u.shape[1])
@@ -187,7 +187,7 @@ class _Fit:
         return np.hstack([np.ones((len(q), 1)), u, u[:, rows] * u[:, columns], nominal - nominal.mean(axis=0)])
 
     def residual(self, lag: float, keep: NDArray[np.bool_] | slice = slice(None)) -> FloatArray:
-        """What the smooth function with the best coefficients leaves, shape (m, 3) [m]."""
+        """Return the residual of the fitted smooth function, shape (m, 3) [m]."""
         A, x = self.terms(lag)[keep], self.x[keep]
         scale = np.linalg.norm(A, axis=0) + np.finfo(float).tiny
         A = A / scale
@@ -195,31 +195,31 @@ class _Fit:
         return x - A @ weights
 
     def whitened(self, lag: float) -> _Fit:
-        """The same with positions in units of their noise, larger in depth, as the residual at `lag` has it."""
+        """Return the same fit with positions whitened by the covariance of the residual at `lag` (larger in depth)."""
         return replace(self, x=self.x @ _whitening(self.residual(lag)).T)
 
     def cost(self, lag: float, keep: NDArray[np.bool_] | slice = slice(None)) -> float:
-        """Sum of squares of the residual [m²], or in units of the noise."""
+        """Return the sum of squares of the residual [m²], or in units of the noise."""
         return float(np.sum(self.residual(lag, keep) ** 2))
 
 
 @dataclass(frozen=True)
 class _RigidFit:
-    """The drawn chain with its tolerances, and the positions to be explained."""
+    """The nominal chain with its tolerances, and the positions to fit."""
 
     wiggle: Wiggle
     parameters: ChainParameters
     t: FloatArray
     x: FloatArray
     start: FloatArray  # (p,)
-    white: FloatArray  # (3, 3): of a difference of positions, in units of its noise
+    white: FloatArray  # (3, 3): whitening matrix of position differences
 
     @classmethod
     def of(cls, smooth: _Fit, lag: float) -> _RigidFit:
-        """The chain where the positions of the smooth function put it.
+        """Place the chain by the smooth function's positions.
 
         Raises:
-            DegenerateDataError: the positions do not tell where that is.
+            DegenerateDataError: the positions do not determine its pose.
         """
         placed = align(
             smooth.chain, smooth.wiggle.angles(smooth.t - lag), smooth.x, pose_known=False, marker_known=False
@@ -230,15 +230,15 @@ class _RigidFit:
 
     @property
     def unknowns(self) -> int:
-        """How many numbers are fitted."""
+        """Number of fitted parameters."""
         return self.parameters.size
 
     def fitted(
         self, lag: float, keep: NDArray[np.bool_] | slice = slice(None), steps: int = 2
     ) -> tuple[FloatArray, FloatArray]:
-        """The tolerances (p,) that explain the positions best, by Gauss-Newton from `start`, and what they leave.
+        """Return the parameter changes (p,) that fit best, by Gauss-Newton from `start`, and the residual.
 
-        The latter has shape (m, 3) [m].
+        The residual has shape (m, 3) [m].
         """
         q, x, change = self.wiggle.angles(self.t - lag)[keep], self.x[keep], self.start
         information = self.parameters.standard_deviations(LOOSE) ** -2.0
@@ -251,16 +251,16 @@ class _RigidFit:
         return change, x - self.parameters.positions(change, q)
 
     def residual(self, lag: float, keep: NDArray[np.bool_] | slice = slice(None)) -> FloatArray:
-        """What the chain with the best tolerances leaves, in units of the noise, shape (m, 3)."""
+        """Return the residual of the best-fitting chain in units of the noise, shape (m, 3)."""
         return self.fitted(lag, keep)[1] @ self.white.T
 
     def whitened(self, lag: float) -> _RigidFit:
-        """The same with residuals in units of their noise, larger in depth, as what is left at `lag` has it."""
+        """Return the same fit with residuals whitened by their covariance at `lag` (larger in depth)."""
         start, left = self.fitted(lag, steps=SETTLING)
         return replace(self, start=start, white=_whitening(left))
 
     def cost(self, lag: float, keep: NDArray[np.bool_] | slice = slice(None)) -> float:
-        """Sum of squares of residual and tolerances, each in units of what is usual."""
+        """Return the sum of squares of residual and parameter changes, each divided by its sigma."""
         change, left = self.fitted(lag, keep)
         return float(
             np.sum((left @ self.white.T) ** 2) + np.sum((change / self.parameters.standard_deviations(LOOSE)) ** 2)
@@ -271,9 +271,9 @@ _AnyFit = _Fit | _RigidFit
 
 
 def _nearest(smooth: _Fit, lag: float) -> tuple[_AnyFit, float, float]:
-    """What explains the positions best, the drawn chain or the smooth function, in units of the noise.
+    """Return the better fit of nominal chain and smooth function, in units of the noise.
 
-    With about the latency that it finds [s], and the RMS distance that it leaves [m].
+    Also return its approximate latency [s] and RMS residual [m].
     """
     left = smooth.residual(lag)
     unexplained = smooth.whitened(lag), lag, _rms(left)
@@ -291,27 +291,27 @@ def _nearest(smooth: _Fit, lag: float) -> tuple[_AnyFit, float, float]:
 
 
 def _rms(left: FloatArray) -> float:
-    """RMS length of vectors (m, 3)."""
+    """Return the RMS length of vectors (m, 3)."""
     return math.sqrt(float(np.mean(np.sum(left**2, axis=1))))
 
 
 def _volume(left: FloatArray, unknowns: int) -> float:
-    """Determinant [m⁶] of the covariance of what a fit leaves (m, 3), as many numbers as it has taken left out.
+    """Return the determinant [m⁶] of the covariance of a fit's residual (m, 3), corrected for the fitted parameters.
 
-    It weighs each direction by its own noise, as the likelihood does: depth does not drown the other two.
+    It weights each direction by its own noise, as the likelihood does, so that depth does not dominate the other two.
     """
     return float(np.linalg.det(left.T @ left / max(len(left) - unknowns / 3.0, 1.0)))
 
 
 def _whitening(residual: FloatArray) -> FloatArray:
-    """What brings residuals (m, 3) to a covariance of one, shape (3, 3)."""
+    """Return the matrix, shape (3, 3), that transforms residuals (m, 3) to unit covariance."""
     noise = residual.T @ residual / len(residual)
     least = SMALL * float(np.trace(noise)) + np.finfo(float).tiny
     return np.asarray(np.linalg.inv(np.linalg.cholesky(noise + least * np.eye(3))), dtype=np.float64)
 
 
 def _require_motion(wiggle: Wiggle, chain: RigidChain) -> None:
-    """LatencyError when there are hardly any readings, or the joints hardly moved in them."""
+    """Raise LatencyError if there are too few readings, or the joints hardly moved in them."""
     if len(wiggle.t_joints) < 2:
         raise LatencyError("there are no encoder readings")
     span = np.ptp(wiggle.q, axis=0)
@@ -325,7 +325,7 @@ def _require_motion(wiggle: Wiggle, chain: RigidChain) -> None:
 
 
 def _require_following(fit: _Fit, cost: float) -> None:
-    """LatencyError when the marker hardly moves with the joints."""
+    """Raise LatencyError if the marker hardly moves with the joints."""
     residual_m = math.sqrt(cost / len(fit.x))
     moved_m = fit.motion_m
     if moved_m > FOLLOWS * residual_m:
@@ -339,7 +339,7 @@ def _require_following(fit: _Fit, cost: float) -> None:
 
 
 def _strange(fit: _Fit, cost: float) -> str:
-    """What to say of a marker that moves otherwise than the joints."""
+    """Return the message for a marker that does not move with the joints."""
     moved_m, residual_m = fit.motion_m, math.sqrt(cost / len(fit.x))
     return (
         f"the marker does not follow the joints: of {1e3 * moved_m:.0f} mm of motion (RMS) {1e3 * residual_m:.0f} mm "
@@ -350,7 +350,7 @@ def _strange(fit: _Fit, cost: float) -> str:
 
 
 def _too_few(wiggle: Wiggle, fixes: int) -> str:
-    """Why there are so few fixes whose angles are known at every latency: short, slow or out of sight."""
+    """Return the reason for too few fixes with known angles at every latency: short, slow or out of sight."""
     t, usable = wiggle.t_marker, f"the marker was seen {fixes} times, {FEWEST_FIXES} are needed"
     span_s = min(t[-1], wiggle.t_joints[-1]) - max(t[0], wiggle.t_joints[0])
     if span_s < SHORTEST_S:
@@ -374,8 +374,10 @@ def _minimum(fit: _AnyFit, near_s: float, keep: NDArray[np.bool_] | slice = slic
 
 
 def _sigma(fit: _AnyFit, lag: float) -> float:
-    """1-sigma [s]: from how the result changes when a stretch of time is left out, which sees residuals that go along
-    with each other; never less than what independent ones would give."""
+    """Return the 1-sigma [s] of the latency, from a jackknife over stretches of time.
+
+    The jackknife accounts for correlated residuals. The result is at least the sigma for independent residuals.
+    """
     blocks = np.arange(len(fit.x)) * BLOCKS // len(fit.x)
     without = np.array([_minimum(fit, lag, blocks != block) for block in range(BLOCKS)])
     jackknife = math.sqrt((BLOCKS - 1) * float(np.mean((without - without.mean()) ** 2)))
@@ -387,7 +389,7 @@ def _sigma(fit: _AnyFit, lag: float) -> float:
 
 
 def _require_one(grid: FloatArray, cost: FloatArray, best: int) -> None:
-    """LatencyError when another latency fits nearly as well."""
+    """Raise LatencyError if another latency fits nearly as well."""
     inner = np.r_[False, (cost[1:-1] <= cost[:-2]) & (cost[1:-1] <= cost[2:]), False]
     rivals = inner & (np.abs(grid - grid[best]) > APART_S) & (np.sqrt(cost) < RIVAL * math.sqrt(cost[best]))
     if rivals.any():

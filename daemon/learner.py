@@ -1,7 +1,7 @@
-"""What learns and answers. It needs a sampler for new pairs, but goes on answering without one.
+"""The learner process of one robot. It needs a sampler for new pairs, but keeps answering without one.
 
 Threads: zenoh's (queries, from an immutable snapshot; published pairs, into a queue), one for each robot that learns
-each pair at once, one at low priority for replay and the solver's orders, and the main thread for status and
+each pair immediately, one at low priority for replay and the solver's orders, and the main thread for status and
 checkpoints; `bodyschema.daemon.learner_host` has the last two.
 """
 
@@ -39,11 +39,11 @@ log = logging.getLogger(__name__)
 
 HISTORY_LIMIT_S = 5.0
 IDLE_S = 0.2
-# Pairs may wait for so long to be judged together, for each of several robots in a process, and at most [s].
+# How long pairs may wait to be evaluated as one batch, per robot of a process, and at most [s].
 TOGETHER_S, LONGEST_TOGETHER_S = 0.08, 1.0
-# Up to so many robots of a process tell their states and write their checkpoints as often as one alone.
+# Up to this many robots per process, states and checkpoints are as frequent as for one alone.
 AS_OFTEN_AS_ONE = 10
-# What has to come round for the learner to be alive.
+# Name of the loop that must keep running.
 LISTENING = "learning"
 LOOPS = (LISTENING, "background", "status")
 TABLES = ("robot", "camera", "zenoh", "daemon", "drivers", "learner", "effects", "background", "unexplained")
@@ -65,20 +65,20 @@ class Learner:
         robots: int = 1,
         turns: FindingTurns | None = None,
     ) -> None:
-        """A learner that goes on from its checkpoint; nothing is declared yet.
+        """Restore the learner from its checkpoint; nothing is declared yet.
 
         Args:
             solver: for this robot alone.
-            loop: what its loop of new pairs is called for the watchdog.
-            robots: so many share the process with it, itself among them.
-            turns: theirs to find calibration and outlook.
+            loop: name of its loop of new pairs for the watchdog.
+            robots: number of robots in the process, including this one.
+            turns: their common time limit for calibration and outlook.
         """
         self._config, self._bus, self._clock = config, bus, clock
         self._service = Service.nobodys(clock) if service is None else service
         self._loop = loop
         self._settings, self._robot = config.tables.learner, config.robot
         self._keys = Keys(config.robot.name)
-        self._version = version("bodyschema")  # a file that is read: once, while there are descriptors for it
+        self._version = version("bodyschema")  # reads a file: once, while descriptors are available
         self._nominal = NominalModel.extended_by(config.simulation)
         self._learning, self._set_aside = go_on(
             lambda: Learning(self._nominal, self._settings, solver, together_s=together_s(robots)),
@@ -102,7 +102,7 @@ class Learner:
 
     @contextlib.contextmanager
     def serving(self) -> Iterator[None]:
-        """Answer and learn from here to the end of the with statement; then write a last checkpoint."""
+        """Answer and learn until the end of the with statement; then write a last checkpoint."""
         listening = threading.Thread(target=self._guarded, args=(self._learn_pairs,), name="learn_pairs")
         listening.start()
         try:
@@ -122,10 +122,10 @@ class Learner:
         return ExpectedMarker(*found, lambda: self._learning.snapshot, self._clock).publishing()
 
     def tick(self) -> None:
-        """What the main thread does from time to time: a checkpoint when one is due.
+        """Do the main thread's periodic work: write a checkpoint when one is due.
 
         Raises:
-            BaseException: whatever ended one of the threads.
+            BaseException: the exception that ended one of the threads.
         """
         if self._failure is not None:
             raise self._failure
@@ -136,7 +136,7 @@ class Learner:
             self.checkpoint()
 
     def checkpoint(self) -> None:
-        """Write a checkpoint; when that fails, health says so."""
+        """Write a checkpoint; a failure appears in the health."""
         with self._checkpoint_lock:
             state = self._learning.state()
             try:
@@ -151,9 +151,9 @@ class Learner:
             self._checkpointed_at = self._clock.now()
 
     def status(self) -> LearnerStatus:
-        """The learner's state."""
+        """Return the learner's state."""
         counters = self._learning.counters
-        at_rest = self._rested_with == counters.pairs  # before what is said below: it is final then
+        at_rest = self._rested_with == counters.pairs  # before the status below: it is final then
         snapshot, recent = self._learning.snapshot, self._learning.recent()
         now = self._clock.now()
         written = self._checkpointed_at if self._checkpoint_problem is None else None
@@ -306,10 +306,10 @@ class Learner:
         return f"written to {self._config.checkpoint_file}"
 
     def reload(self) -> str:
-        """Read robot.toml again; what came of it.
+        """Read robot.toml again; return a message about the result.
 
         Raises:
-            ConfigError: it is wrong; nothing changed.
+            ConfigError: robot.toml is invalid; nothing changed.
         """
         found = reload(self._config, TABLES, CHANGEABLE)
         self._config, self._settings = found.config, found.config.tables.learner
@@ -331,7 +331,7 @@ class Learner:
                 self._changes.note(self._learning.change)
 
     def work(self) -> bool:
-        """A piece of what is not urgent; False when there is none. SolverLostError: the solver lost its pairs."""
+        """Do a piece of background work; return False if there is none. SolverLostError: the solver lost its pairs."""
         self._findings.renew()
         worked = self._learning.work()
         pairs = self._learning.counters.pairs
@@ -339,26 +339,26 @@ class Learner:
         return worked
 
     def restart_solver(self) -> None:
-        """Give a new solver the pairs again."""
+        """Send the pairs to a new solver."""
         self._learning.restart_solver()
         self._rested_with = None
 
     def solve_soon(self) -> None:
-        """Let the solver catch up: nothing else is left to do."""
+        """Let the solver catch up, since there is no other work."""
         self._learning.solve_soon()
 
 
 def more_rarely(robots: int) -> float:
-    """How many times more rarely states are told and checkpoints written, where so many robots share a process."""
+    """Return the factor by which states and checkpoints are rarer when `robots` robots share a process."""
     return max(1.0, robots / AS_OFTEN_AS_ONE)
 
 
 def together_s(robots: int) -> float:
-    """How long pairs may wait to be judged together [s], where so many robots share a process."""
+    """Return how long pairs may wait to be evaluated together [s] when `robots` robots share a process."""
     return 0.0 if robots == 1 else min(TOGETHER_S * robots, LONGEST_TOGETHER_S)
 
 
 def status_line(status: LearnerStatus) -> str:
-    """How the learner is, in a line."""
+    """Return the learner's state as one line."""
     claimed = "" if status.claimed_error_m is None else f", {1e3 * status.claimed_error_m:.1f} mm claimed"
     return with_health(f"{status.state}, {status.pairs} pairs, {status.answering} answers{claimed}", status.health)

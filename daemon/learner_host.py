@@ -1,7 +1,7 @@
-"""One process that learns for one robot or for several: a zenoh session, a solver's process and a background thread.
+"""Run one process that learns for one or several robots: zenoh session, solver process and background thread.
 
-Each robot has its own thread for new pairs, so that one whose sampler is stuck keeps no other from learning. What can
-wait is done for all in turns.
+Each robot has its own thread for new pairs, so that a stuck sampler does not stop the others from learning. Less urgent
+work is done for all in turns.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ log = logging.getLogger(__name__)
 
 TICK_S = 0.05
 STATUS_EVERY_S = 1.0
-# Of one processor: what is not urgent leaves the rest to new pairs and queries, which share the interpreter with it.
+# Fraction of one processor; the rest is left to new pairs and queries, which share the interpreter.
 SHARED_WORK = 0.3
-# Python hands the interpreter from thread to thread this often at least; its own 5 ms would be a query's delay.
+# Python's thread switch interval; its default of 5 ms would delay every query.
 SWITCH_INTERVAL_S = 2e-4
 
 
 def run_learners(configs: Sequence[Config], clock: Clock, wishes: Wishes, notifier: Notifier) -> None:
-    """Learn and answer for all robots until `wishes` has an end.
+    """Learn and answer for all robots until `wishes` requests the end.
 
     Args:
-        notifier: is told when all is up, that every loop works, and how the learners are.
+        notifier: is notified once everything is up, that every loop works, and of the learners' states.
 
     Raises:
         ConfigError: the robots cannot be served by one process.
@@ -62,7 +62,7 @@ def run_learners(configs: Sequence[Config], clock: Clock, wishes: Wishes, notifi
         bus = stack.enter_context(Bus(settings=session_settings(configs)))
         learners = _learners(configs, process, bus, clock, service)
         gc.collect()
-        gc.freeze()  # what start-up left behind need not be looked through again
+        gc.freeze()  # objects of the start-up need not be scanned again
         failed = stack.enter_context(_working(learners, service, clock))
         for config, learner in zip(configs, learners, strict=True):
             stack.enter_context(learner.serving())
@@ -75,10 +75,10 @@ def run_learners(configs: Sequence[Config], clock: Clock, wishes: Wishes, notifi
 
 
 def session_settings(configs: Sequence[Config]) -> dict[str, Any]:
-    """zenoh's configuration of the one session of all robots.
+    """Return zenoh's configuration of the one session of all robots.
 
     Raises:
-        ConfigError: two are called alike, or their tables [zenoh] name other routers or certificates.
+        ConfigError: two have the same name, or their tables [zenoh] name different routers or certificates.
     """
     settings = configs[0].zenoh_settings("learner")
     if len(configs) == 1:
@@ -125,7 +125,7 @@ def _learners(
 
 @contextmanager
 def _working(learners: Sequence[Learner], service: Service, clock: Clock) -> Iterator[list[Exception]]:
-    """The background's thread; what ended it before its time is in the list."""
+    """Run the background thread; an exception that ended it early is in the list."""
     stop, failed = threading.Event(), list[Exception]()
     share = 1.0 if len(learners) == 1 else SHARED_WORK
     background = Background(learners, service, clock, stop, share=share)
@@ -153,12 +153,12 @@ def attend(
     service: Service,
     failed: Sequence[Exception],
 ) -> None:
-    """Statuses, checkpoints and wishes, until the end is wished for."""
+    """Publish states, write checkpoints and serve requests until the end is requested."""
     every_s = STATUS_EVERY_S * more_rarely(len(learners))  # a status takes milliseconds
     begin = time.monotonic()
     due = [begin + every_s * k / len(learners) for k in range(len(learners))]
     while not wishes.ending:
-        # Taken before the round: a wish that comes during it is for every learner, and the next round's.
+        # Taken before the round: a request that comes during it is for every learner, in the next round.
         reloading, wishes.reloading = wishes.reloading, False
         for k, (learner, publish) in enumerate(zip(learners, publishers, strict=True)):
             if time.monotonic() >= due[k]:
@@ -176,7 +176,7 @@ def attend(
 
 
 def _reload(learner: Learner, service: Service) -> None:
-    """Whoever asked by a signal reads the log."""
+    """Reload; the result goes to the log, because the request came by a signal."""
     service.reloading()
     try:
         log.info("robot.toml was read again: %s", learner.reload())

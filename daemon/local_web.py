@@ -1,7 +1,7 @@
-"""What both HTTP servers share: requests name this machine, and no page from elsewhere reads or frames the answers.
+"""Checks that both HTTP servers share: requests must name this machine; other sites cannot read or frame the answers.
 
-A web page from elsewhere can make a browser ask a server on loopback. It cannot choose the header Host, and a name that
-leads here by DNS rebinding shows there.
+A web page from elsewhere can make a browser send requests to a server on loopback. It cannot choose the Host header, so
+a name that resolves here by DNS rebinding is detected.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-store",
 }
-# Any port: a tunnel ends at one of its own.
+# Any port, because a tunnel may end at another one.
 _HERE = re.compile(r"(localhost|127\.0\.0\.1|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE)
 
 
 def host_refusal(hosts: Iterable[str]) -> str | None:
-    """Return what is wrong with the headers Host of a request, for a person; None when nothing is."""
+    """Return what is wrong with the Host headers of a request, for a person; None if nothing is."""
     found = list(hosts)
     if len(found) == 1 and _HERE.fullmatch(found[0]):
         return None

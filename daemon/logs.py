@@ -1,4 +1,4 @@
-"""Where log lines go: to systemd's journal with priorities, or to a person's terminal."""
+"""Send log lines to systemd's journal with priorities, or to a terminal."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from .remedies import as_typed
 # sd-daemon(3): the journal reads a line's priority from its head.
 _PRIORITIES = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
 REPEATED_S = 60.0
-OFTEN = 20  # what differs in its numbers alone may be said so often in that time
+OFTEN = 20  # messages that differ only in numbers may appear this often in that time
 REMEMBERED = 256
 _NUMBER = re.compile(r"\d+")
 
 
 class PlainFormatter(logging.Formatter):
-    """Commands in the lines are as who started this has to type them."""
+    """Prints commands in the form in which the user has to type them."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record."""
+        """Return the formatted record."""
         return as_typed(super().format(record))
 
 
 class JournalFormatter(PlainFormatter):
-    """One line an event, with a priority like `<4>` at its head and without a time: the journal has its own."""
+    """One line per event, with a priority like `<4>` at its head and without a time: the journal has its own."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record; where it has several lines, as in a traceback, they stand side by side."""
+        """Return the formatted record; several lines, as in a traceback, are joined into one."""
         priority = next((number for level, number in _PRIORITIES if record.levelno >= level), 7)
         lines = (line.strip() for line in super().format(record).splitlines())
         return f"<{priority}>{' | '.join(line for line in lines if line)}"
@@ -49,26 +49,26 @@ class _Said:
 
 
 class JournalHandler(logging.StreamHandler[TextIO]):
-    """Keeps back what was just said: the same words within `REPEATED_S`, or `OFTEN` times the same but for numbers.
+    """Suppresses repeats: the same text within `REPEATED_S`, or more than `OFTEN` texts that differ only in numbers.
 
-    How often that was is told when the time is over and anything is logged, and at the end.
+    The number of suppressed messages is logged with the next record after that time, and at the end.
     """
 
     def __init__(self, stream: TextIO, now: Callable[[], float] = time.monotonic) -> None:
-        """Nothing was said yet."""
+        """Start without earlier messages."""
         super().__init__(stream)
         self.setFormatter(JournalFormatter("%(name)s: %(message)s"))
         self._now = now
         self._said: OrderedDict[tuple[str, int, str], _Said] = OrderedDict()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write the record, unless it was just said."""
+        """Write the record, unless it is a repeat."""
         self._forget_before(self._now() - REPEATED_S)
         if self._is_new(record):
             super().emit(record)
 
     def close(self) -> None:
-        """Tell what was kept back so far."""
+        """Report the messages suppressed so far."""
         self._forget_before(self._now())
         super().close()
 
@@ -105,11 +105,11 @@ class JournalHandler(logging.StreamHandler[TextIO]):
 
 
 def set_up(*, verbose: bool = False, environment: Mapping[str, str] = os.environ, stream: TextIO | None = None) -> None:
-    """Send the log to `stream` (stderr): under systemd with priorities and without repeats, else with times."""
+    """Send the log to `stream` (stderr): under systemd with priorities and without repeats, otherwise with times."""
     out = sys.stderr if stream is None else stream
     if is_journal(out, environment):
         handler = JournalHandler(out)
-        faulthandler.enable(out)  # what each thread was at when the watchdog ends the process
+        faulthandler.enable(out)  # shows what each thread did when the watchdog ends the process
     else:
         handler = logging.StreamHandler(out)
         handler.setFormatter(PlainFormatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s", "%H:%M:%S"))
@@ -119,7 +119,10 @@ def set_up(*, verbose: bool = False, environment: Mapping[str, str] = os.environ
 
 
 def is_journal(stream: TextIO, environment: Mapping[str, str]) -> bool:
-    """Whether `stream` ends in the journal. The variable alone does not tell: a desktop's terminals inherit it."""
+    """Return True if `stream` ends in the journal.
+
+    The variable alone is no proof, as terminals of a desktop inherit it.
+    """
     try:
         status = os.fstat(stream.fileno())
     except OSError:

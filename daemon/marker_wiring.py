@@ -1,4 +1,4 @@
-"""A ball's colour, learnt from image files or the robot's own cameras, as the table of robot.toml."""
+"""Learn a ball's colour from image files or the robot's cameras, as a table of robot.toml."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from bodyschema.interfaces.records import ImageArray
 from .reopen import Reopening
 
 READ_S = 0.2
-_IMAGES = 20  # of the time that is looked on
+_IMAGES = 20  # images during the observation
 
 
 def learnt_colour_table(images: Sequence[Path], at: tuple[float, float] | None) -> str:
-    """The table [vision.colour] of the ball at the pixel `at` of the first image, or of the one that moves.
+    """Return the table [vision.colour] of the ball at pixel `at` of the first image, or of the moving one.
 
     Raises:
         ColourUnlearnt: there is no such ball; the message says why.
@@ -29,11 +29,11 @@ def learnt_colour_table(images: Sequence[Path], at: tuple[float, float] | None) 
 
 
 def moving_colour_table(eyes: StereoEyes, clock: Clock, seconds: float, tell: Callable[[str], None]) -> str:
-    """The table [vision.colour] of the ball that moves before the left eye during so long [s].
+    """Return the table [vision.colour] of the ball that moves in the left image during `seconds` [s].
 
     Args:
-        eyes: cameras that are not open; they are closed again.
-        tell: is told what to do, and what is wrong with the cameras.
+        eyes: cameras that are not open; they are closed again afterwards.
+        tell: called with instructions and with problems of the cameras.
 
     Raises:
         ColourUnlearnt: nothing colourful moved.

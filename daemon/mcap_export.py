@@ -3,7 +3,7 @@
 | topic | schema | content |
 | --- | --- | --- |
 | /pair | bodyschema.Row | every column of the row under its own name, exactly |
-| /marker | foxglove.PoseInFrame | the marker, for the 3-D panel; unturned where no orientation was recorded |
+| /marker | foxglove.PoseInFrame | the marker, for the 3-D panel; unrotated where no orientation was recorded |
 
 Metadata `bodyschema` has the joints and the number of rows; `devices/1`, `devices/500` … of each joint what it was read
 with from that pair on: servo, firmware, homing offset and so on, as JSON.
@@ -26,7 +26,7 @@ from .store import Devices
 
 FRAME_ID = "measurement_frame"
 UNTURNED = (0.0, 0.0, 0.0, 1.0)
-LATEST_S = 9e9  # nanoseconds have to fit 64 bits
+LATEST_S = 9e9  # limit of nanoseconds in 64 bits
 
 _POINT = {"type": "object", "properties": {name: {"type": "number"} for name in ("x", "y", "z")}}
 _QUATERNION = {"type": "object", "properties": {name: {"type": "number"} for name in ("x", "y", "z", "w")}}
@@ -50,10 +50,10 @@ def write_mcap(recording: Recording, file: Path, devices: Sequence[Devices] = ()
     """Write `recording` to `file`; message times are `Recording.play_times`, moved to begin at 0 if negative.
 
     Args:
-        devices: what its joints were read with, which becomes metadata.
+        devices: what its joints were read with; it becomes metadata.
 
     Raises:
-        RecordingError: the extra `export` is not installed, or a time cannot be told in nanoseconds.
+        RecordingError: the extra `export` is not installed, or a time does not fit nanoseconds.
         OSError: the file cannot be written.
     """
     writer_type = _writer_type(file)

@@ -1,4 +1,4 @@
-"""Pictures for a browser on this machine: motion JPEG over HTTP on loopback."""
+"""Show pictures in a browser on this machine: motion JPEG over HTTP on loopback."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .local_web import HEADERS, LOOPBACK, host_refusal
 log = logging.getLogger(__name__)
 
 BOUNDARY = "picture"
-# A browser that shows the pictures has a thread of its own here.
+# Each browser that shows the pictures has its own thread here.
 MOST_VIEWERS = 32
 _END_CHECK_S = 0.05
 PAGE = b"<!doctype html><title>bodyschema</title><body style='margin:0;background:#111'><img src=/stream width=100%>"
@@ -26,15 +26,15 @@ class _Server(ThreadingHTTPServer):
     daemon_threads = True
 
     def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ARG002
-        """Log why a request failed; a browser that has gone leaves no traceback on the terminal."""
+        """Log why a request failed; a closed browser causes no traceback on the terminal."""
         log.debug("a request for pictures failed", exc_info=True)
 
 
 class MjpegServer:
-    """Serves the newest picture to whoever looks. Who is slow misses pictures and delays nobody."""
+    """Serves the newest picture to its viewers. A slow viewer misses pictures and delays no other."""
 
     def __init__(self, port: int) -> None:
-        """Nothing listens yet; port 0 takes one that is free."""
+        """Prepare without listening yet; port 0 takes a free one."""
         self._port = port
         self._newest: bytes | None = None
         self._number = 0
@@ -66,18 +66,18 @@ class MjpegServer:
 
     @property
     def address(self) -> str:
-        """Where to look."""
+        """Address to open in the browser."""
         port = self._port if self._server is None else self._server.server_address[1]
         return f"http://{LOOPBACK}:{port}/"
 
     def show(self, jpeg: bytes) -> None:
-        """The newest picture."""
+        """Publish the newest picture."""
         with self._changed:
             self._newest, self._number = jpeg, self._number + 1
             self._changed.notify_all()
 
     def _after(self, number: int) -> tuple[int, bytes] | None:
-        """A picture newer than the one of this number, and its number; None when the server ends."""
+        """Return a picture newer than `number`, and its number; None when the server ends."""
         with self._changed:
             self._changed.wait_for(lambda: self._is_closing or self._number > number)
             if self._is_closing or self._newest is None:

@@ -1,4 +1,4 @@
-"""What a service tells systemd, by sd_notify(3): datagrams to the socket that NOTIFY_SOCKET names."""
+"""Notify systemd of a service's state by sd_notify(3): datagrams to the socket that NOTIFY_SOCKET names."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from collections.abc import MutableMapping
 log = logging.getLogger(__name__)
 
 SOCKET, WATCHDOG, WATCHDOG_PID = "NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"
-SEND_LIMIT_S = 0.5  # working loops tell: a systemd that does not listen must not hold them up
+SEND_LIMIT_S = 0.5  # sent by the working loops: a systemd that does not listen must not block them
 LONGEST_STATUS = 400
-# systemd waits for so long for a start, and on for as long from each sign that it works, told this often [s].
+# systemd waits this long for a start, and again from each sign of life, which is sent this often [s].
 START_LIMIT_S, EXTEND_EVERY_S = 90, 5.0
 
 
 class Notifier:
-    """Tells systemd; without a socket to tell it to, does nothing.
+    """Notifies systemd; does nothing without a socket.
 
     Attributes:
-        watchdog_s: systemd ends the process when it has heard no `WATCHDOG=1` for so long [s]; None: it does not look.
+        watchdog_s: systemd ends the process after this long without `WATCHDOG=1` [s]; None: no watchdog.
     """
 
     def __init__(self, address: str | None = None, watchdog_s: float | None = None) -> None:
-        """Tell nobody, or who listens on `address`: a path, or with `@` at its head an abstract name."""
+        """Notify the socket at `address`, a path or with a leading `@` an abstract name; None: nothing."""
         self._address = None if address is None else _as_address(address)
         self._failed = False
         self._next_extension = 0.0
@@ -33,7 +33,7 @@ class Notifier:
 
     @classmethod
     def of_environment(cls, environment: MutableMapping[str, str] = os.environ) -> Notifier:
-        """What systemd asked this process for. Taken out of the environment: it is not for the process's children."""
+        """Return what systemd requested, and remove it from the environment, as children must not see it."""
         address = environment.pop(SOCKET, None) or None
         microseconds, pid = environment.pop(WATCHDOG, ""), environment.pop(WATCHDOG_PID, "")
         ours = not pid or pid == str(os.getpid())
@@ -42,34 +42,34 @@ class Notifier:
 
     @property
     def is_heard(self) -> bool:
-        """Whether there is somebody to tell: a systemd that started this process."""
+        """True if systemd started this process and listens."""
         return self._address is not None
 
     def ready(self) -> None:
-        """All is up, or up again after `reloading`."""
+        """Report that the start, or the reload after `reloading`, is complete."""
         self._tell("READY=1")
 
     def starting(self) -> None:
-        """Say that the start still works, as often as you like: systemd waits for `START_LIMIT_S` from now."""
+        """Report progress of the start, as often as you like: systemd waits for `START_LIMIT_S` from now."""
         now = time.monotonic()
         if now >= self._next_extension:
             self._next_extension = now + EXTEND_EVERY_S
             self._tell(f"EXTEND_TIMEOUT_USEC={START_LIMIT_S * 1_000_000}")
 
     def reloading(self) -> None:
-        """The configuration is read again; `ready` ends it."""
+        """Report that the configuration is being read again; `ready` ends this."""
         self._tell(f"RELOADING=1\nMONOTONIC_USEC={time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000}")
 
     def stopping(self) -> None:
-        """The process comes to its end."""
+        """Report that the process is stopping."""
         self._tell("STOPPING=1")
 
     def status(self, line: str) -> None:
-        """One line that `systemctl status` shows."""
+        """Send one line that `systemctl status` shows."""
         self._tell(f"STATUS={' '.join(line.split())[:LONGEST_STATUS]}")
 
     def feed_watchdog(self) -> None:
-        """The process works."""
+        """Report that the process works."""
         self._tell("WATCHDOG=1")
 
     def _tell(self, state: str) -> None:

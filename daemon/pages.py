@@ -1,4 +1,4 @@
-"""Pages to print, written as files."""
+"""Write printable pages as files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def write_page(page: Page, out: Path) -> None:
     """Write a page as PDF or SVG.
 
     Raises:
-        ConfigError: the ending is neither, or the file cannot be written.
+        ConfigError: the file's ending is neither, or it cannot be written.
     """
     writer = _WRITERS.get(out.suffix.lower())
     if writer is None:

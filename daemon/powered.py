@@ -1,4 +1,4 @@
-"""Asking joints for torque, or for its end."""
+"""Switch the torque of joints on or off on request."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from bodyschema.interfaces.errors import ConfigError, RequestError
 
 from .sources import Powered
 
-ANSWER_S = 1.5  # a query waits for 2 s
+ANSWER_S = 1.5  # less than the 2 s that a query waits
 
 
 def find_powered(drives: Iterable[object], name: str, file: Path) -> Powered:
-    """The one of an arm's drives that has the name; ConfigError when robot.toml, `file`, does not configure it."""
+    """Return the arm's drive of this name. ConfigError if robot.toml, `file`, does not configure it."""
     for drive in drives:
         if isinstance(drive, Powered) and drive.name == name:
             return drive
@@ -22,10 +22,10 @@ def find_powered(drives: Iterable[object], name: str, file: Path) -> Powered:
 
 
 def asked(drive: Powered, *, on: bool) -> str:
-    """Ask, and wait for what the thread that reads says. What is not done in time is not done later.
+    """Ask, and wait for the answer of the reading thread; a request that times out is cancelled.
 
     Raises:
-        RequestError: it is refused, or nobody reads the servos.
+        RequestError: it is refused, or the servos are not being read.
     """
     answer = drive.ask(on)
     try:

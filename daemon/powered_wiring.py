@@ -1,4 +1,4 @@
-"""Zero-force and gaze of an arm of Dynamixel servos: the models they need, made of the robot's description."""
+"""Wiring of zero-force and gaze of an arm of Dynamixel servos: the models, built from the robot's description."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def holding_torques(robot: RobotDescription) -> Callable[[FloatArray], FloatArray]:
-    """From joint angles [rad] (d,) the torques that hold the arm against gravity [N·m] (d,), by the URDF's masses.
+    """Return a function from joint angles [rad] (d,) to gravity torques [N·m] (d,), by the URDF's masses.
 
     Raises:
         ConfigError: the URDF states no masses that a joint bears.
@@ -37,10 +37,10 @@ def holding_torques(robot: RobotDescription) -> Callable[[FloatArray], FloatArra
 
 
 def open_drives(config: Config, servos: DynamixelConfig, clock: Clock) -> tuple[ZeroForce | Gaze, ...]:
-    """What may move the joints: nothing, unless robot.toml names it; and then nothing, until a person asks.
+    """Return the drives that may move the joints: those that robot.toml names, inactive until a person asks.
 
     Raises:
-        ConfigError: the URDF states no masses, or robot.toml says that somebody else bears the arm.
+        ConfigError: the URDF states no masses, or robot.toml says that the arm is held in another way.
     """
     joints, drives = config.robot.joints, []
     _check_hold(config, servos)
@@ -58,7 +58,7 @@ def open_drives(config: Config, servos: DynamixelConfig, clock: Clock) -> tuple[
 
 
 def _check_hold(config: Config, servos: DynamixelConfig) -> None:
-    """ConfigError when [robot] hold, by which the diagnosis goes, says something else than [drivers.dynamixel]."""
+    """Raise ConfigError if [robot] hold, used by the diagnosis, contradicts [drivers.dynamixel]."""
     hold, is_configured = config.robot.robot.hold, servos.zero_force is not None
     if is_configured == (hold == "zero_force"):
         return

@@ -1,4 +1,4 @@
-"""Since when an arm has had the tool that it has now, as far as the learner beside its store knows."""
+"""Find the first pair with the present tool, from the learner's checkpoint next to the store."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from .recordings import StoredPairs
 def first_pair(pairs: StoredPairs, checkpoint: Path, robot: str) -> int:
     """Return the row, from 1, of the first pair with the present tool.
 
-    1 where no learner of these pairs left a checkpoint to tell.
+    Returns 1 if no learner of these pairs has left a checkpoint.
 
-    Pairs from before a `reset_to_prior` are not among those with the present tool either.
+    Pairs from before a `reset_to_prior` do not count as pairs with the present tool.
     """
     try:
         state = read_checkpoint(checkpoint, robot=robot)
-    except CheckpointError:  # the learner's to complain of; the recording can be calibrated without
+    except CheckpointError:  # the learner reports it; the recording can be calibrated without
         return 1
     if state is None or state.header.counters.store != pairs.store:
         return 1

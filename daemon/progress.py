@@ -1,4 +1,4 @@
-"""How far an experiment has come: said while it runs, and shown while one waits."""
+"""Report the progress of an experiment while it runs."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ TELL_EVERY_S = 5.0
 
 
 def quiet(_said: str) -> None:
-    """For who does not want to know."""
+    """Ignore progress messages."""
 
 
 def counted(say: Say, what: str, items: Sequence[T]) -> Iterator[T]:
-    """The items in their order: says what is done with them at once, and every few seconds how many are done."""
+    """Yield the items in order; report `what` at once, and every few seconds the number done."""
     say(what)
     told = time.monotonic()
     for done, item in enumerate(items):
@@ -32,11 +32,11 @@ def counted(say: Say, what: str, items: Sequence[T]) -> Iterator[T]:
 
 @contextmanager
 def shown_on(console: Console, name: str) -> Iterator[Say]:
-    """A function that shows what is said: one line that is written anew on a terminal, a line each elsewhere."""
+    """Yield a function that shows messages: one updating line on a terminal, a line each elsewhere."""
     if not console.is_terminal:
         yield lambda said: console.print(f"{name}: {said}", highlight=False, soft_wrap=True)
         return
-    # Not at the top: rich's bars take 20 ms to import.
+    # Imported here, because rich's bars take 20 ms.
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
     from rich.table import Column
 

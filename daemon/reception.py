@@ -1,7 +1,7 @@
-"""Queries that wait for their turn: how many, how large, how often, and whose turn it is.
+"""Queue queries fairly, with limits on their number, size and rate.
 
-Whoever asks much waits for himself: sources take turns, and each has its own limits. A query says its source where its
-client gave `source_info`; those that say nothing count as one source.
+Sources take turns, and each has its own limits, so that a source that asks much delays only itself. The source is the
+client's `source_info`; all queries without one count as one source.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What one source may ask under one key.
+    """Limits of one source under one key.
 
     Attributes:
-        rate_hz: queries a second in the long run.
-        burst: queries at once after a rest.
-        waiting: queries without an answer yet.
+        rate_hz: queries per second in the long run.
+        burst: queries at once after a pause.
+        waiting: unanswered queries.
         request_bytes: size of a request's payload.
-        waiting_bytes: of their payloads; eight times that of all sources together.
-        wait_s: a query that waited longer is refused, since nobody waits for its answer any more.
-        sources: sources that wait at the same time.
+        waiting_bytes: sum of their payload sizes; the sum over all sources may be eight times that.
+        wait_s: a query that waited longer is refused, since its client no longer waits for the answer.
+        sources: number of sources waiting at the same time.
     """
 
     rate_hz: float = 5000.0
@@ -43,12 +43,12 @@ class Limits:
 
 
 LIMITS = Limits()
-EVERYBODYS = 8  # times what one may let wait
+EVERYBODYS = 8  # total over all sources, as a multiple of one source's limit
 
 
 @dataclass(slots=True)
 class _Source(Generic[T]):
-    """One who asks: his queries that wait, with the times they came at and their sizes, and what he may still ask."""
+    """One source: its waiting queries with arrival times and sizes, and its remaining allowance."""
 
     left: float
     seen: float
@@ -57,21 +57,21 @@ class _Source(Generic[T]):
 
 
 class Reception(Generic[T]):
-    """The queries under one key until they are taken; many threads bring them, one takes them."""
+    """The queries under one key until they are taken; many threads add them, one takes them."""
 
     def __init__(self, limits: Limits = LIMITS, now: Callable[[], float] = time.monotonic) -> None:
         self._limits, self._now = limits, now
         self._lock = threading.Lock()
         self._size = 0
-        # One for each query that waits, and one for the end: waking up by it is quicker than by a condition.
+        # One item for each waiting query, and one for the end: this wakes up faster than a condition.
         self._turns: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._sources: OrderedDict[str, _Source[T]] = OrderedDict()  # in the order of their turns
 
     def admit(self, source: str, size: int, query: T) -> None:
-        """Let a query wait.
+        """Queue a query.
 
         Args:
-            size: of its payload [bytes].
+            size: size of its payload [bytes].
 
         Raises:
             RequestError: it is too large, or its source asks too much; the message says how much is allowed.
@@ -108,7 +108,7 @@ class Reception(Generic[T]):
         self._turns.put(None)
 
     def take(self) -> tuple[T, RequestError | None] | None:
-        """The next query, as soon as there is one, and why it is not to be answered; None once closed."""
+        """Return the next query, waiting for one, and the reason to refuse it, if any; None once closed."""
         self._turns.get()
         with self._lock:
             name = next((name for name, asking in self._sources.items() if asking.waiting), None)
@@ -122,7 +122,7 @@ class Reception(Generic[T]):
         return query, self._too_late(came)
 
     def close(self) -> None:
-        """Nothing is taken any more."""
+        """Stop taking queries."""
         with self._lock:
             for asking in self._sources.values():
                 asking.waiting.clear()
@@ -140,7 +140,7 @@ class Reception(Generic[T]):
         if asking is None:
             self._make_room()
             asking = self._sources[source] = _Source(float(limits.burst), now)
-            self._sources.move_to_end(source, last=False)  # who comes first has his turn first
+            self._sources.move_to_end(source, last=False)  # first come, first served
         asking.left = min(float(limits.burst), asking.left + limits.rate_hz * (now - asking.seen))
         asking.seen = now
         return asking
@@ -151,7 +151,7 @@ class Reception(Generic[T]):
         resting = [name for name, asking in self._sources.items() if not asking.waiting]
         if not resting:
             raise RequestError(f"{self._limits.sources} clients wait already, and that is the most; ask again later")
-        # Whoever rested longest has least to remember of.
+        # The source that rested longest has the least state to lose.
         del self._sources[min(resting, key=lambda name: self._sources[name].seen)]
 
 

@@ -1,4 +1,4 @@
-"""Copies the running sampler's pairs into a file: first its history, then what comes."""
+"""Copy the running sampler's pairs into a file: first its history, then new ones."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ LIVE_WAIT_S = 0.5
 
 
 class History:
-    """The sampler's stored pairs from one sequence number on, page by page. Publications only say when to look.
+    """The sampler's stored pairs from a sequence number on, page by page. Publications only trigger the next look.
 
     Attributes:
         next_seq: sequence number of the next pair.
-        missing: numbers between the pairs so far that the sampler has no pairs of.
+        missing: numbers between the pairs so far that the sampler does not have.
     """
 
     def __init__(self, bus: Bus, robot: RobotDescription, from_seq: int) -> None:
@@ -44,11 +44,11 @@ class History:
         bus.subscribe(self._keys.pair, lambda _: self._news.set())
 
     def page(self) -> list[Pair]:
-        """The next pairs, at most what one reply holds; none when there are no more for now.
+        """Return the next pairs, at most what one reply holds; an empty list if there are no more for now.
 
         Raises:
             BusError: the sampler does not answer.
-            RecordingError: it writes another store now, whose numbers mean other pairs.
+            RecordingError: it now writes another store, whose numbers belong to other pairs.
         """
         self._news.clear()
         reply = decode(self._bus.ask_one(f"{self._keys.pairs}?from={self.next_seq}"), PairsReply)
@@ -67,12 +67,12 @@ class History:
         return pairs
 
     def wait(self) -> None:
-        """Return when a pair was published, or after a moment."""
+        """Wait for a published pair, or for a moment."""
         self._news.wait(LIVE_WAIT_S)
 
 
 def copy_history(history: History, joints: tuple[str, ...], out: Path) -> int:
-    """Write all pairs that there are into `out`; their number.
+    """Write all existing pairs into `out`; return their number.
 
     Raises:
         RecordingError: there are none, or `out` cannot be written.
@@ -92,10 +92,10 @@ def copy_history(history: History, joints: tuple[str, ...], out: Path) -> int:
 
 
 def follow_history(history: History, joints: tuple[str, ...], out: Path, stopped: Callable[[], bool]) -> int:
-    """Write pairs into `out` as they come until `stopped`; their number.
+    """Write pairs into `out` as they arrive until `stopped`; return their number.
 
-    CSV is written line by line, so that whatever ends the process leaves all rows. The other formats are only whole
-    with their last byte and are written at the end. A sampler that goes away is waited for.
+    CSV is written line by line, so that all rows survive an abrupt end. The other formats are only complete with their
+    last byte and are written at the end. If the sampler goes away, wait for it.
 
     Raises:
         RecordingError: `out` cannot be written, or the sampler came back with another store.

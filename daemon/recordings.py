@@ -1,4 +1,4 @@
-"""Pairs as recordings, and recordings into files: all at once and whole, or not at all."""
+"""Convert pairs to recordings, and write recordings to files atomically."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def from_pairs(pairs: Sequence[Pair], joints: tuple[str, ...], file: Path | None
     """Return the recording of `pairs`, at least one; with pixel centres and orientations where every pair has them.
 
     Args:
-        file: where they are from, for messages.
+        file: their origin, for messages.
     """
     centres = [pair.centres_px for pair in pairs]
     turns = [pair.R for pair in pairs if pair.R is not None]
@@ -56,7 +56,7 @@ def from_pairs(pairs: Sequence[Pair], joints: tuple[str, ...], file: Path | None
 
 @dataclass(frozen=True)
 class StoredPairs:
-    """The pairs of a store.
+    """Pairs of a store.
 
     Attributes:
         store: its identity.
@@ -70,12 +70,12 @@ class StoredPairs:
 
 
 def from_store(file: Path) -> Recording:
-    """All pairs of a store, as `stored_pairs`."""
+    """Return all pairs of a store, as `stored_pairs` does."""
     return stored_pairs(file).recording
 
 
 def stored_pairs(file: Path) -> StoredPairs:
-    """All pairs of a store that can be read, which a sampler may be writing meanwhile. Others are told in the log.
+    """Return all readable pairs of a store, which a sampler may be writing meanwhile. Log the unreadable ones.
 
     Raises:
         StoreError: it cannot be read.
@@ -91,19 +91,19 @@ def stored_pairs(file: Path) -> StoredPairs:
 
 
 def devices_of(store: Path) -> list[Devices]:
-    """What the joints of a store's pairs were read with; StoreError when it cannot be read."""
+    """Return what the joints of a store's pairs were read with. StoreError if it cannot be read."""
     with PairReader(store) as reader:
         return reader.devices()
 
 
 def opened(source: Path, joints: tuple[str, ...] | None = None) -> Recording:
-    """The recording, or the pairs of the store, in `source`.
+    """Return the recording, or the pairs of the store, in `source`.
 
     Args:
-        joints: the robot's; None for those that `source` has.
+        joints: the robot's joints; None for those of `source`.
 
     Raises:
-        StoreError, RecordingError: it cannot be read, or is of other joints.
+        StoreError, RecordingError: it cannot be read, or has other joints.
     """
     if source.suffix.lower() in STORE_ENDINGS:
         recording = from_store(source)
@@ -112,7 +112,7 @@ def opened(source: Path, joints: tuple[str, ...] | None = None) -> Recording:
 
 
 def of_robot(recording: Recording, joints: tuple[str, ...], file: Path) -> Recording:
-    """The recording; RecordingError when it is not of these joints in this order."""
+    """Return the recording. RecordingError if its joints are not these in this order."""
     if recording.joints != joints:
         raise RecordingError(
             f"the pairs are of other joints: {', '.join(recording.joints)}",
@@ -123,7 +123,7 @@ def of_robot(recording: Recording, joints: tuple[str, ...], file: Path) -> Recor
 
 
 def between(recording: Recording, first: int, last: int | None, file: Path) -> Recording:
-    """The rows with the numbers from `first` to `last`, counted from 1; RecordingError when there are none."""
+    """Return the rows `first` to `last`, counted from 1. RecordingError if there are none."""
     numbers = np.arange(1, len(recording) + 1)
     chosen = (numbers >= first) & (numbers <= (last or len(recording)))
     if not chosen.any():
@@ -137,7 +137,7 @@ def between(recording: Recording, first: int, last: int | None, file: Path) -> R
 
 
 def check_target(out: Path, *, force: bool) -> None:
-    """RecordingError unless a recording can be written to `out`: its ending is known and nothing is in the way."""
+    """Raise RecordingError unless a recording can be written to `out`: known ending, no file in the way."""
     if out.suffix.lower() == URDF:
         raise RecordingError("a URDF is of a robot, not of pairs", file=out, remedy="`bodyschema calibrate` learns one")
     if out.suffix.lower() not in _WRITERS:
@@ -149,10 +149,10 @@ def check_target(out: Path, *, force: bool) -> None:
 
 
 def write(recording: Recording, out: Path, devices: Sequence[Devices] = ()) -> None:
-    """Write `recording` in the format of the ending of `out`. The file appears when it is whole.
+    """Write `recording` in the format of the ending of `out`. The file appears once it is complete.
 
     Args:
-        devices: what the joints were read with, which only MCAP has a place for.
+        devices: what the joints were read with; only MCAP stores it.
 
     Raises:
         RecordingError: it cannot be written, or an extra that the format needs is not installed.

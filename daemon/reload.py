@@ -1,4 +1,4 @@
-"""robot.toml read again while a process runs: what takes effect at once, and what needs a new start."""
+"""Read robot.toml again while a process runs: what takes effect at once, and what needs a restart."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ Key = tuple[str, str]
 
 @dataclass(frozen=True, slots=True)
 class Reload:
-    """What another reading of robot.toml found.
+    """Result of reading robot.toml again.
 
     Attributes:
-        config: what is in force from now on; the same as before when nothing changed that can.
+        config: the configuration in force from now on; unchanged if nothing changed that can.
         changed: settings that take effect, as in `daemon.min_step_deg = 2.0`.
-        waiting: settings that need a new start.
+        waiting: settings that need a restart.
     """
 
     config: Config
@@ -29,7 +29,7 @@ class Reload:
     waiting: list[str]
 
     def message(self, process: str) -> str:
-        """What it comes to, with what to do."""
+        """Return a summary, with what to do."""
         said = [f"in force now: {', '.join(self.changed)}"] if self.changed else []
         if self.waiting:
             restart = f"systemctl restart bodyschema-{process}@{self.config.robot.name}"
@@ -44,12 +44,12 @@ def reload(config: Config, tables: Collection[str], changeable: Collection[Key])
     """Read the robot.toml of `config` again.
 
     Args:
-        config: what is in force; overridden settings stay overridden where the command line gave them.
-        tables: which ones the process works with.
-        changeable: table and key of what may change while it runs.
+        config: the configuration in force; settings overridden on the command line stay overridden.
+        tables: those that the process uses.
+        changeable: table and key of settings that may change while it runs.
 
     Raises:
-        ConfigError: robot.toml is wrong now; nothing changed.
+        ConfigError: robot.toml is invalid now; nothing changed.
     """
     found = config.reread()
     changed: list[str] = []
@@ -72,7 +72,7 @@ def reload(config: Config, tables: Collection[str], changeable: Collection[Key])
 
 
 def _table(config: Config, name: str) -> dict[str, Any]:
-    """The settings of a table, defaults included."""
+    """Return the settings of a table, defaults included."""
     described = {"robot": config.robot.robot, "camera": config.robot.camera}
     table = described.get(name, getattr(config.tables, name))
     if isinstance(table, msgspec.Struct):
@@ -81,9 +81,9 @@ def _table(config: Config, name: str) -> dict[str, Any]:
 
 
 def _same_arm(a: Config, b: Config) -> bool:
-    """Whether both have the same way from camera to marker, up to the settings of robot.toml."""
+    """Return True if both have the same chain from camera to marker, apart from robot.toml's settings."""
     if a.robot.robot != b.robot.robot or a.robot.camera != b.robot.camera:
-        return True  # told already
+        return True  # reported already
     arrays = ((a.robot.lower, b.robot.lower), (a.robot.upper, b.robot.upper))
     chains = ((getattr(a.robot.chain, name), getattr(b.robot.chain, name)) for name in ("fixed", "axes", "prismatic"))
     return all(np.array_equal(one, other) for one, other in (*arrays, *chains))

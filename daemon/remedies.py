@@ -1,4 +1,4 @@
-"""Commands in messages, as who gave --robot has to type them."""
+"""Adapt commands in messages to the --robot option that the user gave."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 
 OPTION = "--robot"
-# The others take no robot.toml, or write one.
+# The other commands take no robot.toml, or write one.
 WITH_ROBOT = frozenset(
     {
         *("bench", "command", "doctor", "ik", "joints", "learner", "predict", "record", "run", "sampler", "scan"),
@@ -20,7 +20,7 @@ _LINE = re.compile(r"^bodyschema ([^#\n]+?)(?=\s*(?:#|$))")
 
 
 def given_robot(arguments: Sequence[str]) -> str | None:
-    """What a command line gave as --robot; None where it left it to the environment or the folder."""
+    """Return the --robot of a command line; None if it was left to the environment or the folder."""
     for place, argument in enumerate(arguments):
         name, equals, value = argument.partition("=")
         if name == OPTION:
@@ -29,15 +29,15 @@ def given_robot(arguments: Sequence[str]) -> str | None:
 
 
 def printable(text: str) -> str:
-    """Return the text with its control characters spelt out: a name in a file must not steer the terminal."""
+    """Return the text with its control characters escaped: a name in a file must not control the terminal."""
     return "".join(letter if letter.isprintable() or letter == "\n" else repr(letter)[1:-1] for letter in text)
 
 
 def as_typed(text: str, arguments: Sequence[str] | None = None) -> str:
-    """`text`, each of our commands in it, in backticks or as a whole line, with the --robot of this command line.
+    """Return `text` with this command line's --robot added to each bodyschema command, in backticks or on its own line.
 
     Args:
-        arguments: of the command line; by default of this process.
+        arguments: arguments of the command line; by default those of this process.
     """
     robot = given_robot(sys.argv[1:] if arguments is None else arguments)
     if robot is None:

@@ -1,4 +1,4 @@
-"""Sources that are opened again after their device went away."""
+"""Reopen sources after their device went away."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ R_co = TypeVar("R_co", covariant=True)
 
 
 class Readable(Source, Protocol[R_co]):
-    """A source of whatever kind."""
+    """A source of any kind."""
 
     def read(self, timeout_s: float) -> R_co | None: ...
 
 
 class Reopening(Generic[R_co]):
-    """Reads a source; when it is lost says so once, and tries to open it again, less and less often.
+    """Reads a source. When the source is lost, report it once and try to reopen it at growing intervals.
 
-    A source that is there and not the right one (other cameras, another servo) is told of once more, and waited for.
-    It is back when something was read: a device that can be opened and not be read is not.
+    A source that is present but the wrong one (other cameras, another servo) is reported once more, and waited for. It
+    counts as back once it was read: a device may open and still not be readable.
 
-    The first opening has to succeed: what fails at the start needs a person.
+    The first opening has to succeed: a failure at the start needs a person.
 
     Attributes:
-        trouble: what is wrong with the source, or None.
-        losses: how often it was lost.
+        trouble: the problem with the source, or None.
+        losses: number of times it was lost.
     """
 
     def __init__(
@@ -47,12 +47,12 @@ class Reopening(Generic[R_co]):
         sleep: Callable[[float], None] = time.sleep,
         forbidden: Callable[[], str | None] = lambda: None,
     ) -> None:
-        """Nothing is opened yet.
+        """Store the settings; nothing is opened yet.
 
         Args:
-            name: what messages call the source.
-            wall: the clock for the waiting times.
-            forbidden: a device that this process will never be allowed to open, or None.
+            name: name of the source in messages.
+            wall: clock for the waiting times.
+            forbidden: returns a device that this process will never be allowed to open, or None.
         """
         self._forbidden = forbidden
         self._source, self._name, self._wall, self._sleep = source, name, wall, sleep
@@ -75,10 +75,10 @@ class Reopening(Generic[R_co]):
         self._opened.close()
 
     def read(self, timeout_s: float) -> R_co | None:
-        """As the source's `read`; None also while the source is lost.
+        """Read like the source's `read`; also return None while the source is lost.
 
         Raises:
-            SourceError: it came back as what only a new process may open.
+            SourceError: it came back as a device that only a new process may open.
         """
         if not self._is_open and not self._try_again(timeout_s):
             return None
@@ -125,7 +125,7 @@ class Reopening(Generic[R_co]):
         self._next_try = self._wall.now() + (self._wait_s if soon_s is None else soon_s)
 
     def _tell_refusal(self, error: SourceError) -> None:
-        """Log what has to be mended by a person, each thing once."""
+        """Log problems that need a person, each once."""
         if not isinstance(error, SourceLost) and str(error) != self._refused:
             self._refused = str(error)
             log.warning("%s cannot be taken again: %s; trying on", self._name, error)

@@ -37,7 +37,7 @@ def write_rerun(recording: Recording, file: Path, _devices: Sequence[Devices] = 
     """
     rr = _rerun(file)
     try:
-        file.touch()  # whose own error says nothing of the file
+        file.touch()  # this error names the file; rerun's does not
         stream = rr.RecordingStream("bodyschema")
         stream.save(file)
     except RuntimeError as error:
@@ -68,7 +68,7 @@ def _send_markers(rr: Any, stream: Any, recording: Recording, rows: list[Any]) -
 
 
 def runs(recording: Recording) -> list[FloatArray]:
-    """Positions of each segment, (m, 3) [m]; of all rows where there are none."""
+    """Return the positions of each segment, (m, 3) [m]; of all rows if there are no segments."""
     if recording.segment is None:
         return [recording.x]
     return np.split(recording.x, np.flatnonzero(np.diff(recording.segment)) + 1)

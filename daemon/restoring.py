@@ -1,4 +1,4 @@
-"""A robot put back from a backup, all of it or nothing."""
+"""Restore a robot from a backup, completely or not at all."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ from .keys import Keys
 from .store import leave_out_damage
 from .store_file import NOTHING_CHANGED, explained, lock
 
-# What SQLite keeps beside a store that was not closed; empty: the store itself.
+# Suffixes of the files that SQLite keeps for a store that was not closed; empty: the store itself.
 STORE_PARTS = ("", "-wal", "-shm")
 
 
 @dataclass(frozen=True, slots=True)
 class Restored:
-    """What was put where.
+    """Result of restoring.
 
     Attributes:
-        written: the files that are new.
-        aside: what was in their places before, under its new names.
-        elsewhere: of files that robot.toml names outside its folder: where they are now, by where they were.
+        written: the new files.
+        aside: files that were in their places before, under their new names.
+        elsewhere: files that robot.toml names outside its folder: new path by original path.
         store: identity of the store from now on.
-        unreadable: how many pairs between the oldest and the newest are not in it, because a disk changed them.
+        unreadable: number of pairs between the oldest and the newest that are missing, because a disk corrupted them.
     """
 
     written: list[Path]
@@ -49,15 +49,15 @@ class Restored:
 
 
 def restore(backup: Backup, robot_file: Path, state_dir: Path | None = None, *, force: bool = False) -> Restored:
-    """Put robot.toml and what it names where `robot_file` says, and the state where that robot.toml says.
+    """Restore robot.toml and its files to `robot_file`, and the state to where that robot.toml says.
 
-    The store gets a new identity: from here on its numbers may mean other pairs than in the store that was backed up.
-    The checkpoint is given the same one; a learner elsewhere will say that pairs come from another store.
+    The store gets a new identity, because from now on its numbers may belong to other pairs than in the original. The
+    checkpoint gets the same identity; a learner elsewhere will report that pairs come from another store.
 
     Args:
-        backup: opened.
-        state_dir: where the state goes; None: where robot.toml says, if that is in its folder.
-        force: what is in the way may be moved aside.
+        backup: an open backup.
+        state_dir: folder for the state; None: the one of robot.toml, if that is in its folder.
+        force: existing files may be moved aside.
 
     Raises:
         BackupError: something is in the way, a process runs, or a file cannot be written; nothing was changed.
@@ -97,7 +97,7 @@ def restore(backup: Backup, robot_file: Path, state_dir: Path | None = None, *, 
 
 
 def _tables(backup: Backup) -> dict[str, Any]:
-    """What the robot.toml of the backup says."""
+    """Return the tables of the backup's robot.toml."""
     with tempfile.TemporaryDirectory(prefix="bodyschema-restore-") as scratch:
         file = Path(scratch) / "robot.toml"
         backup.extract(ROBOT_TOML, file)
@@ -110,7 +110,7 @@ def _tables(backup: Backup) -> dict[str, Any]:
 
 
 def _targets(backup: Backup, tables: Mapping[str, Any], robot_file: Path) -> dict[str, Path]:
-    """Where the description's files belong; robot.toml may be called otherwise here."""
+    """Return where the description's files belong; robot.toml may have another name here."""
     allowed = {ROBOT_TOML, *description_files(tables)}
     given = backup.manifest.files.keys() - {STORE, CHECKPOINT}
     if given != allowed:
@@ -190,7 +190,7 @@ def _locked(store: Path, undo: ExitStack) -> int:
 
 
 def _staged(backup: Backup, targets: Mapping[Path, str], scratch: ExitStack) -> dict[Path, Path]:
-    """Write the files into new folders beside their places."""
+    """Write the files into new folders next to their targets."""
     staged: dict[Path, Path] = {}
     for parent in dict.fromkeys(target.parent for target in targets):
         here = {target: name for target, name in targets.items() if target.parent == parent}
@@ -210,10 +210,10 @@ def _staged(backup: Backup, targets: Mapping[Path, str], scratch: ExitStack) -> 
 def _give_identity(
     backup: Backup, tables: Mapping[str, Any], store: Path | None, checkpoint: Path | None
 ) -> tuple[str, int]:
-    """Give a new identity to the staged store, and the same to the staged checkpoint where it is of use.
+    """Give a new identity to the staged store, and the same to the staged checkpoint if it is usable.
 
     Returns:
-        The identity, and how many pairs of the store cannot be read.
+        The identity, and the number of unreadable pairs in the store.
     """
     assert store is not None
     robot = tables.get("robot")
@@ -226,14 +226,14 @@ def _give_identity(
             before = contents["store"]
             with store_schema.transaction(connection):
                 store_schema.write_meta(connection, {**contents, "store": identity, "restored_from": before})
-            connection.execute("PRAGMA journal_mode = DELETE")  # all of it in one file
+            connection.execute("PRAGMA journal_mode = DELETE")  # everything in one file
     except (StoreError, ValueError) as error:
         what = str(error).replace(str(store), STORE)
         raise BackupError(f"the store in {backup.file} cannot be put back: {what}") from error
     try:
         state = None if checkpoint is None else read_checkpoint(checkpoint, robot=backup.manifest.robot)
     except CheckpointError:
-        state = None  # the learner will say what is wrong with it, and learn from the pairs
+        state = None  # the learner will report the problem, and learn from the pairs
     if checkpoint is not None and state is not None and state.header.counters.store == before:
         state.header.counters.store = identity
         write_checkpoint(checkpoint, state, robot=backup.manifest.robot, utc=backup.manifest.written_utc)
@@ -241,7 +241,7 @@ def _give_identity(
 
 
 def _move_aside(target: Path, undo: ExitStack) -> list[Path]:
-    """Rename what is there, so that it is kept; its new names."""
+    """Rename existing files so that they are kept; return the new names."""
     parts = [part for part in STORE_PARTS if os.path.lexists(target.with_name(target.name + part))]
     aside = unused_name(target, "before-restore")
     moved = {target.with_name(target.name + part): aside.with_name(aside.name + part) for part in parts}

@@ -1,4 +1,4 @@
-"""Which pairs a store lets go: the oldest, by age and by size, and never the newest."""
+"""Select the pairs that a store deletes: the oldest, by age and size, and never the newest."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from typing import Self
 
 from .config import DaemonConfig
 
-# At a time, so that no pair waits long for its turn: a delete of so many takes a few milliseconds.
+# Batch size: deleting this many takes a few milliseconds, so no new pair waits long.
 AT_ONCE = 500
 
 
 @dataclass(frozen=True, slots=True)
 class Keep:
-    """What is kept of a store.
+    """Limits of the pairs that a store keeps.
 
     Attributes:
-        days: of this age at most; None: of any.
-        size: bytes of the file in use; None: as many as there are.
-        newest: so many pairs whatever their age and size. A wall clock that jumps ahead makes all pairs old: these
-            stay.
+        days: maximum age; None: any.
+        size: maximum bytes of the file in use; None: unlimited.
+        newest: number of pairs kept whatever their age and size, so that a wall clock that jumps ahead cannot delete
+            all.
     """
 
     days: float | None
@@ -30,15 +30,15 @@ class Keep:
 
     @classmethod
     def of(cls, rules: DaemonConfig) -> Self:
-        """As the table [daemon] says."""
+        """Return the limits of the table [daemon]."""
         return cls(rules.keep_days, None if rules.keep_mb is None else 1e6 * rules.keep_mb, rules.keep_newest)
 
     def last_to_delete(self, connection: sqlite3.Connection, utc: str, newest: int) -> int | None:
-        """Return the newest pair that can go now, with all before it; None when all are to be kept.
+        """Return the newest pair that can be deleted now, with all before it; None to keep all.
 
         Args:
-            utc: now.
-            newest: number of the newest pair, which a damaged row may not tell.
+            utc: current time.
+            newest: number of the newest pair; a damaged row may not contain it.
         """
         if self.days is None and self.size is None:
             return None
@@ -52,13 +52,13 @@ class Keep:
 
 
 def delete_until(connection: sqlite3.Connection, last: int) -> int:
-    """Delete the pairs up to `last`, and what tells of none but them; how many pairs there were."""
+    """Delete the pairs up to `last`, and records that refer only to them; return the number of pairs deleted."""
     deleted = connection.execute("DELETE FROM pairs WHERE seq <= ?", (last,)).rowcount
-    # What the joints are read with holds until the next entry: the newest before the first pair that is left stays.
+    # A device record holds until the next one: keep the newest before the first remaining pair.
     connection.execute(
         "DELETE FROM devices WHERE from_seq < (SELECT max(from_seq) FROM devices WHERE from_seq <= ?)", (last + 1,)
     )
-    # Of several rows: the disk may have changed one.
+    # Count rows, as the disk may have corrupted one.
     connection.execute(
         "DELETE FROM sessions WHERE id < (SELECT min(session) FROM (SELECT session FROM pairs ORDER BY seq LIMIT 10)) "
         "AND id NOT IN (SELECT session FROM devices)"
@@ -67,7 +67,7 @@ def delete_until(connection: sqlite3.Connection, last: int) -> int:
 
 
 def used_bytes(connection: sqlite3.Connection) -> int:
-    """Of the file, without the pages that deleted pairs left and new ones take."""
+    """Return the used bytes of the file, without free pages."""
     pages, free, size = (
         connection.execute(f"PRAGMA {name}").fetchone()[0] for name in ("page_count", "freelist_count", "page_size")
     )
@@ -75,7 +75,7 @@ def used_bytes(connection: sqlite3.Connection) -> int:
 
 
 def _last_before(connection: sqlite3.Connection, first: int, last: int, utc: str) -> int | None:
-    """The newest of the pairs from `first` to `last` such that all of them to it were measured before `utc`."""
+    """Return the newest pair from `first` to `last` such that it and all before it were measured before `utc`."""
     young = connection.execute(
         "SELECT min(seq) FROM pairs WHERE seq BETWEEN ? AND ? AND utc >= ?", (first, last, utc)
     ).fetchone()[0]
@@ -85,5 +85,5 @@ def _last_before(connection: sqlite3.Connection, first: int, last: int, utc: str
 
 
 def _earlier(utc: str, days: float) -> str:
-    """The time so many days before `utc`, as pairs have theirs: the texts sort as the times do."""
+    """Return the time `days` days before `utc`, in the format of the pairs, in which texts sort like times."""
     return (datetime.fromisoformat(utc) - timedelta(days=days)).isoformat(timespec="milliseconds")

@@ -1,4 +1,4 @@
-"""A robot with its effects into files of other programs, and how much better they are on measured data."""
+"""Export a robot with its effects to files of other programs, and measure the improvement on recorded data."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _WITHOUT_MUJOCO = "Not replayed: MuJoCo is not installed (pip install mujoco)"
 
 
 def check_target(out: Path, *, force: bool) -> None:
-    """ConfigError unless a robot can be written to `out`: its ending is known and nothing is in the way."""
+    """Raise ConfigError unless a robot can be written to `out`: its ending is known and no file is in the way."""
     if out.suffix.lower() not in _WRITERS:
         raise ConfigError(f"a robot's files end in {', '.join(_WRITERS)}", file=out, remedy="Give another name")
     if not out.parent.is_dir():
@@ -43,13 +43,13 @@ def check_target(out: Path, *, force: bool) -> None:
 
 
 def write(simulation: Simulation, out: Path) -> list[str]:
-    """Write the simulation in the format of the ending of `out`. The file appears when it is whole.
+    """Write the simulation in the format of the ending of `out`. The file appears once it is complete.
 
     Returns:
-        Sentences on what the file does not hold, or holds in another way.
+        Sentences on what the file does not represent, or represents differently.
 
     Raises:
-        ConfigError: it cannot be written.
+        ConfigError: the file cannot be written.
     """
     part = out.with_name(f".{out.stem}.part{out.suffix}")
     heading = f"{simulation.robot.name}, by bodyschema {version('bodyschema')} from {simulation.robot.file.name}"
@@ -68,9 +68,9 @@ class Row:
     """Errors of one model on measured positions.
 
     Attributes:
-        model: what it is.
-        rms_mm, mean_mm: of the distances to the measured positions.
-        gain_percent: by how much the RMS is smaller than the nominal model's; None for that one.
+        model: its name.
+        rms_mm, mean_mm: RMS and mean of the distances to the measured positions.
+        gain_percent: reduction of the RMS relative to the nominal model; None for that one.
     """
 
     model: str
@@ -80,12 +80,12 @@ class Row:
 
 
 def compared(simulation: Simulation, recording: Recording, out: Path) -> tuple[list[Row], str | None]:
-    """The errors of the nominal model, of the simulation and of the exported file on a recording.
+    """Return the errors of the nominal model, the simulation and the exported file on a recording.
 
-    The nominal model is the robot as described; what robot.toml does not know of camera and marker is fitted for it.
+    The nominal model is the robot as described; unknowns of camera and marker in robot.toml are fitted for it.
 
     Returns:
-        The rows, and why the file itself is not among them, where it is not.
+        The rows, and the reason if the exported file is not among them.
     """
     motion = Motion.of(recording)
     bare = Simulation(simulation.robot)

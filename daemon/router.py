@@ -1,6 +1,6 @@
-"""Where machines meet: a zenoh router that lets nobody in but by TLS, and nobody do what his role does not say.
+"""Run the zenoh router that connects several machines, with TLS and roles.
 
-zenoh's own zenohd takes the same configuration, as a file; here it runs without being installed.
+zenoh's own zenohd accepts the same configuration, as a file; here the router runs without installing zenohd.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ class RouterTables(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         listen: where machines connect, like `tls/0.0.0.0:7450`.
-        tls: the router's certificate, and the authority that signed everybody's.
-        access: by robot's name, or `*` for every robot: who has which role.
-        users_file: lines `user:password` of those who may connect, in the place of certificates.
+        tls: the router's certificate, and the authority that signed all certificates.
+        access: names per role, by the robot's name, or `*` for every robot.
+        users_file: lines `user:password` of permitted users, in place of certificates.
     """
 
     listen: str
@@ -52,7 +52,7 @@ class RouterTables(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class RouterConfig:
-    """A router's description, checked."""
+    """A checked router configuration."""
 
     file: Path
     tables: RouterTables
@@ -90,7 +90,7 @@ class RouterConfig:
         return cls(file, tables, identity)
 
     def settings(self) -> dict[str, Any]:
-        """zenoh's configuration, by path."""
+        """Return zenoh's configuration, by path."""
         return {
             "mode": "router",
             "listen/endpoints": [self.tables.listen],
@@ -105,7 +105,7 @@ class RouterConfig:
         }
 
     def as_zenohd(self) -> str:
-        """The same as a file for zenohd, with the absolute paths of this machine."""
+        """Return the same as a file for zenohd, with this machine's absolute paths."""
         nested: dict[str, Any] = {}
         for path, value in self.settings().items():
             *parents, last = path.split("/")
@@ -117,10 +117,10 @@ class RouterConfig:
 
 
 def run_router(config: RouterConfig, stopping: Callable[[], bool], notifier: Notifier, clock: Clock) -> None:
-    """Pass on what is allowed until `stopping()`.
+    """Route permitted messages until `stopping()`.
 
     Args:
-        notifier: tells who started it that it takes connections, and that it lives.
+        notifier: reports to systemd that the router accepts connections, and that it is alive.
 
     Raises:
         BusError: the port is in use, or zenoh cannot use the certificates.

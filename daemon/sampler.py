@@ -1,4 +1,4 @@
-"""The sampler: marker fixes and joint readings in, pairs into the store and onto zenoh."""
+"""Run the sampler: marker fixes and joint readings in, pairs into the store and onto zenoh."""
 
 from __future__ import annotations
 
@@ -42,18 +42,18 @@ log = logging.getLogger(__name__)
 
 READ_TIMEOUT_S = 0.2
 JOINTS_TIMEOUT_S = 1.0  # how long a frame waits for the encoders to reach its time
-AROUND_S = 0.1  # of a frame whose time is uncertain: how fast the joints are
+AROUND_S = 0.1  # [s] around a frame whose time is uncertain, to estimate the joints' speed
 STATUS_EVERY_S = 1.0
-SILENT_AFTER_S = 2.0  # a source that has said nothing for so long is reported
-ZERO_FORCE = "zero_force"  # that [robot] hold says, and the drive is called
+SILENT_AFTER_S = 2.0  # a source without data for this long is reported
+ZERO_FORCE = "zero_force"  # value of [robot] hold, and name of the drive
 PAIR_CACHE = 1000
 LOW_DISK_BYTES = 200 * 2**20
-# What has to come round for the sampler to be alive.
+# Loops that must keep running.
 LOOPS = ("encoders", "frames")
 
 
 class Sampler:
-    """Turns measurements into pairs: aligned in time, gated, committed to the store, and only then published.
+    """Turns measurements into pairs: aligned in time, gated, committed to the store, and then published.
 
     One thread reads the encoders, the thread that calls `run` does the rest, and zenoh's threads answer queries.
     """
@@ -69,15 +69,15 @@ class Sampler:
         wall: Clock | None = None,
         service: Service | None = None,
     ) -> None:
-        """A sampler over an open bus and an open store; the sources are opened by `run`.
+        """Prepare a sampler over an open bus and an open store; `run` opens the sources.
 
         Args:
-            exit_at_end: return from `run` when the sources are through, instead of going on to serve the history.
+            exit_at_end: return from `run` when the sources end, instead of continuing to serve the history.
             wall: the machine's clock, for rates and UTC; all other times are the sources'.
-            service: is told when all is up, that `LOOPS` work, and how the sampler is.
+            service: is notified once everything is up, that `LOOPS` work, and of the sampler's state.
 
         Raises:
-            ConfigError: the encoders' joints are not robot.toml's.
+            ConfigError: the encoders' joints differ from robot.toml's.
         """
         if sources.joints.joints != config.robot.joints:
             raise ConfigError(
@@ -90,7 +90,7 @@ class Sampler:
         self._wall = SystemClock() if wall is None else wall
         self._service = Service.nobodys(self._wall) if service is None else service
         self._keys = Keys(config.robot.name)
-        self._version = version("bodyschema")  # a file that is read: once, while there are descriptors for it
+        self._version = version("bodyschema")  # reads a file: once, while descriptors are available
         self._powered = {drive.name: drive for drive in sources.powered}
         held = config.robot.robot.hold == "zero_force"
         self._bears = self._powered.get(ZERO_FORCE) if held else None
@@ -109,7 +109,7 @@ class Sampler:
         self._publish = bus.publisher(self._keys.pair, cache=PAIR_CACHE)
         self._publish_status = bus.publisher(self._keys.status("sampler"))
         self._stopping = self._reloading = False
-        # Whoever has been told of a pause can rely on it: no pair comes after the answer.
+        # Once a pause is acknowledged, no pair may follow.
         self._deciding = threading.Lock()
         self._rules = SamplerRules(
             config, store, self._devices, self._wall, gate=self._gate, buffer=self._buffer, deciding=self._deciding
@@ -123,18 +123,18 @@ class Sampler:
         self._last_reading = self._last_frame = self._next_status = self._wall.now()
 
     def stop(self) -> None:
-        """Let `run` come to its end. Only sets a flag: a signal handler may call it."""
+        """Request the end of `run`. Only sets a flag: a signal handler may call it."""
         self._stopping = True
 
     def reload(self) -> None:
-        """Let `run` read robot.toml again. Only sets a flag: a signal handler may call it."""
+        """Request that `run` reads robot.toml again. Only sets a flag: a signal handler may call it."""
         self._reloading = True
 
     def run(self) -> None:
-        """Sample until `stop`, or with `exit_at_end` until the sources are through.
+        """Sample until `stop`, or with `exit_at_end` until the sources end.
 
         Raises:
-            StoreError: the store is damaged; the pair was not published either, and none came after it.
+            StoreError: the store is damaged; the pair was not published, and no pair followed.
             SourceError: a source could not be opened at the start.
         """
         self._service.tell("opening encoders and cameras")
@@ -162,7 +162,7 @@ class Sampler:
                 raise
 
     def status(self) -> SamplerStatus:
-        """What the sampler says of itself; from any thread."""
+        """Return the sampler's state; from any thread."""
         tally = self._tally
         return SamplerStatus(
             robot=self._config.robot.name,
@@ -227,7 +227,7 @@ class Sampler:
             self._tell_when_due()
 
     def _take(self, seen: MarkerFix | MarkerMiss) -> Reason | None:
-        """Make a pair of what was seen, or say why it is none."""
+        """Make a pair from a detection, or return the reason why not."""
         self._buffer.forget_before(seen.t)
         if self._paused or seen.t <= self._resumed_at:
             self._gate.break_segment()
@@ -257,7 +257,7 @@ class Sampler:
             return self._accept(verdict, q, seen)
 
     def _angles(self, fix: MarkerFix) -> FloatArray | Reason:
-        """Joint angles at the time of a fix, if they are known well enough for how well that time is known."""
+        """Return the joint angles at the time of a fix, if they are accurate enough despite that time's uncertainty."""
         if fix.t_sigma > 0:
             moved = self._buffer.moved(fix.t, fix.t_sigma, JOINTS_TIMEOUT_S)
             if isinstance(moved, Reason):
@@ -329,7 +329,7 @@ class Sampler:
                 f"the sampler has nothing to do with {command}. Send it to {self._keys.command('learner')}"
             )
         if command == "resume" and self._paused:
-            # A frame that is still under way shows the arm as it was during the pause.
+            # A frame still in transit shows the arm during the pause.
             self._resumed_at = self._source_clock.now()
         with self._deciding:
             self._paused = command == "pause"
@@ -389,7 +389,7 @@ class Sampler:
         if disk_free(self._store.file) < LOW_DISK_BYTES:
             said.append(f"the disk of {self._store.file} is nearly full")
         said += self._store.complaints
-        return list(dict.fromkeys(said))  # servos tell what their drives say, too
+        return list(dict.fromkeys(said))  # servos repeat the complaints of their drives
 
     def _silences(self) -> list[str]:
         now = self._wall.now()

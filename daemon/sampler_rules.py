@@ -1,4 +1,4 @@
-"""What robot.toml says of the sampler's work, which may change while it runs."""
+"""Apply those settings of robot.toml to the sampler that may change while it runs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CHANGEABLE = {("daemon", key) for key in DaemonConfig.__struct_fields__ if key !
 
 
 class SamplerRules:
-    """Holds those who go by the rules to what robot.toml says; from any thread."""
+    """Applies robot.toml's rules to the sampler's parts; from any thread."""
 
     def __init__(
         self,
@@ -38,21 +38,21 @@ class SamplerRules:
         buffer: JointBuffer,
         deciding: threading.Lock,
     ) -> None:
-        """The rules are those of `config` so far.
+        """Start with the rules of `config`.
 
         Args:
-            deciding: held while a pair is decided on and stored: no pair sees one half of a change.
+            deciding: held while a pair is decided on and stored, so that no pair sees half of a change.
         """
         self._config, self._store, self._devices, self._wall = config, store, devices, wall
         self._gate, self._buffer, self._deciding = gate, buffer, deciding
         self._one_at_a_time = threading.Lock()
 
     def reload(self) -> str:
-        """Read robot.toml again; what came of it. Pairs go on meanwhile.
+        """Read robot.toml again and return a message about the result; sampling continues meanwhile.
 
         Raises:
-            ConfigError: it is wrong; nothing changed.
-            StoreError: the new session cannot be kept; nothing changed.
+            ConfigError: robot.toml is invalid; nothing changed.
+            StoreError: the new session cannot be stored; nothing changed.
         """
         with self._one_at_a_time:
             found = reload(self._config, TABLES, CHANGEABLE)
@@ -63,11 +63,14 @@ class SamplerRules:
         return message
 
     def reload_aside(self, service: Service) -> None:
-        """`reload` in a thread of its own, because frames do not wait; who asked by a signal reads the log."""
+        """Run `reload` in a separate thread, because frames do not wait.
+
+        Log the result, as the request came by a signal.
+        """
         threading.Thread(target=self._reload_for, args=(service,), name="reload").start()
 
     def trim(self) -> None:
-        """Delete a part of the pairs that are not to be kept, if there are some.
+        """Delete a batch of the pairs that are no longer kept, if there are any.
 
         Raises:
             StoreError: the disk is full or broken.

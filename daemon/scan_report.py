@@ -1,4 +1,4 @@
-"""What a scan found, held against robot.toml."""
+"""Compare the result of a scan with robot.toml."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Servo(Protocol):
 
 
 class ScannedPort(Protocol):
-    """What came of a port; see `bodyschema.drivers.scan.ScannedBus`."""
+    """Scan result of a port; see `bodyschema.drivers.scan.ScannedBus`."""
 
     @property
     def port(self) -> str: ...
@@ -55,13 +55,13 @@ class ScannedPort(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class JointFinding:
-    """What was found in the place of a servo of robot.toml.
+    """The finding for a servo of robot.toml.
 
     Attributes:
-        state: "ok", "missing", "wrong model", "not known" (it does not tell what it is), "another rate", "another
+        state: "ok", "missing", "wrong model", "not known" (it does not report its model), "another rate", "another
             port" or "double".
-        mend: what to do; empty where it is ok.
-        servo: what answered; None when nothing did.
+        mend: remedy; empty if the state is ok.
+        servo: the servo that answered; None if there was no answer.
     """
 
     joint: str
@@ -75,12 +75,12 @@ class JointFinding:
 
 @dataclass(frozen=True, slots=True)
 class ScanReport:
-    """All ports, and what robot.toml has to do with it.
+    """All ports, compared with robot.toml.
 
     Attributes:
-        joints: for each servo of robot.toml what is in its place; None without a robot.toml.
-        strangers: who is on one of its ports, but not in it.
-        cameras: of this machine, by the names for robot.toml.
+        joints: finding for each servo of robot.toml; None without a robot.toml.
+        strangers: servos on its ports that robot.toml does not name.
+        cameras: this machine's cameras, by their names in robot.toml.
     """
 
     ports: Sequence[ScannedPort]
@@ -90,19 +90,19 @@ class ScanReport:
 
     @property
     def servos(self) -> list[Servo]:
-        """All that were found."""
+        """All servos found."""
         return [servo for port in self.ports for servo in port.servos]
 
     @property
     def is_well(self) -> bool:
-        """Somebody answered everywhere, and where there is a robot.toml exactly those that it names."""
+        """True if every port answered, and if there is a robot.toml, exactly its servos were found."""
         if any(port.trouble for port in self.ports) or not self.servos or any(s.is_double for s in self.servos):
             return False
         return self.joints is None or (not self.strangers and all(joint.state == "ok" for joint in self.joints))
 
 
 def report_of(ports: Sequence[ScannedPort], config: Config | None) -> ScanReport:
-    """The report; without `config` of the ports alone.
+    """Return the report; without `config`, of the ports alone.
 
     Raises:
         ConfigError: robot.toml has no servos.
@@ -123,7 +123,7 @@ def report_of(ports: Sequence[ScannedPort], config: Config | None) -> ScanReport
 
 
 def _place(found: Sequence[Servo], id: int, model: str, port: str, baud: int) -> tuple[str, str, Servo | None]:
-    """State, what to do, and who is there, for a servo that should be on `port` at `baud`."""
+    """Return state, remedy and servo for a servo that should be on `port` at `baud`."""
     here = [servo for servo in found if servo.id == id and os.path.realpath(servo.port) == os.path.realpath(port)]
     if any(servo.is_double for servo in here) or len([servo for servo in here if servo.baud == baud]) > 1:
         return "double", "two servos have this ID: take one off, give the other another ID", here[0]
@@ -143,14 +143,14 @@ def _place(found: Sequence[Servo], id: int, model: str, port: str, baud: int) ->
 
 
 def _for_model(found: str | None, wanted: str) -> str:
-    """What to do where there is a servo of another model."""
+    """Return the remedy for a servo of another model."""
     if found in known_models():
         return f'set model = "{found}" in robot.toml, or give the servo another ID'
     return f"it is a {found}, which no driver reads: put a {wanted} in its place, or give it another ID"
 
 
 def as_json(report: ScanReport) -> str:
-    """The report as JSON: `ports` with `servos`, `cameras`, and with a robot.toml `joints` and `strangers`."""
+    """Return the report as JSON: `ports` with `servos`, `cameras`, and with a robot.toml `joints` and `strangers`."""
     contents: dict[str, Any] = {"well": report.is_well, "ports": report.ports, "cameras": report.cameras}
     if report.joints is not None:
         contents |= {"joints": report.joints, "strangers": report.strangers}

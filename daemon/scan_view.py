@@ -1,4 +1,4 @@
-"""A scan's report on a terminal of 80 columns."""
+"""Show a scan's report in a terminal of 80 columns."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ RIGHT = ("ID", "fw", "bit/s", "supply", "temp.")
 
 
 def show(console: Console, report: ScanReport) -> None:
-    """Print a table for each port, then what is not as it should be."""
+    """Print a table for each port, then the problems."""
     joints = {id(joint.servo): joint.joint for joint in report.joints or () if joint.servo is not None}
     for port in report.ports:
         console.print(Text(port.port, style="bold"), soft_wrap=True)

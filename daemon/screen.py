@@ -1,4 +1,4 @@
-"""Pieces of terminal screens that more than one command shows."""
+"""Pieces of terminal screens that several commands share."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ BAR_WIDTH = 24
 
 
 def mm(metres: float | None, unit: str = " mm") -> str:
-    """A length in mm with sensible digits; a dash for none."""
+    """Return a length in mm with sensible digits; a dash for None."""
     if metres is None or not math.isfinite(metres):
         return "-"
     value = 1e3 * metres
@@ -22,7 +22,7 @@ def mm(metres: float | None, unit: str = " mm") -> str:
 
 
 def degrees(radians: float | None, unit: str = "°") -> str:
-    """A small angle in degrees with sensible digits; a dash for none."""
+    """Return a small angle in degrees with sensible digits; a dash for None."""
     if radians is None or not math.isfinite(radians):
         return "-"
     value = math.degrees(radians)
@@ -30,14 +30,14 @@ def degrees(radians: float | None, unit: str = "°") -> str:
 
 
 def two_digits(value: float) -> str:
-    """A positive number with two significant digits, never in powers of ten."""
+    """Return a positive number with two significant digits, never in powers of ten."""
     if value <= 0.0 or not math.isfinite(value):
         return f"{value:g}"
     return f"{value:.{max(1 - math.floor(math.log10(value)), 0)}f}"
 
 
 def titled_table(title: str, *, numbers: bool = True) -> Table:
-    """An empty table without lines: names on the left and, unless told otherwise, numbers on the right."""
+    """Return an empty table without lines: names on the left and, by default, numbers on the right."""
     table = Table(box=None, pad_edge=False, show_header=False, title=Text(title, style="bold"), title_justify="left")
     table.add_column(no_wrap=True)
     if numbers:
@@ -46,7 +46,7 @@ def titled_table(title: str, *, numbers: bool = True) -> Table:
 
 
 def rejected(status: SamplerStatus) -> list[tuple[str, int]]:
-    """Rejected frames by reason in words, the most frequent first."""
+    """Return the rejected frames by reason in words, the most frequent first."""
     return [
         (reason.replace("_", " "), count)
         for reason, count in sorted(status.rejected.items(), key=lambda item: -item[1])
@@ -54,7 +54,7 @@ def rejected(status: SamplerStatus) -> list[tuple[str, int]]:
 
 
 def coverage_table(status: SamplerStatus, slides: Collection[str] = ()) -> Table:
-    """For each joint, which part of its range accepted pairs have covered.
+    """Return a table of the part of each joint's range that accepted pairs have covered.
 
     Args:
         slides: names of the prismatic joints.
@@ -76,7 +76,7 @@ def _metres(joint: JointRange) -> str:
 
 
 def bar(joint: JointRange) -> Text:
-    """Which part of its range a joint has covered."""
+    """Return a bar of the part of its range that a joint has covered."""
     span = (joint.upper_limit - joint.lower_limit) or 1.0
     first = round(BAR_WIDTH * (joint.low - joint.lower_limit) / span)
     last = round(BAR_WIDTH * (joint.high - joint.lower_limit) / span)

@@ -1,4 +1,4 @@
-"""A process as a service: ready when it works, watched by its working loops, with a line about how it is."""
+"""Report a process to systemd: readiness, a watchdog fed by its working loops, and a status line."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from bodyschema.interfaces.protocols import Clock
 
 from .notify import Notifier
 
-# systemd waits for so many times longer than the time between two signs of life.
+# systemd's timeout as a multiple of the interval between two signs of life.
 SIGNS_PER_WATCHDOG = 4
 SETTLED_S = 3.0  # a device that was plugged in gets its group a moment after its name
 
 
 class Service:
-    """What systemd is told of a process with working loops; from any thread.
+    """Reports a process with working loops to systemd; from any thread.
 
-    Each loop says `beat` whenever it comes round. The watchdog is fed when all of them have since it was last fed, so
-    that one loop which hangs, whichever it is, starves it.
+    Each loop calls `beat` in every round. The watchdog is fed once all loops have called it since the last feed, so a
+    single hanging loop starves it.
     """
 
     def __init__(
@@ -32,11 +32,11 @@ class Service:
         devices: Sequence[str] = (),
         may_open: Callable[[str], bool] = lambda device: os.access(device, os.R_OK | os.W_OK),
     ) -> None:
-        """Not ready yet.
+        """Start in the state "not ready".
 
         Args:
-            loops: names of the loops that have to come round.
-            devices: what the service was allowed when it was started; access(2) knows of that, too.
+            loops: names of the loops that have to keep running.
+            devices: devices that the service was allowed at its start; access(2) respects this, too.
         """
         self._devices = devices if notifier.is_heard else ()
         self._may_open, self._forbidden_since = may_open, math.inf
@@ -51,11 +51,11 @@ class Service:
 
     @classmethod
     def nobodys(cls, clock: Clock) -> Service:
-        """Of a process that no systemd started."""
+        """Return a service for a process that systemd did not start."""
         return cls(Notifier(), (), clock)
 
     def beat(self, loop: str) -> None:
-        """The loop of this name came round."""
+        """Note a round of the loop of this name."""
         if self._every_s is None:
             return
         with self._lock:
@@ -63,21 +63,21 @@ class Service:
             self._feed_when_due(self._every_s)
 
     def leave(self, loop: str) -> None:
-        """The loop of this name has come to its end, as it should: nobody waits for it any more."""
+        """Note that the loop of this name has ended as it should: the watchdog no longer waits for it."""
         with self._lock:
             self._loops.discard(loop)
 
     def ready(self) -> None:
-        """All is up. Said once; later calls do nothing."""
+        """Report that everything is up. Later calls do nothing."""
         if not self._ready:
             self._ready = True
             self._notifier.ready()
 
     def forbidden(self) -> str | None:
-        """A device that is there and has not been this service's to open for a while; None where there is none.
+        """Return an existing device that this service has not been able to open for a while; None if there is none.
 
-        systemd resolves the names of devices when it starts a service. One that comes back under another number is
-        the service's after a new start.
+        systemd resolves device names when it starts a service. A device that comes back under another number is
+        accessible after a restart of the service.
         """
         found = next((name for name in self._devices if os.path.exists(name) and not self._may_open(name)), None)
         now = self._clock.now()
@@ -85,21 +85,21 @@ class Service:
         return found if now - self._forbidden_since >= SETTLED_S else None
 
     def reloading(self) -> None:
-        """The configuration is read again, until `reloaded`."""
+        """Report that the configuration is being read again, until `reloaded`."""
         self._notifier.reloading()
 
     def reloaded(self) -> None:
-        """The configuration was read again."""
+        """Report that the configuration was read again."""
         self._notifier.ready()
 
     def tell(self, line: str) -> None:
-        """How the process is, in one line."""
+        """Report the state of the process in one line."""
         if line != self._said:
             self._said = line
             self._notifier.status(line)
 
     def stopping(self) -> None:
-        """The process comes to its end."""
+        """Report that the process is stopping."""
         self._notifier.stopping()
 
     def _feed_when_due(self, every_s: float) -> None:
@@ -111,7 +111,7 @@ class Service:
 
 
 def with_health(line: str, health: Sequence[str]) -> str:
-    """A line about how a process is, with the first thing that is wrong."""
+    """Return a line about the state of a process, with the first problem appended."""
     if not health:
         return line
     more = f" (and {len(health) - 1} more)" if len(health) > 1 else ""

@@ -1,4 +1,4 @@
-"""The files of services on a machine: written, shown and removed as one."""
+"""Write, show and remove the files of a machine's services as a unit."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ if TYPE_CHECKING:
     from .router import RouterConfig
 
 Run = Callable[[Sequence[str]], None]
-OLDEST_SYSTEMD = 252  # what is not asked is taken for this one
+OLDEST_SYSTEMD = 252  # assumed where the version is not queried
 
 
 @dataclass(frozen=True, slots=True)
 class UnitFolder:
-    """The folder of units of a machine.
+    """The folder of a machine's units.
 
     Attributes:
-        root: of the machine's file system.
-        run: runs a command; only where `root` is this machine's.
+        root: root of the machine's file system.
+        run: runs a command; only if `root` is this machine's.
     """
 
     root: Path = ROOT
@@ -43,13 +43,13 @@ class UnitFolder:
         return self.root / FOLDER
 
     def write(self, texts: dict[Path, str], command: str) -> None:
-        """Write the files, and let systemd read them.
+        """Write the files, and let systemd reload them.
 
         Args:
-            command: of `bodyschema`, which the remedy of an error names.
+            command: the command line of `bodyschema` for the remedy in an error.
 
         Raises:
-            ConfigError: one cannot be written.
+            ConfigError: a file cannot be written.
         """
         for file, text in texts.items():
             try:
@@ -60,7 +60,7 @@ class UnitFolder:
         self._systemctl("daemon-reload")
 
     def remove(self, units: Sequence[str], files: Sequence[Path], command: str) -> None:
-        """Stop the units, and remove the files and what folders they leave empty.
+        """Stop the units, and remove the files and the folders that become empty.
 
         Raises:
             ConfigError: a file cannot be removed.
@@ -71,7 +71,7 @@ class UnitFolder:
         for file in files:
             try:
                 file.unlink()
-                if file.name == OWN and not any(file.parent.iterdir()):  # `systemctl edit` puts files of its own there
+                if file.name == OWN and not any(file.parent.iterdir()):  # `systemctl edit` puts the user's files there
                     file.parent.rmdir()
             except OSError as error:
                 raise _refused(file, error, f"{command} --uninstall") from error
@@ -83,23 +83,23 @@ class UnitFolder:
 
 
 class UnitFiles(Protocol):
-    """The units of a service on a machine: written, shown and removed as one."""
+    """The units of a service on a machine, written, shown and removed together."""
 
     @property
     def units(self) -> list[str]:
-        """Their names."""
+        """Names of the units."""
         ...
 
     def install(self, texts: dict[Path, str]) -> None:
-        """Write the files, and let systemd read them. Raises ConfigError: one cannot be written."""
+        """Write the files, and let systemd reload them. ConfigError: a file cannot be written."""
         ...
 
     def uninstall(self) -> list[Path]:
-        """Stop and remove them; what was removed. Raises ConfigError: a file cannot be removed."""
+        """Stop and remove the units; return the removed files. ConfigError: a file cannot be removed."""
         ...
 
     def installed(self) -> list[Path]:
-        """What `uninstall` would remove."""
+        """Return the files that `uninstall` would remove."""
         ...
 
 
@@ -108,9 +108,9 @@ class ServiceFiles:
     """The units of one robot, or of the learner of several.
 
     Attributes:
-        name: of the robot, or what the learner of several is called.
+        name: name of the robot, or of the learner of several.
         processes: sampler, learner or both.
-        folder: where the units stand.
+        folder: folder of the units.
     """
 
     name: str
@@ -127,7 +127,7 @@ class ServiceFiles:
         return [f"bodyschema-{process}@{self.name}.service" for process in self.processes]
 
     def texts(self, config: Config, user: str, installed: Installed) -> dict[Path, str]:
-        """What is to be in which file for one robot.
+        """Return the contents of each file for one robot.
 
         Raises:
             ConfigError: its learner is one of several robots on this machine already.
@@ -138,10 +138,10 @@ class ServiceFiles:
         return self._texts(own, installed)
 
     def texts_of_host(self, configs: Sequence[Config], user: str, installed: Installed) -> dict[Path, str]:
-        """The same for the learner of several.
+        """Return the contents of each file for the learner of several robots.
 
         Raises:
-            ConfigError: the learner is called like one of them, or one has a learner here already.
+            ConfigError: the learner has the name of one of them, or one has a learner here already.
         """
         for config in configs:
             if config.robot.name == self.name:
@@ -153,7 +153,7 @@ class ServiceFiles:
         self.folder.write(texts, "install service")
 
     def uninstall(self) -> list[Path]:
-        """This robot's units, and the templates with the last robot."""
+        """Remove this robot's units, and with the last robot the templates."""
         there = self.installed()
         self.folder.remove(self.units, there, "install service")
         return there
@@ -207,7 +207,7 @@ class RouterFiles:
         return [ROUTER]
 
     def texts(self, config: RouterConfig, user: str, installed: Installed) -> dict[Path, str]:
-        """What is to be in its file."""
+        """Return the contents of its file."""
         return {self.folder.path / ROUTER: of_router(config, user, installed)}
 
     def install(self, texts: dict[Path, str]) -> None:
@@ -224,10 +224,10 @@ class RouterFiles:
 
 
 def make_state_folders(configs: Sequence[Config], user: str, root: Path = ROOT) -> None:
-    """Make the `state_dir` that a robot.toml names, owned by `user`; systemd itself makes the others.
+    """Create each `state_dir` that a robot.toml names, owned by `user`; systemd itself creates the others.
 
     Raises:
-        ConfigError: one cannot be made.
+        ConfigError: a folder cannot be created.
     """
     for config in configs:
         folder = root / os.path.abspath(config.state_dir).lstrip("/")
@@ -243,7 +243,7 @@ def make_state_folders(configs: Sequence[Config], user: str, root: Path = ROOT) 
 
 
 def missing(texts: dict[Path, str]) -> dict[Path, str]:
-    """Those of the files that are not there as they should be."""
+    """Return those files that do not exist with these contents."""
     return {file: text for file, text in texts.items() if not file.exists() or file.read_text("utf-8") != text}
 
 
@@ -255,10 +255,10 @@ def _refused(file: Path, error: OSError, command: str) -> ConfigError:
 
 
 def user_for(given: str | None) -> str:
-    """Who a service is to run as: who was named, else who called sudo, else who this is.
+    """Return the user to run a service as: the given one, else the one who called sudo, else the current one.
 
     Raises:
-        ConfigError: there is no such user, or it would be root, or nobody, who owns what is nobody's.
+        ConfigError: there is no such user, or it would be root or the user "nobody".
     """
     name = given or os.environ.get("SUDO_USER") or pwd.getpwuid(os.geteuid()).pw_name
     if name in ("root", "nobody"):
@@ -272,7 +272,7 @@ def user_for(given: str | None) -> str:
 
 
 def systemd_version() -> int:
-    """Of this machine's systemd, or the oldest that the units are for."""
+    """Return this machine's systemd version, or the oldest that the units support."""
     if shutil.which("systemctl") is None:
         return OLDEST_SYSTEMD
     said = subprocess.run(["systemctl", "--version"], capture_output=True, text=True, check=False, timeout=10).stdout

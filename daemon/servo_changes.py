@@ -1,4 +1,4 @@
-"""Changes of servos' EEPROM: planned, carried out with every one in the log, and taken back."""
+"""Plan, write, log and undo changes of servo EEPROM settings."""
 
 from __future__ import annotations
 
@@ -29,25 +29,25 @@ from .eeprom_wiring import (
 )
 from .servo_log import LoggedWrite, ServoLog
 
-ALONE = (ID, BAUD)  # after these the servo is called otherwise
-POSITION_MODE, IGNORED_BEYOND = 3, 1024  # of Dynamixel servos: there no larger homing offset is heeded
+ALONE = (ID, BAUD)  # these change the servo's address
+POSITION_MODE, IGNORED_BEYOND = 3, 1024  # Dynamixel servos ignore a larger homing offset in this mode
 
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """A change, and where its servo is."""
+    """A planned change, and the location of its servo."""
 
     wanted: Wanted
     change: Change
 
     @property
     def is_needed(self) -> bool:
-        """Whether it changes anything."""
+        """True if it changes anything."""
         return self.change.now != self.change.then
 
 
 def assignments(texts: Sequence[str]) -> list[tuple[str, str]]:
-    """`NAME=VALUE`, taken apart; ConfigError when one is not that."""
+    """Parse `NAME=VALUE` assignments. ConfigError if one is malformed."""
     found: list[tuple[str, str]] = []
     for text in texts:
         name, equals, value = text.partition("=")
@@ -64,10 +64,10 @@ def assignments(texts: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def plan(workbench: Workbench, wanted: Sequence[Wanted], wishes: Sequence[tuple[str, str]]) -> list[Planned]:
-    """What would be written. Asks the servos, and writes nothing.
+    """Plan the writes. Queries the servos, and writes nothing.
 
     Raises:
-        ConfigError: a setting that a model does not have, a value out of range, an ID that is taken.
+        ConfigError: a model lacks a setting, a value is out of range, or an ID is taken.
         SourceError: a servo does not answer, or is another model.
     """
     if any(name == ID for name, _ in wishes) and len(wanted) > 1:
@@ -90,10 +90,10 @@ def plan(workbench: Workbench, wanted: Sequence[Wanted], wishes: Sequence[tuple[
 
 
 def plan_zeros(workbench: Workbench, wanted: Sequence[Wanted]) -> list[Planned]:
-    """Homing offsets with which the joints are at 0 where they are now; writes nothing.
+    """Plan homing offsets that set the joints to 0 at their present positions; writes nothing.
 
     Raises:
-        ConfigError: a model has none, or it would not be heeded.
+        ConfigError: a model has no homing offset, or would ignore it.
         SourceError: a servo does not answer, or is another model.
     """
     planned = []
@@ -109,7 +109,7 @@ def plan_zeros(workbench: Workbench, wanted: Sequence[Wanted]) -> list[Planned]:
 
 
 def _require_heeded(wanted: Wanted, servo: FittedServo, setting: Setting, then: int) -> None:
-    """ConfigError when the servo would ignore such an offset, or cannot have it."""
+    """Raise ConfigError if the servo would ignore such an offset, or cannot store it."""
     gentle = "`bodyschema servos zero` without --in-servo tells the zero_ticks for robot.toml, which serve as well"
     what = f"joint {servo.joint!r} would need the homing offset {setting.shown(then)}"
     if not setting.lowest <= then <= setting.highest:
@@ -122,7 +122,7 @@ def _require_heeded(wanted: Wanted, servo: FittedServo, setting: Setting, then: 
 
 
 def zero_ticks(workbench: Workbench, wanted: Sequence[Wanted]) -> list[tuple[FittedServo, int]]:
-    """For each servo its position now: the zero_ticks with which its joint is at 0 there. Writes nothing."""
+    """Return each servo's present position: the zero_ticks that put its joint at 0 there. Writes nothing."""
     found = []
     for one in wanted:
         bus = workbench.bus(one.port, one.baud)
@@ -134,7 +134,7 @@ def zero_ticks(workbench: Workbench, wanted: Sequence[Wanted]) -> list[tuple[Fit
 def carry_out(
     workbench: Workbench, planned: Iterable[Planned], log: ServoLog, clock: Clock, *, undoes: int | None = None
 ) -> list[Done]:
-    """Switch torque off and verify it, then write what is needed, each in the log before it is told to the servo.
+    """Switch torque off and verify it, then write what is needed; log each write before sending it to the servo.
 
     Raises:
         SourceError: a servo's torque stays on, or it does not answer: nothing was written.
@@ -156,7 +156,7 @@ def carry_out(
 
 
 def _written(workbench: Workbench, group: Sequence[Planned]) -> list[Done]:
-    """All of one setting on one port; of rates all before any is looked for."""
+    """Write all planned values of one setting on one port; with baud rates, write all before querying any servo."""
     first = group[0]
     if first.change.setting.name != BAUD:
         bus = workbench.bus(first.wanted.port, first.wanted.baud)
@@ -170,12 +170,12 @@ def _written(workbench: Workbench, group: Sequence[Planned]) -> list[Done]:
 
 
 def rate_of(setting: Setting, value: int) -> int:
-    """The rate that a register's value means [bit/s]."""
+    """Return the baud rate that a register's value stands for [bit/s]."""
     return next(int(word) for word, known in setting.words.items() if known == value)
 
 
 def plan_undo(workbench: Workbench, entries: Sequence[LoggedWrite]) -> tuple[list[Planned], list[str]]:
-    """What would be written to have the old values again, and what is left alone for which reason; writes nothing."""
+    """Plan the writes that restore the old values; also return what is left unchanged, with reasons. Writes nothing."""
     planned, left = [], []
     for entry in reversed(entries):
         model = model_called(entry.table, entry.model)
@@ -201,7 +201,7 @@ def plan_undo(workbench: Workbench, entries: Sequence[LoggedWrite]) -> tuple[lis
 
 
 def is_well(done: Sequence[Done]) -> bool:
-    """Whether all was written, and nothing is to be said."""
+    """Return True if everything was written without remarks."""
     return all(one.outcome is Outcome.WRITTEN and not one.said for one in done)
 
 

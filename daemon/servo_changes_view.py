@@ -1,4 +1,4 @@
-"""Tables of what stands in servos' EEPROM, what would be written there, and what was."""
+"""Tables of servo EEPROM contents, planned writes and results."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .servo_changes import Planned
 
 
 def planned_table(planned: Sequence[Planned]) -> RenderableType:
-    """Each write: servo, register, value now and then; below it what follows."""
+    """Return a table of the writes: servo, register, present and new value; below it the consequences."""
     table = _table("joint", "ID", "register", "now", "", "then")
     for each in planned:
         change = each.change
@@ -26,7 +26,7 @@ def planned_table(planned: Sequence[Planned]) -> RenderableType:
 
 
 def done_table(done: Sequence[Done]) -> RenderableType:
-    """What came of each write."""
+    """Return a table of the result of each write."""
     table = _table("joint", "ID", "register", "before", "", "now")
     said: list[Text] = []
     for one in done:
@@ -41,7 +41,7 @@ def done_table(done: Sequence[Done]) -> RenderableType:
 
 
 def settings_table(servo: FittedServo, values: Sequence[tuple[Setting, int]]) -> RenderableType:
-    """All that may be written to a servo: names, what stands there, what may stand there."""
+    """Return a table of a servo's writable settings: names, present values, permitted values."""
     table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
     for heading in ("register", "", "now", "may be"):
         table.add_column(heading, no_wrap=heading != "may be")
@@ -53,7 +53,7 @@ def settings_table(servo: FittedServo, values: Sequence[tuple[Setting, int]]) ->
 
 
 def zero_lines(found: Sequence[tuple[FittedServo, int]]) -> list[str]:
-    """The lines for robot.toml with which each joint is at 0 where it is now."""
+    """Return the robot.toml lines that put each joint at 0 at its present position."""
     width = max(len(servo.joint) for servo, _ in found)
     return [f"{servo.joint:{width}}  zero_ticks = {ticks}    # {_moves(servo, ticks)}" for servo, ticks in found]
 

@@ -1,4 +1,4 @@
-"""Which servo moves which joint, and the tables of robot.toml that say so."""
+"""Assign servos to joints, and write the corresponding tables of robot.toml."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .servo_wiring import KnownModel, known_models
 
 
 class Candidate(msgspec.Struct, frozen=True):
-    """A servo that answered, as `bodyschema scan --json` tells of it."""
+    """A servo that answered, as `bodyschema scan --json` describes it."""
 
     port: str
     baud: int
@@ -27,7 +27,7 @@ class Candidate(msgspec.Struct, frozen=True):
 
     @property
     def is_usable(self) -> bool:
-        """Whether it is the only one of its ID, of a model that is known, at a rate that robot.toml can name."""
+        """True if no other servo has its ID, its model is known, and robot.toml accepts its baud rate."""
         known = known_models().get(self.model or "")
         return not self.is_double and known is not None and self.baud in known.bauds
 
@@ -42,7 +42,7 @@ class _Scan(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class Fitting:
-    """Servos for joints.
+    """Assignment of servos to joints.
 
     Attributes:
         servos: by joint, in the order of the joints.
@@ -59,10 +59,10 @@ Choose = Callable[[str, Sequence[Candidate]], Candidate | None]
 
 
 def candidates_in(json: bytes, file: object) -> list[Candidate]:
-    """The servos of a scan that was kept.
+    """Return the servos of a saved scan.
 
     Raises:
-        ConfigError: it is none.
+        ConfigError: it is not a scan.
     """
     try:
         scan = msgspec.json.decode(json, type=_Scan)
@@ -74,12 +74,12 @@ def candidates_in(json: bytes, file: object) -> list[Candidate]:
 
 
 def first_of(_joint: str, left: Sequence[Candidate]) -> Candidate | None:
-    """The servo with the lowest ID: arms are numbered from the base."""
+    """Return the servo with the lowest ID, since arms are numbered from the base."""
     return left[0] if left else None
 
 
 def fit(joints: Sequence[str], candidates: Sequence[Candidate], choose: Choose) -> Fitting:
-    """Give each joint a servo.
+    """Assign a servo to each joint.
 
     Raises:
         ConfigError: none of them can be used, or no joint got one.
@@ -101,10 +101,10 @@ def fit(joints: Sequence[str], candidates: Sequence[Candidate], choose: Choose) 
 
 
 def servo_tables(fitting: Fitting) -> str:
-    """The tables [drivers.dynamixel...] or [drivers.feetech...] of robot.toml, commented.
+    """Return the tables [drivers.dynamixel...] or [drivers.feetech...] of robot.toml, with comments.
 
     Raises:
-        ConfigError: the servos are of two makes, or those on one port have different rates.
+        ConfigError: the servos are of two vendors, or those on one port have different baud rates.
     """
     servos, known = list(fitting.servos.values()), known_models()
     make = _make(servos)
@@ -128,7 +128,7 @@ def servo_tables(fitting: Fitting) -> str:
 
 
 def _make(servos: Sequence[Candidate]) -> KnownModel:
-    """What the models of all `servos` have in common."""
+    """Return the properties that the models of all `servos` share."""
     known = known_models()
     makes = {known[servo.model or ""].table: known[servo.model or ""] for servo in servos}
     if len(makes) > 1:
@@ -152,7 +152,7 @@ def _bus_names(servos: Sequence[Candidate]) -> dict[tuple[str, int], str]:
 
 
 def _other_rates(servos: Sequence[Candidate], port: str) -> str:
-    """How all servos of a port get the rate that most of them have."""
+    """Return how to set all servos of a port to the baud rate that most of them have."""
     here = [servo for servo in servos if os.path.realpath(servo.port) == os.path.realpath(port)]
     most, _ = Counter(servo.baud for servo in here).most_common(1)[0]
     commands = [
@@ -169,10 +169,10 @@ def _quoted(text: str) -> str:
 
 
 def read_scan(file: Path) -> list[Candidate]:
-    """The servos in a file that `bodyschema scan --json` wrote.
+    """Return the servos in a file that `bodyschema scan --json` wrote.
 
     Raises:
-        ConfigError: it cannot be read, or is none.
+        ConfigError: it cannot be read, or is not a scan.
     """
     try:
         return candidates_in(read_at_most(file), file)

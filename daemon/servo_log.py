@@ -1,4 +1,4 @@
-"""What was written to servos' EEPROM, one line of JSON each, so that it can be taken back."""
+"""Log of servo EEPROM writes, one line of JSON each, for undo."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ State = Literal["begun", "written", "not written", "something else stands there"
 
 
 class LoggedWrite(msgspec.Struct, frozen=True, kw_only=True):
-    """One number that was written.
+    """One written value.
 
     Attributes:
-        batch: what one command wrote has one number.
-        table: the servo's make.
-        baud, id: of the servo before it was written.
-        name, address: of the register.
-        old, new: its contents before, and what was to be written.
-        state: "begun" stands there before the servo is told, so that nothing is written that the log does not know.
-        undoes: the batch that was taken back.
+        batch: number shared by all writes of one command.
+        table: the servo's vendor.
+        baud, id: baud rate and ID of the servo before the write.
+        name, address: name and address of the register.
+        old, new: its contents before, and the value to write.
+        state: "begun" is logged before the servo is written, so that the log knows every write.
+        undoes: the batch that this one undoes.
     """
 
     utc: str
@@ -47,14 +47,14 @@ class LoggedWrite(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ServoLog:
-    """The log in a state directory; an absent one is empty."""
+    """The log in a state directory; a missing file counts as empty."""
 
     def __init__(self, folder: Path) -> None:
-        """Nothing is opened."""
+        """Set the folder; nothing is opened yet."""
         self.file = folder / FILE
 
     def append(self, entries: Sequence[LoggedWrite]) -> None:
-        """Add lines, on the disk before this returns.
+        """Append lines; they are on disk when this returns.
 
         Raises:
             ConfigError: the file cannot be written.
@@ -70,10 +70,10 @@ class ServoLog:
             raise ConfigError(what, file=self.file, remedy="Make room, or set state_dir in [daemon]") from error
 
     def batches(self) -> dict[int, list[LoggedWrite]]:
-        """By number what each command wrote, every write in its last state.
+        """Return the writes of each command by batch number, each write in its last state.
 
         Raises:
-            BodyschemaError: a line that is no entry, other than a last one that a crash cut short.
+            BodyschemaError: a line is not an entry, except a last one that a crash cut short.
         """
         if not self.file.exists():
             return {}
@@ -92,11 +92,11 @@ class ServoLog:
         return {batch: list(entries) for batch, entries in groupby(ordered, key=lambda entry: entry.batch)}
 
     def next_batch(self) -> int:
-        """A number that no batch has."""
+        """Return an unused batch number."""
         return max(self.batches(), default=0) + 1
 
     def to_undo(self) -> list[LoggedWrite]:
-        """The newest batch that changed something and was not taken back; empty when there is none."""
+        """Return the newest batch that changed something and was not undone; empty if there is none."""
         batches = self.batches()
         undone = {entries[0].undoes for entries in batches.values() if any(e.state == "written" for e in entries)}
         for number in sorted(batches, reverse=True):

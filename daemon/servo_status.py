@@ -1,4 +1,4 @@
-"""How the servos are, for the sampler's status, where the joints are servos."""
+"""Servo health in the sampler's status, if the joints are servos."""
 
 from __future__ import annotations
 
@@ -54,11 +54,11 @@ class BusHealth(Protocol):
 
 @runtime_checkable
 class TellsHealth(Protocol):
-    """Encoders that can say how they are."""
+    """Encoders that report their health."""
 
     @property
     def health(self) -> Sequence[str]:
-        """What is wrong, and what to do."""
+        """Problems, with remedies."""
         ...
 
 
@@ -74,29 +74,29 @@ class Servos(TellsHealth, Protocol):
 
 @runtime_checkable
 class AsksForTurns(Protocol):
-    """Encoders that may not know in which turn a joint is."""
+    """Encoders that may have lost a joint's turn count."""
 
     @property
     def asks_for_turns(self) -> bool: ...
     def accept_turns(self) -> None:
-        """Take the turns nearest to where the joints were."""
+        """Assume the turns nearest to the joints' last positions."""
         ...
 
 
 def complaints_of(joints: JointSource) -> list[str]:
-    """What the encoders say of themselves."""
+    """Return the problems that the encoders report."""
     return list(joints.health) if isinstance(joints, TellsHealth) else []
 
 
 def servos_of(joints: JointSource) -> dict[str, ServoStatus]:
-    """Each joint's servo."""
+    """Return each joint's servo."""
     if not isinstance(joints, Servos):
         return {}
     return {servo.joint: _status(servo) for servo in joints.servo_health}
 
 
 def buses_of(joints: JointSource) -> dict[str, BusStatus]:
-    """How each bus went since the start."""
+    """Return each bus's statistics since the start."""
     if not isinstance(joints, Servos):
         return {}
     return {name: _bus(bus) for name, bus in joints.bus_health.items()}
@@ -124,10 +124,10 @@ def _bus(bus: BusHealth) -> BusStatus:
 
 
 def accept_turns(encoders: object) -> str:
-    """Let encoders that lost their turn count take the turns nearest to where they were; what they did.
+    """Let encoders that lost their turn count assume the turns nearest to the last positions; return a message.
 
     Raises:
-        RequestError: they lost none.
+        RequestError: no turn count was lost.
     """
     if not isinstance(encoders, AsksForTurns) or not encoders.asks_for_turns:
         raise RequestError("no joint has lost its turn count: there is nothing to accept")

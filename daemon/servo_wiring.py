@@ -1,4 +1,4 @@
-"""The wiring of the commands around servos: who is there, and how are they."""
+"""Wiring of the commands that find servos and report their health."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError
 
 if TYPE_CHECKING:
-    from .config import Config  # takes the better part of a second, and a scan may need none
+    from .config import Config  # takes most of a second to import, and a scan may not need it
 
 Servos = DynamixelConfig | FeetechConfig
 
 
 @dataclass(frozen=True, slots=True)
 class KnownModel:
-    """A model of servo that there is a driver for.
+    """A servo model with a driver.
 
     Attributes:
-        table: of its make in robot.toml.
-        bauds: the rates that it can be given there [bit/s].
+        table: its vendor's table in robot.toml.
+        bauds: the baud rates that robot.toml accepts for it [bit/s].
         zero_ticks: the middle of its range.
     """
 
@@ -49,12 +49,12 @@ class KnownModel:
 
 
 def servos_of(config: Config) -> Servos | None:
-    """The servos of robot.toml, if it has some."""
+    """Return the servos of robot.toml, or None if it has none."""
     return config.tables.drivers.dynamixel or config.tables.drivers.feetech
 
 
 def require_servos(config: Config) -> Servos:
-    """The servos of robot.toml; ConfigError when it has none."""
+    """Return the servos of robot.toml. ConfigError if it has none."""
     servos = servos_of(config)
     if servos is None:
         raise ConfigError(
@@ -67,7 +67,7 @@ def require_servos(config: Config) -> Servos:
 
 
 def known_models() -> dict[str, KnownModel]:
-    """The servos that there are drivers for, by name."""
+    """Return the servo models that have a driver, by name."""
     return {
         name: KnownModel(make.table, get_args(baud), model.zero_ticks)
         for make, models, baud in ((DYNAMIXEL, DYNAMIXEL_MODELS, DynamixelBaud), (FEETECH, FEETECH_MODELS, FeetechBaud))
@@ -76,12 +76,12 @@ def known_models() -> dict[str, KnownModel]:
 
 
 def scanned_bauds() -> list[int]:
-    """The rates at which somebody may be [bit/s]."""
+    """Return the baud rates to scan [bit/s]."""
     return sorted({baud for scanner in SCANNERS for baud in scanner.bauds})
 
 
 def ports_to_scan(given: Sequence[str], config: Config | None) -> list[str]:
-    """The ports that were given; else those of robot.toml, and all USB serial ports, each once.
+    """Return the given ports; else those of robot.toml and all USB serial ports, each once.
 
     Raises:
         ConfigError: there are none.
@@ -100,13 +100,13 @@ def ports_to_scan(given: Sequence[str], config: Config | None) -> list[str]:
 
 
 def scan(ports: Sequence[str], bauds: Sequence[int], tell: Tell) -> list[ScannedBus]:
-    """Who is there, port by port, at all rates or at `bauds`."""
+    """Scan port by port, at all rates or at `bauds`."""
     clock = SystemClock()
     return [scan_port(port, SCANNERS, clock, tell, bauds=bauds, latency_s=adapter_latency_s(port)) for port in ports]
 
 
 def configured_ports(config: Config) -> dict[str, str]:
-    """The serial ports of robot.toml, by what they are called."""
+    """Return the serial ports of robot.toml, by name."""
     servos, lines = servos_of(config), config.tables.drivers.serial_lines
     if lines is not None:
         return {"board": lines.port}
@@ -114,23 +114,23 @@ def configured_ports(config: Config) -> dict[str, str]:
 
 
 def port_checks(config: Config, ours: Collection[int] = ()) -> Iterator[Check]:
-    """Of each port of robot.toml: is it there, may it be opened, who has it? `ours` are processes that may have it."""
+    """Check each port of robot.toml: existence, permissions, other users. `ours` are processes that may use it."""
     for name, port in configured_ports(config).items():
         yield from checks.port_checks(name, port, ours=ours)
 
 
 def ports_are_there(config: Config) -> bool:
-    """Whether all ports of robot.toml are."""
+    """Return True if all ports of robot.toml exist."""
     return all(os.path.exists(port) for port in configured_ports(config).values())
 
 
 def other_holders(config: Config) -> list[Holder]:
-    """The other processes that have one of the ports open."""
+    """Return the other processes that have one of the ports open."""
     return [holder for port in configured_ports(config).values() for holder in checks.holders(port)]
 
 
 def servo_checks(config: Config) -> Iterator[Check]:
-    """Of the servos of robot.toml: who is there, how they are, how fast they are read. Writes nothing."""
+    """Check the servos of robot.toml: presence, health, reading rate. Writes nothing."""
     clock = SystemClock()
     match require_servos(config):
         case DynamixelConfig() as servos:
@@ -140,14 +140,14 @@ def servo_checks(config: Config) -> Iterator[Check]:
 
 
 def encoder_checks(config: Config) -> Iterator[Check]:
-    """Of the encoders of robot.toml on a board, if it has some."""
+    """Check the encoders of robot.toml on a board, if it has any."""
     board = config.tables.drivers.serial_lines
     if board is not None:
         yield from checks_of_encoders(board, config.robot.joints, SystemClock())
 
 
 def joint_state_checks(config: Config) -> Iterator[Check]:
-    """Of the ROS 2 robot of robot.toml, if it has one. Only listens."""
+    """Check the ROS 2 robot of robot.toml, if it has one. Only listens."""
     robot = config.tables.drivers.ros2
     if robot is not None:
         from bodyschema.drivers.ros2.checks import joint_state_checks as checks_of_joint_states

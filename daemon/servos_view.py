@@ -1,4 +1,4 @@
-"""The servos of the sampler's status, for a terminal of 80 columns."""
+"""Show the servos of the sampler's status in a terminal of 80 columns."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .status import ServoStatus
 
 
 def servos_table(servos: Mapping[str, ServoStatus]) -> Table:
-    """Each joint's servo: who it is, how it is. What is wrong with one stands in the last column."""
+    """Return a table of each joint's servo: identity, health, and problems in the last column."""
     table = Table(box=None, pad_edge=False, header_style="dim")
     for heading in ("servo", "ID", "model", "fw", "supply", "temp.", "current", "state"):
         right = heading in ("ID", "fw", "supply", "temp.", "current")
@@ -28,7 +28,7 @@ def servos_table(servos: Mapping[str, ServoStatus]) -> Table:
 
 
 def _short(servo: ServoStatus) -> str:
-    """What is wrong, without what to do, which the lines above say."""
+    """Return the problem without its remedy, which is printed above the table."""
     return ", ".join(trouble.split(":")[0] for trouble in servo.troubles)
 
 

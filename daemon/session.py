@@ -1,4 +1,4 @@
-"""What a store keeps of each run of the sampler."""
+"""Describe each run of the sampler for the store."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .store import Session
 
 
 def session_of(config: Config, wall: Clock) -> Session:
-    """The session that begins now with `config`."""
+    """Return the session that starts now with `config`."""
     return Session(
         joints=config.robot.joints,
         started_utc=wall.utc(),

@@ -1,4 +1,4 @@
-"""SIGTERM and SIGINT as a request to come to an orderly end, SIGHUP as one to read robot.toml again."""
+"""Handle SIGTERM and SIGINT as requests for an orderly end, and SIGHUP as a request to read robot.toml again."""
 
 from __future__ import annotations
 
@@ -15,40 +15,40 @@ PR_SET_PDEATHSIG = 1
 
 
 def with_parent() -> dict[str, str]:
-    """Environment for a child that shall not outlive this process; start it from the main thread."""
+    """Return the environment for a child that must not outlive this process; start it from the main thread."""
     return {PARENT: str(os.getpid())}
 
 
 def end_with_parent() -> None:
-    """Come to an orderly end when the parent that asked for it by `with_parent` dies, however it dies."""
+    """Arrange an orderly end for when the parent dies in any way, if it asked for that by `with_parent`."""
     parent = os.environ.pop(PARENT, None)
     if parent is None:
         return
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
-    if os.getppid() != int(parent):  # it died before the kernel was told
+    if os.getppid() != int(parent):  # the parent died before the kernel was told
         sys.exit(1)
 
 
 class Wishes:
-    """What signals ask of a process: plain attributes, which a handler may set."""
+    """Requests that came by signals: plain attributes, which a signal handler may set."""
 
     ending = reloading = False
 
     def end(self) -> None:
-        """Ask it to end."""
+        """Request the end of the process."""
         self.ending = True
 
     def reload(self) -> None:
-        """Ask it to read robot.toml again."""
+        """Request that robot.toml is read again."""
         self.reloading = True
 
 
 @contextmanager
 def on_termination(stop: Callable[[], None], *, reload: Callable[[], None] | None = None) -> Iterator[None]:
-    """Call `stop` when SIGTERM or SIGINT comes, and `reload` when SIGHUP does.
+    """Call `stop` on SIGTERM or SIGINT, and `reload` on SIGHUP.
 
-    Both run between two instructions of the main thread, which may be holding any lock: they must only set a plain
-    attribute (`threading.Event.set` can wait for a lock that the interrupted thread holds).
+    Both run between two instructions of the main thread, which may hold any lock: they must only set a plain attribute
+    (`threading.Event.set` can wait for a lock that the interrupted thread holds).
     """
 
     wanted = {signal.SIGTERM: stop, signal.SIGINT: stop} | ({} if reload is None else {signal.SIGHUP: reload})

@@ -1,4 +1,4 @@
-"""The simulated world, answered over zenoh: its truth for judges, and its tool for whoever plays the user."""
+"""Serve the simulated world over zenoh: its ground truth for evaluation, and its tool for the simulated user."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .bus import Request
 from .sources import Simulation
 from .wire import SCHEMA, CommandReply, decode, encode
 
-# Farther than this from the hand is a mistake of units, not a tool.
+# A longer tool is a mistake of units.
 LONGEST_TOOL_M = 2.0
 
 
@@ -31,7 +31,7 @@ class TruthReply(msgspec.Struct, frozen=True):
         axes: shape (d, 3).
         prismatic: shape (d,).
         t: simulated time [s].
-        turn: how the marker is turned in the chain's last frame, shape (3, 3).
+        turn: rotation of the marker in the chain's last frame, shape (3, 3).
     """
 
     fixed: list[list[list[float]]]
@@ -43,10 +43,10 @@ class TruthReply(msgspec.Struct, frozen=True):
 
 
 def answer_simulation(world: Simulation, clock: Clock, request: Request) -> bytes:
-    """The truth to an empty request; another tool in the hand to a `ToolRequest`.
+    """Answer an empty request with the ground truth; change the tool on a `ToolRequest`.
 
     Raises:
-        RequestError: the tool is not three finite numbers, or is farther away than any tool is.
+        RequestError: the tool is not three finite numbers, or is longer than `LONGEST_TOOL_M`.
     """
     if not request.payload:
         chain = world.true_chain()

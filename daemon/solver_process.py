@@ -1,8 +1,7 @@
-"""The solver in a process of its own.
+"""Run the solver in a separate process.
 
-One solve takes tenths of a second inside LAPACK, which holds the interpreter's lock: in a thread it would keep
-answers waiting that long. The child works at low priority, on a processor at most half of the time, and ends with
-its parent.
+One solve takes tenths of a second inside LAPACK, which holds the interpreter's lock; in a thread it would delay answers
+by that time. The child works at low priority, uses a processor at most half of the time, and ends with its parent.
 
 Both directions carry frames: four bytes of length, then a MessagePack message.
 """
@@ -38,11 +37,11 @@ _LENGTH = struct.Struct("<I")
 
 
 class SolverLostError(BodyschemaError):
-    """The solver's process has ended; `start` begins a new one."""
+    """The solver's process has ended; `start` starts a new one."""
 
 
 class StartTask(msgspec.Struct, frozen=True, tag="start"):
-    """Forget all pairs and begin this task."""
+    """Discard all pairs and start this task."""
 
     number: int
     prior: bytes
@@ -64,7 +63,7 @@ class Learn(msgspec.Struct, frozen=True, tag="learn"):
 
 
 class Solve(msgspec.Struct, frozen=True, tag="solve"):
-    """Solve for all pairs so far."""
+    """Request a solution for all pairs so far."""
 
     robot: int = 0
 
@@ -79,9 +78,9 @@ class Oriented(msgspec.Struct, frozen=True):
 
 
 class Solution(msgspec.Struct, frozen=True):
-    """One answer to `Solve`; without a model when there is no solution.
+    """One answer to `Solve`; the model is missing if there is no solution.
 
-    A `ResidualModel` is what is believed of the arm too, and comes as the model alone.
+    A `ResidualModel` contains the arm's estimate, and is sent alone.
     """
 
     task: int
@@ -101,7 +100,7 @@ _solutions = msgspec.msgpack.Decoder(Solution)
 class SolverProcess:
     """A `Solver` in a child process, started with the first task. Use as a context manager.
 
-    It may keep the pairs of several robots, by their numbers, and solves for one at a time.
+    It may hold the pairs of several robots, by their numbers, and solves for one at a time.
 
     All methods but `__exit__` raise SolverLostError when the child has died.
     """
@@ -120,20 +119,20 @@ class SolverProcess:
 
     @property
     def pid(self) -> int | None:
-        """Process id of the child, or None before the first task."""
+        """Process id of the child; None before the first task."""
         return self._child.pid if self._child is not None else None
 
     def start(self, task: Task, robot: int = 0) -> None:
-        """Forget all pairs and begin a new task."""
+        """Discard all pairs and start a new task."""
         if self._child is None:
             command = module_command("bodyschema.daemon.solver_process")
             environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
-            # In a process group of its own: Ctrl-C in a terminal is the parent's to handle.
+            # A process group of its own: Ctrl-C in a terminal is handled by the parent.
             try:
                 self._child = subprocess.Popen(
                     command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, process_group=0
                 )
-            except OSError as error:  # no memory, or too many open files
+            except OSError as error:  # out of memory, or too many open files
                 raise SolverLostError(f"the solver cannot be started: {error.strerror}; it is tried again") from error
         self._send(
             StartTask(
@@ -148,16 +147,16 @@ class SolverProcess:
         )
 
     def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None, robot: int = 0) -> None:
-        """More pairs, q (n, d) [rad], x (n, 3) [m] and orientations (n, 4), NaN where a pair has none."""
+        """Send more pairs, q (n, d) [rad], x (n, 3) [m] and orientations (n, 4), NaN where a pair has none."""
         told = None if turns is None else turns.astype("<f8").tobytes()
         self._send(Learn(q.shape[1], q.astype("<f8").tobytes(), x.astype("<f8").tobytes(), told, robot))
 
     def solve(self, robot: int = 0) -> None:
-        """Ask for the solution of all pairs so far."""
+        """Request the solution for all pairs so far."""
         self._send(Solve(robot))
 
     def poll(self) -> Solved | None:
-        """The next solution that has come, without waiting."""
+        """Return the next solution that has arrived, without waiting."""
         child = self._child
         if child is None or child.stdout is None:
             return None
@@ -195,7 +194,7 @@ class SolverProcess:
         self._received.clear()
         if child is None or child.stdin is None or child.stdout is None:
             return None
-        with contextlib.suppress(OSError):  # what was left in the buffer finds no reader any more
+        with contextlib.suppress(OSError):  # buffered data has no reader any more
             child.stdin.close()
         child.terminate()
         try:
@@ -242,7 +241,7 @@ def serve(orders: IO[bytes], solutions: IO[bytes]) -> None:
             prior, belief = KBMap.from_bytes(order.prior), ChainBelief.from_bytes(order.belief)
             residual = None if order.residual is None else ResidualModel.from_bytes(order.residual)
             solver.start(Task(order.number, prior, belief, residual, order.prior_stays, order.tolerances))
-            rested_at = 0.0  # a new task begins with few pairs, and somebody waits for it
+            rested_at = 0.0  # a new task starts with few pairs, and its first result is awaited
         elif isinstance(order, Learn):
             solver.learn(
                 np.frombuffer(order.q, dtype="<f8").reshape(-1, order.joints),
@@ -255,8 +254,8 @@ def serve(orders: IO[bytes], solutions: IO[bytes]) -> None:
 
 
 def _solve(solver: DirectSolver, solutions: IO[bytes]) -> float:
-    """Solve, and answer with each solution as it comes; the processor's time that it took [s]."""
-    begin = time.process_time()  # on a busy machine most of the time is waiting, which is rest enough
+    """Solve, and send each solution as it is found; return the processor time used [s]."""
+    begin = time.process_time()  # on a busy machine most of the wall time is waiting, which is rest enough
     for solved in solver.solutions():
         learnt = None if solved.model is None else solved.model.to_bytes()
         belief = solved.belief.to_bytes() if isinstance(solved.belief, ChainBelief) else None
@@ -273,7 +272,7 @@ def _write(stream: IO[bytes], message: msgspec.Struct) -> None:
 
 
 def _read(stream: IO[bytes]) -> StartTask | Learn | Solve | None:
-    """The next order; None when the parent has gone, even in the middle of one."""
+    """Return the next order; None if the parent has gone, even in the middle of one."""
     head = stream.read(_LENGTH.size)
     if len(head) < _LENGTH.size:
         return None
@@ -287,4 +286,4 @@ if __name__ == "__main__":
     try:
         serve(sys.stdin.buffer, sys.stdout.buffer)
     except BrokenPipeError:
-        os._exit(0)  # the parent died while a solution was on its way; flushing at exit would only fail again
+        os._exit(0)  # the parent died while a solution was being sent; flushing at exit would only fail again

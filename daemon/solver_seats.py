@@ -1,4 +1,4 @@
-"""One solver's process for several robots: each has a seat, and they take turns by need."""
+"""Share one solver process between several robots: each has a seat, and they take turns by need."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from bodyschema.interfaces.records import FloatArray
 
 
 class SharedSolver:
-    """Gives a process one robot's orders at a time. For one thread.
+    """Gives a process one robot's orders at a time. Single-threaded.
 
-    What a robot tells waits here until it is its turn: the process does not listen while it solves.
+    A robot's orders wait here for its turn, because the process does not read while it solves.
     """
 
     def __init__(self, process: SolverProcess) -> None:
@@ -23,13 +23,13 @@ class SharedSolver:
         self._turn = 0
 
     def seat(self) -> Seat:
-        """A solver for one more robot."""
+        """Add a robot, and return its solver."""
         seat = Seat(self, self._process, len(self._seats))
         self._seats.append(seat)
         return seat
 
     def attend(self) -> None:
-        """Take what the process has answered, and give the turn to who needs it most.
+        """Collect the process's answers, and give the turn to the robot with the greatest need.
 
         Raises:
             SolverLostError: the process has ended; all seats are empty.
@@ -61,8 +61,8 @@ class Seat:
     """A `Solver` of one robot, in a process shared with others.
 
     Attributes:
-        asked: whether a solution is wanted that the process does not work on yet.
-        answers: those that were not taken yet.
+        asked: True if a solution is wanted that the process does not work on yet.
+        answers: answers not fetched yet.
     """
 
     def __init__(self, shared: SharedSolver, process: SolverProcess, robot: int) -> None:
@@ -73,30 +73,30 @@ class Seat:
         self.answers: deque[Solved] = deque()
 
     def start(self, task: Task) -> None:
-        """Forget all pairs and begin a new task."""
+        """Discard all pairs and start a new task."""
         self.clear()
         self._orders.append(lambda: self._process.start(task, self._robot))
 
     def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None) -> None:
-        """More pairs, q (n, d) [rad], x (n, 3) [m] and orientations (n, 4), NaN where a pair has none."""
+        """Queue more pairs, q (n, d) [rad], x (n, 3) [m] and orientations (n, 4), NaN where a pair has none."""
         self._new += len(q)
         self._orders.append(lambda: self._process.learn(q, x, turns, self._robot))
 
     def solve(self) -> None:
-        """Ask for the solution of all pairs so far, when it is this robot's turn."""
+        """Request the solution for all pairs so far, for this robot's next turn."""
         self.asked = True
 
     def poll(self) -> Solved | None:
-        """The next solution that has come, without waiting."""
+        """Return the next solution that has arrived, without waiting."""
         self._shared.attend()
         return self.answers.popleft() if self.answers else None
 
     def need(self, turn: int) -> float:
-        """How urgent it is: by which share the pairs have grown, times the turns that others have had since."""
+        """Return the urgency: the relative growth of the pairs, times the number of turns of others since."""
         return (turn - self._had_turn) * self._new / max(self._pairs, 1)
 
     def tell(self, turn: int) -> None:
-        """Tell the process all that waits, and ask it."""
+        """Send all queued orders to the process, and request a solution."""
         while self._orders:
             self._orders[0]()
             self._orders.popleft()
@@ -104,7 +104,7 @@ class Seat:
         self._pairs, self._new, self._had_turn, self.asked = self._pairs + self._new, 0, turn, False
 
     def clear(self) -> None:
-        """Nothing was told or asked yet."""
+        """Discard all orders and answers."""
         self._orders.clear()
         self.answers.clear()
         self._pairs = self._new = 0

@@ -1,4 +1,4 @@
-"""What sampler and learner are given to read from and to publish on."""
+"""Interfaces of the sources that sampler and learner read, and of the topics that they publish on."""
 
 from __future__ import annotations
 
@@ -14,48 +14,48 @@ from kbmaps import RigidChain
 
 
 class Simulation(Protocol):
-    """A simulated world, as those see it who may know the truth."""
+    """A simulated world, with access to its ground truth."""
 
     def change_tool(self, marker_xyz: tuple[float, float, float]) -> float:
-        """Put another tool into the hand, its marker at `marker_xyz` [m] in the marker link; the time [s] of that."""
+        """Change the tool: put its marker at `marker_xyz` [m] in the marker link. Return the time [s] of the change."""
         ...
 
     def true_chain(self) -> RigidChain:
-        """The robot as it really is."""
+        """Return the robot's true kinematic chain."""
         ...
 
     def true_turn(self) -> FloatArray:
-        """How the marker really is turned on the hand, shape (3, 3)."""
+        """Return the true rotation of the marker on the hand, shape (3, 3)."""
         ...
 
 
 @runtime_checkable
 class Powered(Protocol):
-    """Joints that have torque from when a person asks for it until anything is not as it must be."""
+    """Joints that have torque from a person's request until any safety condition fails."""
 
     @property
     def name(self) -> str:
-        """In commands: `<name>_on`, `<name>_off`."""
+        """Name in commands: `<name>_on`, `<name>_off`."""
         ...
 
     @property
     def state(self) -> str:
-        """off, on, or dropped: off by itself, until somebody asks again."""
+        """Off, on, or dropped: switched off by itself, until requested again."""
         ...
 
     @property
     def complaints(self) -> tuple[str, ...]:
-        """What is wrong, and what to do."""
+        """Problems, with remedies."""
         ...
 
     def ask(self, on: bool) -> Future[str]:
-        """Ask for torque or its end; the answer comes from the thread that reads, unless it is cancelled before."""
+        """Request torque on or off; the answer comes from the reading thread, unless it is cancelled before."""
         ...
 
 
 @runtime_checkable
 class Head(Powered, Protocol):
-    """A head that turns to where it is told to look."""
+    """A head that can be aimed."""
 
     @property
     def head(self) -> tuple[str, ...]:
@@ -78,29 +78,29 @@ class Head(Powered, Protocol):
         ...
 
     def aim(self, t: float, angles: FloatArray) -> None:
-        """At `t` [s] its joints should stand at `angles` (g,) [rad]."""
+        """Request that its joints are at `angles` (g,) [rad] at `t` [s]."""
         ...
 
 
 class TellsHealth(Protocol):
-    """What can say how it is."""
+    """A device that reports its health."""
 
     @property
     def health(self) -> Sequence[str]:
-        """What is wrong, and what to do."""
+        """Problems, with remedies."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Sources:
-    """Encoders and marker, not opened yet, on one clock; and the simulated world when there is one.
+    """Encoders and marker, not opened yet, on one clock; and the simulated world if there is one.
 
     Attributes:
-        powered: what may move the arm or the head, once a person asks for it.
-        head: the one of them that turns the cameras.
-        cameras: what tells how the cameras are, where there are some.
-        calibration: how they see, where that is not what [camera] says.
-        live: neither encoders nor cameras wait for the other; else what is not read yet stays to be read.
+        powered: drives that may move the arm or the head once a person asks for it.
+        head: the one of them that moves the cameras.
+        cameras: reports the cameras' health, if there are cameras.
+        calibration: the cameras' calibration, if it differs from [camera].
+        live: neither encoders nor cameras wait for the other; otherwise unread data is kept.
     """
 
     joints: JointSource
@@ -115,27 +115,27 @@ class Sources:
 
 
 class StampedJoints(JointSource, Protocol):
-    """Encoders that have a clock of their own."""
+    """Encoders with a clock of their own."""
 
     @property
     def stamp_ns(self) -> int | None:
-        """The newest reading's time on that clock [ns], or None before any."""
+        """Time of the newest reading on that clock [ns]; None before any."""
         ...
 
 
 class MarkerTopic(Source, Protocol):
-    """Takes expected positions."""
+    """A topic for expected positions."""
 
     @property
     def period_s(self) -> float:
-        """No two are wanted closer together [s]."""
+        """Minimum interval between two positions [s]."""
         ...
 
     @property
     def has_sigma(self) -> bool:
-        """Whether listeners are told how sure a position is."""
+        """True if messages include the uncertainty of a position."""
         ...
 
     def publish(self, stamp_ns: int, x: FloatArray, sigma: FloatArray) -> None:
-        """Tell a position [m] and its 1-sigma per axis [m], shapes (3,), at a time on the encoders' clock [ns]."""
+        """Publish a position [m] and its 1-sigma per axis [m], shapes (3,), at a time on the encoders' clock [ns]."""
         ...

@@ -1,4 +1,4 @@
-"""What the two processes say of themselves, under `status/sampler` and `status/learner`."""
+"""Status messages of the two processes, under `status/sampler` and `status/learner`."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class ServoStatus(msgspec.Struct, frozen=True):
     """One joint's servo.
 
     Attributes:
-        firmware: its version, as it tells it.
-        homing_offset: [ticks]; drive_mode: bits; both as its EEPROM has them, 0 where there are none.
-        voltage_v, temperature_c: as it told last; null before it did.
+        firmware: version that it reports.
+        homing_offset: [ticks]; drive_mode: bits; both as stored in its EEPROM, 0 where it has none.
+        voltage_v, temperature_c: last reported values; null before the first.
         current_a: null where it is not measured.
-        troubles: what is wrong with it, and what to do; empty when it is well.
+        troubles: problems, with remedies; empty when it is well.
     """
 
     bus: str
@@ -43,10 +43,10 @@ class BusStatus(msgspec.Struct, frozen=True):
     """One bus of servos since the start.
 
     Attributes:
-        exchanges: questions that were asked.
-        answered: the share of them that was answered as it should be.
-        troubles: the others, by what was wrong.
-        way: with which questions its servos are read, such as Sync Read.
+        exchanges: number of requests sent.
+        answered: share of them with a valid answer.
+        troubles: the failed ones, by kind of failure.
+        way: type of request used for reading its servos, such as Sync Read.
     """
 
     exchanges: int
@@ -60,16 +60,16 @@ class SamplerStatus(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         store: identity of the store.
-        state: running, paused, ended (the source is through) or failed.
-        pairs: sequence number of the newest pair in the store: so many were accepted.
+        state: running, paused, ended (the source is at its end) or failed.
+        pairs: sequence number of the newest pair in the store, which is the number of accepted pairs.
         segment: number of the current segment.
         frames: frames taken since the start.
         rejected: frames that did not become pairs, by reason.
         coverage: by joint.
-        health: sentences about what is wrong; empty when all is well.
-        servos: by joint; empty where the joints are no servos.
-        buses: by name; the same.
-        unreadable: pairs in the store that the disk changed, which are left out.
+        health: sentences about problems; empty when all is well.
+        servos: by joint; empty if the joints are no servos.
+        buses: by name; likewise.
+        unreadable: pairs in the store that the disk corrupted; they are left out.
     """
 
     robot: str
@@ -101,7 +101,7 @@ class CurvePoint(msgspec.Struct, frozen=True, array_like=True):
 
 
 class LearntFigure(msgspec.Struct, frozen=True):
-    """One number of the robot's files: as drawn and as learnt, with half the width of its 95 % interval."""
+    """One value of the robot's files: nominal and learnt, with half the width of its 95 % interval."""
 
     drawn: float
     learnt: float
@@ -109,24 +109,24 @@ class LearntFigure(msgspec.Struct, frozen=True):
 
 
 class JointZero(msgspec.Struct, frozen=True):
-    """What has to be added to a joint's reading, with half the width of its 95 % interval [rad or m]."""
+    """Joint offset to add to a joint's reading, with half the width of its 95 % interval [rad or m]."""
 
     value: float
     half_width: float
 
 
 class ChainCalibration(msgspec.Struct, frozen=True, kw_only=True):
-    """Where camera and tool are and the joints' zeros, as the learnt rigid chain has them.
+    """Pose of camera and tool, and the joint offsets, by the learnt rigid chain.
 
     Attributes:
-        pairs: pairs with the present tool that it was found from.
+        pairs: number of pairs with the present tool used for it.
         camera_link, camera_xyz, camera_rpy: pose of the measurement frame in this link (URDF convention) [m, rad].
         marker_link, marker_xyz: the marker in this link [m].
-        zeros: by joint; null where no motion shows it and it is left as drawn. The other figures are given that.
-        axes_rad, points_m: how well the arm seems to be made: 1-sigma of an axis' tilt and of its shift; null
-            where the pairs do not tell.
+        zeros: by joint; null where the offset is not identifiable and kept at nominal. The other figures assume that.
+        axes_rad, points_m: estimated deviation from the URDF: 1-sigma of axis tilt and of axis shift; null where the
+            pairs do not determine it.
         noise_m: 1-sigma of a measured coordinate.
-        outliers: of the last 500 pairs, those too far from the chain for this noise.
+        outliers: number of outliers among the last 500 pairs: too far from the chain for this noise.
     """
 
     pairs: int
@@ -143,19 +143,19 @@ class ChainCalibration(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Outlook(msgspec.Struct, frozen=True, kw_only=True):
-    """What further pairs would still gain.
+    """Expected gain of further pairs.
 
     Attributes:
-        pairs: pairs with the present tool that it was foreseen from.
-        error_m: expected mean distance to the truth where the arm has been [m].
-        least_error_m: the part of it that no further pair mends [m].
-        anywhere_m: expected mean distance to the truth over the whole ranges of all joints [m].
+        pairs: pairs with the present tool used for the forecast.
+        error_m: expected mean distance to the ground truth where the arm has been [m].
+        least_error_m: the part of it that no further pair can reduce [m].
+        anywhere_m: expected mean distance to the ground truth over the full ranges of all joints [m].
         further_pairs: numbers of further pairs, ascending.
-        like_so_far_m: what `error_m` would be after so many, moving as so far [m].
-        best_motion: the motion that would gain most, in words.
-        best_motion_m: what `error_m` would be after so many of it [m].
-        enough: whether no motion, with as many pairs as the last of `further_pairs`, would lower `error_m` by a tenth,
-            or by a tenth of the noise of a measurement.
+        like_so_far_m: expected `error_m` after each number of further pairs, moving as so far [m].
+        best_motion: the motion that would reduce the error most, in words.
+        best_motion_m: expected `error_m` after each number of further pairs of that motion [m].
+        enough: True if no motion, with as many pairs as the last of `further_pairs`, would lower `error_m` by a tenth,
+            or by a tenth of a measurement's noise.
     """
 
     pairs: int
@@ -170,13 +170,13 @@ class Outlook(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class OrientationStatus(msgspec.Struct, frozen=True):
-    """How well it is known how the marker is turned.
+    """The accuracy of the learnt marker orientation.
 
     Attributes:
-        pairs: pairs with the present tool that said it.
-        answering: which model answers.
+        pairs: pairs with the present tool that have an orientation.
+        answering: the model that answers.
         prequential_rad: recent mean angle between prediction and measurement, before learning [rad], by model.
-        claimed_rad: the angle to the truth [rad] that the learner claims where data is; null before a few pairs.
+        claimed_rad: predicted error angle [rad] within the support of the data; null before a few pairs.
     """
 
     pairs: int
@@ -185,22 +185,23 @@ class OrientationStatus(msgspec.Struct, frozen=True):
     claimed_rad: float | None
 
 
-UNDECIDED = "undecided"  # a change whose kind is not known yet
+UNDECIDED = "undecided"  # a change whose cause is not known yet
 
 
 class Change(msgspec.Struct, frozen=True, kw_only=True):
-    """The last change of the tool, of the camera or of a joint's zero.
+    """The last change of the tool, of the camera or of a joint's offset.
 
     Attributes:
         first_seq: sequence number of the most probable first pair after it.
-        earliest_seq, latest_seq: between which that pair is, with 95 % probability.
-        noticed_seq: the pair with which it was noticed; of a change that was told, the last one before it.
-        found: in the pairs; else it was told.
-        kind: `tool`, `camera`, `joint NAME` (its zero), `other` or `undecided`.
+        earliest_seq, latest_seq: 95 % interval of that pair.
+        noticed_seq: the pair with which it was detected; for a change that was reported by a command, the last pair
+            before it.
+        found: True if it was detected in the pairs; False if it was reported by a command.
+        kind: `tool`, `camera`, `joint NAME` (its offset), `other` or `undecided`.
         probabilities: by kind, those above 1 %.
-        alike: the kind that no motion tells from this one; null where there is none.
-        moved_m: by how much it moved the marker at the pairs since, root mean square [m]; null where nobody knows.
-        can_roll_back: whether the model before it is kept.
+        alike: the kind that no motion can distinguish from this one; null if there is none.
+        moved_m: RMS displacement of the marker at the pairs since [m]; null where unknown.
+        can_roll_back: True if the previous model is kept.
     """
 
     first_seq: int
@@ -220,33 +221,33 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         store: identity of the store the pairs came from, or null before any.
-        state: waiting (no pair yet), aligning (the frame is not known yet), learning or paused.
-        pairs: pairs learnt online, each once.
+        state: waiting (no pair yet), aligning (the measurement frame is not known yet), learning or paused.
+        pairs: number of pairs learnt online, each once.
         last_seq: sequence number of the newest of them.
         replayed: replay steps since the start.
-        pairs_since_change: pairs since the last change, or since the beginning.
-        answering: which model answers queries.
-        prequential_m: error on new pairs, by model: mean distance between the measurement, its noise included, and the
-            prediction made before the pair was learnt [m]; over the same pairs for all models.
-        claimed_error_m: the mean distance to the truth [m], without the measurement's noise, that the learner claims
-            for its predictions where data is.
-        curve: the error on new pairs of the model that answered, over the pairs.
-        model: hash of the model that answers.
-        calibration: camera, tool and joint zeros; null before the first solution with the present tool.
-        outlook: whether there is enough data; null while no solution with the present tool answers.
+        pairs_since_change: pairs since the last change, or since the start.
+        answering: the model that answers queries.
+        prequential_m: error on new pairs, by model: mean distance [m] between the measurement, its noise included, and
+            the prediction made before the pair was learnt; over the same pairs for all models.
+        claimed_error_m: predicted mean distance to the ground truth [m], without measurement noise, within the support
+            of the data.
+        curve: error on new pairs of the answering model, over the number of pairs.
+        model: hash of the answering model.
+        calibration: camera and tool pose and joint offsets; null before the first solution with the present tool.
+        outlook: expected gain of further pairs; null until a solution with the present tool answers.
         gaps_recovered: pairs that had to be fetched from the sampler's history.
-        refused: pairs that could not be taken.
-        doubted: pairs that looked like gross outliers and were learnt with care.
-        changes: changes that were told, or found in the pairs.
-        last_change: the last of them; null where there was none, or it was rolled back.
-        at_rest: whether nothing is left to do with the pairs that came: to fit, to solve, to replay or to find out.
+        refused: pairs that were not accepted.
+        doubted: pairs treated as likely outliers.
+        changes: changes reported by a command, or detected in the pairs.
+        last_change: the last change; null if there was none, or it was rolled back.
+        at_rest: True if all work on the received pairs is done: fitting, solving, replay and findings.
         checkpoint_age_s: time since the last checkpoint, or null before any.
-        health: sentences about what is wrong; empty when all is well.
-        orientation: null where no pair with the present tool said how the marker is turned.
-        prequential_pairs: on how many of the last pairs `prequential_m` was seen.
-        missed: pairs that the sampler no longer kept when this learner asked for them.
-        behind: pairs that are known to be stored and are not learnt yet.
-        age_s: how old the newest learnt pair is, counted from the newest stored one; null before any since the start.
+        health: sentences about problems; empty when all is well.
+        orientation: null if no pair with the present tool has an orientation.
+        prequential_pairs: number of recent pairs that `prequential_m` averages over.
+        missed: pairs that the sampler had already deleted when this learner requested them.
+        behind: pairs known to be stored and not learnt yet.
+        age_s: age of the newest learnt pair, relative to the newest stored one; null before any since the start.
     """
 
     robot: str

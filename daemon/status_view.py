@@ -1,4 +1,4 @@
-"""The two processes' states, asked for and shown."""
+"""Query the two processes' states and show them."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ EVERY_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What the processes said; None where nobody answered."""
+    """States of the processes; None for one that did not answer."""
 
     sampler: SamplerStatus | None
     learner: LearnerStatus | None
 
     @property
     def nobody(self) -> bool:
-        """Whether neither answered."""
+        """True if neither answered."""
         return self.sampler is None and self.learner is None
 
 
 class Watcher:
-    """Asks both processes for their states. Use as a context manager; the processes may come and go."""
+    """Queries both processes for their states. Use as a context manager; the processes may come and go."""
 
     def __init__(self, config: Config) -> None:
         self._keys = Keys(config.robot.name)
@@ -62,7 +62,7 @@ class Watcher:
             self._leave(process)
 
     def look(self) -> Seen:
-        """Their states now."""
+        """Return their current states."""
         sampler, learner = self._ask("sampler"), self._ask("learner")
         return Seen(
             sampler=None if sampler is None else decode(sampler, SamplerStatus),
@@ -70,7 +70,7 @@ class Watcher:
         )
 
     def follow(self) -> Iterator[Seen]:
-        """Their states about once a second, without end."""
+        """Yield their states about once a second, without end."""
         while True:
             yield self.look()
             time.sleep(EVERY_S)
@@ -91,12 +91,12 @@ class Watcher:
 
 
 def as_json(seen: Seen) -> str:
-    """Both states as one line of JSON."""
+    """Return both states as one line of JSON."""
     return msgspec.json.encode({"sampler": seen.sampler, "learner": seen.learner}).decode()
 
 
 def screen(seen: Seen, config: Config) -> RenderableType:
-    """Both states for a person; what a small terminal cuts off is the end of the joints' coverage."""
+    """Return a screen of both states; a small terminal cuts off the end of the joints' coverage."""
     chain = config.robot.chain
     parts: list[RenderableType] = []
     parts += _absent("sampler", config.route("sampler")) if seen.sampler is None else _sampler(seen.sampler)
@@ -167,7 +167,7 @@ def _elsewhere(status: LearnerStatus) -> str:
 def _change(status: LearnerStatus) -> Iterator[str]:
     since, change = f"{status.pairs_since_change} pairs since", status.last_change
     if change is None:
-        # Rolled back, or learning began anew.
+        # Rolled back, or learning was restarted.
         yield f"none in force of {status.changes} told or found; {status.pairs_since_change} pairs count"
         return
     when = f"at pair {change.first_seq}"

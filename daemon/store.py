@@ -29,17 +29,17 @@ from .store_rows import Checked, as_json, checked, decoded, pair_of, require_sou
 
 log = logging.getLogger(__name__)
 
-AUDITED_AT_ONCE = 1000  # rows: so many joint angles are compared in one go
+AUDITED_AT_ONCE = 1000  # number of rows whose joint angles are compared at once
 
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """What one run of the sampler worked with; kept beside the pairs so that they can be understood later.
+    """Configuration of one run of the sampler, stored with the pairs so that they can be understood later.
 
     Attributes:
-        joints: names in the order of q. They belong to the whole store: another order is another store.
+        joints: names in the order of q. They hold for the whole store; another order needs another store.
         robot_toml, urdf: texts of the two files.
-        config: all tables after overriding, as JSON.
+        config: all tables including overrides, as JSON.
     """
 
     joints: tuple[str, ...]
@@ -53,12 +53,12 @@ class Session:
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """What the joints were read with.
+    """Devices that read the joints.
 
     Attributes:
-        session: number of the run of the sampler.
-        from_seq: from this pair on, until the next ones.
-        record: of each joint: names and settings, as its driver tells them.
+        session: number of the sampler's run.
+        from_seq: first pair they apply to, until the next entry.
+        record: for each joint: names and settings, as reported by its driver.
     """
 
     session: int
@@ -69,15 +69,15 @@ class Devices:
 
 @dataclass(frozen=True, slots=True)
 class Audit:
-    """What a look at each row of a store found.
+    """Result of checking each row of a store.
 
     Attributes:
-        pairs: sound ones.
-        newest: number of the newest pair, sound or not; 0 when there is none.
-        session: of the newest sound pair; 0 when there is none.
+        pairs: number of sound pairs.
+        newest: number of the newest pair, sound or not; 0 if there is none.
+        session: session of the newest sound pair; 0 if there is none.
         damage: numbers of pairs that cannot be read.
-        lost_rows: how many rows, of pairs and of what is kept beside them, are there and cannot be read.
-        joint_ranges: smallest and largest joint angles, each shape (d,) [rad or m]; None when there is no pair.
+        lost_rows: number of existing but unreadable rows, of pairs and of related tables.
+        joint_ranges: smallest and largest joint angles, each shape (d,) [rad or m]; None if there is no pair.
     """
 
     pairs: int
@@ -91,7 +91,7 @@ class Audit:
 class PairReader:
     """Reads a pair store, also while a sampler writes it. Use as a context manager; any thread may read.
 
-    A row that the disk changed is passed over, and so is what SQLite cannot read.
+    Rows that the disk corrupted, or that SQLite cannot read, are skipped.
 
     Attributes:
         identity: UUID of the store.
@@ -149,7 +149,7 @@ class PairReader:
         return pairs
 
     def last(self) -> Pair | None:
-        """Return the newest sound pair, or None when there is none."""
+        """Return the newest sound pair, or None if there is none."""
         with self._reading() as connection:
             try:
                 back = scan_back(connection, self._columns, self._pair)
@@ -160,7 +160,7 @@ class PairReader:
             return max(scan(connection, self._columns, self._pair), key=lambda pair: pair.seq, default=None)
 
     def last_seq(self) -> int:
-        """Return the sequence number of the newest pair, sound or not; 0 when there is none."""
+        """Return the sequence number of the newest pair, sound or not; 0 if there is none."""
         with self._reading() as connection:
             behind, newest = 0, 0
             try:
@@ -176,7 +176,7 @@ class PairReader:
             return max(newest + behind, self._given_up_to)
 
     def first_seq(self) -> int:
-        """Return the sequence number of the oldest pair; 1 when there is none."""
+        """Return the sequence number of the oldest pair; 1 if there is none."""
         with self._reading() as connection:
             return oldest(connection)
 
@@ -185,15 +185,15 @@ class PairReader:
         return self.damage.since(self.first_seq()) if self.damage.count else self.damage
 
     def trouble(self) -> str | None:
-        """Return what is wrong with the pages of the file; None when nothing is."""
+        """Return the problem with the file's pages; None if there is none."""
         with self._reading() as connection:
             return store_schema.trouble(connection)
 
     def audit(self, working: Callable[[], None] = lambda: None) -> Audit:
-        """Look at each row. What cannot be read is among `damage` from then on.
+        """Check each row. Unreadable pairs are added to `damage`.
 
         Args:
-            working: is called again and again meanwhile.
+            working: called repeatedly meanwhile.
 
         Raises:
             StoreError: the file cannot be read.
@@ -253,18 +253,18 @@ class PairReader:
 
 
 class PairStore:
-    """Writes a pair store, which it makes when there is none.
+    """Writes a pair store, and creates it if it does not exist.
 
-    Use as a context manager, and append from one thread at a time. A pair that `append` returned is on the disk
-    (`synchronous=FULL`). Sequence numbers run from 1 without gaps. Only one process can have a store open for
-    writing; its death, whatever its kind, frees it.
+    Use as a context manager, and append from one thread at a time. A pair returned by `append` is on the disk
+    (`synchronous=FULL`). Sequence numbers run from 1 without gaps. Only one process can have a store open for writing;
+    the end of the process, of any kind, releases it.
     """
 
     def __init__(self, file: Path, session: Session, *, working: Callable[[], None] = lambda: None) -> None:
-        """Not open yet.
+        """Store the settings; nothing is opened yet.
 
         Args:
-            working: is called again and again while the store is opened, which takes the longer the more pairs it has.
+            working: called repeatedly while the store is opened, which takes longer the more pairs it has.
         """
         self.file = file
         self.reader = PairReader(file)
@@ -283,14 +283,14 @@ class PairStore:
 
     @property
     def audit(self) -> Audit:
-        """What a look at each row found when the store was opened."""
+        """Result of checking each row when the store was opened."""
         if self._audit is None:
             raise StoreError(f"the store {self.file} is closed; use it in a with statement")
         return self._audit
 
     @property
     def complaints(self) -> list[str]:
-        """What is wrong with the file, in sentences; from any thread."""
+        """Problems with the file, in sentences; from any thread."""
         said = [] if self._rebuilt is None else [self._rebuilt]
         damage = self.reader.present_damage()
         return [*said, damage.told(self.file)] if damage.count else said
@@ -309,7 +309,7 @@ class PairStore:
         self._close()
 
     def append(self, segment: int, utc: str, q: FloatArray, fix: MarkerFix) -> Pair:
-        """Number a pair and commit it.
+        """Assign the next number to a pair and commit it.
 
         Raises:
             StoreError: the disk is full or broken; the pair is not in the store.
@@ -323,21 +323,21 @@ class PairStore:
         return pair
 
     def note_devices(self, utc: str, record: Sequence[Mapping[str, object]]) -> None:
-        """Keep what the joints are read with from the next pair on.
+        """Store what the joints are read with from the next pair on.
 
         Raises:
             StoreError: the disk is full or broken.
         """
         connection = self._require_open()
         with explained(self.file), store_schema.transaction(connection):
-            # What no pair was measured with tells nothing of the pairs.
+            # An entry to which no pair belongs carries no information.
             connection.execute("DELETE FROM devices WHERE from_seq > ?", (self._seq,))
             number = connection.execute("SELECT coalesce(max(id), 0) + 1 FROM devices").fetchone()[0]
             told = (number, self._session_id, self._seq + 1, utc, as_json(record))
             connection.execute(store_schema.INSERT["devices"], sealed(told))
 
     def go_on_with(self, session: Session) -> None:
-        """What the sampler works with from the next pair on.
+        """Use this session from the next pair on.
 
         Raises:
             StoreError: the disk is full or broken.
@@ -348,10 +348,10 @@ class PairStore:
             self._begin_session(connection)
 
     def trim(self, keep: Keep, utc: str) -> int:
-        """Delete the oldest pairs that are not to be kept, a part of them at a time; how many were deleted.
+        """Delete a batch of the oldest pairs that are no longer kept; return the number deleted.
 
         Args:
-            utc: now.
+            utc: current time.
 
         Raises:
             StoreError: the disk is full or broken.
@@ -365,11 +365,11 @@ class PairStore:
                 return delete_until(connection, last)
 
     def read(self, from_seq: int = 1, to_seq: int | None = None, limit: int | None = None) -> list[Pair]:
-        """As `PairReader.read`; from any thread."""
+        """Read like `PairReader.read`; from any thread."""
         return self.reader.read(from_seq, to_seq, limit)
 
     def last(self) -> Pair | None:
-        """As `PairReader.last`; from any thread."""
+        """Return the newest pair like `PairReader.last`; from any thread."""
         return self.reader.last()
 
     def _open(self) -> None:
@@ -400,9 +400,9 @@ class PairStore:
             log.error("%s", said)
 
     def _give_up(self, connection: sqlite3.Connection, written: Sequence[bool]) -> None:
-        """Leave the numbers free of pairs that were committed behind a damaged place of the log.
+        """Never reuse the numbers of pairs that were committed after a damaged place in the log.
 
-        One that is missing alone was torn by a power failure, and had not been accepted.
+        A single missing pair was torn by a power failure, and had not been accepted.
         """
         if not any(written):
             return
@@ -416,7 +416,7 @@ class PairStore:
                 store_schema.write_meta(connection, {**contents, store_schema.GIVEN_UP_TO: str(given)})
 
     def _rebuild(self, what: str) -> None:
-        """Go on with a new file that has all that can be read."""
+        """Continue with a new file that contains everything readable."""
         self._require_open().close()
         try:
             kept = rebuild(self.file, self._fresh(), self._working)
@@ -449,7 +449,7 @@ class PairStore:
         session = self._session
         with store_schema.transaction(connection):
             connection.execute("DELETE FROM devices WHERE from_seq > ?", (self._seq,))
-            # A sampler that is started again and again without seeing a pair must not fill the disk.
+            # Repeated restarts of a sampler that sees no pair must not fill the disk.
             connection.execute("DELETE FROM sessions WHERE id > ?", (self._newest_session,))
             number = connection.execute("SELECT coalesce(max(id), 0) + 1 FROM sessions").fetchone()[0]
             told = (session.started_utc, session.robot_toml, session.urdf, session.config, session.version)
@@ -475,19 +475,19 @@ class PairStore:
 
 
 def require_store(file: Path) -> None:
-    """Raise StoreError when there is no such file."""
+    """Raise StoreError if the file does not exist."""
     if not file.is_file():
         raise StoreError(f"there is no store {file}. The sampler makes it: start it with `bodyschema sampler`")
 
 
 def leave_out_damage(file: Path, joints: Sequence[str]) -> Audit:
-    """Rebuild a store that nobody uses where it has something that cannot be read; what is in it then.
+    """Rebuild a store that is not in use if part of it cannot be read; return its contents afterwards.
 
     Args:
-        joints: for a store that lost theirs.
+        joints: joint names for a store that lost its own.
 
     Raises:
-        StoreError: it is not a pair store, or nothing can be read.
+        StoreError: the file is not a pair store, or nothing can be read.
     """
     with explained(file):
         with closing(store_schema.connect(file)) as connection:

@@ -1,4 +1,4 @@
-"""The pairs of a file that may be damaged: what is sound, which numbers are lost, and a new file of the rest."""
+"""Recover the pairs of a damaged file: sound rows, lost numbers, and a new file of the rest."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from .kept_files import sync_folder, unused_name
 from .store_file import is_damage
 from .store_rows import COLUMNS, DamagedRow, decoded, require_sound, sealed
 
-# After so many numbers in a row that cannot be read, larger and larger steps look for the next that can: a damaged
-# page holds some ten pairs, one above it some thousand. A larger value takes longer, a smaller one passes more over.
+# After this many unreadable numbers in a row, the search for the next readable one takes growing steps: a damaged page
+# holds some ten pairs, one above it some thousand. A larger value takes longer, a smaller one skips more.
 PATIENCE = 64
-# A row of `pairs` takes more bytes. Pages that lead in a circle give more rows than fit into the file.
+# Lower bound for a row of `pairs`. Pages linked in a circle yield more rows than fit into the file.
 SMALLEST_ROW_BYTES = 20
-# So many numbers are left free after the newest readable pair where SQLite lost the end of the store: those behind it
-# were given already. A page of 4096 bytes holds at most 37.
+# Numbers left free after the newest readable pair where SQLite lost the end of the store, because they may have been
+# used. A page of 4096 bytes holds at most 37 pairs.
 LEFT_FREE = 50
-SHOWN = 8  # places of damage in a sentence
+SHOWN = 8  # damaged places listed in a sentence
 
 Made = TypeVar("Made")
 Make = Callable[[tuple[Any, ...]], Made]
@@ -35,22 +35,22 @@ Make = Callable[[tuple[Any, ...]], Made]
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """Numbers of pairs that a store had and that cannot be read: ranges, ascending, both ends inclusive."""
+    """Numbers of lost pairs of a store: ranges, ascending, both ends inclusive."""
 
     ranges: tuple[tuple[int, int], ...] = ()
 
     @classmethod
     def between(cls, numbers: Iterable[int]) -> Damage:
-        """Return the numbers that are missing between ascending ones."""
+        """Return the numbers missing from an ascending sequence."""
         return cls(tuple((one + 1, next_one - 1) for one, next_one in pairwise(numbers) if next_one > one + 1))
 
     @property
     def count(self) -> int:
-        """How many numbers there are."""
+        """Number of lost pairs."""
         return sum(last - first + 1 for first, last in self.ranges)
 
     def told(self, file: Path) -> str:
-        """Return a sentence that names the numbers and the remedy."""
+        """Return a sentence with the numbers and the remedy."""
         one = self.count == 1
         many, they = ("1 pair", "It is") if one else (f"{self.count} pairs", "They are")
         return (
@@ -68,7 +68,7 @@ class Damage:
         return Damage(tuple(joined))
 
     def since(self, oldest: int) -> Damage:
-        """Return those from the number `oldest` on."""
+        """Return the part from the number `oldest` on."""
         return Damage(tuple((max(first, oldest), last) for first, last in self.ranges if last >= oldest))
 
     def __str__(self) -> str:
@@ -78,10 +78,10 @@ class Damage:
 
 
 def scan(connection: sqlite3.Connection, columns: str, make: Make[Made], first: int = 1) -> Iterator[Made]:
-    """Yield what `make` gives of each sound row of `pairs` from number `first` on, each once and in order.
+    """Yield `make(row)` for each sound row of `pairs` from number `first` on, each once and in order.
 
     Args:
-        make: raises DamagedRow where a row is not sound; such a row, and what SQLite cannot read, is passed over.
+        make: raises DamagedRow if a row is not sound. Such rows, and rows that SQLite cannot read, are skipped.
     """
     statement = f"SELECT {columns} FROM pairs WHERE seq >= ? ORDER BY seq LIMIT ?"
     position, failed_at = first, None
@@ -104,7 +104,7 @@ def scan(connection: sqlite3.Connection, columns: str, make: Make[Made], first: 
 
 
 def scan_back(connection: sqlite3.Connection, columns: str, make: Make[Made]) -> Iterator[Made | None]:
-    """Yield the same from the newest row on, and None for a row that is not sound.
+    """Yield the same from the newest row backwards, and None for a row that is not sound.
 
     Raises:
         sqlite3.DatabaseError: SQLite cannot read further.
@@ -119,22 +119,22 @@ def scan_back(connection: sqlite3.Connection, columns: str, make: Make[Made]) ->
 
 
 def rebuild(file: Path, fresh: dict[str, str], working: Callable[[], None] = lambda: None) -> Path:
-    """Put a sound store of the present schema in the place of a damaged one, with all that can be read.
+    """Replace a damaged store by a sound one of the present schema, with everything readable.
 
     Args:
-        fresh: `meta` of a new store, for one whose own is lost.
-        working: is called again and again meanwhile.
+        fresh: `meta` of a new store, in case the store's own is lost.
+        working: called repeatedly meanwhile.
 
     Returns:
-        Where the damaged one was kept.
+        Path under which the damaged store was kept.
 
     Raises:
-        sqlite3.Error, OSError: the disk is full or failing; the damaged one is where it was.
+        sqlite3.Error, OSError: the disk is full or failing; the damaged store is unchanged.
     """
     new = file.with_name(f".{file.name}.rebuilt-{uuid.uuid4().hex[:8]}")
     try:
         with closing(store_schema.connect(file)) as source:
-            source.execute("PRAGMA journal_mode = DELETE")  # a log of the old file is not for the new one
+            source.execute("PRAGMA journal_mode = DELETE")  # a log of the old file does not apply to the new one
             with closing(store_schema.connect(new)) as target:
                 target.execute("PRAGMA synchronous = FULL")
                 with store_schema.told_while_working(target, working):
@@ -142,7 +142,7 @@ def rebuild(file: Path, fresh: dict[str, str], working: Callable[[], None] = lam
         kept = unused_name(file, "damaged")
         try:
             os.link(file, kept)
-        except OSError:  # a file system without hard links
+        except OSError:  # the file system has no hard links
             shutil.copyfile(file, kept)
         os.replace(new, file)
         sync_folder(file.parent)
@@ -155,7 +155,7 @@ def rebuild(file: Path, fresh: dict[str, str], working: Callable[[], None] = lam
 def records(connection: sqlite3.Connection, table: str) -> Iterator[tuple[Any, ...] | None]:
     """Yield the rows of `devices` or `sessions` without their checksums, as far as SQLite can read them.
 
-    None is for a row that is not sound. Stores of the first schema have no devices.
+    None stands for a row that is not sound. Stores of the first schema have no devices.
     """
     schema = store_schema.version(connection)
     with_checksums = schema >= store_schema.WITH_CHECKSUMS
@@ -178,12 +178,12 @@ def records(connection: sqlite3.Connection, table: str) -> Iterator[tuple[Any, .
 
 
 def oldest(connection: sqlite3.Connection) -> int:
-    """Return the number of the oldest row of `pairs`; 1 when there is none that SQLite can read."""
+    """Return the number of the oldest row of `pairs`; 1 if SQLite can read none."""
     return _one(connection, "SELECT coalesce(min(seq), 1) FROM pairs", 1)
 
 
 def count_pairs(connection: sqlite3.Connection, otherwise: int) -> int:
-    """Return how many rows `pairs` has, sound or not; `otherwise` when SQLite cannot count them."""
+    """Return the number of rows of `pairs`, sound or not; `otherwise` if SQLite cannot count them."""
     return _one(connection, "SELECT count(*) FROM pairs", otherwise)
 
 
@@ -234,14 +234,14 @@ def _copy(source: sqlite3.Connection, target: sqlite3.Connection, fresh: dict[st
 
 
 def _written(row: tuple[Any, ...]) -> tuple[Any, ...]:
-    """The sealed row, its bytes as texts again."""
+    """Return the sealed row, with bytes decoded to text."""
     return sealed(tuple(value.decode(errors="replace") if isinstance(value, bytes) else value for value in row))
 
 
 def _rows(connection: sqlite3.Connection, statement: str, start: int) -> Iterator[tuple[Any, ...]]:
     """Yield rows as far as SQLite can read them, then raise its error.
 
-    Python's sqlite3 does not give the row before one that cannot be read. It is asked for again as the last one.
+    Python's sqlite3 does not return the row before an unreadable one, so that row is requested again as the last one.
     """
     came = 0
     try:

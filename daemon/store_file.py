@@ -1,4 +1,4 @@
-"""The file of a pair store: one writer, and errors that say what to do."""
+"""The file of a pair store: one writer, and errors with a remedy."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from pathlib import Path
 from bodyschema.interfaces.errors import StoreError, StoreUnwritable
 
 NOTHING_CHANGED = "Nothing was changed"
-# What SQLite says when the disk takes nothing now.
+# SQLite's errors when the disk temporarily accepts no data.
 _PASSING = ("SQLITE_FULL", "SQLITE_IOERR", "SQLITE_READONLY", "SQLITE_CANTOPEN", "SQLITE_BUSY")
 
 
 @contextmanager
 def explained(file: Path) -> Iterator[None]:
-    """Errors of SQLite as StoreErrors that name the file and the remedy."""
+    """Convert SQLite's errors into StoreErrors that name the file and the remedy."""
     try:
         yield
     except sqlite3.Error as error:
@@ -42,7 +42,7 @@ def explanation(file: Path, error: sqlite3.Error) -> str:
 
 
 def is_damage(error: sqlite3.Error) -> bool:
-    """Return True when SQLite found that the file is not as it was written."""
+    """Return True if SQLite found that the file is corrupted."""
     return _name(error).startswith(("SQLITE_CORRUPT", "SQLITE_TOOBIG")) or isinstance(error, sqlite3.DataError)
 
 
@@ -69,7 +69,7 @@ def free_bytes(file: Path) -> int:
 
 
 def disk_free(file: Path) -> int:
-    """Bytes that are free where the store is; StoreError when its directory is gone."""
+    """Return the free bytes on the store's disk. StoreError if its directory is gone."""
     try:
         return free_bytes(file)
     except OSError as error:
@@ -77,7 +77,7 @@ def disk_free(file: Path) -> int:
 
 
 def lock(file: Path) -> int:
-    """A lock on a file beside the store, which the process's end frees and which its children do not inherit."""
+    """Lock a file next to the store; the process's end releases the lock, and children do not inherit it."""
     lock_file = file.with_name(file.name + ".lock")
     try:
         descriptor = os.open(lock_file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)

@@ -1,18 +1,19 @@
-"""SQLite's write-ahead log: what was committed behind a damaged place, which SQLite drops without a word."""
+"""Read SQLite's write-ahead log, to detect commits after a damaged place, which SQLite drops silently."""
 
 from __future__ import annotations
 
 import struct
 from pathlib import Path
 
-# Of the file and of each frame: magic, version, page size, sequence, two salts, checksum; page, size, salts, checksum.
+# Header of the file and of each frame: magic, version, page size, sequence, two salts, checksum; page, size, salts,
+# checksum.
 _HEADER, _FRAME = struct.Struct(">6I8x"), struct.Struct(">4I8x")
 
 
 def commits(store: Path) -> list[bool]:
-    """Return for each frame of the log of a store whether it ended a transaction, up to the first of an older log.
+    """Return for each frame of a store's log whether it ended a transaction, up to the first frame of an older log.
 
-    A log that is not there, or whose header is damaged, has no frames.
+    A missing log, or one with a damaged header, has no frames.
     """
     found: list[bool] = []
     try:

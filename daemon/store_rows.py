@@ -1,4 +1,4 @@
-"""A pair as a row of the store: numbers as JSON, which gives each of them back exactly, and a checksum of the row."""
+"""Convert a pair to a row of the store and back: numbers as JSON, which preserves them exactly, and a row checksum."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import msgspec
 from bodyschema.interfaces.covariance import Upper, upper_triangle
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
 
-# The columns of each table that a checksum covers, in its order.
+# The columns of each table that the checksum covers, in its order.
 COLUMNS = {
     "pairs": "seq, session, segment, t, utc, q, x, cov, centres_px, R, cov_R",
     "devices": "id, session, from_seq, utc, record",
     "sessions": "id, started_utc, robot_toml, urdf, config, version, host",
 }
-# The angles of 60 joints take 1.5 kB. Longer texts were not written by a sampler, and are not decoded.
+# The angles of 60 joints take 1.5 kB. A longer text was not written by a sampler, and is not decoded.
 LARGEST_ANGLES_BYTES = 2**16
 
 _angles = msgspec.json.Decoder(list[float])
@@ -28,11 +28,11 @@ _packed = msgspec.msgpack.Encoder()
 
 
 class DamagedRow(ValueError):
-    """The disk gave back something else than was written."""
+    """The disk returned other data than was written."""
 
 
 class Checked(NamedTuple):
-    """What the check of a whole store needs of a pair."""
+    """The fields of a pair needed for checking a whole store."""
 
     seq: int
     session: int
@@ -40,7 +40,7 @@ class Checked(NamedTuple):
 
 
 def row_of(pair: Pair, session: int) -> tuple[Any, ...]:
-    """The values of the columns of `pairs`."""
+    """Return the values of the columns of `pairs`."""
     arrays = (as_json(pair.q.tolist()), as_json(pair.x.tolist()), as_json(upper_triangle(pair.cov)))
     centres = None if pair.centres_px is None else as_json(pair.centres_px)
     turn = None if pair.R is None else as_json(pair.R.tolist())
@@ -50,20 +50,21 @@ def row_of(pair: Pair, session: int) -> tuple[Any, ...]:
 
 
 def sealed(row: tuple[Any, ...]) -> tuple[Any, ...]:
-    """The row and its checksum."""
+    """Return the row with its checksum appended."""
     return *row, checksum(tuple(value.encode() if isinstance(value, str) else value for value in row))
 
 
 def checksum(row: tuple[Any, ...]) -> int:
-    """CRC-32 of a row whose texts are bytes.
+    """Return the CRC-32 of a row whose texts are bytes.
 
-    It finds each single flipped bit and each changed character for certain; a hash finds them with a probability.
+    It detects each single flipped bit and each changed character with certainty; a hash does so only with high
+    probability.
     """
     return zlib.crc32(_packed.encode(row))
 
 
 def require_sound(row: tuple[Any, ...]) -> None:
-    """Raise DamagedRow when the last value is not the checksum of the others, which are as SQLite has them."""
+    """Raise DamagedRow unless the last value is the checksum of the others, given as SQLite returns them."""
     if checksum(row[:-1]) != row[-1]:
         raise DamagedRow
 
@@ -72,7 +73,7 @@ def decoded(row: tuple[Any, ...], joints: int) -> tuple[Any, ...]:
     """Return the values of a row of `pairs` without its checksum, texts as bytes: numbers and lists of numbers.
 
     Raises:
-        DamagedRow: it is not a row that a sampler with so many joints writes.
+        DamagedRow: it is not a row that a sampler with `joints` joints writes.
     """
     seq, session, segment, t, utc, q, x, upper, centres, turn, cov_turn = row
     try:
@@ -111,7 +112,7 @@ def pair_of(store: str, row: tuple[Any, ...], joints: int) -> Pair:
 
 
 def checked(row: tuple[Any, ...], joints: int) -> Checked:
-    """As `pair_of` of a row that is sound by its checksum, at a fifth of the time.
+    """Decode a row whose checksum is sound, like `pair_of` but in a fifth of the time.
 
     Raises:
         DamagedRow: it has another number of joint angles.
@@ -126,7 +127,7 @@ def checked(row: tuple[Any, ...], joints: int) -> Checked:
 
 
 def as_json(numbers: object) -> str:
-    """Numbers, or what holds them, in a column."""
+    """Return numbers, or containers of numbers, as a column's JSON text."""
     return msgspec.json.encode(numbers).decode()
 
 

@@ -1,4 +1,4 @@
-"""The layout of a pair store: its tables, the migration of each older schema, and what a pair store has to be."""
+"""Layout of a pair store: its tables, the migration of each older schema, and the validity checks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .store_rows import COLUMNS, DamagedRow, checksum, decoded
 SCHEMA_VERSION = 5
 WITH_DEVICES, WITH_ORIENTATION, WITH_CHECKSUMS = 2, 3, 5
 CHECKSUM = "checksum"  # a column of each table, and a key of `meta`
-GIVEN_UP_TO = "given_up_to"  # a key of `meta`: pairs up to this number may have been given, and are lost
+GIVEN_UP_TO = "given_up_to"  # a key of `meta`: pairs up to this number may have been numbered, and are lost
 NUMBERS = ("seq", "id", "session", "segment", "t", "from_seq")  # columns that are not texts
 LONGEST_IDENTITY = 100  # characters; a UUID has 36
 LARGEST_VALUE_BYTES = 2**26  # of one row; URDF and robot.toml of a session are the largest
@@ -37,9 +37,9 @@ CREATE TABLE pairs (
     t REAL NOT NULL, utc TEXT NOT NULL, q TEXT NOT NULL, x TEXT NOT NULL, cov TEXT NOT NULL, centres_px TEXT
 );
 """
-# The statements that lead to each schema from the one before. Those of schema 2: what the joints were read with from
-# pair `from_seq` on. Of schema 3: how the marker is turned. Of schema 4 none: its oldest pairs may have been deleted,
-# which an older bodyschema takes for damage. Of schema 5: a checksum of each row.
+# The statements that migrate to each schema from the previous one. Schema 2: devices that read the joints from pair
+# `from_seq` on. Schema 3: the marker's orientation. Schema 4, no statements: the oldest pairs may have been deleted,
+# which an older bodyschema takes for damage. Schema 5: a checksum of each row.
 _MIGRATIONS = {
     2: """
 CREATE TABLE devices (
@@ -55,27 +55,27 @@ ALTER TABLE pairs ADD COLUMN checksum INTEGER;
 ALTER TABLE devices ADD COLUMN checksum INTEGER;
 ALTER TABLE sessions ADD COLUMN checksum INTEGER""",
 }
-# By table, the statement that inserts a sealed row. A row that has the number already was damaged: a store never gives
-# a number twice.
+# By table, the statement that inserts a sealed row. An existing row with that number was damaged, because a store never
+# assigns a number twice.
 INSERT = {
     table: f"INSERT OR REPLACE INTO {table} ({names}, {CHECKSUM}) VALUES ({'?, ' * len(names.split(', '))}?)"
     for table, names in COLUMNS.items()
 }
-# Pairs that cannot be read when an older store is brought to schema 5 get no checksum.
+# Unreadable pairs get no checksum when an older store is migrated to schema 5.
 _SEAL = "UPDATE {table} SET checksum = sealed_{table}({columns})"
 TABLES = ";".join([_TABLES, *_MIGRATIONS.values()]).split(";")
 
 
 def connect(file: Path, *, readonly: bool = False) -> sqlite3.Connection:
-    """Return a connection for any thread, without transactions of its own. Texts come as bytes.
+    """Return a connection for any thread, without implicit transactions. Texts are returned as bytes.
 
-    What the file itself defines (triggers, generated columns) may not call functions with side effects.
+    Objects defined in the file (triggers, generated columns) may not call functions with side effects.
     """
-    if file.exists() and not file.is_file():  # SQLite would wait for what a pipe never says
+    if file.exists() and not file.is_file():  # SQLite would block on a pipe
         raise StoreError(f"{file} is not a file. Move it away, or give another --state-dir. {NOTHING_CHANGED}")
     uri = f"{file.absolute().as_uri()}?mode={'ro' if readonly else 'rwc'}"
     connection = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
-    connection.text_factory = bytes  # a text that is not UTF-8 spoils its own row alone
+    connection.text_factory = bytes  # a text that is not UTF-8 then affects its own row only
     connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_VALUE_BYTES)
     connection.execute("PRAGMA trusted_schema = OFF")
     return connection
@@ -83,30 +83,30 @@ def connect(file: Path, *, readonly: bool = False) -> sqlite3.Connection:
 
 @contextmanager
 def told_while_working(connection: sqlite3.Connection, working: Callable[[], None]) -> Iterator[None]:
-    """Call `working` again and again while SQLite works on statements of this connection."""
+    """Call `working` repeatedly while SQLite runs statements on this connection."""
     connection.set_progress_handler(working, STEPS_UNTIL_TOLD)
     try:
         yield
     finally:
-        with contextlib.suppress(sqlite3.ProgrammingError):  # it is closed
+        with contextlib.suppress(sqlite3.ProgrammingError):  # the connection is closed
             connection.set_progress_handler(None, 0)
 
 
 @contextmanager
 def transaction(connection: sqlite3.Connection) -> Iterator[None]:
-    """All of it or nothing."""
+    """Run the statements atomically."""
     connection.execute("BEGIN IMMEDIATE")
     try:
         yield
         connection.execute("COMMIT")
     except BaseException:
-        with contextlib.suppress(sqlite3.Error):  # a full disk has rolled back already
+        with contextlib.suppress(sqlite3.Error):  # a full disk has already rolled back
             connection.execute("ROLLBACK")
         raise
 
 
 def check_kind(connection: sqlite3.Connection, file: Path) -> None:
-    """Raise StoreError when `file` is not a pair store, is one of a newer version, or has other tables."""
+    """Raise StoreError if `file` is not a pair store, has a newer version, or has other tables."""
     if connection.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID:
         raise StoreError(
             f"{file} is not a pair store but another SQLite file. Move it away, or give another --state-dir. "
@@ -129,13 +129,13 @@ def version(connection: sqlite3.Connection) -> int:
 
 
 def columns(schema: int) -> str:
-    """Return the columns of `pairs` and its checksum, as far as a store of this schema has them."""
+    """Return the columns of `pairs` and its checksum that exist in this schema."""
     have = _pair_columns(schema)
     return ", ".join(name if name in have else "NULL" for name in [*COLUMNS["pairs"].split(", "), CHECKSUM])
 
 
 def migrate(connection: sqlite3.Connection) -> None:
-    """Bring a store of an older version to this one in one transaction; its pairs stay as they are."""
+    """Migrate an older store to the present schema in one transaction; its pairs are unchanged."""
     found = version(connection)
     if found < SCHEMA_VERSION:
         with transaction(connection):
@@ -148,7 +148,7 @@ def migrate(connection: sqlite3.Connection) -> None:
 
 
 def trouble(connection: sqlite3.Connection) -> str | None:
-    """Return what is wrong with the pages of the file or with its identity; None when nothing is."""
+    """Return the problem with the file's pages or its identity; None if there is none."""
     try:
         found = connection.execute("PRAGMA quick_check(1)").fetchone()[0].decode(errors="replace")
         if found == "ok":
@@ -163,10 +163,10 @@ def trouble(connection: sqlite3.Connection) -> str | None:
 
 
 def meta(connection: sqlite3.Connection) -> dict[str, str]:
-    """Return what is said of the store as a whole: `store`, its identity, `joints` and more.
+    """Return the properties of the whole store: `store`, its identity, `joints` and more.
 
     Raises:
-        ValueError: the disk changed it, or a part is missing.
+        ValueError: the disk corrupted it, or a part is missing.
     """
     rows = connection.execute("SELECT key, value FROM meta LIMIT 100").fetchall()
     try:
@@ -182,12 +182,12 @@ def meta(connection: sqlite3.Connection) -> dict[str, str]:
 
 
 def new_meta(joints: Sequence[str], utc: str) -> dict[str, str]:
-    """Return what is said of a new store."""
+    """Return the properties of a new store."""
     return {"store": str(uuid.uuid4()), "created_utc": utc, "joints": msgspec.json.encode(joints).decode()}
 
 
 def joints_of(meta: dict[str, str]) -> tuple[str, ...]:
-    """Return the names in the order of q; ValueError when they are not names."""
+    """Return the names in the order of q. ValueError if they are not names."""
     try:
         joints = msgspec.json.decode(meta["joints"], type=tuple[str, ...])
     except msgspec.DecodeError as error:
@@ -198,7 +198,7 @@ def joints_of(meta: dict[str, str]) -> tuple[str, ...]:
 
 
 def given_up_to(meta: dict[str, str]) -> int:
-    """Return the largest number that a lost pair may have; 0 where none is lost. ValueError when it is not a number."""
+    """Return the largest possible number of a lost pair; 0 if none is lost. ValueError if it is not a number."""
     number = int(meta.get(GIVEN_UP_TO, "0"))
     if not 0 <= number < 2**62:
         raise ValueError
@@ -206,13 +206,13 @@ def given_up_to(meta: dict[str, str]) -> int:
 
 
 def write_meta(connection: sqlite3.Connection, contents: dict[str, str]) -> None:
-    """Say this of the store as a whole, inside a transaction."""
+    """Write these properties of the whole store, inside a transaction."""
     rows = {**contents, CHECKSUM: str(_checksum_of(contents))} if version(connection) >= WITH_CHECKSUMS else contents
     connection.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", rows.items())
 
 
 def create(connection: sqlite3.Connection, contents: dict[str, str]) -> None:
-    """Make the tables of an empty store."""
+    """Create the tables of an empty store."""
     with transaction(connection):
         for statement in TABLES:
             connection.execute(statement)
@@ -228,7 +228,7 @@ def _pair_columns(schema: int) -> list[str]:
 
 
 def _unlike(connection: sqlite3.Connection, schema: int) -> str | None:
-    """Return what a file has that a pair store of this schema cannot have, or lacks."""
+    """Return a difference between the file and a pair store of this schema; None if there is none."""
     sealed = [CHECKSUM] if schema >= WITH_CHECKSUMS else []
     expected = {"meta": ["key", "value"], "pairs": _pair_columns(schema)}
     others = ("sessions", "devices") if schema >= WITH_DEVICES else ("sessions",)
@@ -249,7 +249,7 @@ def _unlike(connection: sqlite3.Connection, schema: int) -> str | None:
 
 
 def _seal(connection: sqlite3.Connection) -> None:
-    """Give each row its checksum. A pair that cannot be read gets none."""
+    """Add its checksum to each row. An unreadable pair gets none."""
     contents = meta(connection)
     joints = len(joints_of(contents))
 
@@ -264,7 +264,7 @@ def _seal(connection: sqlite3.Connection) -> None:
     for table, function in functions.items():
         names = COLUMNS[table].split(", ")
         connection.create_function(f"sealed_{table}", len(names), function, deterministic=True)
-        # As bytes: a text that is not UTF-8 would end the statement.
+        # As bytes, because a text that is not UTF-8 would abort the statement.
         texts = [name if name in NUMBERS else f"CAST({name} AS BLOB)" for name in names]
         connection.execute(_SEAL.format(table=table, columns=", ".join(texts)))
     connection.execute("INSERT INTO meta VALUES (?, ?)", (CHECKSUM, str(_checksum_of(contents))))

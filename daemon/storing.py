@@ -1,4 +1,4 @@
-"""Pairs into the store, also over a disk that is full, read-only, failing or slow for a while."""
+"""Write pairs into the store despite a disk that is temporarily full, read-only, failing or slow."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from .store import PairStore
 
 log = logging.getLogger(__name__)
 
-# A disk that takes longer over a pair costs frames [s].
+# A disk that takes longer per pair costs frames [s].
 SLOW_S = 0.5
-# So long after a slow pair it is still told [s].
+# How long a slow write stays in the complaints [s].
 SLOW_TOLD_S = 60.0
 
 T = TypeVar("T")
 
 
 class Storing:
-    """Appends pairs to a store. A pair that the disk does not take is given up, and the next one is tried again."""
+    """Appends pairs to a store. A pair that cannot be written is dropped, and the next one is tried."""
 
     def __init__(self, store: PairStore, wall: Clock) -> None:
         self._store, self._wall = store, wall
@@ -33,7 +33,7 @@ class Storing:
 
     @property
     def complaints(self) -> list[str]:
-        """What is wrong with the disk now, in sentences."""
+        """Current problems with the disk, in sentences."""
         said: list[str] = []
         if self._refused is not None:
             said.append(f"{self._refused}. No pairs are taken until the disk does ({self._lost} frames so far)")
@@ -42,10 +42,10 @@ class Storing:
         return said
 
     def append(self, segment: int, q: FloatArray, fix: MarkerFix) -> Pair | None:
-        """The pair, committed; None when the disk did not take it.
+        """Return the committed pair; None if the disk did not accept it.
 
         Raises:
-            StoreError: the store is damaged, or no store any more.
+            StoreError: the store is damaged, or no longer a store.
         """
         pair = self.attempt(lambda: self._store.append(segment, self._wall.utc(), q, fix))
         if pair is not None and self._refused is not None:
@@ -54,7 +54,7 @@ class Storing:
         return pair
 
     def attempt(self, write: Callable[[], T]) -> T | None:
-        """What `write` gives; None when the disk did not take it.
+        """Return the result of `write`; None if the disk did not accept it.
 
         Raises:
             StoreError: as for `append`.

@@ -1,4 +1,4 @@
-"""Child processes that are started again when they die."""
+"""Restart child processes when they die."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ END_LIMIT_S = 10.0
 
 
 class Child:
-    """One process that ought to be running.
+    """A process that is kept running.
 
-    A process that refuses to start (it ends with an error code of its own before it ever ran for `SETTLED_AFTER_S`)
-    needs a person: that is an error. One that was killed, or ends later, is started again, with growing waits as long
-    as it does not settle.
+    If a process refuses to start (it ends with an error code of its own before ever running for `SETTLED_AFTER_S`), a
+    person is needed, and this is an error. A process that was killed, or ends later, is restarted, with growing waits
+    until it settles.
     """
 
     def __init__(self, name: str, command: Sequence[str]) -> None:
@@ -39,7 +39,7 @@ class Child:
         self._wait_s = FIRST_WAIT_S
 
     def tend(self) -> None:
-        """Start the process when it is not running and its time has come.
+        """Start the process if it is not running and its waiting time is over.
 
         Raises:
             BodyschemaError: it refused to start.
@@ -60,12 +60,12 @@ class Child:
             self._ended(code, now)
 
     def end(self) -> None:
-        """Ask the process to end."""
+        """Request the end of the process."""
         if self._process is not None:
             self._process.send_signal(signal.SIGTERM)
 
     def join(self, deadline: float) -> None:
-        """Wait for the process to end until `deadline` on the monotonic clock [s], then kill it."""
+        """Wait for the end of the process until `deadline` on the monotonic clock [s], then kill it."""
         if self._process is None:
             return
         try:
@@ -93,11 +93,11 @@ class Supervisor:
         self._stopping = False
 
     def stop(self) -> None:
-        """Let `run` come to its end. Only sets a flag: a signal handler may call it."""
+        """Request the end of `run`. Only sets a flag: a signal handler may call it."""
         self._stopping = True
 
     def run(self) -> None:
-        """Tend the children until `stop`.
+        """Keep the children running until `stop`.
 
         Raises:
             BodyschemaError: one of them refused to start; the others were ended.

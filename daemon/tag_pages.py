@@ -1,4 +1,4 @@
-"""Pages of tags, and the tables of robot.toml that belong to them."""
+"""Create pages of tags, and the matching tables of robot.toml."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _MOST_TAGS = 100
 
 @dataclass(frozen=True)
 class Tags:
-    """What is to be printed.
+    """The tags to print.
 
     Attributes:
         shape: single tags, or one body of them.
-        ids: numbers of the tags as in 0-5,9; None: from 0 on, as many as the shape has.
-        side_mm: of the black squares.
-        columns, rows, fold_deg: of a plate.
+        ids: numbers of the tags as in 0-5,9; None: as many as the shape has, from 0 on.
+        side_mm: side of the black squares.
+        columns, rows, fold_deg: columns, rows and fold angle [°] of a plate.
     """
 
     shape: ShapeName = "tags"
@@ -41,21 +41,21 @@ class Tags:
 
     @property
     def body(self) -> Shape | None:
-        """What is folded of them; None where they are cut apart."""
+        """The body to fold from the tags; None if they are cut apart."""
         if self.shape == "tags":
             return None
         return cube() if self.shape == "cube" else plate(self.columns, self.rows, self.fold_deg)
 
     @property
     def numbers(self) -> list[int]:
-        """The tags' numbers; ConfigError where they cannot be read, or one is there twice."""
+        """Numbers of the tags. ConfigError if they cannot be parsed, or one is repeated."""
         if self.ids is None:
             return list(range(1 if self.body is None else len(self.body.faces)))
         return numbers_of(self.ids)
 
 
 def numbers_of(ids: str) -> list[int]:
-    """Tags' numbers as in 0-5,9; ConfigError where they cannot be read, or one is there twice."""
+    """Parse tag numbers as in 0-5,9. ConfigError if they cannot be parsed, or one is repeated."""
     found: list[int] = []
     for part in ids.split(","):
         run = _RUN.fullmatch(part.strip())
@@ -70,7 +70,7 @@ def numbers_of(ids: str) -> list[int]:
 
 
 def write_tags(tags: Tags, paper: str, out: Path) -> tuple[float, float]:
-    """Write the page as PDF or SVG; the lengths of its rulers, across and upright [mm].
+    """Write the page as PDF or SVG; return the lengths of its horizontal and vertical rulers [mm].
 
     Raises:
         ConfigError: there are no such tags, they do not fit, or the file cannot be written.
@@ -85,12 +85,12 @@ def write_tags(tags: Tags, paper: str, out: Path) -> tuple[float, float]:
 
 
 def face_mm(tags: Tags) -> float:
-    """Width of a face, from cut or fold to cut or fold [mm]."""
+    """Return the width of a face between cuts or folds [mm]."""
     return FACE_SIDES * tags.side_mm
 
 
 def tables(tags: Tags) -> str:
-    """The tables of robot.toml, for the shape as drawn; of single tags those of the first one."""
+    """Return the tables of robot.toml for the nominal shape; for single tags those of the first one."""
     body, side_m = tags.body, 1e-3 * tags.side_mm
     if body is None:
         return tag_tables(tags.dictionary, side_m, tags.numbers[0])
@@ -98,7 +98,10 @@ def tables(tags: Tags) -> str:
 
 
 def as_printed(tags: Tags, drawn_mm: float, measured_mm: float) -> Tags:
-    """The tags in the size in which a ruler of `drawn_mm` measures `measured_mm`; ConfigError for another line."""
+    """Scale the tags to the size at which the ruler of `drawn_mm` measures `measured_mm`.
+
+    ConfigError for another line.
+    """
     scale = measured_mm / drawn_mm
     if not 0.5 < scale < 2.0:
         raise ConfigError(

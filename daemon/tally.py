@@ -1,4 +1,4 @@
-"""What the sampler has counted: frames, readings, pairs, rejections by reason, rates, and coverage of the joints."""
+"""Count the sampler's frames, readings, pairs, rejections by reason, rates, and joint coverage."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from bodyschema.interfaces.robot import RobotDescription
 
 from .status import JointRange
 
-# Rates are taken over at least this long, so that single frames do not make them jump.
+# Rates are averaged over at least this long, so that single frames do not make them jump.
 RATE_WINDOW_S = 1.0
-# Of the newest frames, 10 s of a usual camera, nearly all have to be refused to be complained of; of the first, fewer.
+# A complaint needs nearly all of the newest frames (10 s of a usual camera; fewer at the start) to be refused.
 NEWEST_FRAMES, FEWEST_FRAMES, NEARLY_ALL = 300, 30, 0.9
-# An arm that stands still, or that an operator paused, is in order. The others have complaints of their own.
+# An arm at rest, or paused by an operator, is in order. The other reasons have complaints of their own.
 _NO_COMPLAINT = frozenset({Reason.TOO_NEAR, Reason.PAUSED, Reason.NOT_STORED, Reason.NOT_BORNE})
 
 
@@ -30,15 +30,15 @@ class Tally:
     def __init__(
         self, robot: RobotDescription, wall: Clock, covered: tuple[FloatArray, FloatArray] | None = None
     ) -> None:
-        """All at zero.
+        """Start all counters at zero.
 
         Args:
-            wall: the clock for rates.
-            covered: smallest and largest joint angles of the pairs that are there already.
+            wall: clock for rates.
+            covered: smallest and largest joint angles of the existing pairs.
         """
         self._robot, self._wall = robot, wall
         self._covered = covered
-        # Every reason is there from the start, because a dict must not grow while another thread copies it.
+        # All reasons exist from the start, because a dict must not grow while another thread copies it.
         self._rejected = dict.fromkeys(Reason, 0)
         self._newest: deque[Reason | None] = deque(maxlen=NEWEST_FRAMES)
         self.readings = self.frames = self.pairs = 0
@@ -58,7 +58,7 @@ class Tally:
 
     @property
     def coverage(self) -> dict[str, JointRange]:
-        """By joint; empty before the first pair."""
+        """Covered ranges by joint; empty before the first pair."""
         covered, robot = self._covered, self._robot
         if covered is None:
             return {}
@@ -70,7 +70,7 @@ class Tally:
 
     @property
     def complaints(self) -> list[str]:
-        """That nearly no frame becomes a pair, mostly why, and what to do; nothing where that is not so."""
+        """Complaint with main reason and remedy if nearly no frame becomes a pair; otherwise empty."""
         newest = tuple(self._newest)
         refused = Counter(reason for reason in newest if reason is not None)
         if len(newest) < FEWEST_FRAMES or refused.total() < NEARLY_ALL * len(newest):
@@ -92,7 +92,7 @@ class Tally:
         self._covered = (q.clip(max=low), q.clip(min=high))
 
     def tick(self) -> None:
-        """Renew the rates when a window is over."""
+        """Update the rates at the end of a window."""
         now = self._wall.now()
         passed = now - self._window_start
         if passed < RATE_WINDOW_S:

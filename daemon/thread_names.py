@@ -1,4 +1,4 @@
-"""What the system's tools call a thread."""
+"""Set thread names for the system's tools."""
 
 from __future__ import annotations
 
@@ -8,6 +8,6 @@ from pathlib import Path
 
 
 def show_name() -> None:
-    """Let `top -H` and `ps -L` call this thread by the beginning of its Python name, where the system can."""
+    """Show the beginning of this thread's Python name in `top -H` and `ps -L`, where the system supports it."""
     with contextlib.suppress(OSError):
         Path(f"/proc/self/task/{threading.get_native_id()}/comm").write_text(threading.current_thread().name[:15])

@@ -1,4 +1,4 @@
-"""Whether the tool was changed in the course of a recording, as its residuals tell."""
+"""Detect from residuals if the tool was changed during a recording."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from bodyschema.interfaces.recording import Recording
 from bodyschema.interfaces.records import FloatArray
 from kbmaps import ChainBelief, ChainParameters, RigidLearner
 
-# On either side of a change there have to be so many pairs, and it has to explain so much of all residuals.
+# Minimum number of pairs on either side of a change, and the share of all squared residuals that it must explain.
 FEWEST = 6
 EXPLAINED = 0.5
-# Residuals beyond so many times the middle one count less: single outliers are no change.
+# Residuals beyond this multiple of the median get less weight, so that single outliers are no change.
 FAR = 5.0
-# Keeps splits apart from which nothing can be told, e.g. of poses that are all alike.
+# Excludes splits that the data cannot determine, e.g. where all poses are alike.
 _RIDGE = 1e-9
 
 
@@ -25,7 +25,7 @@ class ToolJump:
 
     Attributes:
         row: the first row with the other tool, counted from 1.
-        distance_m: how far apart the two tools hold the marker.
+        distance_m: distance between the marker positions of the two tools.
     """
 
     row: int
@@ -33,14 +33,14 @@ class ToolJump:
 
 
 def tool_jump(learner: RigidLearner, recording: Recording) -> ToolJump | None:
-    """The row from which on the marker sits elsewhere on the hand; None where the recording seems to be of one tool.
+    """Return the first row at which the marker has another place on the hand; None if there seems to be one tool.
 
-    Two places of the marker in the place of one (a change point, Page 1955), with all else that may be wrong about the
-    chain fitted along with them, to first order. The chain is distorted by having been fitted to both, so the distance
-    is about right, and the row nearly.
+    This is a change point test (Page 1955): two marker positions instead of one, with all other chain parameters fitted
+    along, to first order. The chain was fitted to both tools and is therefore distorted, so distance and row are
+    approximate.
 
     Args:
-        learner: of all pairs in the recording.
+        learner: fitted to all pairs in the recording.
     """
     if len(recording) < 2 * FEWEST:
         return None
@@ -53,8 +53,10 @@ def tool_jump(learner: RigidLearner, recording: Recording) -> ToolJump | None:
 
 
 def _splits(learner: RigidLearner, recording: Recording) -> tuple[FloatArray, FloatArray]:
-    """Share of the residuals' squares that another tool after each row but the last explains (n - 1,), and how far it
-    is from the first tool (n - 1, 3) [m]."""
+    """Return the share of squared residuals (n - 1,) explained by a tool change after each row but the last.
+
+    Also return the displacement of the marker by that change (n - 1, 3) [m].
+    """
     parameters = ChainParameters(learner.nominal)
     x, jacobian = parameters.linearised(learner.change, recording.q)
     residuals, tools = recording.x - x, jacobian[:, :, parameters.tool]
@@ -66,7 +68,7 @@ def _splits(learner: RigidLearner, recording: Recording) -> tuple[FloatArray, Fl
     target = (roots * residuals).ravel()
     target = (target - basis @ (basis.T @ target)).reshape(residuals.shape)
     columns = roots[:, :, None] * tools
-    # Sums over all rows after each split, of what is left of the columns once all else has been fitted.
+    # Sums over all rows after each split, of the part of the columns that the other parameters do not explain.
     in_basis = _after(np.einsum("nip,nij->npj", basis.reshape(*residuals.shape, -1), columns))
     square = _after(columns.swapaxes(1, 2) @ columns) - in_basis.swapaxes(1, 2) @ in_basis
     product = _after(np.einsum("nij,ni->nj", columns, target))
@@ -75,12 +77,12 @@ def _splits(learner: RigidLearner, recording: Recording) -> tuple[FloatArray, Fl
 
 
 def _weights(residuals: FloatArray) -> FloatArray:
-    """Square roots of the weights (n,) of residuals (n, 3)."""
+    """Return square roots of the weights (n,) of residuals (n, 3)."""
     squares = np.square(residuals).sum(axis=1)
     far = FAR**2 * max(float(np.median(squares)), np.finfo(float).tiny)
     return np.sqrt(far / (far + squares))
 
 
 def _after(values: FloatArray) -> FloatArray:
-    """Sums of all values (n, ...) after each but the last: (n - 1, ...)."""
+    """Return the sums of all values (n, ...) after each but the last: (n - 1, ...)."""
     return np.cumsum(values[::-1], axis=0)[::-1][1:]

@@ -1,4 +1,4 @@
-"""The udev rules for the serial ports of servos and encoders."""
+"""Install udev rules for the serial ports of servos and encoders."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from bodyschema.interfaces.errors import ConfigError
 
 FILE = Path("etc/udev/rules.d/60-bodyschema.rules")
 ROOT = Path("/")
-# Vendor and product of USB adapters that servos come with, and of boards that read encoders. docs/hardware.md says by
-# what each was confirmed.
+# Vendor and product of USB adapters for servos, and of boards that read encoders. docs/hardware.md cites the source of
+# each.
 ADAPTERS = (
     ("0403", "6014", "FTDI FT232H: U2D2"),
     ("0403", "6001", "FTDI FT232R: USB2Dynamixel and many others"),
@@ -38,7 +38,7 @@ Run = Callable[[Sequence[str]], None]
 
 
 def rules() -> str:
-    """The text of the rules file."""
+    """Return the text of the rules file."""
     lines = ["# Written by `bodyschema install udev`; `bodyschema install udev --uninstall` removes it.", "", _LATENCY]
     lines.append(
         "# Whoever sits at the machine, and the group dialout, may open them; modem managers leave them alone."
@@ -53,7 +53,7 @@ def rules() -> str:
 
 
 def run_quietly(command: Sequence[str]) -> None:
-    """Run it; what it says of a machine without udev is of no use."""
+    """Run the command; on a machine without udev its output is useless."""
     if shutil.which(command[0]) is not None:
         subprocess.run(command, capture_output=True, check=False, timeout=10)
 
@@ -63,8 +63,8 @@ class Rules:
     """The rules file of a machine.
 
     Attributes:
-        root: of its file system.
-        run: runs a command; only where `root` is this machine's.
+        root: root of its file system.
+        run: runs a command; only if `root` is this machine's.
     """
 
     root: Path = ROOT
@@ -77,11 +77,11 @@ class Rules:
 
     @property
     def is_current(self) -> bool:
-        """Whether the file is there as it should be."""
+        """True if the file exists and is up to date."""
         return self.file.exists() and self.file.read_text(encoding="utf-8") == rules()
 
     def install(self) -> None:
-        """Write the file, and let udev take it in.
+        """Write the file, and let udev reload it.
 
         Raises:
             ConfigError: the file cannot be written.
@@ -94,10 +94,10 @@ class Rules:
         self._reload()
 
     def uninstall(self) -> bool:
-        """Remove the file; False when there was none.
+        """Remove the file; return False if there was none.
 
         Raises:
-            ConfigError: it cannot be removed.
+            ConfigError: the file cannot be removed.
         """
         try:
             self.file.unlink()

@@ -1,4 +1,4 @@
-"""The units of sampler, learner and router for systemd: of the first two a template each, and what is a robot's own."""
+"""Systemd units of sampler, learner and router: templates of the first two, and each robot's own settings."""
 
 from __future__ import annotations
 
@@ -25,17 +25,18 @@ if TYPE_CHECKING:
 PROCESSES = ("sampler", "learner")
 FOLDER = Path("etc/systemd/system")
 OWN = "robot.conf"
-# Begins the drop-in of a learner of several robots; their names follow.
+# First words of the drop-in of a learner of several robots; their names follow.
 LEARNER_OF = "# The learner of the robots"
 ROUTER = "bodyschema-router.service"
-# Beginnings of what `ProtectHome=tmpfs` and `PrivateTmp=yes` hide.
+# Path prefixes that `ProtectHome=tmpfs` and `PrivateTmp=yes` hide.
 HIDDEN = tuple(Path(path) for path in ("/home", "/root", "/run/user", "/tmp", "/var/tmp"))
 EVERY_ADDRESS = "IPAddressAllow=any"
-# Versions of systemd from which on a service that fails again and again is started less and less often.
+# systemd versions that can restart a repeatedly failing service at growing intervals.
 WITH_RESTART_STEPS = 254
 
 # zenoh asks the kernel for the machine's interfaces (netlink) and places its memory (mbind); the learner's background
-# work makes itself nicer (setpriority). No RemoveIPC: it would take the other unit's shared memory, of the same user.
+# work lowers its priority (setpriority). No RemoveIPC: it would remove the other unit's shared memory, of the same
+# user.
 _SANDBOX = """\
 UMask=0027
 NoNewPrivileges=yes
@@ -124,9 +125,10 @@ IPAddressAllow=localhost
 [Install]
 WantedBy=multi-user.target
 """
-# Longer than any loop's slowest round: the learner's background work took 6 s with twelve joints on a busy machine.
+# Longer than the slowest round of any loop: the learner's background work took 6 s with twelve joints on a busy
+# machine.
 _WATCHDOG_S = {"sampler": 30, "learner": 60}
-# A learner of 50 robots takes 16 MB for each.
+# A learner of 50 robots takes 16 MB for each robot.
 _MEMORY_MIB, _MORE_MIB = 2048, 64
 _READY = {
     "sampler": "encoders and cameras are read, the store is open and zenoh answers",
@@ -145,11 +147,11 @@ PrivateUsers=yes""",
 
 @dataclass(frozen=True, slots=True)
 class Installed:
-    """The bodyschema that the units start.
+    """The bodyschema installation that the units start.
 
     Attributes:
-        command: how it is called.
-        folders: what it is made of.
+        command: path of the command.
+        folders: folders of the installation.
         systemd: version of the machine's systemd.
     """
 
@@ -159,13 +161,13 @@ class Installed:
 
     @classmethod
     def here(cls, systemd: int) -> Installed:
-        """The one that runs."""
+        """Return the running installation."""
         folders = (Path(sys.prefix), Path(sys.base_prefix), Path(__file__).parents[2])
         return cls(module_command("bodyschema"), folders, systemd)
 
 
 def template(process: str, installed: Installed) -> str:
-    """The unit `bodyschema-<process>@.service`."""
+    """Return the unit `bodyschema-<process>@.service`."""
     return _UNIT.format(
         process=process,
         own=OWN,
@@ -180,7 +182,7 @@ def template(process: str, installed: Installed) -> str:
 
 
 def of_robot(process: str, config: Config, user: str, installed: Installed) -> str:
-    """What `bodyschema-<process>@<robot>.service.d/robot.conf` says: whose it is, and what it may see and use."""
+    """Return `bodyschema-<process>@<robot>.service.d/robot.conf`: user, readable files and devices."""
     lines = [f"# {config.robot.name}, as {config.file.absolute()} described it.", "[Service]", f"User={user}"]
     lines.append(f"Environment={_quoted(f'BODYSCHEMA_ROBOT={config.file.absolute()}')}")
     lines += _seen([config], installed)
@@ -192,7 +194,7 @@ def of_robot(process: str, config: Config, user: str, installed: Installed) -> s
 
 
 def of_host(configs: Sequence[Config], user: str, installed: Installed) -> str:
-    """What `bodyschema-learner@<name>.service.d/robot.conf` says where one learner serves several robots."""
+    """Return `bodyschema-learner@<name>.service.d/robot.conf` for one learner of several robots."""
     named = [word for config in configs for word in ("--robot", config.file.absolute())]
     names = " ".join(config.robot.name for config in configs)
     kept = " ".join(f"bodyschema/{config.robot.name}" for config in configs if config.tables.daemon.state_dir is None)
@@ -213,7 +215,7 @@ def of_host(configs: Sequence[Config], user: str, installed: Installed) -> str:
 
 
 def of_router(config: RouterConfig, user: str, installed: Installed) -> str:
-    """The unit `bodyschema-router.service`."""
+    """Return the unit `bodyschema-router.service`."""
     file = config.file.absolute()
     seen = hidden([*installed.folders, file.parent, *(path.parent for path in config.identity.files)])
     return _ROUTER.format(
@@ -226,7 +228,7 @@ def of_router(config: RouterConfig, user: str, installed: Installed) -> str:
 
 
 def devices_of(config: Config) -> list[str]:
-    """The ports and cameras that robot.toml names, each once, and what drivers and trackers of other packages open."""
+    """Return the ports and cameras that robot.toml names, each once, and those of plug-in drivers and trackers."""
     cameras = config.tables.vision.cameras
     named = [*configured_ports(config).values(), *({} if cameras is None else cameras.devices).values()]
     named += [device for plugin in _plugins(config) for device in plugin.devices]
@@ -239,14 +241,14 @@ def _plugins(config: Config) -> list[PluginConfig]:
 
 
 def endpoints_of(config: Config) -> list[str]:
-    """Where the two processes listen or connect to."""
+    """Return the endpoints that the two processes listen on or connect to."""
     zenoh, ros2 = config.tables.zenoh, config.tables.drivers.ros2
     routers = [zenoh.router, "" if ros2 is None else ros2.router]
     return [zenoh.sampler, zenoh.learner, *(router for router in routers if router)]
 
 
 def folders_of(config: Config) -> list[Path]:
-    """The folders of robot.toml and of the files that it names."""
+    """Return the folders of robot.toml and of the files that it names."""
     tables, home = config.tables, config.file.absolute().parent
     cameras, unexplained = tables.vision.cameras, tables.unexplained
     named = [
@@ -260,14 +262,14 @@ def folders_of(config: Config) -> list[Path]:
 
 
 def hidden(folders: Iterable[Path]) -> list[Path]:
-    """Those of `folders` that a service does not see unless it is told to, without those inside others."""
+    """Return those of `folders` that a service sees only by an explicit rule, without those inside others."""
     found = sorted({Path(os.path.abspath(folder)) for folder in folders})
     seen = [folder for folder in found if any(folder.is_relative_to(hiding) for hiding in HIDDEN)]
     return [folder for folder in seen if not any(folder.is_relative_to(other) for other in seen if other != folder)]
 
 
 def _seen(configs: Sequence[Config], installed: Installed) -> list[str]:
-    """What a service of these robots may read, write and reach beyond what all may."""
+    """Return the lines for files and network that a service of these robots needs beyond the template."""
     folders = [*installed.folders, *(folder for config in configs for folder in folders_of(config))]
     lines = [f"BindReadOnlyPaths={_bound(path)}" for path in hidden(folders)]
     states = [config.state_dir for config in configs if config.tables.daemon.state_dir is not None]
@@ -279,12 +281,12 @@ def _seen(configs: Sequence[Config], installed: Installed) -> list[str]:
 
 
 def _bound(path: Path) -> str:
-    """Return the path as optional: where it is missing, the process names it; systemd would say 226/NAMESPACE."""
+    """Return the path as optional: if it is missing, the process reports it; systemd would say 226/NAMESPACE."""
     return _quoted(f"-{path}")
 
 
 def _kept_running(installed: Installed) -> str:
-    """What is done with a process that hangs, or that ended."""
+    """Return the settings for restarting a process that hung or ended."""
     steps = ["RestartSec=5"]
     if installed.systemd >= WITH_RESTART_STEPS:
         steps = ["RestartSec=1", "RestartSteps=6", "RestartMaxDelaySec=60"]
@@ -293,15 +295,15 @@ def _kept_running(installed: Installed) -> str:
 
 
 def _command(words: Iterable[object]) -> str:
-    """Return a command line for systemd.service(5), in which a dollar sign begins a variable."""
+    """Return a command line for systemd.service(5), where a dollar sign starts a variable."""
     return " ".join(_quoted(str(word).replace("$", "$$")) for word in words)
 
 
 def _quoted(word: object) -> str:
-    """A word of a unit file, as systemd.syntax(7) wants it: a percent sign begins a specifier, a colon another path.
+    """Quote a word for a unit file by systemd.syntax(7): a percent sign starts a specifier, a colon another path.
 
     Raises:
-        ConfigError: it has a character that ends a line, or that no text has.
+        ConfigError: it has a character that ends a line, or is not valid in text.
     """
     text = str(word).replace("%", "%%")
     if not text.isprintable():

@@ -1,4 +1,4 @@
-"""Why a process could not be reached, and what to do."""
+"""Explain why a process could not be reached, and what to do."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ ACCEPT_LIMIT_S = 1.0
 
 
 def unreached(route: Route) -> str:
-    """Why none of a route's endpoints could be reached."""
+    """Return the reason why none of a route's endpoints could be reached."""
     last = route.endpoints[-1]
     if not _accepts(last):
         return (
@@ -29,7 +29,7 @@ def unreached(route: Route) -> str:
 
 
 def _accepts(endpoint: str) -> bool:
-    """Whether a connection to a TCP endpoint is taken, be it by a process that never answers."""
+    """Return True if a TCP endpoint accepts connections, even from a process that never answers."""
     protocol, _, address = endpoint.partition("/")
     host, _, port = address.rpartition(":")
     if protocol not in ("tcp", "tls") or not port.isdigit():

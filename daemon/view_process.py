@@ -1,4 +1,4 @@
-"""The page as a process beside those that work."""
+"""Run the page as a separate process."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ PORT = 8420
 
 @contextmanager
 def shown(robot_file: Path, port: int = PORT) -> Iterator[subprocess.Popen[bytes]]:
-    """The page beside this process, from here to the end of the with statement.
+    """Run the page as a separate process until the end of the with statement.
 
-    What becomes of the page is no matter of life for whoever is shown: a port that is taken is a line in the log.
+    The page is not essential: a port that is taken is only logged.
     """
     command = module_command("bodyschema", "view", "--robot", str(robot_file), "--port", str(port))
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, env=os.environ | with_parent(), process_group=0)

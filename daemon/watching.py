@@ -1,4 +1,4 @@
-"""Looking on: pictures of cameras, each encoded and handed on."""
+"""Watch cameras: encode each picture and pass it on."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Pictures(Source, Protocol):
 
 
 class Watching:
-    """Reads pictures until it is told to stop, there are no more, or enough were shown."""
+    """Reads pictures until a stop is requested, there are no more, or enough were shown."""
 
     def __init__(
         self,
@@ -38,12 +38,12 @@ class Watching:
         count: int | None = None,
         clock: Clock | None = None,
     ) -> None:
-        """Nothing was read yet; `pictures` are opened by whoever calls `step`.
+        """Store the settings; the caller of `step` opens `pictures`.
 
         Args:
-            show: given each picture as JPEG.
-            every_s: no two nearer together [s].
-            count: of pictures that are shown.
+            show: called with each picture as JPEG.
+            every_s: minimum interval between pictures [s].
+            count: number of pictures to show.
         """
         self._pictures, self._show, self._every_s = pictures, show, every_s
         self._clock = SystemClock() if clock is None else clock
@@ -53,7 +53,7 @@ class Watching:
 
     @classmethod
     def into(cls, folder: Path, pictures: Pictures, *, every_s: float, count: int | None) -> Self:
-        """Pictures into files 000001.jpg and so on; ConfigError where the folder cannot be made."""
+        """Write pictures into files 000001.jpg and so on. ConfigError if the folder cannot be created."""
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -67,11 +67,11 @@ class Watching:
         )
 
     def stop(self) -> None:
-        """Let `step` say that it is over. Only sets a flag."""
+        """Request that `step` ends. Only sets a flag."""
         self._stopping = True
 
     def step(self, timeout_s: float) -> bool:
-        """Show the next picture, if one comes in time; False when there will be no more."""
+        """Show the next picture, if one arrives in time; return False if there will be no more."""
         if self._stopping or self._left <= 0:
             return False
         try:
@@ -87,7 +87,7 @@ class Watching:
 
     @property
     def said(self) -> str:
-        """In how many frames the marker was found, and why not in the others."""
+        """Share of frames in which the marker was found, and the reasons in the others."""
         return self._pictures.said
 
 

@@ -1,6 +1,6 @@
-"""What goes over zenoh: JSON, or MessagePack when the request asks for it. Every message carries a schema number.
+"""Messages over zenoh: JSON, or MessagePack when the request asks for it. Every message has a schema number.
 
-Requests are checked for unknown keys; replies and publications may grow keys, so readers ignore what they do not know.
+Requests are checked for unknown keys. Replies and publications may gain keys, so readers ignore unknown ones.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class PairMessage(msgspec.Struct, frozen=True):
 
 
 class PairsReply(msgspec.Struct, frozen=True):
-    """Stored pairs in order. `last_seq` is the newest pair in the store: ask again from where the reply ends."""
+    """Stored pairs in order. `last_seq` is the newest pair in the store; continue from where the reply ends."""
 
     store: str
     last_seq: int
@@ -73,13 +73,13 @@ class PredictReply(msgspec.Struct, frozen=True):
     Attributes:
         x: marker positions in the measurement frame [m].
         sigma: their 1-sigma per axis [m].
-        in_support: whether the joint angles lie where data was.
-        model: hash of the model that answered.
-        pairs: how many pairs it had learnt.
-        age_s: how old the last of them is: the time from it to the newest pair that is known to be stored, plus the
-            time since the learner heard of that one; null before any since the learner started.
-        R: orientations of the marker in the measurement frame, unit quaternions x, y, z, w; null where none is learnt.
-        sigma_R: their 1-sigma, of a small turn about each axis of the measurement frame [rad]; null with R.
+        in_support: True where the joint angles lie within the support of the data.
+        model: hash of the answering model.
+        pairs: number of pairs it had learnt.
+        age_s: age of the newest of them: the time from it to the newest pair known to be stored, plus the time since
+            the learner heard of that one; null before any since the learner started.
+        R: orientations of the marker in the measurement frame, unit quaternions x, y, z, w; null if none is learnt.
+        sigma_R: their 1-sigma, of a small rotation about each axis of the measurement frame [rad]; null with R.
     """
 
     x: list[list[float]]
@@ -103,12 +103,12 @@ class JacobianReply(msgspec.Struct, frozen=True):
 
 
 class IkRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Where the marker is wanted.
+    """The requested marker position.
 
     Attributes:
         x: in the measurement frame [m].
-        start: joint angles of the arm as it is now [rad]: the answer is near to them where it can be.
-        posture: joint angles to stay near to as far as x leaves a choice [rad], or "middle" of the joint limits.
+        start: current joint angles of the arm [rad]; the answer is close to them if possible.
+        posture: joint angles to stay close to where x leaves a choice [rad], or "middle" of the joint limits.
     """
 
     x: tuple[float, float, float]
@@ -117,18 +117,18 @@ class IkRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class IkReply(msgspec.Struct, frozen=True):
-    """Joint angles within the limits, and what is missing.
+    """Joint angles within the limits, and the remaining distance.
 
     Attributes:
         q: joint angles [rad].
-        x: where the model puts the marker there [m].
-        distance: from x to what was asked for [m].
-        converged: whether that is nothing, to the solver's tolerance.
+        x: position of the marker there, by the model [m].
+        distance: from x to the requested position [m].
+        converged: True if it is zero, to the solver's tolerance.
         reason: `reached`, `out_of_reach` or `steps_ran_out`.
-        sigma: 1-sigma per axis of x against the truth [m].
-        in_support: whether q lies where data was.
-        model: hash of the model that answered.
-        pairs: how many pairs it had learnt.
+        sigma: 1-sigma per axis of x relative to the ground truth [m].
+        in_support: True if q lies within the support of the data.
+        model: hash of the answering model.
+        pairs: number of pairs it had learnt.
     """
 
     q: list[float]
@@ -144,13 +144,13 @@ class IkReply(msgspec.Struct, frozen=True):
 
 
 class CommandRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A command to one of the processes; which it knows is in its documentation."""
+    """A command to one of the processes; each documents its commands."""
 
     command: CommandName
 
 
 class CommandReply(msgspec.Struct, frozen=True):
-    """The command was carried out; `message` says what that meant."""
+    """Confirmation of a command; `message` describes the result."""
 
     command: str
     message: str
@@ -158,22 +158,22 @@ class CommandReply(msgspec.Struct, frozen=True):
 
 
 class ErrorReply(msgspec.Struct, frozen=True):
-    """What was wrong with a request; nothing was changed."""
+    """Error in a request; nothing was changed."""
 
     error: str
     schema: int = SCHEMA
 
 
 def encode(message: object, encoding: str = JSON) -> bytes:
-    """A message's bytes in `encoding`."""
+    """Return a message's bytes in `encoding`."""
     return _msgpack_encoder.encode(message) if encoding == MSGPACK else _json_encoder.encode(message)
 
 
 def decode(payload: bytes, kind: type[M], encoding: str = JSON) -> M:
-    """The message in `payload`.
+    """Return the message in `payload`.
 
     Raises:
-        RequestError: it is not of this kind; the message says where.
+        RequestError: it is not of this type; the message says where.
     """
     try:
         decoder: Any = msgspec.msgpack if encoding == MSGPACK else msgspec.json
@@ -183,7 +183,7 @@ def decode(payload: bytes, kind: type[M], encoding: str = JSON) -> M:
 
 
 def pair_to_wire(pair: Pair) -> PairMessage:
-    """A pair as its message."""
+    """Return a pair as its message."""
     x, y, z = pair.x.tolist()
     return PairMessage(
         store=pair.store,
@@ -200,10 +200,10 @@ def pair_to_wire(pair: Pair) -> PairMessage:
 
 
 def pair_from_wire(message: PairMessage, joints: int) -> Pair:
-    """A message as a pair.
+    """Return a message as a pair.
 
     Raises:
-        RequestError: it has another number of joints, a number that is not finite, or a quaternion that is none.
+        RequestError: it has another number of joints, a non-finite number, or an invalid quaternion.
     """
     q = np.array(message.q)
     numbers = np.concatenate([q, message.x, message.cov, [message.t], message.R or (), message.cov_R or ()])
@@ -233,10 +233,10 @@ def _four(turn: FloatArray) -> tuple[float, float, float, float]:
 
 
 def position(name: str, values: Sequence[float]) -> FloatArray:
-    """Return a position asked for, shape (3,) [m].
+    """Return a requested position, shape (3,) [m].
 
     Raises:
-        RequestError: a number is not finite, or so large that it is not in metres.
+        RequestError: a number is not finite, or too large to be in metres.
     """
     x = np.array(values, dtype=np.float64)
     if not np.isfinite(x).all():
@@ -253,7 +253,7 @@ def joint_vector(name: str, values: Sequence[float], joints: tuple[str, ...]) ->
     """Return one number for each joint, shape (d,) [rad].
 
     Raises:
-        RequestError: too many or too few, or one that no joint has.
+        RequestError: the count is wrong, or a value is impossible for its joint.
     """
     if len(values) != len(joints):
         raise RequestError(
@@ -268,7 +268,7 @@ def joint_angles(request: JointsRequest, joints: tuple[str, ...]) -> FloatArray:
     """Return the request's joint angles, shape (n, d) [rad].
 
     Raises:
-        RequestError: a row of the wrong length, a number that no joint has, an empty or too large batch.
+        RequestError: a row has the wrong length, a value is impossible for a joint, or the batch is empty or too large.
     """
     if not request.q:
         raise RequestError("q is empty; send one vector of joint angles or a list of them")

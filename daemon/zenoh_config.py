@@ -1,4 +1,4 @@
-"""The table [zenoh] of robot.toml: where the processes are, and who may reach them."""
+"""The table [zenoh] of robot.toml: endpoints of the processes, and access to them."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ class ZenohConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The table [zenoh].
 
     Attributes:
-        sampler, learner: where the two processes listen. Beyond this machine only with `tls` and `access`.
-        router: where machines meet: both processes connect to it too, and whoever does not find them here asks there;
-            empty where there is none.
-        tls: certificates; needed for every endpoint that is not on this machine.
+        sampler, learner: endpoints of the two processes. Beyond this machine only with `tls` and `access`.
+        router: endpoint where machines meet: both processes connect to it too, and clients that do not find them on
+            this machine ask there; empty if there is none.
+        tls: certificates; required for every endpoint beyond this machine.
         login: name and password for a router or a process that asks for them.
-        users_file: lines `user:password` of those who may connect to the processes, in the place of certificates.
-        access: who may do what at the processes, where they listen beyond this machine.
+        users_file: lines `user:password` of users who may connect to the processes, in place of certificates.
+        access: roles at the processes, if they listen beyond this machine.
     """
 
     sampler: str = "tcp/127.0.0.1:7447"
@@ -42,12 +42,12 @@ class ZenohConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     access: Names | None = None
 
     def endpoint(self, process: str) -> str:
-        """Where `sampler` or `learner` listens."""
+        """Return the endpoint of `sampler` or `learner`."""
         return self.learner if process == "learner" else self.sampler
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Certificates, keys and passwords, as they are named."""
+        """Certificates, keys and passwords, as named in the table."""
         tls, login = self.tls, self.login
         named = (
             *(() if tls is None else (tls.ca, tls.certificate, tls.key)),
@@ -57,11 +57,11 @@ class ZenohConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return tuple(name for name in named if name is not None)
 
     def identity(self, folder: Path) -> Identity | None:
-        """Who this machine is to others; None without certificates. ConfigError where its files cannot be used."""
+        """Return this machine's credentials; None without certificates. ConfigError if its files are unusable."""
         return None if self.tls is None else Identity.of(self.tls, self.login, self.users_file, folder)
 
     def check(self, file: Path, text: str) -> None:
-        """ConfigError with the line for what is no endpoint, or open to the network without protection."""
+        """Raise ConfigError with the line if an endpoint is invalid, or open to the network without protection."""
 
         def refuse(key: str, what: str, remedy: str) -> None:
             raise ConfigError(f"zenoh.{key}{what}", file=file, line=line_of(text, ("zenoh", key)), remedy=remedy)
@@ -106,20 +106,20 @@ class ZenohConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ConfigError(error.what, file=file, line=line, remedy=error.remedy) from error
 
     def route(self, process: str, folder: Path) -> Route:
-        """Where a client finds the process: on this machine, or through the router."""
+        """Return the route to the process: on this machine, or through the router."""
         own = self.endpoint(process)
         endpoints = (own, self.router) if self.router else (own,)
         return Route(endpoints, self.identity(folder))
 
     def settings_of(self, process: str, robot: str, folder: Path) -> dict[str, Any]:
-        """zenoh's configuration of the process, apart from what every session of ours has."""
+        """Return zenoh's configuration of the process, apart from what all our sessions share."""
         connect = [self.sampler] if process == "learner" else []
         settings: dict[str, Any] = {
             "listen/endpoints": [self.endpoint(process)],
             "connect/endpoints": [*connect, self.router] if self.router else connect,
         }
         if self.router:
-            # A router passes nothing on between peers, which do not know each other here.
+            # A router forwards nothing between peers, which do not know each other here.
             settings["mode"] = "router"
         identity = self.identity(folder)
         if identity is not None:

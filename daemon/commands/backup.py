@@ -18,11 +18,11 @@ def backup(
     state_dir: Annotated[Path | None, Parameter(help="Where state lives; else as robot.toml says.")] = None,
     force: Annotated[bool, flag("Replace the file if it is there.")] = False,
 ) -> None:
-    """Copy pairs, checkpoint, robot.toml and the files that it names into one file; also while all of it runs.
+    """Copy pairs, checkpoint, robot.toml and the files that it names into one file; works while all of it runs.
 
     It is a ZIP archive with a checksum of every file, and only you can read it: robot.toml may hold passwords.
 
-    Needs: a store (`bodyschema sampler` makes it).
+    Needs: a store (`bodyschema sampler` creates it).
 
     Next: `bodyschema restore` on this or another machine.
     """

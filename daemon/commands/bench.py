@@ -34,12 +34,12 @@ def bench(
     ] = 0,
     seed: Annotated[int, Parameter(help="Of the faults' dice.", validator=Number(gte=0))] = 0,
 ) -> None:
-    """A dry run of your robot.toml: its servos on a port that any program opens like a real one. Until Ctrl-C.
+    """Emulate the servos of robot.toml on a port that any program can open like a real one. Ends with Ctrl-C.
 
     The servos are those of `[drivers.dynamixel]` or `[drivers.feetech]`, the encoders those of
-    `[drivers.serial_lines]`, with their wire time and their rules; the simulated hand guides them (without pybullet
-    each swings slowly). PORT.toml is written beside PORT, your robot.toml with the bench's port and a state of its own,
-    for the other commands. Both are removed at the end.
+    `[drivers.serial_lines]`, with their timing and protocol rules. The simulated hand guides the arm; without pybullet
+    each joint swings slowly. PORT.toml is written next to PORT for the other commands: your robot.toml with the
+    emulator's port and a state of its own. Both files are removed at the end.
 
     Needs: robot.toml with servos (`bodyschema robot new`) or encoders, no hardware.
 
@@ -65,7 +65,7 @@ def bench(
 
 
 def _made(run: BenchRun, console: Console) -> BenchRun:
-    """The bench with its motion, which takes a moment to make."""
+    """Prepare the emulator's motion, which takes a moment; return the emulator."""
     if not console.is_terminal:
         run.prepare(lambda _: None)
         return run

@@ -19,11 +19,12 @@ def board(
     """Write the calibration board as a page to print, in true size.
 
     Print it at 100 % ("actual size"), measure the two rulers on the page, and glue the sheet onto something flat and
-    stiff: glass, aluminium, thick board. A bent sheet is a wrong calibration that looks like a good one.
+    stiff: glass, aluminium, thick board. A bent sheet gives a wrong calibration that looks like a good one.
 
     Needs: a printer.
 
-    Next: `bodyschema calibrate cameras` with the same options; --ruler-mm if the ruler is not what it says.
+    Next: `bodyschema calibrate cameras` with the same options; add --ruler-mm if a ruler does not have its stated
+    length.
     """
     from rich.console import Console
 

@@ -22,14 +22,14 @@ def command(
     ] = None,
     robot: RobotFile = HERE,
 ) -> None:
-    """Tell a running process to do something.
+    """Send a command to a running process.
 
-    `pause` and `resume` accepting pairs (or, with --to learner, learning); `reload` reads robot.toml again and says
-    what of it needs a new start; `zero_force_on` lets the servos bear the arm, `gaze_on` turns the head to the hand,
-    `..._off` switches their torque off; `accept_turns` when a joint lost its turn count while its bus was away, and
-    stands where the message says: the turn nearest to where it was is taken; `tool_changed` when another tool is in the
-    hand; `rollback` goes back to the model before the last change; `reset_to_prior` forgets what was learnt, not the
-    stored pairs; `checkpoint` writes the learner's state now.
+    `pause` and `resume` stop and restart accepting pairs (or, with --to learner, learning). `reload` reads robot.toml
+    again and lists the settings that need a restart. `zero_force_on` lets the servos hold the arm, `gaze_on` turns the
+    head to the hand, and `..._off` switches their torque off. `accept_turns` is for a joint that lost its turn count
+    while its bus was away, if it is where the message says: it assumes the turn nearest to its last position.
+    `tool_changed` reports a tool change; `rollback` restores the model before the last change; `reset_to_prior`
+    discards what was learnt, but not the stored pairs; `checkpoint` writes the learner's state now.
 
     Needs: that process running (`bodyschema run`).
 

@@ -20,12 +20,12 @@ def compare(
     ] = None,
     as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
 ) -> None:
-    """How far the positions of two recordings are apart, row by row.
+    """Compare the positions of two recordings row by row.
 
-    Rows count as the same where all joints agree to 1e-6 rad (1e-6 m of a joint that slides); others are said and
-    left out. Where the recordings have different numbers of rows, each is compared with the one at its joint angles.
+    Rows match where all joints agree to 1e-6 rad (1e-6 m for a prismatic joint); other rows are reported and left out.
+    If the recordings have different numbers of rows, each row is compared with the one at the same joint angles.
 
-    Needs: two recordings at the same joint angles: one measured, one from `bodyschema simulate`, say.
+    Needs: two recordings at the same joint angles, for example a measured one and one from `bodyschema simulate`.
 
     Next: `bodyschema simulate` with another robot.toml; `bodyschema calibrate`.
     """

@@ -9,14 +9,14 @@ from bodyschema.daemon.commands.options import HERE, RobotFile, flag
 
 
 def doctor(*, robot: RobotFile = HERE, json: Annotated[bool, flag("As JSON.")] = False) -> None:
-    """What is wrong with ports, servos, disk, clock or zenoh, each with the command that mends it. Under 5 s.
+    """Check ports, servos, disk, clock and zenoh; print for each problem the command that fixes it. Under 5 s.
 
-    The servos are asked who they are and how they are, and are read as fast as it goes for a moment. Nothing is written
-    to them, and torque stays as it is. While the sampler runs, it tells instead. Exit code 1 when something is wrong.
+    The servos are queried for identity and health, and read at full speed for a moment. Nothing is written to them, and
+    torque stays as it is. While the sampler runs, its status is used instead. Exit code 1 if there is a problem.
 
     Needs: robot.toml (`bodyschema config init`).
 
-    Next: what the last column says; `bodyschema scan` when a servo is missing.
+    Next: the commands in the last column; `bodyschema scan` if a servo is missing.
     """
     from rich.console import Console
 

@@ -42,12 +42,12 @@ def list_robots(
     watch: Annotated[bool, flag("Go on showing it, until Ctrl-C.")] = False,
     json: Annotated[bool, flag("As JSON, a list with both processes' states.")] = False,
 ) -> None:
-    """All robots that are there: pairs, rate, error, the model that answers, health.
+    """List all running robots: pairs, rate, error, answering model, health.
 
-    Found by their liveliness tokens. With --watch --json there is one line about every second. Exit code 1 when
-    nobody is there.
+    Robots are found by their liveliness tokens. With --watch --json, prints one line about every second. Exit code 1 if
+    no robot is found.
 
-    Needs: robots that run (`bodyschema run`), and a way to them.
+    Needs: running robots (`bodyschema run`), and a network route to them.
 
     Next: `bodyschema fleet compare`; `bodyschema status --robot` for one of them.
     """
@@ -88,13 +88,14 @@ def compare(
     robot: Robots = (),
     as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
 ) -> None:
-    """How far the models of robots of one type are apart, and which unit is off, in which figures.
+    """Compare the models of robots of one type; find the unit that differs, and in which figures.
 
-    Robots are of one type when their joints have the same names. Their learners are asked at the same poses, from the
-    ranges that most of them have moved in; each model is laid as a whole on the median of all, since cameras stand
-    where they stand. Zeros and tool that stand out from the others' are named.
+    Robots are of one type if their joints have the same names. Their learners are queried at the same poses, from the
+    ranges that most of them have moved in. Each model is rigidly aligned with the median of all, since the cameras
+    stand in different places. Joint offsets and tools that differ from the others' are named.
 
-    Needs: at least two robots of a type whose learners run, and the sampler of one of them; three to say which is off.
+    Needs: at least two robots of a type with running learners, and the sampler of one of them; three to find which
+    differs.
 
     Next: `bodyschema fleet diagnose` with their recordings, for causes.
     """
@@ -142,10 +143,11 @@ def diagnose(
     seed: Annotated[int, Parameter(help="Of the resampling behind the intervals.", validator=Number(gte=0))] = 0,
     as_json: Annotated[bool, flag("Print the summary as JSON.", name="--json")] = False,
 ) -> None:
-    """`bodyschema diagnose` of many recordings side by side, and which unit of a type is off and why.
+    """Run `bodyschema diagnose` on many recordings in parallel; find the unit of a type that differs, and why.
 
-    A recording that fails is a row that says why. What more than half of the units of a type have is told as their
-    description's. Ctrl-C ends it; reports that were written stay. Exit code 1 when no recording could be diagnosed.
+    A recording that fails is a row with the reason. An error that more than half of the units of a type share is
+    attributed to their description. Ctrl-C ends it and keeps the reports already written. Exit code 1 if no recording
+    could be diagnosed.
 
     Needs: the extra `fleet` (`pip install 'bodyschema[fleet]'`); workers elsewhere need this package, not the files.
 

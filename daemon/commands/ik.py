@@ -33,14 +33,14 @@ def ik(
     deg: Annotated[bool, flag("Angles are in degrees.")] = False,
     as_json: Annotated[bool, flag("Print the learner's reply as it is.", name="--json")] = False,
 ) -> None:
-    """Ask the learner for joint angles that bring the marker to a position, in the measurement frame.
+    """Ask the learner for joint angles that bring the marker to a position in the measurement frame.
 
-    The angles are within the URDF's limits. Ends with exit code 1 where the position is not reached, after showing how
-    near one can get. Nothing moves. Write negative values after `--`, as in `bodyschema ik -- -0.1 0.2 0.7`.
+    The angles are within the URDF's limits. If the position cannot be reached, shows the closest solution and ends with
+    exit code 1. Nothing moves. Write negative values after `--`, as in `bodyschema ik -- -0.1 0.2 0.7`.
 
     Needs: a running learner (`bodyschema run` or `bodyschema learner`).
 
-    Next: the same from a program of yours, from where your arm is: docs/zenoh.md.
+    Next: the same from your own program, starting at your arm's current angles: docs/zenoh.md.
     """
     import math
 

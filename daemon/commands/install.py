@@ -38,9 +38,9 @@ def udev(
     uninstall: Annotated[bool, flag("Remove the rules.")] = False,
     root: Root = Path("/"),
 ) -> None:
-    """Rules for udev: servo adapters may be opened, and do not keep bytes back. Shows them, asks, then writes them.
+    """Install udev rules that let you open servo adapters and reduce their latency. Shows them and asks first.
 
-    Needs: the right to write to /etc/udev/rules.d, by sudo.
+    Needs: permission to write to /etc/udev/rules.d, by sudo.
 
     Next: plug the adapter in again; `bodyschema doctor`.
     """
@@ -91,15 +91,15 @@ def service(
     uninstall: Annotated[bool, flag("Stop the services and remove them; pairs stay.")] = False,
     root: Root = Path("/"),
 ) -> None:
-    """Units for systemd: sampler and learner of this robot from boot on, started again when they fail, sandboxed.
+    """Install systemd units: sampler and learner of this robot from boot on, restarted on failure, sandboxed.
 
-    The sampler may open the ports and cameras that robot.toml names and nothing else: install again when they are
-    others. State is kept in /var/lib/bodyschema/ROBOT unless robot.toml says where. Of several robots it is one
-    learner that serves them all; their samplers are installed where the robots are.
+    The sampler may open only the ports and cameras that robot.toml names; install again when they change. State is kept
+    in /var/lib/bodyschema/ROBOT unless robot.toml names another folder. For several robots, one learner serves them
+    all; their samplers are installed on the robots' machines.
 
-    Needs: robot.toml that `bodyschema run` works with, and the right to write to /etc/systemd/system, by sudo.
+    Needs: robot.toml that works with `bodyschema run`, and permission to write to /etc/systemd/system, by sudo.
 
-    Next: the `systemctl enable --now` that it prints; docs/operation.md has logs, upgrades and backups.
+    Next: the `systemctl enable --now` that it prints; docs/operation.md describes logs, upgrades and backups.
     """
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.fleet.hosting import configs_of, descriptions
@@ -149,9 +149,9 @@ def router(
     uninstall: Annotated[bool, flag("Stop the router and remove its unit.")] = False,
     root: Root = Path("/"),
 ) -> None:
-    """A unit for systemd: the router where machines meet, from boot on, started again when it fails, sandboxed.
+    """Install a systemd unit: the zenoh router from boot on, restarted on failure, sandboxed.
 
-    Needs: router.toml that `bodyschema router` works with, keys that --user can read, and the right to write to
+    Needs: router.toml that works with `bodyschema router`, keys that --user can read, and permission to write to
     /etc/systemd/system, by sudo.
 
     Next: the `systemctl enable --now` that it prints; `bodyschema doctor` on the machines that connect.
@@ -169,7 +169,7 @@ def router(
 
 
 def _install_units(units: UnitFiles, texts: dict[Path, str], *, yes: bool, dry_run: bool) -> bool:
-    """Return whether they are installed now."""
+    """Return True if they are installed now."""
     from rich.console import Console
     from rich.prompt import Confirm
 

@@ -25,14 +25,14 @@ def joints(
     json: Annotated[bool, flag("A line of JSON instead, every half second.")] = False,
     zero_force: Annotated[bool, flag("The servos bear the arm meanwhile: [drivers.dynamixel.zero_force].")] = False,
 ) -> None:
-    """Each joint's angle, speed, current and temperature while you move it by hand, until Ctrl-C.
+    """Show each joint's angle, speed, current and temperature while you move it by hand. Ends with Ctrl-C.
 
-    Torque of servos is switched off first: hold the arm, it will sink. With --zero-force the servos then bear it, until
-    Ctrl-C or until anything is in doubt: stay ready to hold it. Below the table stands where the URDF says that the
-    marker went by the joint that you moved last: if it went the other way, the sign is wrong. Angles beyond the URDF's
-    limits are told, too.
+    Servo torque is switched off first: hold the arm, because it will sink. With --zero-force the servos then hold it,
+    until Ctrl-C or any fault: stay ready to hold it. The line below the table shows where, by the URDF, the marker went
+    when you moved the last joint: if it went the other way, the sign is wrong. Angles beyond the URDF's limits are
+    reported, too.
 
-    Needs: robot.toml with servos (`bodyschema robot new`), encoders or a ROS 2 robot, and no sampler that runs.
+    Needs: robot.toml with servos (`bodyschema robot new`), encoders or a ROS 2 robot, and no running sampler.
 
     Next: correct what the line below the table names; then `bodyschema run`.
     """
@@ -70,7 +70,7 @@ def joints(
 
 
 class _Ending:
-    """Whether it was asked for."""
+    """Flag for a requested end."""
 
     def __init__(self) -> None:
         self.asked = False
@@ -85,7 +85,7 @@ def _line(text: str) -> None:
 
 
 def _first(watch: JointsWatch) -> Seen:
-    """The first look that has all; SourceError when none comes."""
+    """Return the first complete state. SourceError if there is none in time."""
     import time
 
     from bodyschema.interfaces.errors import SourceError
@@ -101,7 +101,7 @@ def _first(watch: JointsWatch) -> Seen:
 
 
 def _begin(watch: JointsWatch, force: Powered) -> None:
-    """Zero-force on, and what is to be known of that; RequestError when it is refused."""
+    """Switch zero-force on and print its answer. RequestError if it is refused."""
     answer = force.ask(True)
     while not answer.done():
         watch.look()

@@ -32,15 +32,15 @@ def latency(
     save: Annotated[Path | None, Parameter(help="Keep readings and positions in this CSV file.")] = None,
     as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
 ) -> None:
-    """How long before its time stamp an image was taken, with its uncertainty. Move the arm by hand for 5 s.
+    """Measure the latency of the cameras' time stamps, with its uncertainty. Move the arm by hand for 5 s.
 
-    Move it to and fro, quickly but not evenly, more than one joint, the marker in sight of both eyes. The shift in time
-    is looked for at which the marker follows the joint angles best. No calibrated model is needed: how the real arm
-    differs from the drawn one is fitted along.
+    Move it to and fro, quickly but unevenly, with more than one joint and the marker in sight of both cameras. The
+    estimate is the time shift at which the marker follows the joint angles best. No calibrated model is needed:
+    deviations of the arm from its URDF are fitted along.
 
-    Needs: robot.toml with encoders and cameras, and no sampler that runs; or a recording; or --sim.
+    Needs: robot.toml with encoders and cameras, and no running sampler; or a recording; or --sim.
 
-    Next: put the two lines that are printed into [vision.cameras].
+    Next: put the two printed lines into [vision.cameras].
     """
     from rich.console import Console
 
@@ -87,4 +87,4 @@ def _wiggle(config: Config, recording: Path | None, seconds: float, *, sim: bool
     for text in (*seen.health, seen.said):
         if text:
             console.print(text, markup=False, soft_wrap=True)
-    return seen.wiggle.with_stamps_later(known_s)  # as the camera gave them, before robot.toml's latency was taken off
+    return seen.wiggle.with_stamps_later(known_s)  # as the camera sent them, before robot.toml's latency was subtracted

@@ -28,14 +28,15 @@ def learner(
 ) -> None:
     """Learn the robot's kinematics and answer queries. Ends with SIGTERM or Ctrl-C.
 
-    New pairs come from the sampler, on this machine or another; without one the learner answers from what it knows.
-    Of several robots each pair is learnt as it comes, and what can wait is done in turns (docs/fleet.md).
+    New pairs come from the sampler, on this machine or another; without one, the learner answers from what it has
+    learnt. With several robots, each pair is learnt as it arrives, and less urgent work is done in turns
+    (docs/fleet.md).
 
     Needs: robot.toml (`bodyschema config init`), and for new pairs `bodyschema sampler`.
 
-    Next: `bodyschema predict`, `bodyschema status`; of several robots `bodyschema fleet list`.
+    Next: `bodyschema predict`, `bodyschema status`; for several robots `bodyschema fleet list`.
     """
-    # Before numpy is loaded: its threads would fight with each other and with the answers for the cores.
+    # Before numpy is loaded: its threads would compete with each other and with the answers for the cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from contextlib import nullcontext
 
@@ -57,7 +58,7 @@ def learner(
         spread(configs, processes, ["--verbose"] if verbose else [])
         return
     notifier, wishes = Notifier.of_environment(), Wishes()
-    # In a terminal SIGHUP says that it was closed.
+    # In a terminal SIGHUP means that the terminal was closed.
     reload = wishes.reload if notifier.is_heard else None
     with shown(files[0]) if view else nullcontext(), on_termination(wishes.end, reload=reload):
         run_learners(configs, SystemClock(), wishes, notifier)

@@ -63,13 +63,13 @@ def print_tags(
 ) -> None:
     """Write a page with tags in true size, and print their tables for robot.toml.
 
-    Solid lines are to cut along, dashed ones to fold along. Print it at 100 % ("actual size") and measure the two
-    rulers. Paper alone is not rigid: glue the sheet around a block, or onto a plate, with faces as wide as is said. The
-    tables say where the tags are if it was folded as drawn; `bodyschema marker cluster` measures where they are.
+    Cut along solid lines and fold along dashed ones. Print at 100 % ("actual size") and measure the two rulers. Paper
+    alone is not rigid: glue the sheet around a block, or onto a plate, with faces of the stated width. The tables hold
+    for the nominal shape; `bodyschema marker cluster` measures where the tags really are.
 
     Needs: a printer.
 
-    Next: put what was printed into robot.toml; `bodyschema marker cluster` for what was glued by hand.
+    Next: put the printed tables into robot.toml; `bodyschema marker cluster` for tags glued by hand.
     """
     from rich.console import Console
 
@@ -102,15 +102,15 @@ def cluster(
     family: Family = "apriltag_36h11",
     as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
 ) -> None:
-    """Measure where the tags of a cluster are on it, from images, and print its tables for robot.toml.
+    """Measure the poses of a cluster's tags from images, and print its tables for robot.toml.
 
-    About 20 pairs of images, the cluster turned from one to the next so that every two neighbours are seen together
-    some time. Their places and all poses are fitted together; the frame of the marker is that
-    of the tag with the lowest number. What does not fit one rigid body is left out and named.
+    Take about 20 pairs of images and turn the cluster from one to the next, so that every two neighbouring tags are
+    seen together at some time. The tags' poses and all cluster poses are fitted together; the marker's frame is that of
+    the tag with the lowest number. Observations that do not fit one rigid body are left out and named.
 
     Needs: cameras.toml, and images of those cameras; no hardware.
 
-    Next: put what was printed into robot.toml; `bodyschema watch cameras`.
+    Next: put the printed tables into robot.toml; `bodyschema watch cameras`.
     """
     from rich.console import Console
 
@@ -144,13 +144,13 @@ def learn(
 ) -> None:
     """Learn a ball's colour from images, and print the table [vision.colour] for robot.toml.
 
-    Either --at: the ball is all that has the colour of that pixel and joins it. Or --auto: three images or more, in
-    which the ball moves; the most colourful thing that moves is taken. With --auto and no images the robot's own
-    cameras look on while you move the ball.
+    With --at, the ball is the region that has the colour of that pixel and is connected to it. With --auto, give three
+    images or more in which the ball moves; the most colourful moving object is taken. With --auto and no images, the
+    robot's own cameras watch while you move the ball.
 
-    Needs: image files, no hardware; or robot.toml with cameras, and no sampler that runs.
+    Needs: image files, no hardware; or robot.toml with cameras, and no running sampler.
 
-    Next: put what was printed into robot.toml, in the place of `colour = ...`.
+    Next: put the printed table into robot.toml, in place of `colour = ...`.
     """
     from bodyschema.daemon.marker_wiring import learnt_colour_table
     from bodyschema.interfaces.errors import BodyschemaError

@@ -22,14 +22,14 @@ def predict(
     deg: Annotated[bool, flag("Angles are in degrees.")] = False,
     as_json: Annotated[bool, flag("Print the learner's reply as it is.", name="--json")] = False,
 ) -> None:
-    """Ask the learner where the marker is, in the measurement frame.
+    """Ask the learner for the marker position in the measurement frame.
 
     Without values, reads them from standard input as JSON: one vector, or a list of them. Write negative values
     after `--`, as in `bodyschema predict --deg -- 10 -20 30 40 0 15 5`.
 
     Needs: a running learner (`bodyschema run` or `bodyschema learner`).
 
-    Next: the same from a program of yours, over zenoh: docs/zenoh.md.
+    Next: the same from your own program, over zenoh: docs/zenoh.md.
     """
     import numpy as np
     from rich.console import Console
@@ -52,7 +52,7 @@ def predict(
 
 
 def _notes(config: Config, q: FloatArray, deg: bool) -> Iterator[str]:
-    """What is to be said of joint values q (n, d) [rad, m] that the arm cannot have."""
+    """Yield remarks on joint values q (n, d) [rad, m] that the arm cannot have."""
     import numpy as np
 
     from bodyschema.daemon.plausibility.limits import beyond_limits, limits_text
@@ -70,7 +70,7 @@ def _notes(config: Config, q: FloatArray, deg: bool) -> Iterator[str]:
 
 
 def _request(values: tuple[float, ...], config: Config, deg: bool) -> JointsRequest:
-    """What to ask; RequestError when it is no vector of joint angles."""
+    """Return the request. RequestError if the input is not a vector of joint angles."""
     import numpy as np
 
     from bodyschema.daemon.wire import JointsRequest, joint_angles

@@ -24,7 +24,7 @@ def record(
 ) -> None:
     """Copy the running sampler's pairs into a file.
 
-    For the store of a sampler that is not running take `bodyschema export`.
+    For the store of a sampler that is not running, use `bodyschema export`.
 
     Needs: a running sampler (`bodyschema run` or `bodyschema sampler`).
 

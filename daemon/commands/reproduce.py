@@ -28,18 +28,18 @@ def reproduce(
     ] = True,
     as_json: Annotated[bool, flag("Print curves and figures as JSON.", name="--json")] = False,
 ) -> None:
-    """Run the experiments of Ulbrich et al. 2009 again, and hold the outcome against the paper's figures.
+    """Rerun the experiments of Ulbrich et al. 2009, and compare the results with the paper's figures.
 
-    The arm is the shipped upper body, simulated. Walks go through the sampler. Beside the paper's method run the
-    daemon's learner and the other models, on the same pairs. In figures 5 and 7 the marker is also measured: stereo
-    images are rendered and tracked, encoders read in ticks.
+    The arm is the shipped upper body, simulated. Walks go through the sampler. The daemon's learner and other models
+    learn the same pairs as the paper's method. In figures 5 and 7 the marker is also measured: stereo images are
+    rendered and tracked, and encoders are read in ticks.
 
     Time on two idle cores: fig4 half a minute, fig5 and fig7 about a minute and a half each, fig6 one minute, exactness
     a few seconds. With --no-real fig5 takes half a minute and fig7 one minute.
 
     Needs: no hardware; pybullet and matplotlib (pip install 'bodyschema[sim,plots]').
 
-    Next: docs/reproduced.md tells what the paper leaves open, how it was read here, and what --json prints.
+    Next: docs/reproduced.md describes what the paper leaves open, how it was interpreted, and what --json prints.
     """
     import sys
     import time

@@ -20,13 +20,13 @@ def restore(
     ] = None,
     force: Annotated[bool, flag("Move what is in the way aside.")] = False,
 ) -> None:
-    """Put a backup back: robot.toml, the files that it names, pairs and checkpoint. Verified before anything changes.
+    """Restore a backup: robot.toml, the files that it names, pairs and checkpoint. Verified before anything changes.
 
-    The store is another one from then on, so that no learner mixes its new pairs with those that came after the backup.
+    The store gets a new identity, so that no learner mixes its new pairs with those that came after the backup.
 
-    Needs: sampler and learner at rest.
+    Needs: sampler and learner stopped.
 
-    Next: `bodyschema run`, or `systemctl start` of the robot's services.
+    Next: `bodyschema run`, or `systemctl start` for the robot's services.
     """
     from rich.console import Console
 

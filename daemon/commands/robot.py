@@ -39,14 +39,14 @@ def new(
     out: Annotated[Path, Parameter(name="--robot", help="The file to write.")] = HERE,
     yes: Annotated[bool, flag("Do not ask: the joints of the URDF get the servos in the order of their IDs.")] = False,
 ) -> None:
-    """Write a commented robot.toml: joints from the URDF, a servo for each of them. Never replaces a file.
+    """Write a commented robot.toml: joints from the URDF, and a servo for each. Never replaces a file.
 
-    Asks for each joint which servo moves it; joints without one stand still. What is written is checked against the
-    URDF. Nothing is written to any servo.
+    Asks which servo moves each joint; joints without a servo stay fixed. The result is checked against the URDF.
+    Nothing is written to any servo.
 
-    Needs: your robot's URDF, and servos with their supply on (or a scan that was kept).
+    Needs: your robot's URDF, and powered servos (or a saved scan).
 
-    Next: mend what is marked CHECK; `bodyschema joints` for signs and zeros; `bodyschema config check`.
+    Next: correct the entries marked CHECK; `bodyschema joints` for signs and zeros; `bodyschema config check`.
     """
     from bodyschema.daemon.commands.config import say, write_new
     from bodyschema.daemon.config import Config
@@ -91,7 +91,7 @@ def _candidates(source: str, ports: Sequence[str], bauds: Sequence[int]) -> list
 
 
 def _asked(joint: str, left: Sequence[Candidate]) -> Candidate | None:
-    """Which servo moves `joint`, as the user says."""
+    """Ask the user which servo moves `joint`; return it, or None."""
     from rich.prompt import Prompt
 
     if not left:
@@ -108,7 +108,7 @@ def _asked(joint: str, left: Sequence[Candidate]) -> Candidate | None:
 
 
 def _name(servo: Candidate, left: Sequence[Candidate]) -> str:
-    """Its ID; with its port where that is needed."""
+    """Return its ID, with its port where the ID is not unique."""
     alone = sum(other.id == servo.id for other in left) == 1
     return str(servo.id) if alone else f"{servo.id}@{servo.port}"
 

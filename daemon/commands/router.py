@@ -17,10 +17,10 @@ def router(
     zenohd: Annotated[bool, flag("Print the configuration for zenoh's own zenohd, and end.")] = False,
     verbose: Annotated[bool, flag("Log more.")] = False,
 ) -> None:
-    """Let machines meet: sampler, learner and viewers connect here by TLS, and each does what its role says.
+    """Run the zenoh router that connects several machines, with TLS and roles for sampler, learner and viewers.
 
-    Ends with SIGTERM or Ctrl-C. docs/security.md shows how certificates are made; deploy/ has files to begin with;
-    `bodyschema install router` lets systemd keep it running.
+    Ends with SIGTERM or Ctrl-C. docs/security.md describes how to create certificates; deploy/ has example files;
+    `bodyschema install router` runs it as a systemd service.
 
     Needs: router.toml, and the certificates that it names.
 

@@ -18,7 +18,7 @@ def run(
     view: Annotated[bool, flag("Show the page of `bodyschema view` too.")] = False,
     verbose: Annotated[bool, flag("Log more.")] = False,
 ) -> None:
-    """Start sampler and learner, each as a process of its own, and start again the one that dies. Ctrl-C ends both.
+    """Start sampler and learner as separate processes, and restart one that dies. Ctrl-C ends both.
 
     Needs: robot.toml (`bodyschema config init`), and --sim or a recording named in its table [drivers].
 

@@ -18,10 +18,10 @@ def sampler(
     exit_at_end: Annotated[bool, flag("End when a recording is through.")] = False,
     verbose: Annotated[bool, flag("Log more.")] = False,
 ) -> None:
-    """Turn encoder readings and camera frames into pairs, keep and publish them. Ends with SIGTERM or Ctrl-C.
+    """Turn encoder readings and camera frames into pairs, store and publish them. Ends with SIGTERM or Ctrl-C.
 
-    The store takes each pair before it is published. While it cannot (the disk is full), the status says so and no
-    pairs are taken.
+    Each pair is stored before it is published. While the store cannot be written (the disk is full), the status reports
+    it and no pairs are taken.
 
     Needs: robot.toml (`bodyschema config init`) with joints and cameras or a recording; or --sim.
 
@@ -45,13 +45,13 @@ def sampler(
     config = Config.load(robot)
     if state_dir is not None:
         config = config.with_state_dir(state_dir)
-    with (  # the store comes last: what goes wrong before leaves no trace
+    with (  # the store comes last, so that an earlier failure leaves no trace
         open_sources(config, sim=sim) as sources,
         Bus(listen=config.tables.zenoh.sampler, settings=config.zenoh_settings("sampler")) as bus,
         PairStore(config.store_file, session_of(config, SystemClock()), working=notifier.starting) as store,
     ):
         service = Service(notifier, LOOPS, SystemClock(), devices=devices_of(config))
         process = Sampler(config, sources, bus, store, exit_at_end=exit_at_end, service=service)
-        # In a terminal SIGHUP says that it was closed.
+        # In a terminal SIGHUP means that the terminal was closed.
         with on_termination(process.stop, reload=process.reload if notifier.is_heard else None):
             process.run()

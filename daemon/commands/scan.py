@@ -21,14 +21,14 @@ def scan(
     ] = None,
     json: Annotated[bool, flag("As JSON.")] = False,
 ) -> None:
-    """Which servos are there: every USB serial port, at every rate, in every protocol. Up to 15 s for a port.
+    """Find servos on every USB serial port, at every baud rate, in every protocol. Up to 15 s per port.
 
-    Dynamixel servos of both protocols, and Feetech servos: a table of ID, model, firmware, supply, temperature, torque,
-    and of what is wrong. With --robot also which servos are missing, of another model, at another rate, double, or not
-    in robot.toml. Below, the cameras, by the names for robot.toml. Nothing is written to any servo, and torque stays as
-    it is. Exit code 1 when not all is as it should be, or nobody answers.
+    Finds Dynamixel servos of both protocols, and Feetech servos; prints a table of ID, model, firmware, voltage,
+    temperature, torque and problems. With --robot, also reports servos that are missing, of another model, at another
+    rate, duplicate, or not in robot.toml. Below are the cameras, by their names for robot.toml. Nothing is written to
+    any servo, and torque stays as it is. Exit code 1 if there is a problem, or no servo answers.
 
-    Needs: servos with their supply on, and the right to open the port (`bodyschema doctor` tells).
+    Needs: powered servos, and permission to open the port (`bodyschema doctor` checks it).
 
     Next: `bodyschema robot new --from scan`; `bodyschema doctor`.
     """

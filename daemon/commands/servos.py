@@ -57,9 +57,9 @@ def show(
     baud: Baud = RATE,
     robot: RobotFile = HERE,
 ) -> None:
-    """All that may be written to the servos of robot.toml: names, what stands there, what may. Writes nothing.
+    """Show the writable settings of the servos of robot.toml: names, present values, permitted values. Writes nothing.
 
-    Needs: robot.toml with servos, or --port and --id; and no sampler that runs.
+    Needs: robot.toml with servos, or --port and --id; and no running sampler.
 
     Next: `bodyschema servos set`.
     """
@@ -91,16 +91,16 @@ def set_(
     yes: Yes = False,
     robot: RobotFile = HERE,
 ) -> None:
-    """Write settings to servos' EEPROM: shows them first, asks, switches torque off, writes, reads back.
+    """Write settings to servo EEPROM: shows them first, asks, switches torque off, writes, reads back.
 
-    `bodyschema servos show` lists the names. `id` and `baud` are set alone; an ID that is taken is refused, and after
-    another rate each servo is looked for there. Values are those of the register, but for the rate in bit/s and
-    words (operating_mode=current). Torque is switched off: hold the arm, it will sink. Exit code 1 when something was
-    not written.
+    `bodyschema servos show` lists the names. `id` and `baud` are set alone. An ID that is taken is refused; after a
+    change of rate each servo is searched at the new rate. Values are register values, except for the rate in bit/s and
+    words (operating_mode=current). Torque is switched off: hold the arm, because it will sink. Exit code 1 if something
+    was not written.
 
-    Needs: robot.toml with servos, or --port and --id; and no sampler that runs.
+    Needs: robot.toml with servos, or --port and --id; and no running sampler.
 
-    Next: what it says of robot.toml; `bodyschema servos undo` takes it back.
+    Next: the changes to robot.toml that it prints; `bodyschema servos undo` reverts the writes.
     """
     from bodyschema.daemon.servo_changes import assignments, plan
     from bodyschema.interfaces.errors import ConfigError
@@ -126,12 +126,12 @@ def zero(
     yes: Yes = False,
     robot: RobotFile = HERE,
 ) -> None:
-    """The joint's zero is where it is now: tells zero_ticks for robot.toml, and writes nothing.
+    """Set a joint's zero to its present position: prints zero_ticks for robot.toml, and writes nothing.
 
-    With --in-servo the servo's homing offset is written instead, so that its position here is the zero_ticks that
-    robot.toml has. Either way pairs that were measured before have another zero.
+    With --in-servo, the servo's homing offset is written instead, so that its position here is robot.toml's zero_ticks.
+    Either way, pairs measured before have another zero.
 
-    Needs: robot.toml with servos, the joint held where its zero is to be, and no sampler that runs.
+    Needs: robot.toml with servos, the joint held at its intended zero, and no running sampler.
 
     Next: put zero_ticks into robot.toml; `bodyschema joints` shows the angles.
     """
@@ -153,9 +153,9 @@ def zero(
 
 @servos.command(sort_key=4)
 def undo(*, dry_run: DryRun = False, yes: Yes = False, port: Port = None, robot: RobotFile = HERE) -> None:
-    """Take back what the last of these commands wrote. What was changed by somebody else since is left alone.
+    """Undo what the last of these commands wrote. Settings that were changed otherwise since then are left alone.
 
-    Needs: the servos of then on the ports of then; --port when they were named so.
+    Needs: the same servos on the same ports; --port if they were selected that way.
 
     Next: `bodyschema servos show`.
     """
@@ -202,7 +202,7 @@ def _workbench(wanted: Sequence[Wanted]) -> Workbench:
 
 
 def _log(robot: Path, port: str | None) -> ServoLog:
-    """Beside the robot's pairs; of servos that no robot.toml knows, in a place of their own."""
+    """Return the log next to the robot's pairs; for servos without a robot.toml, in a separate place."""
     from bodyschema.daemon.config import Config, state_home
     from bodyschema.daemon.servo_log import ServoLog
 

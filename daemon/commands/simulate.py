@@ -23,10 +23,10 @@ def simulate(
     seed: Annotated[int, Parameter(help="Of the noise.", validator=Number(gte=0))] = 0,
     force: Annotated[bool, flag("Replace OUT when it is there.")] = False,
 ) -> None:
-    """What the simulation would have measured at the joint angles of a recording.
+    """Simulate what would have been measured at the joint angles of a recording.
 
-    The robot is that of a robot.toml, or of an extended.toml with what `[[effects]]` add to it (docs/effects.md).
-    The columns are t and segment, where the recording has them, the joints, and x, y, z.
+    The robot is that of a robot.toml, or of an extended.toml with its `[[effects]]` (docs/effects.md). The columns are
+    t and segment, where the recording has them, the joints, and x, y, z.
 
     Needs: a recording and a robot.toml; no hardware, no running daemon.
 

@@ -16,11 +16,11 @@ def status(
 ) -> None:
     """Show what sampler and learner are doing: rates, rejected frames, joint coverage, errors, health.
 
-    With --watch --json there is one line about every second. Exit code 1 when neither answers.
+    With --watch --json, prints one line about every second. Exit code 1 if neither answers.
 
     Needs: one of them running (`bodyschema run`).
 
-    Next: `bodyschema command` to pause, or to tell of a changed tool; `bodyschema predict`.
+    Next: `bodyschema command` to pause, or to report a tool change; `bodyschema predict`.
     """
     from rich.console import Console
     from rich.live import Live

@@ -20,12 +20,12 @@ def view(
     ] = PORT,
     verbose: Annotated[bool, flag("Log more.")] = False,
 ) -> None:
-    """A page in a browser on this machine: error over time, where to move next, residuals, segments, buttons.
+    """Serve a page for a browser on this machine: error over time, where to move next, residuals, segments, buttons.
 
-    It reads everything over zenoh, so it may run anywhere that reaches both processes, and they may come and go. The
-    page is for this machine alone (docs/view.md says how to look at it from another). Ends with SIGTERM or Ctrl-C.
+    It reads everything over zenoh, so it can run on any machine that reaches both processes, and they may come and go.
+    Only this machine can open the page (docs/view.md describes access from another). Ends with SIGTERM or Ctrl-C.
 
-    Needs: the extra `view` (`pip install 'bodyschema[view]'`), robot.toml, and something to see: `bodyschema run`.
+    Needs: the extra `view` (`pip install 'bodyschema[view]'`), robot.toml, and running processes: `bodyschema run`.
 
     Next: open the address in a browser.
     """

@@ -45,15 +45,16 @@ def cameras(
         int | None, Parameter(help="End after so many pictures; else with Ctrl-C.", validator=Number(gte=1))
     ] = None,
 ) -> None:
-    """Both eyes' images with what was found in them: in a browser on this machine, or as files.
+    """Show both cameras' images with what was detected in them: in a browser on this machine, or as files.
 
-    Yellow: a disc of the marker's colour. Green: the marker, with the other eye's row through it in yellow, and how far
-    the rows differ as a red bar, ten times as long. Red: what was refused, and why. Tags have their numbers, the marker
-    made of them its axes x, y, z in red, green, blue. While nothing says how the cameras see, the images as they come.
+    Yellow: a disc of the marker's colour. Green: the marker, with the corresponding row of the other image in yellow,
+    and the row difference as a red bar, ten times as long. Red: rejected detections, with the reason. Tags have their
+    numbers; the marker made of them has its axes x, y, z in red, green, blue. Without a calibration, the raw images are
+    shown.
 
-    Needs: robot.toml with cameras, and no sampler that runs: a camera can be opened once.
+    Needs: robot.toml with cameras, and no running sampler, because a camera can be opened only once.
 
-    Next: mend colour, light or focus; `bodyschema calibrate cameras`; `bodyschema run`.
+    Next: correct colour, light or focus; `bodyschema calibrate cameras`; `bodyschema run`.
     """
     from contextlib import ExitStack
 

@@ -1,3 +1,3 @@
-"""The demo: a scene in simulation, the two real processes, one that asks, one that judges, and a view of it all."""
+"""The demo: a simulated scene, the two real processes, a querying client, an evaluation and a view."""
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""A process of its own that asks the learner for predictions all the while, as a robot's controller would.
+"""A separate process that continuously asks the learner for predictions, as a robot's controller would.
 
-It prints one JSON line a second: how many answers it got and how long they took.
+It prints one JSON line per second: the number of answers and their latency.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ RATE_HZ = 20.0
 
 
 def main(robot_file: str, seed: str) -> None:
-    """Ask until the input ends or the learner is gone for good."""
+    """Ask until the input ends or the learner does not come back."""
     config = Config.load(Path(robot_file))
     rng = np.random.default_rng(int(seed))
     with _patient_client(config.tables.zenoh.learner) as bus:

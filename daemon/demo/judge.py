@@ -1,7 +1,7 @@
-"""The judge alone knows the simulated robot's truth, and holds the learner's answers against it.
+"""Evaluate the learner's answers against the simulator's ground truth on held-out poses.
 
-It asks about poses that were never learnt: poses near those the arm has been guided through, each joint moved by a
-few degrees, so that they lie in the data's region without being data.
+The held-out poses are near those that the arm has been guided through, with each joint moved by a few degrees: within
+the support of the data, but not part of it.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ JITTER_DEG = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What the judge found.
+    """Result of the evaluation.
 
     Attributes:
-        pairs: pairs that the answering model had learnt.
-        error_m: mean distance between prediction and truth on held-out poses [m].
+        pairs: number of pairs that the answering model had learnt.
+        error_m: mean distance between prediction and ground truth on held-out poses [m].
         nominal_m: the same for the nominal model [m].
-        within_sigma: share of coordinates that lie within the claimed 1-sigma.
-        angle_rad: mean angle between predicted and true orientation there [rad]; None where none is learnt.
-        angles_within_sigma: share of their components that lie within the claimed 1-sigma.
+        within_sigma: share of coordinates within the predicted 1-sigma.
+        angle_rad: mean angle between predicted and true orientation there [rad]; None if none is learnt.
+        angles_within_sigma: share of the angles' components within the predicted 1-sigma.
     """
 
     pairs: int
@@ -44,7 +44,7 @@ class Verdict:
 
 
 class Judge:
-    """Compares the learner's answers with the simulated truth."""
+    """Compares the learner's answers with the simulated ground truth."""
 
     def __init__(self, robot: RobotDescription, sampler: Bus, learner: Bus, seed: int) -> None:
         self._robot, self._sampler, self._learner = robot, sampler, learner
@@ -55,7 +55,7 @@ class Judge:
 
     @property
     def seen(self) -> int:
-        """How many accepted pairs the judge knows of."""
+        """Number of accepted pairs fetched so far."""
         return len(self._seen)
 
     def follow(self) -> None:
@@ -69,22 +69,22 @@ class Judge:
                 return
 
     def new_region(self) -> None:
-        """From now on the data's region is where the arm goes from here."""
+        """Restart the region of the data: from now on only new pairs define it."""
         self._region_start = len(self._seen)
 
     def change_tool(self, marker_xyz: FloatArray) -> None:
-        """Put another tool into the robot's hand."""
+        """Change the tool in the robot's hand."""
         self._sampler.ask_one(self._keys.simulation, json.dumps({"tool": marker_xyz.tolist()}).encode())
 
     def truth(self) -> RigidChain:
-        """The simulated robot as it really is, its last frame turned as the marker is."""
+        """Return the true kinematics of the simulated robot, with the marker's rotation in its last frame."""
         raw = json.loads(self._sampler.ask_one(self._keys.simulation))
         fixed = np.array(raw["fixed"])
         fixed[-1, :3, :3] = nearest_rotation(fixed[-1, :3, :3] @ np.array(raw["turn"]))
         return RigidChain(fixed, axes=np.array(raw["axes"]), prismatic=np.array(raw["prismatic"], dtype=bool))
 
     def verdict(self) -> Verdict | None:
-        """Hold the learner's present answers against the truth; None before any pair."""
+        """Evaluate the learner's current answers; return None before any pair."""
         self.follow()
         region = self._seen[self._region_start :]
         if not len(region):
@@ -107,7 +107,7 @@ class Judge:
 
 
 def _turned(answer: PredictReply, truth: FloatArray) -> dict[str, float]:
-    """How far predicted orientations are from the true ones (n, 3, 3); nothing where none are learnt."""
+    """Return the errors of predicted orientations against the true ones (n, 3, 3); empty if none are learnt."""
     if answer.R is None or answer.sigma_R is None:
         return {}
     turns = rotation_vectors(rotation_matrices("R", answer.R) @ truth.swapaxes(1, 2))

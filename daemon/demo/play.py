@@ -1,4 +1,4 @@
-"""The demo's script: guide the arm, change its tool half-way, go on, and tell what was learnt."""
+"""Script of the demo: guide the arm, change its tool half-way, continue, and report the result."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PAIRS_BETWEEN_VERDICTS = 15
 
 @dataclass
 class Snapshot:
-    """What the view shows."""
+    """The data that the view shows."""
 
     change_after: int
     target: int
@@ -44,14 +44,14 @@ class Snapshot:
 
 @dataclass(frozen=True, slots=True)
 class Chapter:
-    """How things stood at the end of one part of the demo.
+    """State at the end of one part of the demo.
 
     Attributes:
-        pairs: pairs learnt with this part's tool.
-        verdict: what the judge found.
-        claimed_m: the error that the learner claimed [m], or None.
-        claimed_rad: the same of the marker's orientation [rad], or None.
-        outlook: what the learner expected of further pairs, or None.
+        pairs: number of pairs learnt with this part's tool.
+        verdict: errors against the ground truth.
+        claimed_m: predicted error [m], or None.
+        claimed_rad: predicted error of the marker's orientation [rad], or None.
+        outlook: expected gain of further pairs, or None.
     """
 
     pairs: int
@@ -63,9 +63,9 @@ class Chapter:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What the demo found: the learning curve, and how things stood before and after the tool change.
+    """Result of the demo: the learning curve, and the state before and after the tool change.
 
-    `changed_at` pairs came before it.
+    `changed_at` is the number of pairs before the change.
     """
 
     rows: list[CurveRow]
@@ -81,10 +81,10 @@ def play(scene: Scene, *, first: int, second: int, seed: int, show: Callable[[Sn
 
     Args:
         first, second: pairs to learn before and after the tool change.
-        show: called with the state of things about twice a second.
+        show: called with the current state about twice a second.
 
     Raises:
-        BusError: a process did not start, died, or stopped making progress; its log says why.
+        BusError: a process did not start, died, or stopped making progress; its log has the reason.
     """
     config = Config.load(scene.robot_file)
     endpoints, keys = config.tables.zenoh, Keys(config.robot.name)
@@ -103,7 +103,7 @@ def play(scene: Scene, *, first: int, second: int, seed: int, show: Callable[[Sn
 
 
 def stalled(sampler: SamplerStatus) -> str:
-    """What to say when no pair has come for too long."""
+    """Return the message for a sampler that has made no pair for too long."""
     why = ", ".join(f"{count} rejected: {reason}" for reason, count in rejected(sampler))
     seen = f"the sampler has seen {sampler.frames} frames" + (f", {why}" if why else "")
     return f"no new pair for {STALL_LIMIT_S:.0f} s; {seen}. More may be in daemon.log. Try another --seed or marker"
@@ -125,7 +125,7 @@ class _Stage:
         self._judge = Judge(self.config.robot, self.sampler, self.learner, self.seed)
 
     def learn(self, pairs: int, phase: str, change_after: int, target: int) -> Chapter:
-        """Look on until the learner has learnt so many pairs with the present tool."""
+        """Wait until the learner has learnt `pairs` pairs with the present tool."""
         snapshot = Snapshot(change_after, target, self.asker, phase, self._sampler_status(), self._learner_status())
         begin = snapshot.learner.pairs
         next_verdict, progress_at = begin + 1, time.monotonic()
@@ -150,7 +150,10 @@ class _Stage:
             time.sleep(GLANCE_S)
 
     def change_tool(self) -> int:
-        """What a person would do: pause, change the tool, tell the learner, go on. How many pairs came before."""
+        """Act as a user would: pause, change the tool, report it to the learner, resume.
+
+        Return the earlier pairs' number.
+        """
         self._command("sampler", "pause")
         self._judge.follow()
         while self._learner_status().last_seq < self._judge.seen:

@@ -1,4 +1,4 @@
-"""The learning curve as numbers and as a picture."""
+"""Write the learning curve as numbers and as a picture."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _STYLE = (
 
 @dataclass(frozen=True, slots=True)
 class CurveRow:
-    """One moment of the demo: errors are mean distances [m]; the truth is known to the judge alone.
+    """One moment of the demo: mean errors against the simulator's ground truth [m].
 
-    `angle_rad` is the mean angle to the true orientation on held-out poses [rad], None where none is learnt.
+    `angle_rad` is the mean angle to the true orientation on held-out poses [rad]; None if none is learnt.
     """
 
     pairs: int
@@ -38,7 +38,7 @@ class CurveRow:
 
 
 def write_curve(rows: Sequence[CurveRow], file: Path) -> None:
-    """The curve as CSV, in mm and degrees; the angles are there where orientations are learnt."""
+    """Write the curve as CSV, in mm and degrees; angles only where orientations are learnt."""
     turned = any(row.angle_rad is not None for row in rows)
     with file.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)

@@ -1,4 +1,4 @@
-"""The processes of the demo: the daemon as `bodyschema run` starts it, and one that asks for predictions."""
+"""The processes of the demo: the daemon as `bodyschema run` starts it, and a client that asks for predictions."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ class Daemon:
         self._process, self._scene = process, scene
 
     def check(self) -> None:
-        """BusError when it has ended."""
+        """Raise BusError if it has ended."""
         if self._process.poll() is not None:
             raise BusError(
                 f"the daemon ended with exit code {self._process.returncode}; {self._scene.log_file} says why"
             )
 
     def wait_for(self, endpoint: str, alive: str) -> None:
-        """Return as soon as the process that listens on `endpoint` is alive; BusError when it is not in time."""
+        """Return once the process that listens on `endpoint` is alive. BusError if it is not alive in time."""
         limit = time.monotonic() + START_LIMIT_S
         while not is_alive(endpoint, alive):
             self.check()
@@ -51,7 +51,7 @@ class Daemon:
 
 @contextmanager
 def started_daemon(scene: Scene) -> Iterator[Daemon]:
-    """Sampler and learner, from here to the end of the with statement."""
+    """Run sampler and learner until the end of the with statement."""
     command = module_command("bodyschema", "run", "--sim", "--robot", str(scene.robot_file))
     with scene.log_file.open("wb") as log:
         environment = os.environ | with_parent()
@@ -63,7 +63,7 @@ def started_daemon(scene: Scene) -> Iterator[Daemon]:
 
 
 class Asker:
-    """What the asking process has said so far."""
+    """Output of the asking process."""
 
     def __init__(self, lines: queue.SimpleQueue[bytes]) -> None:
         self._lines = lines
@@ -73,7 +73,7 @@ class Asker:
         self.worst_ms = 0.0
 
     def update(self) -> None:
-        """Take in what it said since the last call."""
+        """Read its output since the last call."""
         while not self._lines.empty():
             said = json.loads(self._lines.get())
             self.answers += said["answers"]
@@ -83,7 +83,7 @@ class Asker:
 
 @contextmanager
 def started_asker(scene: Scene, seed: int) -> Iterator[Asker]:
-    """A process that asks for predictions, from here to the end of the with statement."""
+    """Run a process that asks for predictions until the end of the with statement."""
     command = module_command("bodyschema.daemon.demo.asker", str(scene.robot_file), str(seed))
     lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)

@@ -1,4 +1,4 @@
-"""Tags on the tip of the tool, as tables of robot.toml: one alone, or a cube of six."""
+"""Tags on the tip of the tool, as tables of robot.toml: a single tag, or a cube of six."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.records import FloatArray
 
-# Side of the cube [m], and of the black squares on it as a share: the white margin of a tag is an eighth of its side.
+# Side of the cube [m], and of its black squares as a fraction: the white margin of a tag is an eighth of its side.
 CUBE_M, SQUARE = 0.07, 0.8
-# Side of the black square of a tag alone, and how far it stands before the tool's middle [m]: clear of the stick.
+# Side of a single tag's black square, and its distance in front of the tool's centre line [m], clear of the stick.
 TAG_M, BEFORE_M = 0.06, 0.007
 FORWARD = np.array([1.0, 0.0, 0.0])
 
 
 def tag_tables(towards_hand: FloatArray) -> str:
-    """The tables [vision] for one tag along the tool's end, which looks ahead when the arm hangs.
+    """Return the tables [vision] for one tag along the tool's end, facing forward when the arm hangs.
 
-    The tool is behind it: one that met it from the front would cover it.
+    The tool is behind the tag; in front it would cover it.
 
     Args:
-        towards_hand: where the tool comes from (3,), in the marker's frame, any length, not forward.
+        towards_hand: direction of the tool from the marker (3,), in the marker's frame, any length, not forward.
     """
     up = towards_hand / np.linalg.norm(towards_hand)
     ahead = FORWARD - (FORWARD @ up) * up
@@ -30,12 +30,12 @@ def tag_tables(towards_hand: FloatArray) -> str:
 
 
 def cube_tables(towards_hand: FloatArray) -> str:
-    """The tables [vision] for a cube that stands on one of its corners, six tags on it.
+    """Return the tables [vision] for a cube that stands on one of its corners, with six tags.
 
-    The tool ends in that corner and covers none of the faces, so that three of them look back at the hand.
+    The tool ends in that corner and covers no face, so that three faces point back to the hand.
 
     Args:
-        towards_hand: where the tool comes from (3,), in the marker's frame, any length.
+        towards_hand: direction of the tool from the marker (3,), in the marker's frame, any length.
     """
     lines = _head(SQUARE * CUBE_M)
     on_corner = Rotation.align_vectors(towards_hand[None] / np.linalg.norm(towards_hand), np.ones((1, 3)) / np.sqrt(3))[
@@ -56,7 +56,7 @@ def _tag(id: int, xyz: FloatArray, rpy: FloatArray) -> list[str]:
 
 
 def _outward(normal: FloatArray) -> Rotation:
-    """A rotation that turns z into `normal` (3,)."""
+    """Return a rotation that turns z into `normal` (3,)."""
     side = np.roll(normal, 1)
     return Rotation.from_matrix(np.column_stack([side, np.cross(normal, side), normal]))
 

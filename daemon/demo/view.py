@@ -1,4 +1,4 @@
-"""What the demo shows: a live screen on a terminal, plain lines elsewhere."""
+"""Show the demo: a live screen on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PLAIN_EVERY_S = 5.0
 
 @contextmanager
 def shown_on(console: Console) -> Iterator[Callable[[Snapshot], None]]:
-    """A function that shows a snapshot on `console`."""
+    """Yield a function that shows a snapshot on `console`."""
     if not console.is_terminal:
         yield _Lines(console)
         return
@@ -35,7 +35,7 @@ def shown_on(console: Console) -> Iterator[Callable[[Snapshot], None]]:
 
 
 class _Lines:
-    """Lines of less than 80 characters, a few seconds apart, and none that says what the last one said."""
+    """Prints lines of less than 80 characters, a few seconds apart, without repeats."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -64,7 +64,7 @@ class _Lines:
 
 
 def _screen(snapshot: Snapshot) -> RenderableType:
-    """Not higher than 23 lines with the demo's seven joints, so that a terminal of 24 holds it."""
+    """Return the screen; with the demo's seven joints it has at most 23 lines, which fit a terminal of 24."""
     sampler, learner = snapshot.sampler, snapshot.learner
     head = Table.grid(padding=(0, 1), expand=True)
     head.add_column(ratio=1)
@@ -116,7 +116,7 @@ def _asker(snapshot: Snapshot) -> Text:
 
 
 def show_outcome(console: Console, outcome: Outcome, scene: Scene) -> None:
-    """The summary at the end."""
+    """Print the summary at the end."""
     first, second = outcome.first_tool, outcome.second_tool
     table = Table(title="Mean error on held-out poses, against the simulated truth", title_justify="left")
     table.add_column("", no_wrap=True)

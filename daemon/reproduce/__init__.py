@@ -1,4 +1,4 @@
-"""The experiments of Ulbrich et al. 2009, run again."""
+"""Rerun the experiments of Ulbrich et al. 2009."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The simulated arm of the experiments, and the poses it is learnt in."""
+"""The simulated arm of the experiments, and the poses for learning it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bodyschema.interfaces.robot import RobotDescription
 from bodyschema.interfaces.toml_file import read_toml
 from kbmaps import ChainTolerances, RigidChain
 
-# Head and arm joints by their number, in the order from camera to marker; each has at least two of the head.
+# Head and arm joints by their number, ordered from camera to marker; each set has at least two head joints.
 JOINTS = {
     5: ("neck_yaw", "neck_pitch", "shoulder_flexion", "shoulder_abduction", "elbow_flexion"),
     6: ("neck_yaw", "neck_pitch", "shoulder_flexion", "shoulder_abduction", "upperarm_rotation", "elbow_flexion"),
@@ -31,7 +31,7 @@ JOINTS = {
         "forearm_rotation",
     ),
 }
-# Another six: one of the head and five of the arm.
+# Another set of six: one of the head and five of the arm.
 OTHER_SIX = (
     "neck_pitch",
     "shoulder_flexion",
@@ -40,7 +40,7 @@ OTHER_SIX = (
     "elbow_flexion",
     "forearm_rotation",
 )
-# A crude estimate: 1-sigma of each component of a joint's rotation [rad], of a link [m], and of the marker [m].
+# Errors of a crude estimate: 1-sigma of each component of a joint's rotation [rad], of a link [m] and the marker [m].
 CRUDE_TURN, CRUDE_LINK_M, CRUDE_MARKER_M = np.radians(3.0), 0.015, 0.060
 CRUDE = ChainTolerances(
     axes=CRUDE_TURN,
@@ -53,7 +53,7 @@ CRUDE = ChainTolerances(
 
 
 def configuration(joints: Sequence[str], state_dir: Path, rules: DaemonConfig, *, sim_seed: int = 0) -> Config:
-    """robot.toml of the shipped upper body, with other joints, another folder for the store and other rules."""
+    """Return the shipped upper body's robot.toml with other joints, store folder and rules."""
     file = demonstration_model()
     tables, text = read_toml(file)
     tables["robot"] = {**tables["robot"], "joints": list(joints), "held_at": {}}
@@ -64,19 +64,19 @@ def configuration(joints: Sequence[str], state_dir: Path, rules: DaemonConfig, *
 
 
 def arm(joints: int | Sequence[str]) -> RigidChain:
-    """The shipped upper body with so many joints, or these, from the left camera to the ball."""
+    """Return the shipped upper body with these joints, or this number of them, from the left camera to the ball."""
     names = JOINTS[joints] if isinstance(joints, int) else joints
     return configuration(names, Path(), DaemonConfig()).robot.chain
 
 
 def longer_tool(chain: RigidChain, by_m: float) -> RigidChain:
-    """The chain with its marker farther from the hand."""
+    """Return the chain with its marker `by_m` farther from the hand [m]."""
     marker = chain.fixed[-1][:3, 3]
     return chain.with_tool(by_m * marker / np.linalg.norm(marker))
 
 
 def crude_estimate(rng: np.random.Generator, chain: RigidChain) -> RigidChain:
-    """The chain as a crude estimate has it: its errors are drawn from `CRUDE`."""
+    """Return a crude estimate of the chain, with errors sampled from `CRUDE`."""
     fixed = chain.fixed.copy()
     for transform in fixed:
         turn = Rotation.from_rotvec(CRUDE_TURN * rng.normal(size=3))
@@ -86,11 +86,11 @@ def crude_estimate(rng: np.random.Generator, chain: RigidChain) -> RigidChain:
 
 
 def uniform(rng: np.random.Generator, count: int, joints: int, range_deg: float) -> FloatArray:
-    """Poses (count, joints) [rad], each joint uniform within ± the range."""
+    """Return poses (count, joints) [rad], each joint uniform within ± the range."""
     return np.radians(rng.uniform(-range_deg, range_deg, (count, joints)))
 
 
 def beside(rng: np.random.Generator, q: FloatArray, count: int, sigma_deg: float = 5.0) -> FloatArray:
-    """Poses (count, d) near those of a walk, none of them in it."""
+    """Return poses (count, d) near those of a walk, but not part of it."""
     chosen = q[rng.integers(len(q), size=count)]
     return chosen + np.radians(sigma_deg) * rng.normal(size=chosen.shape)

@@ -1,4 +1,4 @@
-"""The claim of exactness: 3ᵈ noise-free samples determine the map."""
+"""Test of exactness: 3ᵈ noise-free samples determine the map."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from .arm import arm, uniform
 from .experiment import Curve, Experiment, Panel, Reading, Run, distances
 from .least_squares import blank_map
 
-# From so far to either side [°], and so many times 3ᵈ samples.
+# Joint range to either side [°], and the number of samples as a multiple of 3ᵈ.
 _ZONES = ((80.0, 1, "tab:blue"), (20.0, 2, "tab:orange"))
 
 
 def exactness(run: Run, *, joints: tuple[int, ...] = (5, 6, 7)) -> Experiment:
-    """As many noise-free samples as control points give the arm back; from a narrow zone, twice as many."""
+    """Recover the arm from as many noise-free samples as control points; from a narrow zone, from twice as many."""
     curves = [
         Curve(f"{'' if factor == 1 else f'{factor} · '}3ᵈ samples from ±{zone:.0f}°", colour)
         for zone, factor, colour in _ZONES

@@ -1,4 +1,4 @@
-"""What an experiment gives: curves as the paper draws them, and readings to hold against its figures."""
+"""Results of an experiment: curves as the paper plots them, and figures to compare with the paper's."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ import numpy as np
 from bodyschema.daemon.progress import Say
 from bodyschema.interfaces.records import FloatArray
 
-# The mean length of a noise vector with a unit standard deviation per axis: 2 √(2/π).
+# Mean length of a noise vector with unit standard deviation per axis: 2 √(2/π).
 MEAN_NOISE = 2.0 * math.sqrt(2.0 / math.pi)
 
-# Poses (n, d) [rad] and positions (n, 3) [m] of the marker in them, to learn.
+# Training data: poses (n, d) [rad] and marker positions (n, 3) [m].
 Pairs = tuple[FloatArray, FloatArray]
-# Poses (n, d) [rad] and where the marker is in them (n, 3) [m], by name.
+# Test data by name: poses (n, d) [rad] and marker positions (n, 3) [m].
 Tests = Mapping[str, Pairs]
 
 
 @dataclass(frozen=True)
 class Run:
-    """How an experiment is to be run.
+    """Settings of a run.
 
     Attributes:
-        rng: draws poses, noise and crude estimates.
-        seed: of the simulated robot whose images are rendered.
-        real: whether the measured curves are wanted, which take minutes.
-        say: told what is being done.
+        rng: generator for poses, noise and crude estimates.
+        seed: seed of the simulated robot whose images are rendered.
+        real: True to compute the measured curves, which take minutes.
+        say: called with progress messages.
     """
 
     rng: np.random.Generator
@@ -43,14 +43,14 @@ class Curve:
     """One line of a figure: errors [m] over the number of samples or cycles.
 
     Attributes:
-        name: as the legend says it.
-        colour: the paper's, where it has this curve.
-        style: of the line, as matplotlib calls it.
-        width: of the line [points].
-        thin: varies from pair to pair; drawn in the background, as a band.
+        name: name in the legend.
+        colour: the paper's colour, if it has this curve.
+        style: line style, in matplotlib's notation.
+        width: line width [points].
+        thin: True for values that vary from pair to pair; they are plotted in the background, as a band.
         count: samples or cycles (n,).
         mean: mean errors [m] (n,).
-        largest: largest errors [m] (n,); empty where the figure has none.
+        largest: largest errors [m] (n,); empty if the figure has none.
     """
 
     name: str
@@ -63,23 +63,23 @@ class Curve:
     largest: list[float] = field(default_factory=list)
 
     def add(self, count: int, errors: FloatArray) -> None:
-        """The errors [m] (m,) at one count."""
+        """Add the errors [m] (m,) at one count."""
         self.count.append(count)
         self.mean.append(float(errors.mean()))
         self.largest.append(float(errors.max()))
 
     def add_one(self, count: int, error_m: float) -> None:
-        """A single error [m] at one count."""
+        """Add a single error [m] at one count."""
         self.count.append(count)
         self.mean.append(error_m)
 
     def at(self, count: int) -> float | None:
-        """The mean error [m] at the last count that is not larger; None before the first."""
+        """Return the mean error [m] at the largest count up to this one; None before the first."""
         known = [mean for place, mean in zip(self.count, self.mean, strict=True) if place <= count]
         return known[-1] if known else None
 
     def first_below(self, limit_m: float) -> int | None:
-        """The first count from which on the mean error stays below the limit [m]."""
+        """Return the first count from which on the mean error stays below the limit [m]."""
         above = [place for place, mean in enumerate(self.mean) if mean >= limit_m]
         place = above[-1] + 1 if above else 0
         return self.count[place] if place < len(self.count) else None
@@ -92,9 +92,9 @@ class Panel:
     Attributes:
         title: what it shows.
         curves: its lines.
-        as_paper: drawn as the paper draws it: counts on a linear axis, and the largest errors too, dotted. Otherwise
-            counts are on a logarithmic one, from 1 on.
-        styles: what a line's style means, where it means something.
+        as_paper: True to plot as the paper does: counts on a linear axis, and the largest errors too, dotted. Otherwise
+            the axis of the counts is logarithmic, from 1 on.
+        styles: meaning of the line styles, where they have one.
     """
 
     title: str
@@ -105,14 +105,14 @@ class Panel:
 
 @dataclass(frozen=True)
 class Reading:
-    """One figure of the paper beside ours, under one reading of what the paper leaves open.
+    """A figure of the paper and ours, under one interpretation of what the paper leaves open.
 
     Attributes:
-        what: what was measured.
-        read_as: how the paper was read here.
-        paper: what the paper says.
-        value: what its method gave here; None where it was not reached.
-        unit: of the value.
+        what: the measured quantity.
+        read_as: the interpretation of the paper.
+        paper: the paper's figure.
+        value: our figure with the paper's method; None if it was not reached.
+        unit: unit of the value.
     """
 
     what: str
@@ -124,7 +124,7 @@ class Reading:
 
 @dataclass(frozen=True)
 class Column:
-    """Where a comparison was tested, and after how many pairs."""
+    """The test set of a comparison, and the number of pairs learnt."""
 
     test: str
     count: int
@@ -135,9 +135,9 @@ class Comparison:
     """Other models on the same pairs.
 
     Attributes:
-        title: what the numbers are.
-        columns: where it was tested, and after how many pairs.
-        rows: mean errors [m], one a column, by model; None where a model says nothing yet.
+        title: meaning of the numbers.
+        columns: test set and number of pairs of each column.
+        rows: mean errors [m], one per column, by model; None if a model has no prediction yet.
     """
 
     title: str
@@ -147,17 +147,17 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Experiment:
-    """What one experiment gave.
+    """Result of one experiment.
 
     Attributes:
-        name: as on the command line.
-        title: what it is.
-        counted: what the curves' counts are.
+        name: name on the command line.
+        title: description.
+        counted: meaning of the curves' counts.
         panels: the plots of the figure, the paper's own first.
-        readings: the paper's figures beside ours.
+        readings: the paper's figures and ours.
         comparison: other models on the same pairs.
-        notes: what the paper leaves open, and how it was read here.
-        floor_m: lengths below are drawn as this one [m].
+        notes: what the paper leaves open, and how it was interpreted.
+        floor_m: lengths below this are plotted as this one [m].
     """
 
     name: str
@@ -171,5 +171,5 @@ class Experiment:
 
 
 def distances(x: FloatArray, other: FloatArray) -> FloatArray:
-    """Distances [m] (n,) between positions, both (n, 3)."""
+    """Return the distances [m] (n,) between positions, both (n, 3)."""
     return np.linalg.norm(x - other, axis=1)

@@ -20,7 +20,7 @@ _PAPER = "about 2,200"
 
 
 def fig4(run: Run, *, samples: int = 13_000, tests: int = 6_000) -> Experiment:
-    """Least squares over growing subsets of noisy pairs, tested without noise within ±80° and ±120°."""
+    """Run least squares on growing subsets of noisy pairs, tested without noise within ±80° and ±120°."""
     pairs, held = _drawn(run.rng, JOINTS[6], samples, tests)
     counts = [n for n in (800, *range(1_000, 4_000, 200), *range(4_000, 13_001, 1_000)) if n <= samples]
     what = f"exact learning, solved after up to {counts[-1]:,} samples"
@@ -63,13 +63,13 @@ def fig4(run: Run, *, samples: int = 13_000, tests: int = 6_000) -> Experiment:
 
 
 def crossing(training: Curve, test: Curve) -> int | None:
-    """The first count at which the mean test error is not above the mean training error."""
+    """Return the first count at which the mean test error does not exceed the mean training error."""
     means = zip(test.count, test.mean, training.mean, strict=True)
     return next((count for count, of_test, of_training in means if of_test <= of_training), None)
 
 
 def _drawn(rng: np.random.Generator, joints: Sequence[str], samples: int, tests: int) -> tuple[Pairs, Tests]:
-    """Noisy pairs, and poses within and beyond their range with true positions."""
+    """Return noisy pairs, and poses within and beyond their range with true positions."""
     chain, d = arm(joints), len(joints)
     q = uniform(rng, samples, d, HALF_DEG)
     x = chain.positions(q) + SIGMA_M * rng.normal(size=(samples, 3))
@@ -78,7 +78,7 @@ def _drawn(rng: np.random.Generator, joints: Sequence[str], samples: int, tests:
 
 
 def _least_squares(pairs: Pairs, held: Tests, counts: Iterable[int]) -> tuple[Curve, dict[str, Curve]]:
-    """Training, and the tests, in the paper's colours."""
+    """Return the curves of training and tests, in the paper's colours."""
     training = Curve("training", "tab:green")
     return training, plain(blank_map(pairs[0].shape[1], HALF_DEG), pairs, counts, held, training=training)
 

@@ -1,4 +1,4 @@
-"""Figure 5: exact learning of five joints, measured beside simulated."""
+"""Figure 5: exact learning of five joints, from measured and from simulated data."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ AS_MEASURED, TRUE = "test points as measured", "true test points"
 
 @dataclass(frozen=True)
 class _Data:
-    """Pairs to learn, and test poses with noisy positions and with true ones."""
+    """Training pairs, and test poses with noisy and with true positions."""
 
     pairs: Pairs
     tests: Tests
 
 
 def fig5(run: Run, *, train: int = 1_000, test: int = 500) -> Experiment:
-    """Least squares from nothing, on tracked positions and on simulated ones with noise in the same poses."""
+    """Run least squares without prior knowledge, on tracked positions and on simulated noisy ones in the same poses."""
     chain = arm(5)
     counts = list(range(300, train + 1, 50))
     run.say(f"a walk of {train + test:,} pairs through the sampler")

@@ -1,4 +1,4 @@
-"""Figure 6: seven joints, the exact map, and a marker that was moved by 250 mm."""
+"""Figure 6: seven joints, the exact map, and a marker displaced by 250 mm."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _PAPER = "about 50 mm"
 
 
 def fig6(run: Run, *, online: int = 1_700, cycles: int = 3_000) -> Experiment:
-    """The paper's rule from the exact map of the old tool, and other models that know the arm and not the tool."""
+    """Run the paper's rule from the exact map of the old tool, and other models that know the arm but not the tool."""
     nominal = arm(7)
     chain = longer_tool(nominal, MOVED_M)
     run.say(f"a walk of {online:,} pairs through the sampler")
@@ -81,7 +81,7 @@ def _tests(rng: np.random.Generator, q: FloatArray, chain: RigidChain) -> Tests:
 def _other_readings(
     run: Run, nominal: RigidChain, chain: RigidChain, streams: dict[str, Stream], online: int, cycles: int
 ) -> list[Reading]:
-    """The paper's rule under other readings of its set-up."""
+    """Run the paper's rule under other interpretations of its set-up."""
     run.say("a walk of larger steps")
     noisy = streams["σ = 20 mm"]
     true = chain.positions(noisy.q)
@@ -108,7 +108,7 @@ def _other_readings(
 
 
 def _across(tool: FloatArray) -> FloatArray:
-    """A unit vector (3,) at right angles to the tool."""
+    """Return a unit vector (3,) perpendicular to the tool."""
     across: FloatArray = np.cross(tool, np.eye(3)[np.argmin(np.abs(tool))]).astype(np.float64)
     return across / np.linalg.norm(across)
 

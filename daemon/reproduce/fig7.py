@@ -1,4 +1,4 @@
-"""Figure 7: six joints from a crude estimate, measured beside simulated."""
+"""Figure 7: six joints from a crude estimate, measured and simulated."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Found = dict[str, dict[str, dict[str, Curve]]]
 
 @dataclass(frozen=True)
 class _Size:
-    """How many pairs are learnt as they come, cycles in all, and pairs of the guided walk held out for tests."""
+    """Number of online pairs, of cycles in all, and of pairs of the guided walk held out for tests."""
 
     online: int
     cycles: int
@@ -39,7 +39,7 @@ class _Size:
 
 
 def fig7(run: Run, *, online: int = 600, cycles: int = 2_200, held_out: int = 400, onward: int = 200) -> Experiment:
-    """The paper's rule and other models from a crude estimate: tracked positions of a guided walk, and simulated."""
+    """Run the paper's rule and other models from a crude estimate, on a tracked guided walk and on simulated walks."""
     size = _Size(online, cycles, held_out, onward)
     chain = arm(6)
     crude = crude_estimate(run.rng, chain)
@@ -81,7 +81,7 @@ def _notes(noise_m: float | None) -> list[str]:
 
 
 def _random_walks(run: Run, chain: RigidChain, size: _Size) -> dict[str, Stream]:
-    """The paper's simulation: a walk without noise; with noise; and in steps of 1° to 3° of each joint."""
+    """Simulate as the paper does: a walk without noise, with noise, and in steps of 1° to 3° of each joint."""
     run.say(f"walks of {size.online:,} pairs through the sampler")
     q, q_joint = (walk(run.rng, size.online, JOINTS[6], each_joint=each, say=run.say) for each in (False, True))
     order = in_stages(run.rng, size.online, size.cycles)
@@ -100,7 +100,7 @@ def _tests(rng: np.random.Generator, q: FloatArray, chain: RigidChain) -> Tests:
 
 
 def _measured(rng: np.random.Generator, found: Measured, size: _Size) -> dict[str, Stream]:
-    """The guided walk as tracked, and the drawn chain's positions at the same readings, as the paper has it."""
+    """Return the guided walk as tracked, and like the paper, the nominal chain's positions at the same readings."""
     first = size.online + size.held_out
     shuffled = rng.permutation(first)
     learnt, held, onward = np.sort(shuffled[: size.online]), shuffled[size.online :], slice(first, None)
@@ -119,7 +119,7 @@ def _measured(rng: np.random.Generator, found: Measured, size: _Size) -> dict[st
 
 
 def _papers_panel(learnt: Found, apart: Curve) -> Panel:
-    """The paper's red and orange curve; without measurements, noise stands in for them."""
+    """Return the paper's red and orange curves; without measurements, noise replaces them."""
     if MEASURED in learnt:
         red, orange = learnt[SAME_POSES][RULE][HELD_OUT_TRUE], learnt[MEASURED][RULE][HELD_OUT]
         names = (SAME_POSES, MEASURED)

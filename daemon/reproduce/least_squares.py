@@ -1,4 +1,4 @@
-"""The paper's exact method over growing numbers of pairs."""
+"""The paper's exact method for growing numbers of pairs."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from kbmaps import ExactLearner, KBMap, blockwise_precision, follow_a_path, lear
 
 from .experiment import Curve, Pairs, Tests, distances
 
-# The paper's.
+# The paper's colours.
 COLOURS = {"test": "tab:blue", "extrapolation": "tab:orange"}
 REGULARISED = "KB-Map, precision from the pairs"
 
 
 def blank_map(joints: int, half_range_deg: float) -> KBMap:
-    """A map that knows nothing of the arm, for joints within ± the range."""
+    """Return a map without knowledge of the arm, for joints within ± the range."""
     half = np.full(joints, np.radians(half_range_deg))
     bases = learning_bases(-half, half)
     return KBMap(bases, np.zeros((3, *(basis.size for basis in bases))))
@@ -25,11 +25,11 @@ def blank_map(joints: int, half_range_deg: float) -> KBMap:
 def plain(
     prior: KBMap, pairs: Pairs, counts: Iterable[int], tests: Tests, *, training: Curve | None = None
 ) -> dict[str, Curve]:
-    """Least squares over the first pairs, for each of the counts: a curve for each test.
+    """Fit the first pairs by least squares, for each of the counts; return a curve for each test.
 
     Args:
         counts: ascending.
-        training: gets the errors on the pairs learnt.
+        training: receives the errors on the training pairs.
     """
     q, x = pairs
     learner, done = ExactLearner(prior), 0
@@ -48,7 +48,7 @@ def plain(
 def regularised(
     pairs: Pairs, counts: Iterable[int], tests: Tests, *, styles: Sequence[str] = ("-", "--")
 ) -> dict[str, Curve]:
-    """The daemon's exact member: the precision of a prior that knows nothing is chosen by the pairs themselves."""
+    """Run the daemon's exact model, which selects the precision of an uninformative prior from the pairs."""
     q, x = pairs
     curves = {test: Curve(REGULARISED, "tab:gray", style) for test, style in zip(tests, styles, strict=False)}
     prior = blank_map(q.shape[1], 180.0)

@@ -1,4 +1,4 @@
-"""The measured side: the simulated robot, guided or put into postures, rendered, tracked and sampled."""
+"""Measured data: the simulated robot, guided or put into postures, rendered, tracked and sampled."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _SPARE = 1.05
 
 @dataclass(frozen=True)
 class Measured:
-    """What the sampler made of rendered images and encoder ticks.
+    """The sampler's pairs from rendered images and encoder ticks.
 
     Attributes:
         q: readings (n, d) [rad].
-        x: positions as tracked (n, 3) [m].
-        true: left eye to marker as it really is, over the readings.
-        nominal: as the robot's description has it.
+        x: tracked positions (n, 3) [m].
+        true: true chain from left eye to marker, over the readings.
+        nominal: the same by the robot's description.
     """
 
     q: FloatArray
@@ -45,7 +45,7 @@ class Measured:
 
 
 def guided_walk(joints: int, count: int, seed: int, say: Say) -> Measured:
-    """A walk by the virtual hand, in the sampler's steps of 1° to 3°."""
+    """Return a walk by the virtual hand, in the sampler's steps of 1° to 3°."""
     with tempfile.TemporaryDirectory(prefix="bodyschema_") as folder:
         config = configured(JOINTS[joints], Path(folder), DaemonConfig(), sim_seed=seed)
         with open_sources(config, sim=True) as sources:
@@ -54,7 +54,7 @@ def guided_walk(joints: int, count: int, seed: int, say: Say) -> Measured:
 
 
 def postures(joints: int, count: int, seed: int, say: Say) -> Measured:
-    """Postures drawn independently, without a path between them: the sampler's rule on steps is off."""
+    """Return independently sampled postures, without a path between them: the sampler's step rule is off."""
     with tempfile.TemporaryDirectory(prefix="bodyschema_") as folder:
         config = configured(JOINTS[joints], Path(folder), DaemonConfig(any_step=True), sim_seed=seed)
         with open_postures(config, int(_SPARE * count)) as sources:

@@ -1,4 +1,4 @@
-"""The models that learn the same pairs as the paper's method. One more is one more line in a tuple here."""
+"""Models that learn the same pairs as the paper's method. A tuple below lists them, one line each."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ from kbmaps.model import Model
 
 from .experiment import Curve, Pairs, Tests, distances
 
-# Pairs from which a chain is searched where nothing is known of the arm.
+# Number of pairs for the search for a chain if the arm is unknown.
 SEARCHED = 100
 UNKNOWN = ChainTolerances(
     axes=inf, points=inf, zeros=inf, slide_zeros=inf, tool=inf, base_rotation=inf, base_translation=inf
 )
-# A tensor train's prior has no exact numbers; this is near enough [rad, m].
+# A tensor train's prior needs positive standard deviations; this is small enough [rad, m].
 _LEAST_STD = 1e-6
-# How far a tensor train may leave rigidity, as a share of how far its links may be turned.
+# Permitted deviation of a tensor train from rigidity, relative to that of its link rotations.
 _ELLIPSE_SHARE = 0.05
 
 
 @dataclass(frozen=True)
 class Knowledge:
-    """What a model is told before the first pair; the noise is not among it.
+    """Prior knowledge of a model, without the noise.
 
     Attributes:
-        chain: the arm as drawn, or as searched in the first pairs.
-        tolerances: how far the real one may be from it.
+        chain: the nominal arm, or the one found from the first pairs.
+        tolerances: possible deviation of the real arm from it.
         half_range: each joint's range is ± this [rad].
     """
 
@@ -51,21 +51,21 @@ class Knowledge:
 
     @classmethod
     def searched(cls, rng: np.random.Generator, q: FloatArray, x: FloatArray, half_range: float) -> Knowledge:
-        """Nothing is known of the arm, so that its first pairs have to tell."""
+        """Find the chain of an unknown arm from its first pairs."""
         return cls(find_chain(q[:SEARCHED], x[:SEARCHED], rng=rng), UNKNOWN, half_range)
 
     @property
     def bases(self) -> tuple[JointBasis, ...]:
-        """Bases orthonormal over the joints' ranges."""
+        """Orthonormal bases over the joints' ranges."""
         half = np.full(self.chain.joints, self.half_range)
         return learning_bases(-half, half)
 
 
 @dataclass(frozen=True)
 class Contender:
-    """A model under the name, in the colour and in the width [points] of its curve.
+    """A model with the name, colour and width [points] of its curve.
 
-    Models that are often equally good have widths far apart.
+    Models that are often equally good have clearly different widths.
     """
 
     name: str
@@ -87,7 +87,7 @@ def _tensor_train_around(known: Knowledge) -> Model:
     )
 
 
-# With a drawing of the arm.
+# With a nominal chain.
 WITH_DRAWING = (
     Contender("rigid chain", "tab:blue", lambda known: RigidLearner(known.chain, known.tolerances), 5.0),
     Contender(
@@ -116,13 +116,13 @@ def learn_all(
     suffix: str = "",
     say: Say = quiet,
 ) -> dict[str, dict[str, Curve]]:
-    """Each contender's errors after so many of the pairs q (n, d) [rad] and x (n, 3) [m]: curves by model and test.
+    """Return each model's errors after the first pairs q (n, d) [rad] and x (n, 3) [m]: curves by model and test.
 
     Args:
-        counts: ascending; 0 is what a model says before the first pair.
-        styles: of the tests' lines.
-        suffix: what the curves' names end with.
-        say: told which contender learns, and how far it is.
+        counts: numbers of pairs, ascending; 0 is the prediction before the first pair.
+        styles: line styles of the tests.
+        suffix: suffix of the curves' names.
+        say: called with the name of the learning model and its progress.
     """
     q, x = pairs
     found: dict[str, dict[str, Curve]] = {}
@@ -144,5 +144,5 @@ def learn_all(
 
 
 def spread_counts(first: int, last: int, number: int = 12) -> list[int]:
-    """So many counts at most between two, evenly spread over their logarithms."""
+    """Return at most `number` counts from `first` to `last`, evenly spaced on a logarithmic scale."""
     return sorted({*np.geomspace(first, last, number).round().astype(int).tolist(), last})

@@ -1,4 +1,4 @@
-"""The figures as pictures."""
+"""Plot the figures."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
-# Curves with so few points get markers.
+# Curves with at most this many points get markers.
 _FEW = 15
-# A dash and a gap [points], the same for all widths, so that dashes of curves that coincide nest too.
+# A dash and a gap [points], the same for all widths, so that dashes of coinciding curves overlap.
 _DASH = (9.0, 5.0)
-# What varies from pair to pair is drawn as a band over so many stretches, between these percentiles, and its median.
+# Number of intervals of the band for values that vary from pair to pair: these percentiles, and the median.
 _STRETCHES = 70
 _BAND = (10.0, 50.0, 90.0)
-# On a logarithmic axis no more points than so many a decade: their means.
+# Maximum number of points per decade of a logarithmic axis; points are averaged.
 _A_DECADE = 15
-# Errors down to here have plain numbers on the axis, smaller ones powers of ten [mm].
+# Errors above this are labelled with plain numbers, smaller ones with powers of ten [mm].
 _PLAIN_MM = 1e-3
 
 
 def plot(experiment: Experiment, file: Path) -> None:
-    """The panels side by side as a PNG: thick lines are mean errors, dotted ones the largest, as in the paper."""
+    """Plot the panels side by side as a PNG: thick lines are mean errors, dotted ones the largest, as in the paper."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -44,7 +44,7 @@ def plot(experiment: Experiment, file: Path) -> None:
 
 
 def draw(axes: Axes, panel: Panel, floor_m: float) -> None:
-    """One panel; lengths below the floor [m] are drawn on it."""
+    """Plot one panel; lengths below the floor [m] are plotted on it."""
     axes.set_yscale("log")
     bands, curves = ([curve for curve in panel.curves if curve.thin is thin] for thin in (True, False))
     for curve in bands:
@@ -61,7 +61,7 @@ def draw(axes: Axes, panel: Panel, floor_m: float) -> None:
 
 
 def _line(axes: Axes, curve: Curve, floor_m: float, *, as_paper: bool) -> None:
-    """Narrow lines above wide ones: where they coincide all are seen."""
+    """Plot narrow lines above wide ones, so that coinciding lines all remain visible."""
     counts, means = np.array(curve.count), 1e3 * np.maximum(curve.mean, floor_m)
     if not as_paper:
         counts, means = _thinned(counts[counts > 0], means[counts > 0])
@@ -74,7 +74,7 @@ def _line(axes: Axes, curve: Curve, floor_m: float, *, as_paper: bool) -> None:
 
 
 def _band(axes: Axes, curve: Curve, floor_m: float) -> None:
-    """What varies from pair to pair, as most of it and its median."""
+    """Plot values that vary from pair to pair as a percentile band with its median."""
     stretches = np.array_split(np.arange(len(curve.count)), min(_STRETCHES, len(curve.count)))
     counts = [np.mean([curve.count[place] for place in stretch]) for stretch in stretches]
     lengths = 1e3 * np.maximum(curve.mean, floor_m)
@@ -84,7 +84,7 @@ def _band(axes: Axes, curve: Curve, floor_m: float) -> None:
 
 
 def _thinned(counts: FloatArray, means: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Of points that lie close on a logarithmic axis, their mean; the last one stays."""
+    """Average points that are close on a logarithmic axis; keep the last one."""
     if len(counts) <= _FEW:
         return counts, means
     decades = np.round(_A_DECADE * np.log10(counts[:-1]))
@@ -94,7 +94,7 @@ def _thinned(counts: FloatArray, means: FloatArray) -> tuple[FloatArray, FloatAr
 
 
 def _scales(axes: Axes, *, logarithmic_counts: bool) -> None:
-    """Counts and errors as plain numbers, as long as they are no rounding errors."""
+    """Label counts and errors with plain numbers, unless they are rounding errors."""
     from matplotlib.ticker import LogLocator, NullFormatter
 
     if logarithmic_counts:
@@ -112,7 +112,7 @@ def _scales(axes: Axes, *, logarithmic_counts: bool) -> None:
 
 
 def _floor(axes: Axes, lowest_mm: float) -> None:
-    """A line that shorter lengths are drawn on, and beneath it what it is."""
+    """Draw the line of the plotted minimum, with a label below it."""
     axes.axhline(lowest_mm, color="grey", lw=0.6, zorder=0.0)
     axes.set_ylim(bottom=lowest_mm * (lowest_mm / axes.get_ylim()[1]) ** 0.07)
     where = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "ha": "right", "va": "top"}
@@ -120,7 +120,7 @@ def _floor(axes: Axes, lowest_mm: float) -> None:
 
 
 def _legend(axes: Axes, panel: Panel) -> None:
-    """Below the plot: each name once, then what styles mean."""
+    """Put the legend below the plot: each name once, then the meaning of the styles."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

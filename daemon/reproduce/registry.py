@@ -1,4 +1,4 @@
-"""The experiments by their names."""
+"""The experiments by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pairs as the daemon's sampler makes them, from sources that run for as long as pairs are wanted."""
+"""Make pairs with the daemon's sampler, from sources that run as long as pairs are wanted."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss
 
 
 class _Enough:
-    """A marker source that ends as soon as the store has enough pairs."""
+    """A marker source that ends once the store has enough pairs."""
 
     def __init__(self, marker: MarkerSource, stored: PairReader, count: int, say: Say) -> None:
         self._marker, self._stored, self._count, self._say = marker, stored, count, say
@@ -49,10 +49,10 @@ class _Enough:
 
 
 def sampled(config: Config, sources: Sources, count: int, say: Say) -> tuple[FloatArray, FloatArray]:
-    """The first pairs that the sampler accepts: q (count, d) [rad or m] and x (count, 3) [m].
+    """Return the first pairs that the sampler accepts: q (count, d) [rad or m] and x (count, 3) [m].
 
     Raises:
-        SourceError: the sources ended before.
+        SourceError: the sources ended too early.
         StoreError: the store cannot be written.
     """
     with Bus() as bus, PairStore(config.store_file, session_of(config, SystemClock())) as store:

@@ -1,4 +1,4 @@
-"""An experiment on the terminal."""
+"""Show an experiment in a terminal."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from rich.table import Table
 
 from .experiment import Column, Comparison, Experiment, Reading
 
-# Lengths below are rounding errors [m].
+# Smaller lengths are rounding errors [m].
 ROUNDING_M = 1e-12
 
 
 def show(console: Console, experiment: Experiment, plot: Path) -> None:
-    """The paper's figures beside ours, other models, what was read into the paper, and where the plot is."""
+    """Print the paper's figures and ours, other models, interpretations of the paper, and the plot's path."""
     console.print()
     console.print(_readings(experiment))
     console.print()
@@ -28,7 +28,7 @@ def show(console: Console, experiment: Experiment, plot: Path) -> None:
 
 
 def mm(length_m: float | None) -> str:
-    """A length in mm, in three digits; rounding errors are told as such."""
+    """Return a length in mm with three digits; rounding errors are marked as such."""
     if length_m is None:
         return "-"
     if length_m < ROUNDING_M:
@@ -38,7 +38,7 @@ def mm(length_m: float | None) -> str:
 
 
 def _readings(experiment: Experiment) -> Table:
-    """What was measured, with the paper's figure beside it, heads the ways to read the paper."""
+    """Return a table of the figures, with the paper's value above the results of each interpretation."""
     table = Table(title=experiment.title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
     table.add_column("")
     table.add_column("its method, here", justify="right")
@@ -60,7 +60,7 @@ def _value(reading: Reading) -> str:
 
 
 def _comparison(comparison: Comparison) -> Table:
-    """A column for each number of pairs; where it was tested heads the models."""
+    """Return a table with a column for each number of pairs; the models are grouped by test set."""
     counts = sorted({column.count for column in comparison.columns})
     table = Table(
         title=f"{comparison.title} [mm]", title_justify="left", box=SIMPLE_HEAD, pad_edge=False, show_edge=False

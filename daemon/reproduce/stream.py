@@ -1,4 +1,4 @@
-"""Learning pair by pair, then again in random order: the paper's rule, the daemon's learner, and other models."""
+"""Learn pair by pair, then again in random order, by the paper's rule, the daemon's learner and other models."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .models import WITH_DRAWING, Knowledge, learn_all, spread_counts
 
 ALPHA = np.radians(60.0)
 EVERY = 10
-# After so few pairs the models are compared, and at the end of those that came.
+# The models are compared after this few pairs, and at the end of the online pairs.
 EARLY = 30
 RULE, LEARNER = "paper's rule", "this learner"
 _LEAST_SIGMA_M = 1e-4
@@ -27,14 +27,14 @@ _LEAST_SIGMA_M = 1e-4
 
 @dataclass(frozen=True)
 class Stream:
-    """Pairs in the order in which they are learnt: first as they came, then permuted.
+    """Pairs in learning order: first as they arrived, then permuted.
 
     Attributes:
-        name: what the pairs are.
+        name: description of the pairs.
         q, x: the pairs (n, d) [rad] and (n, 3) [m].
-        sigma: 1-sigma of a coordinate that the daemon's learner is told [m].
-        order: places of the pairs, one a cycle; the first n are 0 … n − 1.
-        tests: where errors are measured.
+        sigma: 1-sigma of a coordinate that is given to the daemon's learner [m].
+        order: indices of the pairs, one per cycle; the first n are 0 … n − 1.
+        tests: test sets for the errors.
     """
 
     name: str
@@ -46,23 +46,23 @@ class Stream:
 
     @property
     def online(self) -> int:
-        """Pairs that came, before the replay."""
+        """Number of online pairs, before the replay."""
         return len(self.q)
 
 
 def in_stages(rng: np.random.Generator, online: int, cycles: int) -> NDArray[np.intp]:
-    """The order of so many cycles: pairs as they come, then all of them permuted, again and again."""
+    """Return the order of `cycles` cycles: online pairs first, then repeated permutations of all of them."""
     again = [rng.permutation(online) for _ in range(cycles // online + 1)]
     return np.concatenate([np.arange(online), *again])[:cycles]
 
 
 def bernstein_map(chain: RigidChain, alpha: float = ALPHA) -> KBMap:
-    """The chain in the paper's basis."""
+    """Return the chain in the paper's basis."""
     return chain.to_kbmap(tuple(JointBasis.bernstein(alpha) for _ in range(chain.joints)))
 
 
 def papers_rule(prior: KBMap, stream: Stream, say: Say) -> dict[str, Curve]:
-    """The paper's rule (eq. 20) with μ0 = 1 over all cycles: a curve for each test."""
+    """Run the paper's rule (eq. 20) with μ0 = 1 over all cycles; return a curve for each test."""
     learner = NLMS(prior, 1.0)
     curves = {test: Curve(RULE, "tab:red") for test in stream.tests}
     what = f"{RULE}, {stream.name}: cycles, {EVERY} at a time"
@@ -75,7 +75,7 @@ def papers_rule(prior: KBMap, stream: Stream, say: Say) -> dict[str, Curve]:
 
 
 def background(prior: KBMap, stream: Stream, say: Say) -> tuple[Curve, Curve]:
-    """The error on each pair before the paper's rule learns it, and how far consecutive markers are apart."""
+    """Return the error on each pair before the paper's rule learns it, and the distance between consecutive markers."""
     learner = NLMS(prior, 1.0)
     errors = Curve("each pair before it is learnt", "tab:green", thin=True)
     steps = Curve("distance of consecutive markers", "lightskyblue", thin=True)
@@ -90,7 +90,7 @@ def background(prior: KBMap, stream: Stream, say: Say) -> tuple[Curve, Curve]:
 
 
 def daemons_learner(nominal: RigidChain, stream: Stream, say: Say, *, tool_changed: bool) -> dict[str, Curve]:
-    """The daemon's learner on the same pairs, each once and in their order; it replays by itself."""
+    """Run the daemon's learner on the same pairs, each once and in order; it replays on its own."""
     limit = np.full(nominal.joints, np.pi)
     learning = Learning(NominalModel(nominal, -limit, limit), LearnerConfig(), DirectSolver())
     if tool_changed:
@@ -111,12 +111,12 @@ def daemons_learner(nominal: RigidChain, stream: Stream, say: Say, *, tool_chang
 def learn_stream(
     stream: Stream, nominal: RigidChain, known: Knowledge, say: Say, *, tool_changed: bool
 ) -> dict[str, dict[str, Curve]]:
-    """Everybody on one stream: curves by model and test.
+    """Run all models on one stream; return curves by model and test.
 
     Args:
-        nominal: what the paper's rule and the daemon's learner begin with.
-        known: what the other models begin with.
-        tool_changed: whether the daemon's learner is told that the marker was moved.
+        nominal: initial chain of the paper's rule and of the daemon's learner.
+        known: prior knowledge of the other models.
+        tool_changed: True if the tool change is reported to the daemon's learner.
     """
     found = {
         RULE: papers_rule(bernstein_map(nominal), stream, say),

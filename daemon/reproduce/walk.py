@@ -1,4 +1,4 @@
-"""The paper's random walk, as encoders and cameras see it, through the daemon's sampler."""
+"""Make pairs from the paper's random walk, as seen by encoders and cameras, with the daemon's sampler."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from kbmaps import RigidChain
 from .arm import configuration
 from .sampling import sampled
 
-# Normally distributed about zero with this standard deviation [rad].
+# Standard deviation of the poses, normally distributed about zero [rad].
 WALK_SIGMA = np.radians(22.0)
 STEP_DEG = (1.0, 3.0)
 _FRAME_S = 1 / 30
@@ -30,7 +30,7 @@ _COV = frozen_array(np.eye(3) * 1e-6)
 
 
 class _Walk:
-    """Metropolis steps through poses (d,) [rad]; two threads may ask, each at its own pace."""
+    """Metropolis steps through poses (d,) [rad]; two threads may read, each at its own pace."""
 
     def __init__(self, rng: np.random.Generator, joints: int, stretch: float) -> None:
         self._rng, self._step = rng, stretch * _FRAME_STEP / np.sqrt(joints)
@@ -48,7 +48,7 @@ class _Walk:
 
 
 class _Source:
-    """What both sources of a walk share: frames are counted from the opening on."""
+    """Common part of both sources of a walk: frames are counted from the opening on."""
 
     def __init__(self, walk: _Walk) -> None:
         self._walk, self._frame = walk, 0
@@ -66,7 +66,7 @@ class _Source:
 
 
 class _Encoders(_Source):
-    """Exact readings, one a frame."""
+    """Exact readings, one per frame."""
 
     def __init__(self, walk: _Walk, joints: Sequence[str]) -> None:
         super().__init__(walk)
@@ -78,7 +78,7 @@ class _Encoders(_Source):
 
 
 class _Marker(_Source):
-    """Exact fixes: noise is added to the pairs, so that two noises can be learnt in the same poses."""
+    """Exact fixes; noise is added to the pairs, so that two noise levels can be learnt in the same poses."""
 
     def __init__(self, walk: _Walk, chain: RigidChain) -> None:
         super().__init__(walk)
@@ -92,14 +92,13 @@ class _Marker(_Source):
 def walk(
     rng: np.random.Generator, count: int, joints: Sequence[str], *, each_joint: bool = False, say: Say = quiet
 ) -> FloatArray:
-    """A random walk (count, d) [rad] whose poses are normally distributed, in steps of 1° to 3°.
+    """Return a random walk (count, d) [rad] with normally distributed poses, in steps of 1° to 3°.
 
     The daemon's sampler decides which of its frames become pairs.
 
     Args:
-        each_joint: 1° to 3° is what a joint moves on average (the root mean square), not the Euclidean norm over all
-            joints.
-        say: told how many pairs there are.
+        each_joint: 1° to 3° is the root mean square step of a joint, not the Euclidean norm over all joints.
+        say: called with the number of pairs.
     """
     stretch = float(np.sqrt(len(joints))) if each_joint else 1.0
     rules = DaemonConfig(min_step_deg=stretch * STEP_DEG[0], max_step_deg=stretch * STEP_DEG[1])
