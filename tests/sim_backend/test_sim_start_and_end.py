@@ -78,7 +78,7 @@ def test_a_robot_without_stereo_calibration_is_told_which_keys_are_missing():
     for key in ("focal_px", "principal_point_px", "baseline_m", "image_size_px"):
         del tables["camera"][key]
     robot = RobotDescription.from_tables(tables, text, file)
-    with pytest.raises(ConfigError, match="focal_px, principal_point_px, baseline_m"), SimWorld(robot, SimConfig()):
+    with pytest.raises(ConfigError, match="focal_px, principal_point_px, image_size_px"), SimWorld(robot, SimConfig()):
         pass
 
 
