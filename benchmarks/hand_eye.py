@@ -123,9 +123,8 @@ def learnt(
         np.concatenate([getattr(report.base_rotation, end), getattr(report.base_translation, end)])
         for end in ("low", "high")
     )
-    return np.linalg.inv(report.T_measured_nominal @ placed.T_measured_nominal), (
-        (low < truth) & (truth < high)
-    ).astype(np.float64)
+    T: FloatArray = np.asarray(np.linalg.inv(report.T_measured_nominal @ placed.T_measured_nominal), dtype=np.float64)
+    return T, ((low < truth) & (truth < high)).astype(np.float64)
 
 
 def of_opencv(python: Path, grippers: FloatArray, poses: list[Pose]) -> dict[str, FloatArray]:

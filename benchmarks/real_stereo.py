@@ -17,6 +17,7 @@ from bodyschema.vision.calibration.calibrate import Asked, Calibrated, calibrate
 from bodyschema.vision.calibration.gather import gathered
 from bodyschema.vision.calibration.images import pair_files, read_pairs
 from bodyschema.vision.calibration.view import View
+from bodyschema.vision.rig import StereoRig
 
 BOARD = Board(10, 7, 0.025, pattern="chessboard")
 USUAL = Path("/usr/share/doc/opencv-doc/examples/data")
@@ -39,6 +40,7 @@ def main() -> None:
 def rows(ours: Calibrated, theirs: dict[str, float]) -> list[tuple[str, str, str, str]]:
     """Name, our value, its sigma and OpenCV's value."""
     rig = ours.rig
+    assert isinstance(rig, StereoRig)
     values = dict(zip(rig.names, zip(rig.vector.tolist(), rig.sigma.tolist(), strict=True), strict=True))
     wanted = (
         "left.fx_px",

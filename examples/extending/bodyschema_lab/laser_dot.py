@@ -28,7 +28,8 @@ class LaserDot:
 
     def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
         """The dot in both eyes, or why there is none."""
-        left, right = self._centre(frame.left), self._centre(frame.right)
+        right = None if frame.right is None else self._centre(frame.right)
+        left = self._centre(frame.left)
         if left is None or right is None:
             return MarkerMiss(frame.t, Reason.NO_MARKER)
         if abs(left[1] - right[1]) > ROWS_PX:
