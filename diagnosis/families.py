@@ -136,7 +136,7 @@ def _turned(what: str, calibration: StereoCalibration, axes: FloatArray) -> Fami
 
 
 def _giving(run: Simulated, k: int) -> list[Family]:
-    """Return families of a joint's support that yields under the arm's weight: in any way, or by springs on its axes."""
+    """Return families of a joint's support yielding under the arm's weight: in any way, or by springs on its axes."""
     what = f"what carries {run.simulation.robot.joints[k]} gives under the arm's weight"
     found = [Family(what, "body", None, (), False, _link(k), loads) for loads in (_moments(k), _wrenches(k))]
     supports = run.simulation.gravity.in_supports(k)

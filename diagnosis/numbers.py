@@ -52,7 +52,7 @@ _SAID_AGAIN = ("sine_rad", "cosine_rad", "sine_m", "cosine_m")
 _LEAST_DIGITS, _MOST_DIGITS = 0, 6
 # Half widths of an interval above which a length [m] or an angle [rad] is not identifiable.
 _UNTOLD = (("_rad", 0.5), ("_m", 0.1))
-# Numbers that say when and how, not how much.
+# Parameters of time and shape rather than size.
 _SAYS_HOW = ("t0", "cycles", "phase", "time_constant", "length", "hold")
 # An interval whose halves differ by more than this share is written with both its ends.
 _LOPSIDED = 0.3

@@ -22,7 +22,7 @@ from .unknown import Unknowns
 
 # Signals that differ by less than this, twice the log-likelihood that the right one is expected to gain, are one.
 SAME = 6.0
-# Residual share of a cause's χ² on any motion when an equivalent rival replaces it: the error of linear steps.
+# Predictions are the same if their expected Δχ² is smaller.
 _SAME_SHARE = 1e-3
 # A less probable rival is not listed.
 PROBABLE = 0.02

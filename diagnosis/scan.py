@@ -212,7 +212,7 @@ class Scan:
         return Candidate(effect.with_values(values), float(gains[best]), int(dofs[best]), _COARSE)
 
     def _each(self, effect: Effect, shapes: FloatArray) -> System:
-        """For each shape (m,), which scales the same columns row by row."""
+        """Return the system of each shape (m,), which scales the same columns row by row."""
         run = self._fit.run
         if effect.name == "thermal_drift":
             constant = np.broadcast_to(np.eye(3), (len(run.motion), 3, 3))
@@ -262,7 +262,7 @@ class Scan:
         return Candidate(effect.with_values(values), float(gains[best]), dof, len(holds))
 
     def _ripple(self, effect: Effect, least: float) -> Candidate | None:
-        """Return the best ripple over whole cycles per turn, then near the best; for a prismatic joint, over its path."""
+        """Return the best ripple over whole cycles per turn, then near the best; prismatic joints use their path."""
         place = self._fit.simulation.place(effect)
         span = max(float(np.ptp(self._fit.run.readings.q[:, place.joint])), 1e-6)
         first, step = (2.0, 1.0) if not place.prismatic else (1.0 / span, 1.0 / span)
