@@ -1,6 +1,6 @@
 """Model the manufacturing tolerances: small errors of every link, axis and drive.
 
-The position and axis of each link, its zero included, deviate by N(0, (s τ)²); so do the small periodic errors of each
+The position and axis of each link, its joint offset included, deviate by N(0, (s τ)²); so do the small periodic errors of each
 drive. The data determine three scales s: for lengths, for angles and for drives. This background is part of every fit
 and never a finding; a cause is larger.
 """
@@ -15,7 +15,7 @@ import numpy as np
 from bodyschema.effects import Effect, Simulated, Simulation
 from bodyschema.interfaces.records import FloatArray
 
-# Workshop tolerances (1 sigma): link length [m], axis or zero [rad], drive over a turn [rad].
+# Workshop tolerances (1 sigma): link length [m], axis or joint offset [rad], drive over a turn [rad].
 LENGTH_M, ANGLE_RAD, DRIVE_RAD = 0.3e-3, float(np.radians(0.06)), float(np.radians(0.01))
 # Tolerance of a prismatic joint's drive [m].
 _DRIVE_M = 0.03e-3
@@ -59,7 +59,7 @@ class Background:
             tolerances are centred on them.
 
     Attributes:
-        effects: the background's effects at zero: a link at each joint, eccentricity and ripple of each drive.
+        effects: the background's effects with zero amounts: a link at each joint, eccentricity and ripple of each drive.
         columns: derivatives (n, 3, p) [m] of the measured positions with respect to the amounts.
         tolerances: prior standard deviation of each amount (p,).
         start: the simulation's amounts (p,), about which the columns are linearised.
@@ -153,7 +153,7 @@ def weighted_products(columns: FloatArray, inner: FloatArray, weights: FloatArra
 
 
 def background_effects(simulation: Simulation, q: FloatArray) -> tuple[Effect, ...]:
-    """Return the tolerance effects at zero: for each joint that moves over q (n, d), and each link between."""
+    """Return the tolerance effects with zero amounts: for each joint that moves over q (n, d), and each link between."""
     robot, found = simulation.robot, []
     for k, joint in enumerate(robot.joints):
         found.append(_resting(Effect.at(robot, "link_geometry", joint)))

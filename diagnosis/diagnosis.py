@@ -60,7 +60,7 @@ class Diagnosis:
         hypotheses: the effects that were tested, and the reasons why others were not.
         nominal: the unchanged simulation.
         aligned: with the parameters that robot.toml does not know fitted.
-        geometry: with all lengths, axes, zeros, the tool and the camera's pose free.
+        geometry: with all lengths, axes, joint offsets, the tool and the camera's pose free.
         extended: with the causes, the tolerances, and the smooth model of the unnamed causes.
         tolerated: sizes of the tolerances.
         standings: assessment of each cause against its rivals.

@@ -123,7 +123,7 @@ class Tolerances(msgspec.Struct, frozen=True):
 
     Attributes:
         length_mm: of the positions of links.
-        angle_deg: of axes and zeros.
+        angle_deg: of axes and joint offsets.
         drive_deg: of the periodic errors of drives.
     """
 

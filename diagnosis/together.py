@@ -308,7 +308,7 @@ def _better(tried: Sequence[Together], here: Together) -> Together | None:
 def together(start: Fit, hypotheses: Sequence[Effect]) -> Fit:
     """Fit the set of causes with the most evidence beside tolerances everywhere.
 
-    The best sets to first order are refitted and compared again about their own parameters, until no other comes near.
+    The best sets to first order are refitted and compared again about their own parameters, until no other set comes near.
 
     Args:
         start: without a background.

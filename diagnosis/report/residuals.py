@@ -154,7 +154,7 @@ def binned(x: FloatArray, y: FloatArray) -> Bins:
 
 
 def structure(x: FloatArray, y: FloatArray) -> float:
-    """Return the share of the variance of y explained by x, beyond chance; 0 if not significant (analysis of variance)."""
+    """Return the share of the variance of y that x explains, beyond chance; 0 if not significant (ANOVA)."""
     member = _members(x)
     n, groups = len(y), int(member.max()) + 1
     if groups < 2 or n <= groups:
