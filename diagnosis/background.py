@@ -1,8 +1,8 @@
 """Model the manufacturing tolerances: small errors of every link, axis and drive.
 
-The position and axis of each link, its joint offset included, deviate by N(0, (s τ)²); so do the small periodic errors of each
-drive. The data determine three scales s: for lengths, for angles and for drives. This background is part of every fit
-and never a finding; a cause is larger.
+The position and axis of each link, its joint offset included, deviate by N(0, (s τ)²). So do the small periodic errors
+of each drive. The data determine three scales s: for lengths, for angles and for drives. This background is part of
+every fit and never a finding; a cause is larger.
 """
 
 from __future__ import annotations
@@ -54,12 +54,12 @@ class Background:
     Args:
         run: run of a simulation, whose background may be empty.
         whitening: (n, 3, 3), to units in which the stated noise has unit covariance.
-        scales: of the tolerances; None for no background at all.
+        scales: scales of the tolerances; None for no background at all.
         before: the background from which this one is derived; None where the simulation's own errors are known and the
             tolerances are centred on them.
 
     Attributes:
-        effects: the background's effects with zero amounts: a link at each joint, eccentricity and ripple of each drive.
+        effects: the effects with zero amounts: a link at each joint, eccentricity and ripple of each drive.
         columns: derivatives (n, 3, p) [m] of the measured positions with respect to the amounts.
         tolerances: prior standard deviation of each amount (p,).
         start: the simulation's amounts (p,), about which the columns are linearised.
@@ -153,7 +153,7 @@ def weighted_products(columns: FloatArray, inner: FloatArray, weights: FloatArra
 
 
 def background_effects(simulation: Simulation, q: FloatArray) -> tuple[Effect, ...]:
-    """Return the tolerance effects with zero amounts: for each joint that moves over q (n, d), and each link between."""
+    """Return the tolerance effects, with zero amounts, of each joint that moves over q (n, d) and each link between."""
     robot, found = simulation.robot, []
     for k, joint in enumerate(robot.joints):
         found.append(_resting(Effect.at(robot, "link_geometry", joint)))

@@ -59,14 +59,14 @@ class Diagnosis:
     Attributes:
         hypotheses: the effects that were tested, and the reasons why others were not.
         nominal: the unchanged simulation.
-        aligned: with the parameters that robot.toml does not know fitted.
-        geometry: with all lengths, axes, joint offsets, the tool and the camera's pose free.
-        extended: with the causes, the tolerances, and the smooth model of the unnamed causes.
+        aligned: fit of the parameters that robot.toml does not know.
+        geometry: fit with all lengths, axes, joint offsets, the tool and the camera's pose free.
+        extended: fit with the causes, the tolerances, and the smooth model of the unnamed causes.
         tolerated: sizes of the tolerances.
         standings: assessment of each cause against its rivals.
         left: residual structure that no effect fits.
         blocks: blocks of time for held-out errors.
-        seed: of the resampling.
+        seed: seed of the resampling.
         ended_early: True if the search stopped at its limit, so that more causes may exist.
     """
 
@@ -218,7 +218,7 @@ def diagnose(
 
     Args:
         only, without: names of effects to test, all by default, and not to test.
-        seed: of the resampling.
+        seed: seed of the resampling.
         blocks: blocks of held-out rows; blocks of time by default.
         tell: called with short messages on progress.
     """

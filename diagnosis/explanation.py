@@ -43,12 +43,12 @@ _BEYOND_DOUBT = 60.0
 class Explanation:
     """A set of named causes with a set of unnamed ones.
 
-    fit: with the named causes alone.
+    Attributes:
+        fit: the fit with the named causes alone.
         apart: with the unnamed causes removed from the data; None if there is no unnamed cause.
         worth: log-evidence of the whole, comparable only with that of other explanations [nats].
         size: RMS change by the unnamed causes beyond the named ones, in units of the stated noise.
         promise: first-order gain of the best single unnamed cause beside the named ones [nats].
-        promise: what the best single way without a name is worth beside the causes, to first order [nats].
     """
 
     fit: Fit

@@ -203,7 +203,7 @@ class Fit:
         agree = float((self.left[1:][follows] * self.left[:-1][follows]).sum())
         squares = float(np.square(self.left[1:][follows]).sum())
         rho = float(np.clip(agree / max(squares, 1e-300), 0.0, 0.99))
-        # Standard error bound of ρ for white rows.
+        # Two standard errors of ρ for white rows.
         unsure = 2.0 / np.sqrt(max(3.0 * float(follows.sum()), 1.0))
         return (1.0 - rho) / (1.0 + rho) if rho > unsure else 1.0
 

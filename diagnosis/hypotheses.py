@@ -21,7 +21,7 @@ class Hypotheses:
     """The effects to test, and the reasons why others are left out.
 
     Attributes:
-        effects: one of each, with zero amounts.
+        effects: one of each kind and place, with zero amounts.
         limitations: reasons why some were left out, a sentence each.
     """
 

@@ -28,7 +28,7 @@ def low_rank(inner: FloatArray, toward: FloatArray, amounts: int, rank: int) -> 
         amounts: b.
 
     Returns:
-        The sum of squares that it explains, and the functions (b, rank) that the moves follow.
+        The sum of squares that it explains, and the functions (b, rank) that the motions follow.
     """
     moves = len(toward) // amounts
     inner = inner + _RIDGE * np.eye(len(toward))

@@ -39,7 +39,7 @@ class Nameless:
         """Return the most probable one; None where none is tried.
 
         Args:
-            fit: with the cause.
+            fit: the fit with the cause.
             tried: fits without the cause, beside unnamed causes.
         """
         allowance = cost_of_names([cause], search) + SPECIFIC - _LESS_USUAL

@@ -122,9 +122,9 @@ class Tolerances(msgspec.Struct, frozen=True):
     A lower end of 0 means that the recording does not show them: they are no larger than the upper end.
 
     Attributes:
-        length_mm: of the positions of links.
-        angle_deg: of axes and joint offsets.
-        drive_deg: of the periodic errors of drives.
+        length_mm: tolerance of the positions of links.
+        angle_deg: tolerance of axes and joint offsets.
+        drive_deg: size of the periodic errors of drives.
     """
 
     length_mm: Interval

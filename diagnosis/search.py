@@ -31,7 +31,7 @@ Key = tuple[str, str | None, str | None]
 Named = frozenset[tuple[Key, int]]
 # Maximum of effects at one place that begin at a moment, and of ripples, which differ in their periods.
 _MOST_MOMENTS, _MOST_RIPPLES = 2, 4
-# Minimum cost of a parameter [nats], and the bisection rounds.
+# Minimum cost of a parameter [nats], and the fixed-point rounds of `rise_for`.
 _CHEAPEST, _ROUNDS = 1.5, 30
 # A rival must explain this share of a cause's gain; differences within this count as equal [nats].
 _COMES_NEAR, _EQUAL = 0.8, 0.3

@@ -22,7 +22,7 @@ def joints_of(family: Family, numbers: FloatArray, run: Simulated) -> frozenset[
     """Return the joints that err or on which the error depends, by their indices in q.
 
     Args:
-        numbers: of the family (p,).
+        numbers: parameters of the family (p,).
     """
     own = frozenset[int]() if family.joint is None else frozenset({family.joint})
     if family.over_time:
@@ -36,7 +36,7 @@ def shares(family: Family, numbers: FloatArray, run: Simulated) -> FloatArray:
     It is half the mean square change when only this joint is taken from another row (Jansen 1999).
 
     Args:
-        numbers: of the family (p,).
+        numbers: parameters of the family (p,).
     """
     rng = np.random.default_rng(_SEED)
     amounts, moves = family.amounts(run), family.moves(run)

@@ -76,8 +76,8 @@ class Together:
     Attributes:
         chosen: indices of its candidates.
         worth: its evidence less the cost of naming its causes [nats]; comparable only with that of other sets.
-        scales: of the tolerances.
-        sigma: of the noise, in units of the stated one.
+        scales: scales of the tolerances.
+        sigma: size of the noise, in units of the stated one.
         spent: effective number of data that determine each scale (3,).
         amounts: amounts of all its columns (p,).
         factor: factor of their precision, from `cho_factor`.
@@ -98,7 +98,7 @@ class Sets:
     """Sets of causes beside one fit, to first order.
 
     Args:
-        fit: with a background.
+        fit: a fit with a background.
         candidates: possible causes, each with the amounts, periods and moments about which it is linearised.
         doubt: minimum cost of naming one of them [nats].
     """
@@ -308,7 +308,7 @@ def _better(tried: Sequence[Together], here: Together) -> Together | None:
 def together(start: Fit, hypotheses: Sequence[Effect]) -> Fit:
     """Fit the set of causes with the most evidence beside tolerances everywhere.
 
-    The best sets to first order are refitted and compared again about their own parameters, until no other set comes near.
+    The best sets to first order are refitted and compared again about their own parameters, until no other is near.
 
     Args:
         start: without a background.

@@ -39,7 +39,7 @@ _ROUNDS, _ENOUGH = 5, 0.1
 _RANKS = (1, 2)
 # Largest factor by which an unnamed family may worsen held-out errors.
 _NO_WORSE = 1.02
-# Number of runners-up considered, and the share of the best first-order worth that they need.
+# Number of best families considered, and the share of the best first-order worth that they need.
 _NEAREST, _NEAR = 3, 0.9
 
 

@@ -58,7 +58,7 @@ def write_corrected(simulation: Simulation, folder: Path, heading: str) -> Path 
         The file; None where nothing is to be corrected.
 
     Raises:
-        ConfigError: it cannot be written.
+        ConfigError: the file cannot be written.
     """
     geometry = corrected_geometry(simulation)
     file = folder / corrected_file(simulation.robot)

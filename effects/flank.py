@@ -13,7 +13,7 @@ def flanks(torque: FloatArray, hold: float, before: float = 0.0) -> FloatArray:
     It changes sides when the opposite torque exceeds `hold`: until then friction in the gear keeps it in place.
 
     Args:
-        torque: of gravity about the joint, in the order of the rows [N·m or N], shape (n,).
+        torque: gravity's torque about the joint, in the order of the rows [N·m or N], shape (n,).
         hold: friction [N·m or N].
         before: flank before the first row; 0 if unknown, then the sign of the first torque counts.
     """

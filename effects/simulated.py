@@ -38,7 +38,7 @@ class Simulated:
     Attributes:
         readings: encoder readings at the time of the images.
         q: true joint angles (n, d) [rad, m].
-        frames: of the joints and the marker (n, d + 1, 4, 4) in the nominal camera's frame.
+        frames: frames of the joints and the marker (n, d + 1, 4, 4) in the nominal camera's frame.
         x_true, x_placed, x_camera: the marker (n, 3) [m] seen by the nominal camera, by the camera as it was set up,
             and by the camera at its present pose.
         measured: simulated measurements (n, 3) [m].
@@ -157,7 +157,7 @@ class Simulated:
         return np.stack(columns, axis=2)
 
     def _latency(self, effect: Effect) -> FloatArray:
-        # Encoder errors are those of the earlier moment too.
+        # Include the encoder errors: they too are those of the earlier moment.
         latency = self.simulation.latency_s
         later, sooner = (self.simulation.unloaded(self.motion.earlier(latency + s)) for s in (_STEP_S, -_STEP_S))
         return np.einsum("nij,nj->ni", self.by_joint, (later - sooner) / (2.0 * _STEP_S))[:, :, None]

@@ -26,10 +26,10 @@ _OF_A_CELL = 1.0
 
 @dataclass(frozen=True)
 class Panel:
-    """One plot.
+    """A plot with its title.
 
     Attributes:
-        title: what it shows.
+        title: description of the plot.
         svg: the plot.
         tells: share of the variance before that depends on the plotted quantity.
     """
