@@ -45,7 +45,7 @@ class Explanation:
 
     Attributes:
         fit: the fit with the named causes alone.
-        apart: with the unnamed causes removed from the data; None if there is no unnamed cause.
+        apart: fit with the unnamed causes removed from the data; None if there is no unnamed cause.
         worth: log-evidence of the whole, comparable only with that of other explanations [nats].
         size: RMS change by the unnamed causes beyond the named ones, in units of the stated noise.
         promise: first-order gain of the best single unnamed cause beside the named ones [nats].

@@ -133,7 +133,7 @@ class Tolerances(msgspec.Struct, frozen=True):
 
 
 class Pairs(msgspec.Struct, frozen=True):
-    """Numbers of pairs in total, held out, and classified as outliers."""
+    """Numbers of samples in total, held out, and classified as outliers."""
 
     total: int
     held_out: int

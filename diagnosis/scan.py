@@ -267,7 +267,7 @@ class Scan:
         span = max(float(np.ptp(self._fit.run.readings.q[:, place.joint])), 1e-6)
         first, step = (2.0, 1.0) if not place.prismatic else (1.0 / span, 1.0 / span)
         coarse: FloatArray = np.asarray(first + step * np.arange(_MOST_CYCLES - 1), dtype=np.float64)
-        # The width of a peak is the change that shifts the phase by 1 rad over the range.
+        # The width of a peak is the change that shifts the phase by one turn over the range.
         width = 1.0 / span if place.prismatic else 2.0 * np.pi / span
         bands = [coarse]
         if not place.prismatic:

@@ -117,7 +117,7 @@ def _beside(columns: Sequence[FloatArray], rows: int) -> FloatArray:
 class _Functions:
     """Functions of the readings of some families, each scaled to move the marker by 1 m (RMS) over all postures.
 
-    They are computed along the rigid chain with only those effects that depend on the readings alone.
+    They are computed along the rigid chain with the effects that it can hold, so they depend on the readings alone.
     """
 
     def __init__(self, fit: Fit, families: Sequence[Family]) -> None:

@@ -51,7 +51,7 @@ def _drawn(
     title: str,
     axes: tuple[str, str],
 ) -> Panel:
-    """Plot single pairs, their means, and the fitted curve."""
+    """Plot single samples, their means, and the fitted curve."""
     x, y = points
     some = residuals.some(POINTS, rows)
     bins = binned(x[rows], y[rows])

@@ -213,7 +213,7 @@ class _Document:
         limits = {} if joint.kind == "continuous" else {"range": texts(np.array([joint.lower, joint.upper]))}
         zero = {"ref": repr(-errors.offset)} if errors.offset else {}
         inertia = self._inertia(joint) + _ARMATURE
-        # MuJoCo's friction and limits soften with the inertia of the joints, and a backlash needs them hard.
+        # MuJoCo's friction and limits are softer the lighter the joints in the row are; a backlash needs them hard.
         heavy = {"armature": f"{inertia:.4g}"} if errors.play else {}
         self._joint(body, joint.name, **kind, **limits, **zero, **heavy)
         gain = f"{_SERVO_RATE**2 * inertia:.4g}"
