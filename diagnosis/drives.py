@@ -10,7 +10,7 @@ from .fit import Fit
 from .scan import Scan
 from .search import NAMED, nats
 
-# Each round may add one ripple per joint.
+# Maximum of rounds; each may add one ripple per joint.
 _ROUNDS = 8
 # Ripples whose phases differ by less over a joint's range are the same [turns].
 _APART = 0.75

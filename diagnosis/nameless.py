@@ -15,8 +15,8 @@ from .fit import Fit, amount_columns
 from .search import Search
 from .unknown import SPECIFIC, Apart, Unknowns
 
-# Prior penalty against a named cause [nats]. Accepting one in place of a cause takes `SPECIFIC` instead, so that a cause
-# is not given up for something that fits as well by chance.
+# Prior penalty against a named cause [nats]. Accepting one in place of a cause takes `SPECIFIC` instead, so that a
+# cause is not given up for something that fits as well by chance.
 _LESS_USUAL = 1.5
 
 

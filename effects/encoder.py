@@ -1,4 +1,4 @@
-"""Model encoder errors, the first stage from a reading to the joint's true angle; each effect is their difference."""
+"""Model encoder errors, the first stage; each effect gives the joint's true angle minus the reading."""
 
 from __future__ import annotations
 
