@@ -1,1 +1,1 @@
-"""From measured data and the robot's simulation to causes with names."""
+"""Find the named causes of the difference between measured data and the robot's simulation."""

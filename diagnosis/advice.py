@@ -1,4 +1,4 @@
-"""What to measure next where something is still open."""
+"""Advise what to measure next where a question is still open."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from .nameless import Nameless
 from .rivals import Rival, apart_on, whole_range, widened
 from .search import describe
 
-# Twice the log-likelihood by which a motion has to tell two causes apart to be worth advising.
+# Smallest Δχ² between two causes at which a motion is worth advising.
 _TELLS = 25.0
-# What shows that something without a name is there.
+# Measurements that reveal an unnamed cause.
 _WATCH = {
     "joint": "compare its reading with an angle that is measured otherwise",
     "body": "press on it, or record with a second marker on what carries it",
@@ -22,7 +22,7 @@ _WATCH = {
 
 
 def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """Sentences: which motion would tell causes apart that this one does not, and what to do about what has no name."""
+    """Return sentences of advice: motions that would separate confounded causes, and steps against unnamed causes."""
     told = []
     for cause, standing in zip(diagnosis.causes, diagnosis.standings, strict=True):
         for rival in standing.rivals:
@@ -50,7 +50,7 @@ def _reach(diagnosis: Diagnosis) -> str:
 
 
 def _motion(diagnosis: Diagnosis, cause: Effect, rival: Rival) -> str:
-    """Which joint, moved through its whole range, tells two causes apart best."""
+    """Return advice on the joint that, moved through its whole range, best separates two causes."""
     robot, fit = diagnosis.extended.simulation.robot, diagnosis.extended
     pair = f"{describe(cause)} from {rival.described}"
     apart = [apart_on(fit, rival.instead, widened(fit, [k])) for k in range(len(robot.joints))]

@@ -1,4 +1,4 @@
-"""Ripples that a recording cannot tell from finer or coarser ones, because a joint was read at regular angles."""
+"""Find ripples that a recording confuses with finer or coarser ones because a joint was read at regular angles."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bodyschema.interfaces.records import FloatArray
 from .fit import Fit
 from .scan import FINEST
 
-# Two waves whose phases agree so well over all readings are one.
+# Waves whose phases agree this well over all readings are the same wave.
 _SAME = 0.97
 _FEWEST_CYCLES = 2
 
@@ -30,16 +30,16 @@ def alias_sentences(fit: Fit) -> list[str]:
 
 
 def aliases(fit: Fit, ripple: Effect) -> list[float]:
-    """Return other numbers of cycles a turn that are the same as those of a ripple at all readings."""
+    """Return the other numbers of cycles per turn that look the same as a ripple's own at all readings."""
     q = fit.observations.motion.q[:, fit.simulation.place(ripple).joint]
     own = float(ripple.values[-1])
     cycles = np.arange(_FEWEST_CYCLES, FINEST + 1.0)
-    # Waves of the same phase, or of the opposite one, at each reading; neighbours of a ripple are no aliases.
+    # Compare waves of the same and of opposite phase; close neighbours of a ripple are not aliases.
     same = np.maximum(_agreement(cycles - own, q), _agreement(cycles + own, q)) > _SAME
     apart = np.abs(cycles - own) > 2.0 * np.pi / max(float(np.ptp(q)), 1e-6)
     return [float(one) for one in cycles[same & apart]]
 
 
 def _agreement(cycles: FloatArray, q: FloatArray) -> FloatArray:
-    """Return how well waves of frequencies (m,) agree over readings (n,): 1 if all have the same phase."""
+    """Return the agreement of waves of frequencies (m,) over readings (n,): 1 if all have the same phase."""
     return np.abs(np.exp(1j * np.multiply.outer(cycles, q)).mean(axis=1))

@@ -1,4 +1,4 @@
-"""What robot.toml calls not known: fitted first, and never a finding."""
+"""Fit what robot.toml marks as unknown before anything else; it is never a finding."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _ROUNDS, _KEPT = 10, 0.8
 
 
 def aligned(observations: Observations, simulation: Simulation) -> Fit:
-    """The simulation with the free camera pose and the free marker fitted, where robot.toml does not know them."""
+    """Fit the free camera pose and the free marker where robot.toml does not know them."""
     robot = simulation.robot
     nuisances = free_effects(robot)
     if not robot.camera.pose_known:
@@ -29,14 +29,14 @@ def aligned(observations: Observations, simulation: Simulation) -> Fit:
 
 
 def free_effects(robot: RobotDescription) -> list[Effect]:
-    """The effects that stand for what robot.toml does not know."""
+    """Return the effects that stand for what robot.toml does not know."""
     names = [] if robot.camera.pose_known else ["camera_pose"]
     names += [] if robot.robot.marker_known else ["tool_offset"]
     return [Effect.at(robot, name) for name in names]
 
 
 def placed(predicted: FloatArray, x: FloatArray) -> FloatArray:
-    """The pose (6,) of a camera from which predicted points (n, 3) look like x (n, 3), for most of them."""
+    """Return the camera pose (6,) from which predicted points (n, 3) match most of the measured points x (n, 3)."""
     kept = np.ones(len(x), dtype=bool)
     turn, shift = np.eye(3), np.zeros(3)
     for _ in range(_ROUNDS):

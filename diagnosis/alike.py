@@ -1,8 +1,8 @@
-"""Causes beside the geometry that say much the same of a recording: they share a direction.
+"""Find confounded causes: effects that explain much of the same error beside the best geometry.
 
-An encoder off its axis and a joint that gives under the arm's weight both follow a sine of the joint's angle. What one
-of them explains of what the best geometry leaves, the other may explain as well: then a recording says that something
-is there, and hardly which.
+An eccentric encoder and a joint that yields under the arm's weight both follow a sine of the joint angle. What one of
+them explains beyond the best geometry, the other may explain as well. The recording then shows that an error exists,
+but hardly which of the two it is.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from bodyschema.interfaces.records import FloatArray
 from .fit import Fit
 from .scan import Candidate, Scan
 
-# What raises twice the log-likelihood by less beside the geometry, or explains less of what it leaves, is nothing.
+# Smallest Δχ² beside the geometry, and smallest explained share of its residuals, that count.
 _WORTH, _EXPLAINS = 25.0, 0.01
-# So much of their directions, and of what the smaller one explains, has to be the same.
+# Smallest shared part of the directions, and of what the smaller effect explains.
 _DIRECTION, _SHARED = 0.5, 0.7
-# A ripple that comes round less often is what an encoder off its axis does.
+# A ripple with fewer cycles per turn acts like an eccentric encoder.
 _FEWEST_CYCLES = 1.5
 _GEOMETRIC = ("link_geometry", "joint_offset")
-# Directions of which less is left, as a share, are none.
+# A direction with a smaller remaining share counts as zero.
 _TOLD = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
 class Alike:
-    """Two effects at one joint, each alone beside the best geometry.
+    """Two confounded effects at one joint, each fitted alone beside the best geometry.
 
     Attributes:
-        one: the one that explains most at its joint.
-        other: what shares a direction with it.
+        one: the effect that explains most at its joint.
+        other: the effect that shares a direction with it.
         one_explains, other_explains: their shares of the squared error that the best geometry leaves.
         shared: the share of what `other` explains that `one` explains too.
-        preferred: by how much more `one` raises twice the log-likelihood.
+        preferred: Δχ² of `one` less that of `other`.
     """
 
     one: Effect
@@ -51,7 +51,7 @@ class Alike:
 
 @dataclass(frozen=True, eq=False)
 class _Direction:
-    """A candidate with an orthonormal basis (3 n, r) of what it changes beside the geometry."""
+    """A candidate with an orthonormal basis (3 n, r) of the changes it makes beside the geometry."""
 
     candidate: Candidate
     basis: FloatArray
@@ -59,7 +59,7 @@ class _Direction:
 
 
 def alike(geometry: Fit, hypotheses: Iterable[Effect]) -> tuple[Alike, ...]:
-    """What shares a direction with the strongest effect of each joint, beside the fit of the best geometry."""
+    """Return the effects that share a direction with the strongest effect of each joint, beside the best geometry."""
     flat = geometry.orthogonal.reshape(geometry.left.size, -1)
     left = geometry.left.ravel()
     left = left - flat @ (flat.T @ left)

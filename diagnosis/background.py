@@ -1,8 +1,8 @@
-"""The background: each link, axis and drive of an arm is off by a little, within what its makers tolerate.
+"""Model the manufacturing tolerances: small errors of every link, axis and drive.
 
-A link's place and its axis, the zero with it, are off by N(0, (s τ)²), and so are the small periodic errors of each
-drive. One scale s for lengths, one for angles and one for the drives are what the data tell. The background is part
-of every fit and never a finding; a cause is what is larger.
+The position and axis of each link, its joint offset included, deviate by N(0, (s τ)²). So do the small periodic errors
+of each drive. The data determine three scales s: for lengths, for angles and for drives. This background is part of
+every fit and never a finding; a cause is larger.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ import numpy as np
 from bodyschema.effects import Effect, Simulated, Simulation
 from bodyschema.interfaces.records import FloatArray
 
-# What workshops tolerate: of a link's length, of an axis or a zero, and of a drive over a turn [m, rad].
+# Workshop tolerances (1 sigma): link length [m], axis or joint offset [rad], drive over a turn [rad].
 LENGTH_M, ANGLE_RAD, DRIVE_RAD = 0.3e-3, float(np.radians(0.06)), float(np.radians(0.01))
-# Of a sliding joint's drive [m].
+# Tolerance of a prismatic joint's drive [m].
 _DRIVE_M = 0.03e-3
-# The periodic errors of a drive that every arm has: once and twice a turn of the joint.
+# Periodic errors of every drive: once and twice per turn of the joint.
 _TWICE = 2.0
 _PERIODIC = ("joint_eccentricity", "joint_ripple")
-# So many times as large as drives' errors usually are an error of a drive is one like others.
+# A drive error within this multiple of the usual size is a tolerance.
 _LIKE_OTHERS = 3.0
-# A row whose weight differs from one by less counts in full.
+# A row counts in full if its weight differs from 1 by less.
 _COUNTS_IN_FULL = 1e-9
-# Of the scales' logarithms before the data.
+# Prior standard deviation of the logarithms of the scales.
 SPREAD = 2.0
 
 
 class Scales(NamedTuple):
-    """How many times larger tolerances are than `LENGTH_M`, `ANGLE_RAD` and `DRIVE_RAD`."""
+    """Sizes of the tolerances as multiples of `LENGTH_M`, `ANGLE_RAD` and `DRIVE_RAD`."""
 
     lengths: float = 1.0
     angles: float = 1.0
@@ -39,30 +39,30 @@ class Scales(NamedTuple):
 
     @property
     def no_larger(self) -> Scales:
-        """These, but none larger than a workshop's."""
+        """Return these scales, each limited to 1 (a workshop's tolerance)."""
         return Scales(*np.minimum(self, 1.0).tolist())
 
     @property
     def doubt(self) -> float:
-        """How improbable they are before the data, beside those of a workshop [nats]."""
+        """Penalty of these scales under their prior, relative to a scale of 1 [nats]."""
         return float(0.5 * np.square(np.log(self) / SPREAD).sum())
 
 
 class Background:
-    """Small errors everywhere beside a run of a simulation, to first order about those that the simulation has.
+    """Small errors throughout a simulated run, to first order about those that the simulation already has.
 
     Args:
-        run: of a simulation, whose background may be empty.
-        whitening: (n, 3, 3), to units in which the stated noise is one.
-        scales: of what is tolerated; None for no background at all.
-        before: the background from which this one has come; None where a simulation's own errors are known, and what
-            is tolerated lies about them.
+        run: run of a simulation, whose background may be empty.
+        whitening: (n, 3, 3), to units in which the stated noise has unit covariance.
+        scales: scales of the tolerances; None for no background at all.
+        before: the background from which this one is derived; None where the simulation's own errors are known and the
+            tolerances are centred on them.
 
     Attributes:
-        effects: those of the background at rest: a link at each joint, eccentricity and ripple of each drive.
-        columns: derivatives (n, 3, p) [m] of what is measured by its amounts.
-        tolerances: how large each may be, 1-sigma (p,).
-        start: the amounts (p,) of the simulation, about which the columns are.
+        effects: the effects with zero amounts: a link at each joint, eccentricity and ripple of each drive.
+        columns: derivatives (n, 3, p) [m] of the measured positions with respect to the amounts.
+        tolerances: prior standard deviation of each amount (p,).
+        start: the simulation's amounts (p,), about which the columns are linearised.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Background:
         own = () if scales is None else simulation.background or background_effects(simulation, run.motion.q)
         self.effects = tuple(_resting(effect) for effect in own)
         amounts = np.concatenate([np.empty(0), *(effect.values[effect.amounts] for effect in own)])
-        # What is tolerated counts from here.
+        # Tolerances are centred here.
         self._centre = amounts
         if before is not None and before.scales is not None:
             self._centre = np.append(before._centre, np.zeros(len(amounts) - len(before._centre)))
@@ -85,11 +85,11 @@ class Background:
         self.tolerances = units if scales is None else units * np.asarray(scales)[self.group]
 
     def shift(self, amounts: FloatArray) -> FloatArray:
-        """What amounts (p,) other than those of the simulation add to what is measured (n, 3) [m]."""
+        """Return the change of the measured positions (n, 3) [m] when the amounts (p,) differ from the simulation's."""
         return self.columns @ (amounts - self.start)
 
     def with_amounts(self, amounts: FloatArray) -> tuple[Effect, ...]:
-        """The background's effects with amounts (p,)."""
+        """Return the background's effects with amounts (p,)."""
         ends = np.cumsum([len(effect.amounts) for effect in self.effects])
         return tuple(
             _with(effect, (self._centre + amounts)[end - len(effect.amounts) : end])
@@ -98,12 +98,12 @@ class Background:
 
     @property
     def given(self) -> tuple[Effect, ...]:
-        """The errors about which everything is tolerated, as a simulation had them beforehand; none that are 0."""
+        """Known errors of the simulation, on which the tolerances are centred; empty if all are 0."""
         given = self.with_amounts(np.zeros_like(self.start))
         return given if self._centre.any() else ()
 
     def tolerates(self, effect: Effect) -> bool:
-        """Whether an effect is a periodic error of a drive that is no larger than that of others."""
+        """Return True if an effect is a periodic drive error no larger than those of other drives."""
         if self.scales is None or effect.name not in _PERIODIC:
             return False
         usual = self.scales.lengths * _DRIVE_M if effect.prismatic else self.scales.drives * DRIVE_RAD
@@ -111,12 +111,12 @@ class Background:
 
     @cached_property
     def precision(self) -> FloatArray:
-        """Of the amounts beforehand (p,)."""
+        """Prior precision of the amounts (p,)."""
         return 1.0 / np.square(self.tolerances)
 
     @cached_property
     def white(self) -> FloatArray:
-        """`columns` (3 n, p), whitened."""
+        """Whitened `columns` (3 n, p)."""
         return (self._whitening @ self.columns).reshape(3 * len(self.columns), len(self.tolerances))
 
     @cached_property
@@ -124,27 +124,27 @@ class Background:
         return self.white.T @ self.white
 
     def inner(self, weights: FloatArray) -> FloatArray:
-        """Products (p, p) of the whitened columns with one another, rows weighted (n,)."""
+        """Return the products (p, p) of the whitened columns, rows weighted (n,)."""
         return weighted_products(self.white, self._inner, weights)
 
     @cached_property
     def spectrum(self) -> FloatArray:
-        """Squared lengths of what the background changes (p,), in units of the stated noise."""
+        """Squared lengths (p,) of the background's changes, in units of the stated noise."""
         return np.maximum(np.linalg.eigvalsh(self._inner * np.outer(self.tolerances, self.tolerances)), 0.0)
 
     def spent(self, sigma: float) -> float:
-        """How many numbers of the data it takes for itself where the noise is `sigma` times the stated one."""
+        """Return the effective number of parameters of the background for noise `sigma` times the stated one."""
         return float((self.spectrum / (self.spectrum + sigma**2)).sum())
 
     def volume(self, sigma: float) -> float:
-        """What having so many possibilities costs [nats]."""
+        """Return the Occam cost of the background's free parameters [nats]."""
         return float(0.5 * np.log1p(self.spectrum / sigma**2).sum())
 
 
 def weighted_products(columns: FloatArray, inner: FloatArray, weights: FloatArray) -> FloatArray:
-    """Products (p, p) of columns (3 n, p) with one another, rows weighted (n,), from those without weights.
+    """Return the weighted products (p, p) of columns (3 n, p) from the unweighted ones, rows weighted (n,).
 
-    Only the rows that do not count in full are gone through.
+    Only rows that do not count in full are visited.
     """
     partly = np.flatnonzero(1.0 - weights > _COUNTS_IN_FULL)
     rows = columns.reshape(len(weights), 3, columns.shape[1])[partly] * np.sqrt(1.0 - weights[partly])[:, None, None]
@@ -153,7 +153,7 @@ def weighted_products(columns: FloatArray, inner: FloatArray, weights: FloatArra
 
 
 def background_effects(simulation: Simulation, q: FloatArray) -> tuple[Effect, ...]:
-    """What is a little off everywhere, at rest: at each joint that moves over q (n, d), and each link between."""
+    """Return the tolerance effects, with zero amounts, of each joint that moves over q (n, d) and each link between."""
     robot, found = simulation.robot, []
     for k, joint in enumerate(robot.joints):
         found.append(_resting(Effect.at(robot, "link_geometry", joint)))
@@ -175,7 +175,7 @@ def _with(effect: Effect, amounts: FloatArray) -> Effect:
 
 def _groups(effect: Effect) -> np.ndarray:
     if effect.name != "link_geometry":
-        # A screw is a length: how true gears run says nothing of it.
+        # A ball screw's ripple is a length; the drive scale of gears does not apply.
         return np.full(len(effect.amounts), 0 if effect.prismatic else 2)
     return np.array([0, 0, 0, 1, 1, 1])
 

@@ -1,4 +1,4 @@
-"""A diagnosis in the words and figures of `diagnosis.json`."""
+"""Convert a diagnosis to the words and figures of `diagnosis.json`."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ from .search import NAMED, nats
 from .words import evidence, is_unsure, sentence
 
 _HALF_WIDTH_95 = 1.959964
-# What chance brings about less often than this wants a word why it is no cause.
+# Below this p-value, the report explains why a hypothesis is not a cause.
 _HARDLY_CHANCE = 1e-3
 
 
 def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
-    """All that machines need to know of a diagnosis."""
+    """Return the machine-readable form of a diagnosis."""
     percent, interval = diagnosis.gain()
     causes = _causes(diagnosis)
     rms = _rms_mm(diagnosis)
@@ -87,7 +87,7 @@ def _rms_mm(diagnosis: Diagnosis) -> Errors:
     kept = diagnosis.markers
     figures = {name: 1e3 * float(np.sqrt(np.square(d[kept]).mean())) for name, d in diagnosis.held_out.items()}
     traces = np.trace(diagnosis.noise[kept], axis1=1, axis2=2)
-    # What is left of rows that were not fitted has all of the noise in it.
+    # Residuals of held-out rows contain all of the noise.
     return Errors(**figures, noise_floor=min(1e3 * float(np.sqrt(traces.mean())), figures["extended"]))
 
 
@@ -176,7 +176,7 @@ def _parameters(diagnosis: Diagnosis, cause: Effect, standing: Standing) -> dict
         value = float(cause.values[k])
         if k in fitted:
             half = float(halves[fitted.index(k)])
-            # A period, a time constant and what is left of a move are never negative.
+            # A period, a time constant and a remaining share cannot be negative.
             low = max(value - half, 0.0) if k in cause.shapes else value - half
             numbers[parameter.name] = Interval(value, (low, value + half))
         else:
@@ -192,7 +192,7 @@ def _moment_interval(cause: Effect, itself: Candidate) -> tuple[float, float]:
 
 
 def _derived(cause: Effect, covariance: FloatArray) -> dict[str, Interval]:
-    """Amplitude and phase of what has a sine and a cosine: value · sin(period · angle + phase)."""
+    """Return amplitude and phase of an effect with sine and cosine: value · sin(period · angle + phase)."""
     names = [parameter.name for parameter in cause.parameters]
     if names[0] not in ("sine_rad", "sine_m"):
         return {}
@@ -221,7 +221,7 @@ def _rejected(diagnosis: Diagnosis) -> tuple[Rejected, ...]:
 
 
 def _why_not(diagnosis: Diagnosis, candidate: Candidate, tried: int) -> str:
-    """Why a hypothesis is no cause although chance hardly brings about what it explains."""
+    """Return the reason why a hypothesis with a small p-value is not a cause."""
     if diagnosis.left.is_there:
         return "what has no name shows in it"
     if not candidate.effect.is_possible:

@@ -1,4 +1,4 @@
-"""What nobody knows where a run begins: on which side of its play a joint is, and how far it was from rest."""
+"""Find rows at which the state of a joint is unknown: its side of the backlash, or its distance from rest."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from bodyschema.effects.flank import flanks
 
 from .fit import Fit
 
-# A joint that has made up for all but so much of what it lacked is at rest.
+# A settling joint is at rest when this share of its initial lag remains.
 _AT_REST = 0.05
-# A joint that has gone so many lengths of its hysteresis is strained as its last direction has it.
+# After this many hysteresis lengths, only the last direction determines the strain.
 _STRAINED = 3.0
-# Friction of a loaded play is known to within this factor, and a load that is a smaller share of the largest is none.
+# Uncertainty factor of the friction in a loaded backlash, and the smallest relative load that counts.
 _FRICTION_WITHIN, _UPRIGHT = 2.0, 0.02
 
 
 def before_contact(fit: Fit) -> NDArray[np.bool_]:
-    """Rows (n,) at which nobody knows on which side of its play a joint is: it has not crossed it in this run yet."""
+    """Return rows (n,) before a joint first crosses its backlash in a run; its side is unknown until then."""
     motion = fit.observations.motion
     rows = np.zeros(len(motion), dtype=np.bool_)
     for effect in fit.simulation.effects:
@@ -33,7 +33,7 @@ def before_contact(fit: Fit) -> NDArray[np.bool_]:
 
 
 def before_rest(fit: Fit) -> NDArray[np.bool_]:
-    """Rows (n,), but for the first of a run, at which a joint still lacks some of what it lacked as the run began."""
+    """Return rows (n,), except the first of a run, at which a joint has not settled from before the run."""
     motion = fit.observations.motion
     memory = max((effect.value("memory") for effect in fit.simulation.effects if effect.name == "settling"), default=0)
     rows = np.zeros(len(motion), dtype=np.bool_)
@@ -44,7 +44,7 @@ def before_rest(fit: Fit) -> NDArray[np.bool_]:
 
 
 def between_flanks(fit: Fit) -> NDArray[np.bool_]:
-    """Rows (n,) at which the flank that a loaded play hangs on depends on how large its friction is."""
+    """Return rows (n,) at which the contact side of a loaded backlash depends on the size of its friction."""
     rows = np.zeros(len(fit.observations.motion), dtype=np.bool_)
     for effect in fit.simulation.effects:
         if effect.name != "gravity_backlash":
@@ -56,5 +56,5 @@ def between_flanks(fit: Fit) -> NDArray[np.bool_]:
 
 
 def doubtful(fit: Fit) -> NDArray[np.bool_]:
-    """Rows (n,) whose past is not known well enough."""
+    """Return rows (n,) whose history is not known well enough."""
     return before_contact(fit) | before_rest(fit) | between_flanks(fit)

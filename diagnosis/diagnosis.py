@@ -1,4 +1,4 @@
-"""From a recording and a simulation to what the simulation gets wrong."""
+"""Find what a simulation gets wrong, from a recording."""
 
 from __future__ import annotations
 
@@ -32,42 +32,42 @@ from .together import Tolerated, together, tolerated
 from .unknown import Unknowns
 
 Told = Callable[[str], None]
-# Fewer fixes than this that are not the marker are no finding.
+# Fewer outliers than this are not a finding.
 _FEWEST_OUTLIERS = 3
-# So much more probable it has to be that there are some [nats].
+# Smallest evidence gain for reporting outliers [nats].
 _OUTLIERS_NAMED = 15.0
-# Where they are off so often where the arm is faster, motion has to do with it.
+# Outliers count as motion-related if they occur on faster rows at least this often.
 _MOSTLY = 0.8
-# How far off, in units of what depends on the way between two readings, is farther than that way can explain.
+# Farther off than this, in units of the change by the path between two readings, the path cannot be the reason.
 _BY_SO_MUCH = 4.0
-# Where more rows than this are doubtful, leaving them out costs more than they do harm.
+# With a larger share of doubtful rows, dropping them costs more than keeping them.
 MOST_DOUBTFUL = 0.25
-# Beside what has no name a cause stays named only if it is more probable than not.
+# Beside an unnamed cause, a named cause stays only if it is more probable than not.
 _HALF = 0.5
-# Tolerances of another size than that are taken up (in logarithms), so many times at most.
+# Smallest change of the tolerance scales (in logarithms) that triggers a refit, and the maximum of refits.
 _SAME_SCALE, _RESCALED = 0.25, 3
-# What is fitted takes at most this share of the noise for itself.
+# The fit absorbs at most this share of the noise.
 _MOST_SPENT = 0.9
-# Of the instrument's noise, another size than that is taken up (in logarithms).
+# Smallest change of the instrument's noise (in logarithms) that triggers a refit.
 _SAME_NOISE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """What a simulation gets wrong, and all that a report shows of it.
+    """The errors found in a simulation, with all that a report shows of them.
 
     Attributes:
-        hypotheses: what was tested, and what could not be.
-        nominal: the simulation as it is.
-        aligned: with what robot.toml does not know.
-        geometry: with all lengths, axes, zeros, the tool and the camera's pose free.
-        extended: with the causes, the tolerances, and the smooth model of what has no name.
-        tolerated: how large the tolerances are.
-        standings: how each cause stands against its rivals.
-        left: what no effect fits.
-        blocks: of time, by which rows were held out.
-        seed: of the resampling.
-        ended_early: whether the search for causes ended at its longest, so that there may be more.
+        hypotheses: the effects that were tested, and the reasons why others were not.
+        nominal: the unchanged simulation.
+        aligned: fit of the parameters that robot.toml does not know.
+        geometry: fit with all lengths, axes, joint offsets, the tool and the camera's pose free.
+        extended: fit with the causes, the tolerances, and the smooth model of the unnamed causes.
+        tolerated: sizes of the tolerances.
+        standings: assessment of each cause against its rivals.
+        left: residual structure that no effect fits.
+        blocks: blocks of time for held-out errors.
+        seed: seed of the resampling.
+        ended_early: True if the search stopped at its limit, so that more causes may exist.
     """
 
     hypotheses: Hypotheses
@@ -89,20 +89,20 @@ class Diagnosis:
 
     @cached_property
     def errors(self) -> dict[str, FloatArray]:
-        """Measured minus predicted (n, 3) [m] by each simulation, on rows that it was not fitted to."""
+        """Measured minus predicted (n, 3) [m] by each simulation, on held-out rows."""
         fits = {"nominal": self.nominal, "aligned": self.aligned, "geometry": self.geometry}
         errors = {name: held_out_errors(fit, self.blocks) for name, fit in fits.items()}
         return errors | {"extended": self._extended_errors(self.extended)}
 
     @cached_property
     def with_names_alone(self) -> FloatArray | None:
-        """Distances (n,) [m] with the causes and no model of what has no name; None where there is no such model."""
+        """Held-out distances (n,) [m] with the named causes and no smooth model; None where there is no such model."""
         if self.left.model is None or self.left.model.stored is None:
             return None
         return np.linalg.norm(held_out_errors(self.aligned.with_causes(self.causes), self.blocks), axis=1)
 
     def _extended_errors(self, fit: Fit) -> FloatArray:
-        """Measured minus predicted (n, 3) [m] on rows that causes and smooth model have not seen."""
+        """Return measured minus predicted (n, 3) [m] on rows held out from causes and smooth model."""
         if self.left.model is None:
             return held_out_errors(fit, self.blocks)
         return fit.observations.x - fit.predicted + self.left.model.unseen
@@ -114,12 +114,12 @@ class Diagnosis:
 
     @cached_property
     def markers(self) -> np.ndarray:
-        """Which fixes are probably the marker (n,)."""
+        """True for fixes (n,) that are probably the marker."""
         return is_marker(self.extended)
 
     @property
     def outliers(self) -> int:
-        """How many are not."""
+        """Number of outliers."""
         return int(self._off.sum())
 
     @property
@@ -128,15 +128,15 @@ class Diagnosis:
 
     @property
     def outliers_are_found(self) -> bool:
-        """Whether there are so many, so far off, that it is a finding."""
+        """Return True if outliers are numerous and large enough to be a finding."""
         worth = self.extended.noise.log_likelihood - self.extended.without_outliers
         named = self.outliers >= _FEWEST_OUTLIERS and worth > _OUTLIERS_NAMED
         return named and not self._off_where_fast() and not self._off_by_what_is_inexact()
 
     def _off_by_what_is_inexact(self) -> bool:
-        """Whether the fixes are off by no more than what is known only roughly may matter.
+        """Return True if the outliers are no farther off than roughly known influences can explain.
 
-        That is the way between two readings, which nobody has seen, and what has no name.
+        These are the path between two readings, which was not observed, and unnamed causes.
         """
         fit = self.extended
         changes = [changed_by_the_way(fit)]
@@ -147,50 +147,50 @@ class Diagnosis:
         return bool(np.median(off) < _BY_SO_MUCH**2 * squares.sum())
 
     def _off_where_fast(self) -> bool:
-        """Whether the fixes that are off are those at the fastest rows: then it is motion that is not understood."""
+        """Return True if the outliers are mostly at the fastest rows; the motion is then poorly modelled."""
         motion = self.extended.observations.motion
         steps = np.linalg.norm(motion.moves, axis=1)
         duration = np.ones(len(motion)) if motion.t is None else np.append(np.inf, np.diff(motion.t))
         speed = steps / np.maximum(duration, 1e-9)
         on, off = self.markers, self._off
-        # How often a row that is off is faster than one that is not.
+        # Probability that an outlier row is faster than another row.
         faster = [stats.mannwhitneyu(v[off], v[on]).statistic / (off.sum() * on.sum()) for v in (steps, speed)]
         return max(faster) > _MOSTLY
 
     def gain(self) -> tuple[float, tuple[float, float]]:
-        """By how much the RMS falls from aligned to extended [%], with its 95 % interval."""
+        """Return the reduction of the RMS from aligned to extended [%], with its 95 % interval."""
         kept = np.where(self.markers, 1.0, 0.0)
         return gain_percent(self.held_out["aligned"] * kept, self.held_out["extended"] * kept, self.blocks, self.seed)
 
     @cached_property
     def without(self) -> dict[Identity, FloatArray]:
-        """Distances (n,) [m] on rows not fitted, without each of the causes."""
+        """Held-out distances (n,) [m] without each of the causes."""
         errors = {c.identity: self._extended_errors(self.extended.without(c)) for c in self.causes}
         return {key: np.linalg.norm(error, axis=1) for key, error in errors.items()}
 
     @cached_property
     def noise(self) -> FloatArray:
-        """Covariances (n, 3, 3) [m²] of the noise, from what is left when all is explained that can be."""
+        """Noise covariances (n, 3, 3) [m²], from the residuals of the complete model."""
         fit, kept = self.extended, self.markers
         unstored = 0.0 if self.left.model is None else self.left.model.unstored
         left = (fit.observations.x - fit.predicted - unstored)[kept]
         roots = np.linalg.inv(fit.observations.whitening)
         stated = roots @ np.swapaxes(roots, 1, 2)
-        # In the shape of the stated noise, and as large as what is left is: what was fitted took its share of it.
+        # Scale the stated noise to the size of the residuals, corrected for what the fit absorbed.
         spent = min(fit.background.spent(fit.noise.sigma) / max(left.size, 1), _MOST_SPENT)
         size = np.square(left).sum() / np.trace(stated[kept], axis1=1, axis2=2).sum() / (1.0 - spent)
         return float(size) * stated
 
     @cached_property
     def with_tolerances_alone(self) -> FloatArray | None:
-        """Distances (n,) [m] with the tolerances and no cause, on rows not fitted; None where no tolerance shows."""
+        """Held-out distances (n,) [m] with tolerances and no cause; None where no tolerance shows."""
         if not self.causes or not self.tolerated.seen.any():
             return None
         return np.linalg.norm(held_out_errors(self.extended.with_causes([]), self.blocks), axis=1)
 
     @cached_property
     def alike(self) -> tuple[Alike, ...]:
-        """Effects that share a direction beside the best geometry."""
+        """Confounded effects beside the best geometry."""
         named = {cause.key for cause in self.causes}
         joints = {cause.where for cause in self.causes}
         pairs = alike(self.geometry, (effect for effect in self.hypotheses.effects if effect.where in joints))
@@ -198,7 +198,7 @@ class Diagnosis:
 
     @cached_property
     def rejected(self) -> list[tuple[Candidate, Added]]:
-        """The hypotheses that were not taken, as each would do best beside the causes."""
+        """Rejected hypotheses, each with its best fit beside the causes."""
         present = {cause.key for cause in self.causes}
         candidates = Scan(self.extended).candidates(h for h in self.hypotheses.effects if h.key not in present)
         return list(zip(candidates, added(self.extended, candidates, self.blocks), strict=True))
@@ -214,13 +214,13 @@ def diagnose(
     blocks: Blocks | None = None,
     tell: Told = lambda _: None,
 ) -> Diagnosis:
-    """What `simulation` gets wrong of a recording.
+    """Find what `simulation` gets wrong about a recording.
 
     Args:
         only, without: names of effects to test, all by default, and not to test.
-        seed: of the resampling.
-        blocks: by which rows are held out; of time by default.
-        tell: is told what happens, in a few words.
+        seed: seed of the resampling.
+        blocks: blocks of held-out rows; blocks of time by default.
+        tell: called with short messages on progress.
     """
     observations = Observations.of(recording, simulation)
     start = aligned(observations, simulation)
@@ -275,12 +275,12 @@ def diagnose(
 
 
 def _searched(begun: Fit, search: Search, enough: Callable[[Sequence[Fit], float], bool]) -> Fit:
-    """With what a search finds from there, and tolerances as large as they then are."""
+    """Run the search for causes from a fit, and refit with tolerances updated to what it finds."""
     extended = begun
     for _ in range(_RESCALED):
         extended = search.run(with_small_ripples(begun), enough)
         before = extended.background.scales or Scales()
-        # What has no name may be all there is, and make tolerances seem larger than they are.
+        # Unnamed causes may be all there is, and inflate the apparent tolerances.
         bare = extended.with_causes([])
         search.path = [bare.tolerating(before.no_larger), bare, *search.path[1:]]
         scales = tolerated(extended).scales
@@ -292,7 +292,7 @@ def _searched(begun: Fit, search: Search, enough: Callable[[Sequence[Fit], float
 
 
 def _geometry(start: Fit) -> Fit:
-    """The best purely geometric model."""
+    """Fit the best purely geometric model."""
     robot = start.simulation.robot
     present = {effect.key for effect in start.simulation.effects}
     wanted = [Effect.at(robot, "camera_pose"), Effect.at(robot, "tool_offset")]

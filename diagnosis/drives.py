@@ -1,4 +1,4 @@
-"""Small periodic errors of drives beyond those that every drive has: part of the background, found one by one."""
+"""Add small periodic drive errors to the background, one by one, beyond those that every drive has."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from .fit import Fit
 from .scan import Scan
 from .search import NAMED, nats
 
-# Rounds in which each joint may be given one more.
+# Maximum of rounds; each may add one ripple per joint.
 _ROUNDS = 8
-# Two whose phases part by less than this over a joint's range are one [turns].
+# Ripples whose phases differ by less over a joint's range are the same [turns].
 _APART = 0.75
 
 
 def with_small_ripples(fit: Fit) -> Fit:
-    """With the ripples in its background that show in the data and are no larger than what is tolerated of drives."""
+    """Add to the background the ripples that the data show and that are no larger than the drive tolerance."""
     scales = fit.background.scales
     if scales is None:
         return fit
@@ -38,7 +38,7 @@ def with_small_ripples(fit: Fit) -> Fit:
 
 
 def _is_there(fit: Fit, ripple: Effect) -> bool:
-    """Whether a fit has one of so nearly the same period that the two could cancel."""
+    """Return True if a fit already has a ripple of so similar a period that the two could cancel."""
     joint = fit.simulation.robot.joints.index(str(ripple.where))
     span = float(np.ptp(fit.observations.motion.q[:, joint])) / (1.0 if ripple.prismatic else 2.0 * np.pi)
     others = [effect for effect in (*fit.causes, *fit.background.effects) if effect.name == ripple.name]

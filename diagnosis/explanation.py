@@ -1,4 +1,4 @@
-"""Which part of what is wrong has names, and which has none."""
+"""Separate errors that have a named cause from those that have none."""
 
 from __future__ import annotations
 
@@ -16,39 +16,39 @@ from .search import NAMED, Search, describe, named
 from .together import tolerated
 from .unknown import Apart, Unknowns, Way
 
-# What has no name is taken for so much more probability than the named causes alone [nats].
+# Unnamed causes are accepted if they are more probable than named ones alone by this [nats].
 _MARGIN = 8.0
 _MOST_UNKNOWNS = 3
-# What is said to first order of several ways may be exceeded so many times.
+# Safety factor on the first-order gain of several unnamed causes.
 _SLACK = 1.2
-# What a number of a named cause costs when sets of causes are compared [nats].
+# Cost of each parameter of a named cause when sets of causes are compared [nats].
 _NUMBER = 3.0
-# What is left of large causes because their form is not quite theirs is nothing without a name: a share of them all,
-# and a larger one of those that depend on the way between two readings, which nobody has seen.
+# The imperfect shape of large causes is not an unnamed cause, up to a share of all causes, and a larger share of those
+# that depend on the unobserved path between two readings.
 _OF_THE_CAUSES, _OF_THE_WAY = 0.05, 0.12
 _BY_THE_WAY = ("backlash", "settling", "hysteresis", "camera_latency")
-# Less than this share of all is a rest.
+# A smaller share than this is a remainder.
 _REST = 0.25
-# Causes that the same ways without a name can be, as probably to within this, are no causes [nats].
+# Causes that the same unnamed families explain as well, to within this, are dropped [nats].
 _AS_GOOD = 8.0
-# So many causes more may come after the next.
+# Assumed maximum of further causes after the next.
 _MANY = 10
-# Of the fits on the way to all causes, these are asked whether they are better beside what has no name.
+# Of the fits along the search, this many first and last ones are tried beside unnamed causes.
 _FIRST, _LAST = 3, 2
-# What is worth more than this no rounding of readings that stand still brings about [nats].
+# Rounded readings of a joint at rest cannot produce more evidence than this [nats].
 _BEYOND_DOUBT = 60.0
 
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """A set of causes, and ways to differ that have no name.
+    """A set of named causes with a set of unnamed ones.
 
     Attributes:
-        fit: with the causes alone.
-        apart: with what has no name taken away; None where there is nothing of the kind.
-        worth: how probable they are together, in nats that count only beside those of others.
-        size: how much what has no name adds to what the causes alone can say (RMS), in units of the stated noise.
-        promise: what the best single way without a name is worth beside the causes, to first order [nats].
+        fit: the fit with the named causes alone.
+        apart: fit with the unnamed causes removed from the data; None if there is no unnamed cause.
+        worth: log-evidence of the whole, comparable only with that of other explanations [nats].
+        size: RMS change by the unnamed causes beyond the named ones, in units of the stated noise.
+        promise: first-order gain of the best single unnamed cause beside the named ones [nats].
     """
 
     fit: Fit
@@ -59,28 +59,28 @@ class Explanation:
 
     @property
     def beside(self) -> Fit:
-        """The causes beside what has no name."""
+        """The named causes, fitted beside the unnamed ones."""
         return self.fit if self.apart is None else self.apart.fit
 
     @property
     def unknown(self) -> tuple[Way, ...]:
-        """What has no name."""
+        """The unnamed causes."""
         return () if self.apart is None else self.apart.chosen
 
     @property
     def is_specific(self) -> bool:
-        """Whether all that has no name is as specific as what has one."""
+        """True if every unnamed cause is as specific as a named one."""
         return all(way.family.is_specific for way in self.unknown)
 
 
 def explain(
     found: Fit, tried: Iterable[Fit], unknowns: Unknowns, search: Search, tell: Callable[[str], None]
 ) -> Explanation:
-    """The causes found as they are, unless fewer of them and something without a name are clearly more probable.
+    """Keep the causes found, unless fewer of them with unnamed causes are clearly more probable.
 
     Args:
-        found: with all causes that the search has named.
-        tried: the fits on its way there, the first without any cause.
+        found: the fit with all named causes of the search.
+        tried: the fits along the search, the first without any cause.
     """
     path = list(tried)
     whole = _length(found, found.run.measured - path[0].run.measured)
@@ -88,10 +88,10 @@ def explain(
     inexact = max(_OF_THE_CAUSES * whole, _OF_THE_WAY * _length(found, changed_by_the_way(found)))
     if best.apart is not None and (best.size < inexact or not unknowns.predicts(best.apart, found)):
         best = replace(best, apart=None, size=0.0)
-    # Where the causes explain by far the most, they are not given up for what explains the rest.
+    # Named causes that explain nearly everything are not given up for what explains the rest.
     is_rest = best.size < _REST * whole
     margin = _MARGIN if is_rest else 0.0
-    # So much may a way be worth beside fewer causes at most: to first order it explains no more than beside them all.
+    # Upper bound of an unnamed cause's gain: to first order it explains no more beside fewer causes.
     hope = found.log_likelihood + best.promise if best.apart is None else np.inf
     looked_at = {(named(found.causes), found.background.scales)}
     for fit in [*path[:_FIRST], *path[_FIRST:][-_LAST:]]:
@@ -133,12 +133,12 @@ def useful(explanation: Explanation, blocks: Blocks, tell: Callable[[str], None]
 
 
 def _missed(fit: Fit, blocks: Blocks) -> FloatArray:
-    """Squared distances (n,) [m²] on rows not fitted."""
+    """Return squared held-out distances (n,) [m²]."""
     return np.square(held_out_errors(fit, blocks)).sum(axis=1)
 
 
 def _rescaled(best: Explanation, apart: Apart, unknowns: Unknowns, search: Search) -> Explanation:
-    """With tolerances as large as they are beside what has no name, where that is more probable."""
+    """Refit with the tolerance scales found beside the unnamed causes, where that is more probable."""
     scales = tolerated(apart.fit).scales
     again = _with_unknown(best.fit.tolerating(scales), unknowns, search)
     before = best.fit.background.scales
@@ -147,13 +147,13 @@ def _rescaled(best: Explanation, apart: Apart, unknowns: Unknowns, search: Searc
 
 
 def needs_no_more_names(path: Sequence[Fit], worth: float, unknowns: Unknowns, search: Search) -> bool:
-    """Whether one of the first fits of a search has all that can be named, beside something without a name.
+    """Return True if an early fit of the search, with unnamed causes, already explains the data.
 
-    It has to be more probable than many more causes would be that are each worth as much as the next.
+    It has to be more probable than many further causes, each worth as much as the next.
 
     Args:
-        path: its fits, the last with all causes that it has named.
-        worth: what the next of them would be worth [nats].
+        path: the fits of the search, the last with all causes named so far.
+        worth: evidence gain of the next cause [nats].
     """
     fit = path[-1]
     if unknowns.nearest(fit)[0][1] < _MANY * worth / _MOST_UNKNOWNS:
@@ -167,7 +167,7 @@ def needs_no_more_names(path: Sequence[Fit], worth: float, unknowns: Unknowns, s
 
 
 def _is_as_good(fewer: Explanation, explanation: Explanation) -> bool:
-    """Whether fewer causes do as well beside ways without a name that are no others."""
+    """Return True if fewer named causes do as well with a subset of the same unnamed causes."""
     if len(fewer.fit.causes) >= len(explanation.fit.causes):
         return False
     ways, needed = ({way.family.what for way in one.unknown} for one in (explanation, fewer))
@@ -175,7 +175,7 @@ def _is_as_good(fewer: Explanation, explanation: Explanation) -> bool:
 
 
 def changed_by_the_way(fit: Fit) -> FloatArray:
-    """What causes that depend on the way between two readings change (n, 3) [m]."""
+    """Return the change (n, 3) [m] by causes that depend on the path between two readings."""
     change = np.zeros_like(fit.residuals)
     for cause in fit.causes:
         if cause.name in _BY_THE_WAY:
@@ -184,12 +184,12 @@ def changed_by_the_way(fit: Fit) -> FloatArray:
 
 
 def _length(fit: Fit, change: FloatArray) -> float:
-    """How large a change (n, 3) [m] is (RMS), in units of the stated noise."""
+    """Return the RMS size of a change (n, 3) [m], in units of the stated noise."""
     return float(np.sqrt(np.square(fit.observations.whitened(change[:, :, None])).mean()))
 
 
 def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search, least: float = -np.inf) -> Explanation:
-    """With the ways that are worth it, one after the other; given up where they will hardly be worth `least` [nats]."""
+    """Add worthwhile unnamed causes one by one; stop where the total will hardly reach `least` [nats]."""
     apart: Apart | None = None
     promise, names = -np.inf, cost_of_names(fit.causes, search)
     while not fit.is_exact and (apart is None or len(apart.chosen) < _MOST_UNKNOWNS):
@@ -198,7 +198,7 @@ def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search, least: float = -
         way, more = near[0]
         promise = more if apart is None else promise
         spent = 0.0 if apart is None else unknowns.cost(apart)
-        # The ways that are left are worth hardly more than this one each.
+        # Each remaining unnamed cause is worth hardly more than this one.
         if here.log_likelihood - names - spent + _SLACK * (_MOST_UNKNOWNS - len(chosen)) * max(more, 0.0) < least:
             break
         if more < NAMED or (more < _BEYOND_DOUBT and unknowns.agreed(here, chosen, way) < 0.0):
@@ -212,12 +212,12 @@ def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search, least: float = -
 
 
 def cost_of_names(causes: Iterable[Effect], search: Search) -> float:
-    """What causes cost where sets of causes are compared [nats]."""
+    """Return the cost of causes where sets of causes are compared [nats]."""
     return sum(_NUMBER * len(effect.amounts) + search.doubt_of(effect) for effect in causes)
 
 
 def _pruned(explanation: Explanation, unknowns: Unknowns, search: Search, *, rest: bool) -> Explanation:
-    """Without causes that are not worth it beside what has no name; with a rest, without those that it can be."""
+    """Remove causes not worth keeping beside unnamed ones; with a remainder, those the unnamed ones can replace."""
     for cause in explanation.fit.causes:
         fewer = without_one(explanation, cause, unknowns, search)
         redundant = _is_as_good(fewer, explanation) if rest else fewer.worth > explanation.worth - NAMED
@@ -227,5 +227,5 @@ def _pruned(explanation: Explanation, unknowns: Unknowns, search: Search, *, res
 
 
 def without_one(explanation: Explanation, cause: Effect, unknowns: Unknowns, search: Search) -> Explanation:
-    """The explanation without one of its causes."""
+    """Return the explanation without one of its causes."""
     return _with_unknown(explanation.fit.without(cause), unknowns, search)

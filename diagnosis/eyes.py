@@ -1,4 +1,4 @@
-"""A stereo pair whose eyes are turned against each other, which no effect of the table is."""
+"""Model a stereo pair whose cameras are rotated relative to each other (vergence), which no named effect covers."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from scipy.spatial.transform import Rotation
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
 
-# By which derivatives are taken [rad].
+# Step for numerical derivatives [rad].
 _STEP = 1e-5
-# Rounds in which what was reported is undone.
+# Fixed-point iterations to invert the distortion.
 _ROUNDS = 8
 
 
 def reported(x: FloatArray, calibration: StereoCalibration, turn: FloatArray) -> FloatArray:
-    """What the calibration triangulates (n, 3) [m] of points (n, 3) [m] in the left optical frame.
+    """Return the triangulated points (n, 3) [m] of true points (n, 3) [m] in the left optical frame.
 
     Args:
-        turn: of the right eye, as a rotation vector (3,) in its own optical frame [rad].
+        turn: of the right camera, as a rotation vector (3,) in its own optical frame [rad].
     """
     baseline = np.array([calibration.baseline_m, 0.0, 0.0])
-    # A row vector times R is its transpose's: into the turned eye.
+    # Row vectors times R apply the inverse rotation: into the rotated camera's frame.
     right = (x - baseline) @ Rotation.from_rotvec(turn).as_matrix()
     one, other = x[:, :2] / x[:, 2:], right[:, :2] / right[:, 2:]
     depth = calibration.baseline_m / (one[:, 0] - other[:, 0])
@@ -29,7 +29,7 @@ def reported(x: FloatArray, calibration: StereoCalibration, turn: FloatArray) ->
 
 
 def undone(x: FloatArray, calibration: StereoCalibration, turn: FloatArray) -> FloatArray:
-    """The points (n, 3) [m] of which `reported` says x (n, 3) [m]."""
+    """Return the true points (n, 3) [m] that `reported` maps to x (n, 3) [m]."""
     points = x
     for _ in range(_ROUNDS):
         points = points + (x - reported(points, calibration, turn))
@@ -37,6 +37,6 @@ def undone(x: FloatArray, calibration: StereoCalibration, turn: FloatArray) -> F
 
 
 def by_turn(x: FloatArray, calibration: StereoCalibration, axes: FloatArray) -> FloatArray:
-    """Derivatives (n, 3, a) [m/rad] of `reported` at points (n, 3) by turns about some axes (a, 3)."""
+    """Return derivatives (n, 3, a) [m/rad] of `reported` at points (n, 3), for turns about axes (a, 3)."""
     ends = [(reported(x, calibration, _STEP * axis), reported(x, calibration, -_STEP * axis)) for axis in axes]
     return np.stack([(above - below) / (2.0 * _STEP) for above, below in ends], axis=2)

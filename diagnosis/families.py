@@ -1,4 +1,4 @@
-"""Ways to differ that no effect of the table covers: any smooth error of a joint, a link, the tool or the cameras."""
+"""Define unnamed error families: smooth errors of a joint, a link, the tool or the cameras."""
 
 from __future__ import annotations
 
@@ -17,37 +17,37 @@ from kbmaps.rotations import cross_matrix
 from .eyes import by_turn, undone
 
 _HARMONICS, _TIMES, _JOINT_TIMES = 5, 4, (8, 32, 96)
-# So many rows there must be for each half wave over time.
+# Minimum of rows per half wave over time.
 _ROWS_A_WAVE = 10
-# Time constants of what warms up, as shares of the recording's time.
+# Time constants of warming up, as shares of the recording's duration.
 _WARMING = (0.07, 0.2, 0.6)
-# One spring about all axes of a frame, and one along all of them beside it.
+# One torsional spring about all axes of a frame, optionally with one linear spring along all of them.
 _TILT = np.repeat([[0.0], [1.0]], 3, axis=0)
 _TILT_AND_SINK = np.repeat(np.eye(2), 3, axis=0)
-# One spring about both axes across a link, which lies along the third; a link shorter than this does not bend [m].
+# One spring about both axes across a link, whose third axis lies along it; a shorter link does not bend [m].
 _BEND, _SHORTEST = np.array([[0.0], [0.0], [0.0], [1.0], [1.0], [0.0]]), 0.02
-# Axes of its own optical frame about which an eye is turned: towards the other, or any.
+# Axes of its own optical frame about which a camera is rotated: vergence only, or any.
 _TOWARDS, _ANY_WAY = np.eye(3)[1:2], np.eye(3)
 Columns = Callable[[Simulated], FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """One way to differ.
+    """One family of smooth errors.
 
     Attributes:
-        what: in a few words.
-        kind: what errs: a joint, a body (a link, the tool, the camera), or the place in the image.
-        joint: the joint that errs, or before which a link does; None where it is no one joint.
-        drivers: the joint on which alone it depends, or the two; empty for all else.
-        over_time: whether it depends on time.
-        moves: what moves, by one unit each (n, 3, a) [m].
-        amounts: what it may depend on (n, b); each of the moves is any linear function of it.
-        ties: each of the moves is proportional to its own amount instead (b = a), by factors that are these mixtures
-            (a, p) of the numbers; None for any function.
-        is_specific: whether it says as much of what is wrong as an effect with a name does.
-        undone: what would be measured (n, 3) [m] without it, of what was (n, 3) and its numbers (p,); None where that
-            is as much less as its columns say.
+        what: short description.
+        kind: the erring part: a joint, a body (a link, the tool, the camera), or the place in the image.
+        joint: the erring joint, or the joint after the erring link; None where there is no single joint.
+        drivers: the one or two joints on which alone it depends; empty for other families.
+        over_time: True if it depends on time.
+        moves: displacements (n, 3, a) [m] per unit of each motion.
+        amounts: functions (n, b) that it may depend on; each motion is a linear combination of them.
+        ties: instead, each motion is proportional to its own amount (b = a), by factors that are these mixtures (a, p)
+            of the parameters; None for free functions.
+        is_specific: True if it is as specific as a named effect.
+        undone: function from measured positions (n, 3) and parameters (p,) to the positions (n, 3) without it; None
+            where subtracting the linear columns is exact.
     """
 
     what: str
@@ -62,25 +62,25 @@ class Family:
     undone: Callable[[FloatArray, FloatArray], FloatArray] | None = None
 
     def columns(self, run: Simulated) -> FloatArray:
-        """Derivatives (n, 3, p) of what is measured by its numbers [m], a b where none are tied."""
+        """Return derivatives (n, 3, p) [m] of the measured positions by its parameters; p = a b where none are tied."""
         moved, functions = self.moved(run), self.functions(run)
         return (moved[:, :, :, None] * functions[:, None, None, :]).reshape(len(moved), 3, -1)
 
     def moved(self, run: Simulated) -> FloatArray:
-        """What moves (n, 3, m) [m], each by any function of `functions`; ties are in it."""
+        """Return displacements (n, 3, m) [m], each scaled by any of `functions`; ties are already applied."""
         moves = self.moves(run)
         return moves if self.ties is None else (moves * self.amounts(run)[:, None, :]) @ self.ties
 
     def functions(self, run: Simulated) -> FloatArray:
-        """Of what each of `moved` may depend on (n, a); ones where they are tied."""
+        """Return the functions (n, a) that each of `moved` may depend on; ones where they are tied."""
         return self.amounts(run) if self.ties is None else np.ones((len(run.motion), 1))
 
     def along(self, functions: FloatArray) -> Family:
-        """The part of it whose moves follow some combinations (b, r) of what it may depend on."""
+        """Return the subfamily whose motions follow given combinations (b, r) of the functions."""
         return replace(self, amounts=lambda run: self.amounts(run) @ functions)
 
     def moved_by(self, run: Simulated, numbers: FloatArray) -> FloatArray:
-        """By how much each of the moves is there (n, a) with these numbers (p,)."""
+        """Return the amount of each motion (n, a) for given parameters (p,)."""
         amounts = self.amounts(run)
         if self.ties is not None:
             return amounts * (self.ties @ numbers)
@@ -88,7 +88,7 @@ class Family:
 
 
 def families(run: Simulated) -> list[Family]:
-    """All that this motion can show."""
+    """Return all families that this motion can show."""
     robot, motion = run.simulation.robot, run.motion
     joints = [k for k in range(motion.q.shape[1]) if np.ptp(motion.q[:, k]) > 1e-4]
     names, timed = robot.joints, motion.t is not None
@@ -124,7 +124,7 @@ def families(run: Simulated) -> list[Family]:
 
 
 def _turned(what: str, calibration: StereoCalibration, axes: FloatArray) -> Family:
-    """The right eye turned about some of its axes (a, 3)."""
+    """Return the family of the right camera rotated about some of its axes (a, 3)."""
 
     def moves(run: Simulated) -> FloatArray:
         return by_turn(run.measured, calibration, axes)
@@ -136,7 +136,7 @@ def _turned(what: str, calibration: StereoCalibration, axes: FloatArray) -> Fami
 
 
 def _giving(run: Simulated, k: int) -> list[Family]:
-    """What carries a joint gives under the arm's weight: in any way, or by springs along and about axes."""
+    """Return families of a joint's support yielding under the arm's weight: in any way, or by springs on its axes."""
     what = f"what carries {run.simulation.robot.joints[k]} gives under the arm's weight"
     found = [Family(what, "body", None, (), False, _link(k), loads) for loads in (_moments(k), _wrenches(k))]
     supports = run.simulation.gravity.in_supports(k)
@@ -153,9 +153,9 @@ def _giving(run: Simulated, k: int) -> list[Family]:
 
 
 def _middle(T_link_joint: FloatArray) -> FloatArray:
-    """Pose (4, 4) of a joint's frame in one half way to it from its link's origin, with the third axis along the link.
+    """Return the pose (4, 4) of a joint's frame in a frame halfway along its link, whose third axis is along the link.
 
-    There a beam under a moment seems to have a hinge: its end turns and shifts as if it had.
+    A beam under an end moment acts as if hinged there: the rotation and shift of its end match a hinge's.
     """
     T, way = np.eye(4), T_link_joint[:3, 3]
     one, other = np.linalg.svd(way[None])[2][1:]
@@ -185,7 +185,7 @@ def _anywhere(run: Simulated) -> FloatArray:
 
 
 def _in_depth(run: Simulated) -> FloatArray:
-    """Along the ray on which the left eye sees the marker."""
+    """Return unit displacements along the ray on which the left camera sees the marker."""
     return run.measured[:, :, None]
 
 
@@ -204,7 +204,7 @@ def _any_of_both(k: int, j: int) -> Columns:
 
 
 def _any_of_time(count: int) -> Columns:
-    """One, and cosines (n, count + 1) over the time of the recording."""
+    """Return a constant and cosines (n, count + 1) over the time of the recording."""
 
     def amounts(run: Simulated) -> FloatArray:
         clock = run.motion.clock
@@ -229,7 +229,7 @@ def _wrenches(k: int) -> Columns:
 
 
 def _link_about(k: int, T: FloatArray) -> Columns:
-    """The link before a joint moved along and turned about the axes of a frame, in which the joint's is at T (4, 4)."""
+    """Return columns of the link before a joint, moved along and turned about a frame with the joint at T (4, 4)."""
 
     def moves(run: Simulated) -> FloatArray:
         along, about = np.split(_link(k)(run) @ np.kron(np.eye(2), T[:3, :3].T), 2, axis=2)
@@ -239,7 +239,7 @@ def _link_about(k: int, T: FloatArray) -> Columns:
 
 
 def _own_loads(k: int, T: FloatArray) -> Columns:
-    """Force along and moment about each axis of a frame (n, 6), in which the joint's is at T (4, 4)."""
+    """Return force along and moment about each axis (n, 6) of a frame that has the joint at T (4, 4)."""
 
     def loads(run: Simulated) -> FloatArray:
         moments, forces = (part @ T[:3, :3].T for part in np.split(run.wrenches[:, k], 2, axis=1))
@@ -249,7 +249,7 @@ def _own_loads(k: int, T: FloatArray) -> Columns:
 
 
 def _places_in_image(degree: int) -> Columns:
-    """Monomials (n, b) up to a degree of the place in the image and the relative distance."""
+    """Return monomials (n, b) up to a degree in image position and relative distance."""
 
     def amounts(run: Simulated) -> FloatArray:
         x = run.measured
@@ -263,13 +263,13 @@ def _places_in_image(degree: int) -> Columns:
 
 
 def _trends(run: Simulated, j: int) -> FloatArray:
-    """A joint's reading and its square (n, 2)."""
+    """Return a joint's reading and its square (n, 2)."""
     q = run.motion.q[:, [j]]
     return np.concatenate([q, np.square(q)], axis=1)
 
 
 def _harmonics(run: Simulated, j: int, count: int) -> FloatArray:
-    """Sines and cosines (n, 2 count) of a joint's reading; of a slide, of its path as half a turn."""
+    """Return sines and cosines (n, 2 count) of a joint's reading; a prismatic joint's range counts as half a turn."""
     q = run.motion.q[:, j]
     if run.simulation.robot.chain.prismatic[j]:
         q = np.pi * (q - q.min()) / max(float(np.ptp(q)), 1e-9)
@@ -281,5 +281,5 @@ def _one(run: Simulated) -> FloatArray:
 
 
 def _with_one(amounts: FloatArray) -> FloatArray:
-    """The error may have a part that depends on nothing: it belongs to the same cause."""
+    """Add a constant: a part of the error that depends on nothing belongs to the same cause."""
     return np.concatenate([np.ones((len(amounts), 1)), amounts], axis=1)

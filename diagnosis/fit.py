@@ -1,4 +1,4 @@
-"""Fitting the numbers of effects to measured positions, some of which are not the marker at all."""
+"""Fit the parameters of effects to measured positions, some of which are outliers."""
 
 from __future__ import annotations
 
@@ -15,43 +15,43 @@ from bodyschema.interfaces.records import FloatArray
 from .background import Background, Scales
 from .observations import Observations
 
-# An effect is not expected to be larger than so many times its usual size; what cannot be told stays near nothing.
+# Prior limit of an effect, in units of its usual size; unidentifiable parameters stay near zero.
 LARGEST = 10.0
-# Steps until the likelihood rises by less than this [nats].
+# Maximum of steps, and the rise of the likelihood below which the fit has converged [nats].
 _ROUNDS, _ENOUGH = 12, 0.02
-# A fit is given up after a step where so many times what the next promises, and so much more [nats], would not do.
+# Give up a fit if this multiple of the next step's promise, and this much more [nats], would not suffice.
 _SLACK, _LITTLE = 2.0, 5.0
-# A step that would raise it by less is not tried [nats].
+# A step that promises a smaller rise is not tried [nats].
 _NOT_TRIED = 1e-3
-# How far a step may take a ripple's phase over its range [rad], what is left of a settling, and a time constant, as a
-# share of it.
+# Step limits: phase of a ripple over its range [rad], remaining share of a settling, relative change of a time
+# constant.
 _OF_A_PEAK, _OF_A_MEMORY, _OF_A_TIME = 0.5, 0.1, 0.3
 _LONGEST_MEMORY, _FEWEST_CYCLES = 0.95, 1.5
-# A period or a time constant of which nothing is told may be off by so many such steps.
+# Uncertainty, in such steps, of a period or a time constant that is not identifiable.
 _UNTOLD = 10.0
-# A drift that is over after a smaller share of the recording is none: what is measured is off from the beginning.
+# A drift that ends within a smaller share of the recording is an offset from the beginning.
 SHORTEST_DRIFT = 0.03
 _FEWEST_OUTLIERS = 1e-4
-# Of time, whose agreement says how far the numbers are sure.
+# Blocks of time whose disagreement widens the intervals.
 _BLOCKS = 60
 _EM_ROUNDS = 6
-# What is left is never taken to be smaller, in units of the stated noise: it would be the rounding of numbers.
+# Floor of the residuals, in units of the stated noise: numerical rounding.
 ROUNDED = 1e-9
-# So large a share of so many rows is no outliers.
+# A larger share of outliers within such a window is a change and not outliers.
 _WINDOW, _BURST = 61, 0.45
 
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """A mixture: most fixes have the shape of the stated noise, `sigma` times its size; a share lie anywhere.
+    """A mixture: most fixes have the stated noise times `sigma`; a share of outliers lies anywhere.
 
-    Fixes that are not the marker are scattered. Where many in a row are off, something has changed.
+    Outliers are scattered. Where many rows in a row are off, something has changed.
 
     Attributes:
         sigma: size of the noise, in units of the stated one.
-        share: of the fixes that are not the marker.
-        weights: how probably each fix is the marker (n,).
-        log_likelihood: of all residuals [nats].
+        share: share of outliers.
+        weights: probability of each fix to be the marker (n,).
+        log_likelihood: log-likelihood of all residuals [nats].
     """
 
     sigma: float
@@ -67,14 +67,14 @@ class Noise:
         start: Noise | None = None,
         spent: Callable[[float], float] = lambda _: 0.0,
     ) -> Noise:
-        """The most probable noise of residuals (n, 3), by expectation maximisation; rows not trusted count nothing.
+        """Fit the most probable noise of residuals (n, 3), by expectation maximisation; untrusted rows are ignored.
 
         Args:
-            spent: how many of the numbers a background of tolerances takes for itself beside noise of a size.
+            spent: effective number of parameters of a background of tolerances, for noise of a given size.
         """
         trusted, outlier_density = observations.trusted, observations.outlier_density
         squares = np.einsum("ni,ni->n", residuals, residuals)
-        # Of three squared normal coordinates the median is 2.366.
+        # The median of the sum of three squared standard normal coordinates is 2.366.
         sigma = float(np.sqrt(max(np.median(squares[trusted]) / 2.366, ROUNDED**2)))
         share = 0.02 if start is None else start.share
         weights, total = np.ones(len(squares)), -np.inf
@@ -101,14 +101,14 @@ class Fit:
     """A simulation fitted to observations.
 
     Attributes:
-        observations: what it was fitted to.
+        observations: the data of the fit.
         simulation: with all effects, the nuisances first.
-        nuisances: how many of its effects are no findings.
-        background: what tolerances may change.
-        tolerated: by how much each of them does (p,).
+        nuisances: number of leading effects that are not findings.
+        background: changes that the tolerances allow.
+        tolerated: amount of each of them (p,).
         run: the simulation over the observed motion.
         residuals: (n, 3) in units of the stated noise.
-        noise: what is known of it.
+        noise: the fitted noise model.
     """
 
     observations: Observations
@@ -127,14 +127,14 @@ class Fit:
 
     @cached_property
     def without_outliers(self) -> float:
-        """The log-likelihood if all fixes were the marker [nats]."""
+        """Log-likelihood if all fixes were the marker [nats]."""
         squares = np.square(self.residuals[self.observations.trusted]).sum(axis=1)
         variance = max(float(squares.mean()) / 3.0, ROUNDED**2)
         return float(-1.5 * len(squares) * (np.log(2.0 * np.pi * variance) + 1.0))
 
     @cached_property
     def row_log_likelihoods(self) -> FloatArray:
-        """Of each row (n,) [nats]; nothing of rows that are not trusted."""
+        """Log-likelihood of each row (n,) [nats]; 0 for untrusted rows."""
         squares, noise = np.einsum("ni,ni->n", self.residuals, self.residuals), self.noise
         inlier = np.log1p(-noise.share) - 1.5 * np.log(2.0 * np.pi * noise.sigma**2) - 0.5 * squares / noise.sigma**2
         either = np.logaddexp(inlier, np.log(noise.share) + self.observations.outlier_density)
@@ -142,24 +142,24 @@ class Fit:
 
     @property
     def is_exact(self) -> bool:
-        """Whether only the rounding of numbers is left, as of the simulation's own output."""
+        """True if only numerical rounding is left, as for the simulation's own output."""
         return self.noise.sigma <= ROUNDED
 
     @property
     def log_likelihood(self) -> float:
-        """Of the observations, less what implausibly large effects and tolerances cost [nats]."""
+        """Log-likelihood of the observations, less the prior cost of large effects and tolerances [nats]."""
         beyond = 0.5 * float(self.background.precision @ np.square(self.tolerated))
         beyond += self.background.volume(self.noise.sigma)
         return self.noise.log_likelihood - _cost(self.simulation.effects[self.nuisances :]) - beyond
 
     @cached_property
     def predicted(self) -> FloatArray:
-        """What is measured (n, 3) [m] by all effects and tolerances."""
+        """Predicted measurements (n, 3) [m] with all effects and tolerances."""
         return self.run.measured + self.background.shift(self.tolerated)
 
     @cached_property
     def precision(self) -> FloatArray:
-        """Of the amounts of all effects, then of the tolerances, beforehand (p,)."""
+        """Prior precision of the amounts of all effects, then of the tolerances (p,)."""
         return np.append(prior_precision(self.simulation, self.nuisances), self.background.precision)
 
     @cached_property
@@ -169,49 +169,49 @@ class Fit:
 
     @property
     def run_columns(self) -> FloatArray:
-        """Derivatives (n, 3, p) of what is measured by all amounts, and then by all tolerances [m]."""
+        """Derivatives (n, 3, p) of the predictions by all amounts, and then by all tolerances [m]."""
         return np.concatenate([amount_columns(self.run, self.simulation.effects), self.background.columns], axis=2)
 
     @property
     def columns(self) -> FloatArray:
-        """`run_columns`, whitened and weighted."""
+        """Whitened and weighted `run_columns`."""
         return np.concatenate([self.effect_columns, self.tolerance_columns.reshape(*self.left.shape, -1)], axis=2)
 
     @cached_property
     def effect_columns(self) -> FloatArray:
-        """Derivatives (n, 3, p) of what is measured by the amounts of all effects, whitened and weighted."""
+        """Derivatives (n, 3, p) of the predictions by the amounts of all effects, whitened and weighted."""
         return self.weighted(amount_columns(self.run, self.simulation.effects))
 
     @property
     def tolerance_columns(self) -> FloatArray:
-        """Derivatives (3 n, p) of what is measured by all tolerances, whitened and weighted."""
+        """Derivatives (3 n, p) of the predictions by all tolerances, whitened and weighted."""
         return self.background.white * np.repeat(self.root_weights, 3, axis=0)
 
     @property
     def _amounts(self) -> int:
-        """How many amounts all effects have."""
+        """Number of amounts of all effects."""
         return sum(len(effect.amounts) for effect in self.simulation.effects)
 
     def weighted(self, columns: FloatArray) -> FloatArray:
-        """Columns (n, 3, p) [m] whitened and weighted."""
+        """Return columns (n, 3, p) [m] whitened and weighted."""
         return self.observations.whitened(columns) * self.root_weights[:, :, None]
 
     @cached_property
     def independence(self) -> float:
-        """How many independent rows there are for each (0 to 1], as neighbours agree: (1 - ρ) / (1 + ρ)."""
+        """Effective number of independent rows per row (0 to 1], from the lag-1 correlation: (1 - ρ) / (1 + ρ)."""
         follows = ~self.observations.motion.begins[1:]
         agree = float((self.left[1:][follows] * self.left[:-1][follows]).sum())
         squares = float(np.square(self.left[1:][follows]).sum())
         rho = float(np.clip(agree / max(squares, 1e-300), 0.0, 0.99))
-        # Of white rows it is within so much of nothing.
+        # Two standard errors of ρ for white rows.
         unsure = 2.0 / np.sqrt(max(3.0 * float(follows.sum()), 1.0))
         return (1.0 - rho) / (1.0 + rho) if rho > unsure else 1.0
 
     @cached_property
     def absorbed(self) -> tuple[FloatArray, FloatArray]:
-        """Orthonormal directions (3 n, r) that tolerances change, and which share of the squares there is theirs (r,).
+        """Orthonormal directions (3 n, r) that tolerances change, and the absorbed share of the squares in each (r,).
 
-        To all that is tested the background is noise that is shared among the rows (Rasmussen and Williams 2006, 2.7).
+        Tests treat the background as noise shared among the rows (Rasmussen and Williams 2006, 2.7).
         """
         tolerances = self.background.tolerances
         inner = self.background.inner(self.noise.weights) * np.outer(tolerances, tolerances)
@@ -222,7 +222,7 @@ class Fit:
         return directions, values / (values + self.noise.sigma**2)
 
     def unshared(self, flat: FloatArray) -> FloatArray:
-        """Weighted columns (3 n, k) in units in which the background and the noise together are white."""
+        """Return weighted columns (3 n, k) in units in which background and noise together are white."""
         directions, shares = self.absorbed
         if not len(shares):
             return flat
@@ -230,18 +230,18 @@ class Fit:
 
     @cached_property
     def evident(self) -> FloatArray:
-        """What the effects leave (n, 3), weighted and `unshared`."""
+        """Residuals of the effects (n, 3), weighted and `unshared`."""
         return self.left_by(self.run.measured)
 
     def left_by(self, predicted: FloatArray) -> FloatArray:
-        """What a prediction (n, 3) [m] by effects leaves (n, 3), weighted and `unshared`."""
+        """Return the residuals of a prediction (n, 3) [m] by effects, weighted and `unshared` (n, 3)."""
         untolerated = self.background.shift(np.zeros_like(self.tolerated))
         left = self.observations.residuals(predicted + untolerated) * self.root_weights
         return self.unshared(left.reshape(-1, 1)).reshape(left.shape)
 
     @cached_property
     def orthogonal(self) -> FloatArray:
-        """An orthonormal basis (n, 3, r) of what the amounts of effects can change, `unshared`."""
+        """Orthonormal basis (n, 3, r) of the directions that the amounts of effects can change, `unshared`."""
         n = len(self.left)
         flat = self.unshared(self.effect_columns.reshape(3 * n, self._amounts))
         scales = np.linalg.norm(flat, axis=0)
@@ -256,21 +256,21 @@ class Fit:
 
     @cached_property
     def shape_columns(self) -> FloatArray:
-        """Derivatives (n, 3, s) of what is measured by all periods and time constants, whitened and weighted."""
+        """Derivatives (n, 3, s) of the predictions by all periods and time constants, whitened and weighted."""
         parts = [self.run.by_shape(effect) for effect in self.causes if effect.shapes]
         return self.weighted(np.concatenate(parts, axis=2)) if parts else np.empty((len(self.run.motion), 3, 0))
 
     @cached_property
     def covariance(self) -> FloatArray:
-        """Of all amounts (p, p), nuisances first, then of periods and time constants.
+        """Covariance of all amounts (p, p), nuisances first, then of periods and time constants.
 
-        Where blocks of time disagree by more than independent rows would, it is larger (Liang and Zeger 1986).
+        It is widened where blocks of time disagree by more than independent rows would (Liang and Zeger 1986).
         """
         columns = np.concatenate([self.columns, self.shape_columns], axis=2)
         flat, variance = columns.reshape(self.left.size, -1), self.noise.sigma**2
         precision = np.append(self.precision, self._shape_precision / _UNTOLD**2)
         information = flat.T @ flat / variance + np.diag(precision)
-        # In units in which each number is told alike: seconds and radians are of very different size.
+        # Normalise the units, since seconds and radians differ widely in size.
         units = np.outer(scales := np.sqrt(np.diag(information)), scales)
         covariance = np.asarray(np.linalg.pinv(information / units, rcond=1e-14, hermitian=True) / units)
         scores = np.einsum("nip,ni->np", columns, self.left) / variance
@@ -282,15 +282,15 @@ class Fit:
 
     @property
     def _shape_precision(self) -> FloatArray:
-        """Of periods and time constants (s,): how far one step may take them."""
+        """Prior precision of periods and time constants (s,), from the limit of one step."""
         reaches = [_reach(self.run, effect, k) for effect in self.causes for k in effect.shapes]
         return 1.0 / np.square(np.array(reaches))
 
     def step(self) -> tuple[FloatArray, float]:
-        """The Gauss-Newton step of amounts, periods and time constants, and how far it may raise the likelihood.
+        """Return the Gauss-Newton step of amounts, periods and time constants, and its promised rise of the likelihood.
 
         Returns:
-            (p + s,), and [nats].
+            The step (p + s,), and the rise [nats].
         """
         precision = np.append(self.precision, self._shape_precision) * self.noise.sigma**2
         own = [effect.values[effect.amounts] for effect in self.simulation.effects]
@@ -302,7 +302,7 @@ class Fit:
         return step, 0.5 * float(step @ gradient) / self.noise.sigma**2
 
     def _products(self) -> tuple[FloatArray, FloatArray]:
-        """Of all columns with one another (p + s, p + s), and with what is left (p + s,)."""
+        """Return the products of all columns with one another (p + s, p + s), and with the residuals (p + s,)."""
         flat = np.concatenate([self.effect_columns, self.shape_columns], axis=2).reshape(self.left.size, -1)
         roots = np.repeat(self.root_weights, 3, axis=0)
         across = (flat * roots).T @ self.background.white
@@ -320,7 +320,7 @@ class Fit:
         return normal, gradient
 
     def places(self, cause: Effect) -> list[int]:
-        """Where the amounts of a cause, then its periods and time constants are in `covariance`."""
+        """Return the indices in `covariance` of a cause's amounts, then of its periods and time constants."""
         amounts, shapes = 0, self._amounts + len(self.tolerated)
         for index, effect in enumerate(self.simulation.effects):
             own = effect.shapes if index >= self.nuisances else []
@@ -330,7 +330,7 @@ class Fit:
         raise ValueError(f"{cause.name} is no effect of this fit")
 
     def moved(self, step: FloatArray) -> tuple[Simulation, FloatArray]:
-        """The simulation with its numbers moved by a step (p + s,), and the tolerances."""
+        """Return the simulation and the tolerances after a step (p + s,)."""
         effects, first = [], 0
         shape = self._amounts + len(self.tolerated)
         for index, effect in enumerate(self.simulation.effects):
@@ -345,27 +345,27 @@ class Fit:
         return self.simulation.with_effects(effects), self.tolerated + step[first : first + len(self.tolerated)]
 
     def stepped(self, step: FloatArray) -> Fit:
-        """With its numbers moved by a step (p + s,)."""
+        """Return the fit after a step (p + s,), without further steps."""
         return self._with(*self.moved(step))
 
     def at(self, simulation: Simulation) -> Fit:
-        """A simulation with the same nuisances and tolerances, as it is."""
+        """Evaluate a simulation with the same nuisances and tolerances, without fitting it."""
         return self._with(simulation, self.tolerated)
 
     def _with(self, simulation: Simulation, tolerated: FloatArray) -> Fit:
         return _at(self.observations, simulation, self.nuisances, self.noise, self.background, tolerated)
 
     def to(self, observations: Observations, start: Simulation | None = None) -> Fit:
-        """The same, or another simulation to start from, refitted to other observations of the same motion."""
+        """Refit to other observations of the same motion, optionally from another simulation."""
         simulation = start or self.simulation
         fit = _at(observations, simulation, self.nuisances, self.noise, self.background, self.tolerated)
         return improved(fit)
 
     def tolerating(self, scales: Scales, also: Collection[Effect] = ()) -> Fit:
-        """With tolerances of these scales beside it, linear about what they are here; all refitted.
+        """Refit with tolerances of these scales, linearised about their present values.
 
         Args:
-            also: some of the causes, which are no more findings but tolerated.
+            also: causes that become tolerances and are no longer findings.
         """
         simulation = self.settled().simulation
         if also:
@@ -377,7 +377,7 @@ class Fit:
         return improved(_at(self.observations, simulation, self.nuisances, self.noise, background))
 
     def settled(self) -> Fit:
-        """The same with its tolerances in the simulation."""
+        """Return the same fit with its tolerances moved into the simulation."""
         if self.background.scales is None:
             return self
         simulation = self.simulation.with_background(self.background.with_amounts(self.tolerated))
@@ -387,10 +387,10 @@ class Fit:
 
     @property
     def written(self) -> Simulation:
-        """The simulation to be written down: its tolerances as they were found, and all else refitted beside them.
+        """Return the simulation to be stored: tolerances as found, and everything else refitted beside them.
 
-        Tolerances are found to first order. Where a link turns one way and the camera the other, what each of them
-        does to second order is left over.
+        Tolerances are found to first order. Where a link turns one way and the camera the other, their second-order
+        terms are left over.
         """
         settled = self.settled()
         if settled.background.scales is None:
@@ -399,7 +399,7 @@ class Fit:
         return improved(_at(self.observations, settled.simulation, self.nuisances, self.noise, background)).simulation
 
     def untolerated(self) -> Fit:
-        """The same, refitted without any tolerance."""
+        """Refit without any tolerance."""
         if self.background.scales is None:
             return self
         simulation = self.simulation.with_background(self.background.given)
@@ -407,32 +407,32 @@ class Fit:
         return improved(_at(self.observations, simulation, self.nuisances, self.noise, background))
 
     def without(self, cause: Effect) -> Fit:
-        """All causes but one, refitted."""
+        """Refit with all causes but one."""
         return self.with_causes([effect for effect in self.causes if effect.identity != cause.identity])
 
     def with_causes(self, causes: Sequence[Effect]) -> Fit:
-        """Other causes in the place of these, all refitted."""
+        """Refit with other causes in place of the present ones."""
         return improved(self.starting(causes))
 
     def starting(self, causes: Sequence[Effect]) -> Fit:
-        """Other causes in the place of these, all as they are."""
+        """Replace the causes, without fitting."""
         return self.at(self.simulation.with_effects((*self.simulation.effects[: self.nuisances], *causes)))
 
 
 def fitted(observations: Observations, simulation: Simulation, nuisances: int, start: Noise | None = None) -> Fit:
-    """The most probable amounts of all effects of `simulation`, by Gauss-Newton steps that are halved where too far.
+    """Fit the most probable amounts of all effects of `simulation`, by damped Gauss-Newton steps.
 
-    Periods and time constants of the causes move along; moments stay as they are. Nothing else is tolerated.
+    Periods and time constants of the causes are fitted too; moments stay fixed. There are no tolerances.
     """
     run = simulation.run(observations.motion)
     return improved(_at(observations, simulation, nuisances, start, Background(run, observations.whitening, None)))
 
 
 def improved(fit: Fit, least: float = -np.inf) -> Fit:
-    """The same simulation with the most probable numbers, as `fitted` has them.
+    """Refit the parameters of a fit by Gauss-Newton steps, as in `fitted`.
 
     Args:
-        least: where it cannot be expected to become as probable as this it is given up, as far as it has come [nats].
+        least: log-likelihood to reach; the fit is given up early once it cannot be expected to [nats].
     """
     for done in range(_ROUNDS):
         if not fit.simulation.effects and not len(fit.tolerated):
@@ -457,7 +457,7 @@ def improved(fit: Fit, least: float = -np.inf) -> Fit:
 
 
 def _rise(promised: float, fit: Fit) -> float:
-    """By how much the log-likelihood rises when the noise is smaller, too, after a step that promises so much."""
+    """Return the rise of the log-likelihood after a step when the noise estimate falls as well."""
     half_square = 1.5 * float(fit.noise.weights.sum())
     return -half_square * float(np.log1p(-min(promised / max(half_square, 1e-300), 0.999999)))
 
@@ -478,24 +478,24 @@ def _at(
 
 
 def solved(normal: FloatArray, gradient: FloatArray) -> FloatArray:
-    """The shortest solution (p,) of normal equations, in units in which each column has the same length."""
+    """Return the shortest solution (p,) of normal equations, with columns scaled to equal length."""
     scales = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     return np.linalg.lstsq(normal / np.outer(scales, scales), gradient / scales, rcond=1e-12)[0] / scales
 
 
 def _reach(run: Simulated, effect: Effect, k: int) -> float:
-    """How far one step may take a period or a time constant, so that the derivative still says something."""
+    """Return the largest step of a period or a time constant for which its derivative is still valid."""
     if effect.name == "joint_ripple":
         return _OF_A_PEAK / max(float(np.ptp(run.readings.q[:, run.simulation.place(effect).joint])), 1e-6)
     return _OF_A_MEMORY if effect.name == "settling" else _OF_A_TIME * float(effect.values[k])
 
 
 def _bounded(effect: Effect, k: int, value: float, clock: FloatArray) -> float:
-    """A period or a time constant that can be."""
+    """Limit a period or a time constant to its valid range."""
     if effect.name == "settling":
         return float(np.clip(value, 0.0, _LONGEST_MEMORY))
     if effect.parameters[k].name == "cycles_per_turn":
-        # Once a turn it would be an eccentricity.
+        # At once per turn it would be an eccentricity.
         value = max(value, _FEWEST_CYCLES)
     if effect.name == "thermal_drift":
         value = max(value, SHORTEST_DRIFT * float(clock[-1] - clock[0]))
@@ -503,7 +503,7 @@ def _bounded(effect: Effect, k: int, value: float, clock: FloatArray) -> float:
 
 
 def prior_precision(simulation: Simulation, nuisances: int) -> FloatArray:
-    """Of all amounts (p,): what is not known beforehand may be anything."""
+    """Return the prior precision of all amounts (p,); unknown ones have 0."""
     parts = []
     for k, effect in enumerate(simulation.effects):
         usual = np.array([effect.parameters[j].usual for j in effect.amounts])
@@ -520,6 +520,6 @@ def _cost(causes: Sequence[Effect]) -> float:
 
 
 def amount_columns(run: Simulated, effects: Sequence[Effect]) -> FloatArray:
-    """Derivatives (n, 3, p) of what is measured by the amounts of effects [m]."""
+    """Return derivatives (n, 3, p) of the predictions by the amounts of effects [m]."""
     parts = [run.columns(effect)[:, :, effect.amounts] for effect in effects]
     return np.concatenate(parts, axis=2) if parts else np.empty((len(run.motion), 3, 0))

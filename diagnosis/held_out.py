@@ -1,6 +1,6 @@
-"""What a model misses on blocks of time that it was not fitted to.
+"""Predict blocks of time that a model was not fitted to.
 
-A fit without a block differs from the full one by a Newton step, so no model is fitted twice: with H the information
+A fit without a block differs from the full one by a Newton step, so no model is fitted twice. With H the information
 of the other blocks and g the gradient of the block's own likelihood, the amounts move by -H⁻¹ g.
 """
 
@@ -20,21 +20,21 @@ from .observations import IntArray
 from .scan import Candidate
 from .scatter import instruments
 
-# Blocks of time, and how many folds they are dealt to in turn.
+# Maximum of blocks of time, and the number of folds they are dealt to in turn.
 _MOST_BLOCKS, _FOLDS = 80, 5
 FEWEST_ROWS_A_BLOCK = 5
 _BOOTSTRAPS = 2000
-# A fix that is more probably not the marker counts in no figure.
+# A fix whose probability of being the marker is lower is left out of all figures.
 _MARKER = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """Rows in blocks of time.
+    """Assignment of rows to blocks of time.
 
     Attributes:
         of_row: the block of each row (n,).
-        count: how many there are.
+        count: number of blocks.
     """
 
     of_row: IntArray
@@ -42,24 +42,24 @@ class Blocks:
 
     @classmethod
     def cut(cls, rows: int, most: int = _MOST_BLOCKS) -> Blocks:
-        """As many blocks of the same length as make sense for so many rows."""
+        """Cut rows into blocks of equal length, as many as make sense."""
         count = int(np.clip(rows // FEWEST_ROWS_A_BLOCK, _FOLDS, most))
         return cls(np.arange(rows) * count // max(rows, 1), count)
 
     @property
     def fold(self) -> IntArray:
-        """The fold of each row (n,)."""
+        """Fold of each row (n,)."""
         return self.of_row % _FOLDS
 
     def sums(self, values: FloatArray) -> FloatArray:
-        """Sums (blocks, ...) of values (n, ...)."""
+        """Return sums (blocks, ...) of values (n, ...)."""
         sums = np.zeros((self.count, *values.shape[1:]))
         np.add.at(sums, self.of_row, values)
         return sums
 
 
 def held_out_errors(fit: Fit, blocks: Blocks) -> FloatArray:
-    """Measured minus predicted (n, 3) [m], each row predicted without its own fold."""
+    """Return measured minus predicted (n, 3) [m], each row predicted without its own fold."""
     errors = fit.observations.x - fit.predicted
     if not len(fit.precision):
         return errors
@@ -72,7 +72,7 @@ def held_out_errors(fit: Fit, blocks: Blocks) -> FloatArray:
 
 
 def gain_percent(before: FloatArray, after: FloatArray, blocks: Blocks, seed: int) -> tuple[float, tuple[float, float]]:
-    """By how much the RMS of distances (n,) falls, in percent, and its 95 % interval by resampling blocks."""
+    """Return the reduction of the RMS of distances (n,) [%], and its 95 % interval from resampled blocks."""
     rows = blocks.sums(np.stack([np.square(before), np.square(after)], axis=1))
     total = rows.sum(axis=0)
     drawn = np.random.default_rng(seed).integers(blocks.count, size=(_BOOTSTRAPS, blocks.count))
@@ -87,11 +87,11 @@ def gain_percent(before: FloatArray, after: FloatArray, blocks: Blocks, seed: in
 
 @dataclass(frozen=True, slots=True)
 class Added:
-    """What one more hypothesis would bring.
+    """Gain of one more hypothesis on held-out data.
 
     Attributes:
-        held_out_gain_percent: by how much the squared error falls on rows that were not fitted.
-        p_value: of no gain at all, over blocks as a whole, for this hypothesis alone.
+        held_out_gain_percent: reduction of the squared error on held-out rows.
+        p_value: p-value of no gain, from the agreement of blocks, for this hypothesis alone.
     """
 
     held_out_gain_percent: float
@@ -99,7 +99,7 @@ class Added:
 
 
 def added(fit: Fit, candidates: Sequence[Candidate], blocks: Blocks) -> list[Added]:
-    """What each of the candidates would bring on top of a fit, to first order."""
+    """Return the first-order gain of each candidate on top of a fit."""
     folds = _Folds.of(fit, fit.columns, blocks)
     before = folds.products.missed(fit.precision)
     return [_added(fit, candidate.effect, folds, before, blocks) for candidate in candidates]
@@ -115,18 +115,18 @@ def _added(fit: Fit, effect: Effect, folds: _Folds, before: float, blocks: Block
 
 
 def held_out_square(fit: Fit, columns: FloatArray, precision: FloatArray, blocks: Blocks) -> float:
-    """Sum of the squares that columns (n, 3, p) leave of what a fit has left, on rows that were not fitted."""
+    """Return the sum of squared held-out residuals of a fit after adding columns (n, 3, p)."""
     return _Folds.of(fit, columns, blocks).products.missed(precision)
 
 
 @dataclass(frozen=True, eq=False)
 class _Products:
-    """Of columns with one another and with what a fit has left, fold by fold.
+    """Products of columns with one another and with the residuals of a fit, fold by fold.
 
     Attributes:
         inner, toward: (folds, p, p) and (folds, p).
-        square: of all that is left.
-        variance: of the noise, in units of the stated one.
+        square: sum of squares of all residuals.
+        variance: noise variance, in units of the stated one.
     """
 
     inner: FloatArray
@@ -135,7 +135,7 @@ class _Products:
     variance: float
 
     def missed(self, precision: FloatArray) -> float:
-        """Sum of the squares that is left of rows whose fold was not fitted, with this precision (p,) of amounts."""
+        """Return the sum of squared held-out residuals, with prior precision (p,) of the amounts."""
         square = self.square
         if not len(precision):
             return square
@@ -148,11 +148,11 @@ class _Products:
 
 @dataclass(frozen=True, eq=False)
 class _Folds:
-    """Columns and what a fit has left, fold by fold.
+    """Columns and residuals of a fit, fold by fold.
 
     Attributes:
-        rows: of each fold: which they are, the columns there (3 m, p), and what is left (3 m,).
-        products: of them.
+        rows: for each fold, its row numbers, the columns there (3 m, p), and the residuals (3 m,).
+        products: their products.
     """
 
     rows: tuple[tuple[IntArray, FloatArray, FloatArray], ...]
@@ -160,7 +160,7 @@ class _Folds:
 
     @classmethod
     def of(cls, fit: Fit, columns: FloatArray, blocks: Blocks) -> _Folds:
-        """Columns (n, 3, p)."""
+        """Split columns (n, 3, p) and the residuals of a fit into folds."""
         rows = []
         for fold in range(_FOLDS):
             own = np.flatnonzero(blocks.fold == fold)
@@ -170,7 +170,7 @@ class _Folds:
         return cls(tuple(rows), _Products(inner, toward, square, fit.noise.sigma**2))
 
     def beside(self, more: FloatArray) -> _Products:
-        """With more columns (n, 3, k)."""
+        """Return the products with more columns (n, 3, k) appended."""
         p, k = self.products.inner.shape[1], more.shape[2]
         inner, toward = np.empty((_FOLDS, p + k, p + k)), np.empty((_FOLDS, p + k))
         inner[:, :p, :p], toward[:, :p] = self.products.inner, self.products.toward
@@ -183,11 +183,13 @@ class _Folds:
 
 
 def block_p_value(fit: Fit, columns: FloatArray, blocks: Blocks) -> float:
-    """Of columns (n, 3, k) that explain nothing of what is left, judged by how the blocks agree.
+    """Return the p-value that columns (n, 3, k) explain nothing of the residuals, from the agreement of blocks.
 
-    The noise of the scores comes from the blocks' own, with the columns fitted: so it is right where neighbouring rows
-    are not independent, as when a joint stands still and is rounded in the same way again and again (Liang and Zeger
-    1986; Hotelling's T² for so few blocks).
+    The noise of the scores comes from the blocks' own scores, with the columns fitted. So it is right where
+    neighbouring
+    rows are correlated, as when a joint stands still and is rounded in the same way again and again (Liang and Zeger
+    1986;
+    Hotelling's T² for few blocks).
     """
     basis, flat = fit.orthogonal.reshape(fit.left.size, -1), columns.reshape(fit.left.size, -1)
     flat = fit.unshared(flat)
@@ -199,13 +201,13 @@ def block_p_value(fit: Fit, columns: FloatArray, blocks: Blocks) -> float:
     k = int(told.sum())
     if not 0 < k < blocks.count:
         return 1.0
-    # Orthonormal columns: the amounts that fit best are the scores themselves.
+    # For orthonormal columns, the scores are the best-fitting amounts.
     beside = beside @ (vectors[:, told] / np.sqrt(values[told]) / scales[:, None])
     return scores_p_value(beside, fit.evident, blocks)
 
 
 def scores_p_value(columns: FloatArray, left: FloatArray, blocks: Blocks) -> float:
-    """As `block_p_value`, of orthonormal columns (n, 3, k) that explain nothing of `left` (n, 3)."""
+    """Return the p-value of `block_p_value` for orthonormal columns (n, 3, k) and residuals `left` (n, 3)."""
     k = columns.shape[2]
     scores = np.einsum("nik,ni->nk", columns, left)
     total = scores.sum(axis=0)
@@ -217,7 +219,7 @@ def scores_p_value(columns: FloatArray, left: FloatArray, blocks: Blocks) -> flo
 
 
 def is_marker(fit: Fit) -> np.ndarray:
-    """Which fixes are probably the marker (n,), of those rows that are trusted; the others are neither."""
+    """Return True for trusted fixes (n,) that are probably the marker."""
     return fit.noise.weights >= _MARKER
 
 

@@ -1,4 +1,4 @@
-"""What could be the cause: every effect of the table at every place where it can sit, and what this data can test."""
+"""List the hypotheses to test: every effect at every place where it can act, as far as the data can test it."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from bodyschema.effects import KINDS, Effect, Kind, Simulation
 
 from .observations import Observations
 
-# A joint that moves less than this tells nothing of itself [rad, m].
+# A joint that moves less than this cannot be tested [rad, m].
 STILL = 1e-4
 _FEWEST_ROWS = 20
 
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
-    """What is tested, and what is not.
+    """The effects to test, and the reasons why others are left out.
 
     Attributes:
-        effects: one of each, at rest.
-        limitations: why some were left out, a sentence each.
+        effects: one of each kind and place, with zero amounts.
+        limitations: reasons why some were left out, a sentence each.
     """
 
     effects: tuple[Effect, ...]
@@ -37,7 +37,7 @@ class Hypotheses:
         only: Collection[str] = (),
         without: Collection[str] = (),
     ) -> Hypotheses:
-        """All that this recording of this robot can test, of the effects asked for."""
+        """List all requested effects that this recording of this robot can test."""
         limits = _Limits(simulation, observations)
         robot = simulation.robot
         effects = []
@@ -56,7 +56,7 @@ class Hypotheses:
 
 
 class _Limits:
-    """What this recording cannot test."""
+    """Effects that this recording cannot test."""
 
     def __init__(self, simulation: Simulation, observations: Observations) -> None:
         self._simulation, self._motion = simulation, observations.motion
@@ -84,7 +84,7 @@ class _Limits:
             )
 
     def excludes(self, kind: Kind) -> bool:
-        """Whether no effect of this kind can be tested, or all of it is free anyway."""
+        """Return True if no effect of this kind can be tested, or if all of it is free anyway."""
         robot = self._simulation.robot
         if kind.needs_weight:
             return robot.robot.hold == "torque_free" or not self._simulation.gravity.known

@@ -1,4 +1,4 @@
-"""How large the instrument's noise is beside that of readings in whole ticks."""
+"""Estimate the instrument's noise beside the encoders' quantisation."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ _FACTORS = np.geomspace(0.05, 20.0, 61)
 
 
 def instrument_factor(fit: Fit) -> float:
-    """The most probable factor on the stated standard deviations, given what a fit has left and what rounding does."""
+    """Return the most probable factor on the stated standard deviations, given the residuals and the quantisation."""
     observations = fit.observations
     rows = fit.noise.weights >= 0.5
     left = (observations.x - fit.predicted)[rows]
     stated, rounding = observations.stated[rows], observations.rounding[rows]
     if not rounding.any():
         return observations.stated_factor
-    # Together diagonal: with V stated Vᵀ = I and V rounding Vᵀ = diag(r), each coordinate has the variance f² + r.
+    # Diagonalise both: with V stated Vᵀ = I and V rounding Vᵀ = diag(r), each coordinate has the variance f² + r.
     root = np.linalg.inv(np.linalg.cholesky(stated))
     shares, axes = np.linalg.eigh(root @ rounding @ np.swapaxes(root, 1, 2))
     squares = np.square(np.einsum("nji,njk,nk->ni", axes, root, left)).ravel()

@@ -1,4 +1,4 @@
-"""Structure that no effect fits: which joints it depends on, and a smooth model of it."""
+"""Describe residual structure that no effect fits: the joints it depends on, and a smooth model of it."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from .unknown import Apart, Unknowns
 
 @dataclass(frozen=True, eq=False)
 class Leftover:
-    """What is left when all causes have been named.
+    """Residual structure after all causes have been named.
 
     Attributes:
-        what: what moves, and on what it depends, in words.
-        joints: at which joints it acts or on which it depends, by their places in q.
-        with_time: whether it depends on time.
-        p_value: of so much structure by chance.
-        model: the causes beside a smooth model of it; None where nothing is left.
-        untold: what it depends on time, in words, so that it is in no model that can be stored.
+        what: descriptions of the erring part and of what the error depends on.
+        joints: indices in q of the joints at which it acts or on which it depends.
+        with_time: True if it depends on time.
+        p_value: p-value of this structure arising by chance.
+        model: the causes beside a smooth model of it; None where no structure is left.
+        untold: descriptions of time-dependent parts, which no stored model can contain.
     """
 
     what: tuple[str, ...]
@@ -36,12 +36,12 @@ class Leftover:
 
     @property
     def is_there(self) -> bool:
-        """Whether there is any structure."""
+        """True if there is any structure."""
         return bool(self.what)
 
 
 def leftover(explanation: Explanation, unknowns: Unknowns, blocks: Blocks) -> Leftover:
-    """What the families of an explanation say of what its causes leave."""
+    """Return the residual structure that the families of an explanation describe."""
     fit, apart = explanation.fit, explanation.apart
     if fit.is_exact:
         return Leftover((), (), False, 1.0)
@@ -61,6 +61,6 @@ def leftover(explanation: Explanation, unknowns: Unknowns, blocks: Blocks) -> Le
 
 
 def _chance(fit: Fit, apart: Apart, unknowns: Unknowns) -> float:
-    """Of so much structure where there is none."""
+    """Return the p-value of this structure arising by chance."""
     gain = 2.0 * (apart.fit.log_likelihood - fit.log_likelihood)
     return float(stats.chi2.sf(max(gain, 0.0), max(unknowns.told(apart).shape[2] + apart.choice, 1)))

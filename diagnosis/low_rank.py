@@ -1,4 +1,4 @@
-"""Tables of numbers of low rank: where a few moves follow a few functions, however many of both there are."""
+"""Fit low-rank tables of numbers: a few functions drive all motions, however many of both there are."""
 
 from __future__ import annotations
 
@@ -8,27 +8,27 @@ from bodyschema.interfaces.records import FloatArray
 
 from .fit import solved
 
-# Rounds in which moves and functions are found in turn, until what they explain rises by less than this.
+# Maximum of alternating rounds; stop when the explained sum rises by less.
 _ROUNDS, _ENOUGH = 12, 0.1
-# Beside sums of squares of columns as long as one.
+# Ridge, relative to columns of unit length.
 _RIDGE = 1e-7
 
 
 def numbers_of(moves: int, amounts: int, rank: int) -> int:
-    """How many numbers are free in a table of so many rows and columns and this rank."""
+    """Return the number of free parameters of a table with this size and rank."""
     return rank * (moves + amounts - rank)
 
 
 def low_rank(inner: FloatArray, toward: FloatArray, amounts: int, rank: int) -> tuple[float, FloatArray]:
-    """The table of numbers (a, b) of a rank that explains most, by alternating least squares.
+    """Fit the table of numbers (a, b) of a given rank that explains most, by alternating least squares.
 
     Args:
         inner: products (a b, a b) of the columns, one for each of a moves and b amounts.
-        toward: their products (a b,) with what is to be explained.
+        toward: their products (a b,) with the data to be explained.
         amounts: b.
 
     Returns:
-        The sum of squares that it explains, and the functions (b, rank) that the moves follow.
+        The sum of squares that it explains, and the functions (b, rank) that the motions follow.
     """
     moves = len(toward) // amounts
     inner = inner + _RIDGE * np.eye(len(toward))

@@ -1,4 +1,4 @@
-"""Numbers of `diagnosis.json` for people: degrees, millimetres and percent, with as many digits as are told."""
+"""Format the numbers of `diagnosis.json` for people: degrees, millimetres and percent, with significant digits only."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from .result import Cause, Indistinguishable, Interval, Rejected
 
 _DEG = math.degrees(1.0)
-# By the end of a number's name: its factor and unit. The first that fits is taken.
+# Factor and unit by the suffix of a number's name; the first match applies.
 _UNITS: tuple[tuple[str, float, str], ...] = (
     ("_kgm", 1.0, " kg·m"),
     ("_kg", 1.0, " kg"),
@@ -47,12 +47,12 @@ _LABELS = {
     "time_constant": "time constant",
     "share": "of the fixes",
 }
-# What an amplitude and a phase say again.
+# Parameters already given as amplitude and phase.
 _SAID_AGAIN = ("sine_rad", "cosine_rad", "sine_m", "cosine_m")
 _LEAST_DIGITS, _MOST_DIGITS = 0, 6
-# Half widths from which on a recording tells nothing of a length [m] or an angle [rad].
+# Half widths of an interval above which a length [m] or an angle [rad] is not identifiable.
 _UNTOLD = (("_rad", 0.5), ("_m", 0.1))
-# Numbers that say when and how, not how much.
+# Parameters of time and shape rather than size.
 _SAYS_HOW = ("t0", "cycles", "phase", "time_constant", "length", "hold")
 # An interval whose halves differ by more than this share is written with both its ends.
 _LOPSIDED = 0.3
@@ -60,13 +60,13 @@ _LOPSIDED = 0.3
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """One number of a cause, written out.
+    """One formatted number of a cause.
 
     Attributes:
-        label: what it is.
+        label: name of the quantity.
         value, interval: with unit; the interval as a half width or as both ends, "" where there is none.
-        may_be_none: whether its interval holds zero.
-        is_told: whether the recording tells it at all.
+        may_be_none: True if its interval contains zero.
+        is_told: True if the recording determines it.
     """
 
     label: str
@@ -80,30 +80,30 @@ class Number:
 
 
 def numbers_of(cause: Cause, *, timed: bool) -> list[Number]:
-    """The numbers of a cause.
+    """Return the formatted numbers of a cause.
 
     Args:
-        timed: whether the recording has times; else a moment is the number of a row.
+        timed: True if the recording has times; otherwise a moment is a row number.
     """
     names = [name for name in cause.parameters if name not in _SAID_AGAIN or not _has_amplitude(cause)]
     return [number(name, cause.parameters[name], timed=timed) for name in names]
 
 
 def told_values(cause: Cause) -> dict[str, float]:
-    """The numbers of a cause without the shifts and turns that the recording does not tell; all where it tells none."""
+    """Return a cause's numbers without shifts and turns that are not identifiable; all if none is."""
     parts = {name for name in cause.parameters if name.removeprefix("r")[1:] in ("_m", "_rad")}
     told = {n: of.value for n, of in cause.parameters.items() if n not in parts or number(n, of).is_told}
     return told if told.keys() & parts or not parts else {name: of.value for name, of in cause.parameters.items()}
 
 
 def telling(numbers: list[Number]) -> list[Number]:
-    """Those that are told and surely not zero; where none is, those that are told."""
+    """Return the identifiable numbers that are not zero; if there are none, all identifiable ones."""
     told = [n for n in numbers if n.is_told] or numbers
     return [n for n in told if not n.may_be_none] or told
 
 
 def number(name: str, interval: Interval, *, timed: bool = True) -> Number:
-    """One number with its interval."""
+    """Format one number with its interval."""
     factor, unit = _unit(name, timed)
     value, low, high = (factor * v for v in (interval.value, *interval.ci95))
     half = 0.5 * (high - low)
@@ -129,42 +129,42 @@ def _label(name: str) -> str:
 
 
 def place(what: Cause | Rejected) -> str:
-    """Effect and joint, as in `joint_coupling of elbow with shoulder`."""
+    """Return effect and joint, as in `joint_coupling of elbow with shoulder`."""
     return named(what.effect, what.where, what.source)
 
 
 def named(effect: str, where: str | None, source: str | None) -> str:
-    """As `place`."""
+    """Return effect and joint in the form of `place`."""
     at = "" if where is None else f" at {where}"
     return f"{effect}{at}{'' if source is None else f' from {source}'}"
 
 
 def rival_named(rival: Indistinguishable) -> str:
-    """What a cause may be as well: its name and place, or what it is where it has no name."""
+    """Return the name and place of a rival, or its description if it has no name."""
     return rival.what or named(rival.effect, rival.where, rival.source)
 
 
 def chance(p: float) -> str:
-    """A p-value."""
+    """Format a p-value."""
     if p < 0.001:
         return "< 0.001"
     return "1" if p >= 0.995 else f"{p:.2g}"
 
 
 def percent(share: float) -> str:
-    """A probability that is never said to be certain."""
+    """Format a probability, never as certain."""
     if share >= 0.995:
         return "> 99 %"
     return "< 1 %" if share < 0.005 else f"{100.0 * share:.0f} %"
 
 
 def share(of_hundred: float) -> str:
-    """A share of a gain [%]."""
+    """Format a share of a gain [%]."""
     return "< 1 %" if 0.05 <= of_hundred < 0.5 else f"{round(of_hundred)} %"
 
 
 def mm(value: float | None) -> str:
-    """A length that is in mm already."""
+    """Format a length given in mm."""
     if value is None or not math.isfinite(value):
         return "–"
     return _fixed(value, 0 if value >= 100 else 1 if value >= 10 else 2 if value >= 0.1 else 3, "")
@@ -185,7 +185,7 @@ def _has_amplitude(cause: Cause) -> bool:
 
 
 def _digits(half: float) -> int:
-    """So that the half width has two figures."""
+    """Return the digits that give the half width two significant figures."""
     if half <= 0.0 or not math.isfinite(half):
         return 3
     return min(max(1 - math.floor(math.log10(half)), _LEAST_DIGITS), _MOST_DIGITS)

@@ -1,4 +1,4 @@
-"""What was measured, and how exactly: positions with the shape of their noise."""
+"""Hold measured positions with the covariance of their noise."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from bodyschema.interfaces.records import FloatArray
 
 IntArray = NDArray[np.intp]
 
-# Where nothing is said of the noise it is taken as round; its size is estimated in any case [m].
+# Isotropic noise for recordings that state none; its size is estimated in any case [m].
 _UNIT_M = 1e-3
-# How far outliers may lie: this times the spread of what was measured.
+# Outliers lie within this multiple of the spread of the measured positions.
 _OUTLIER_SPREAD = 2.0
-# A measured variance is never taken to be smaller than this share of the median one.
+# Floor of a measured variance, as a share of the median one.
 _SMALLEST_VARIANCE = 1e-4
-# Runs shorter than this are single poses, not ways.
+# Shorter runs are single poses, not paths.
 _ROWS_A_RUN = 10
-# Readings nearer than this are one; so many different ones it takes to see a step, so far they may be off it.
+# Closer readings are equal; minimum of distinct gaps to find a step; tolerance around its multiples.
 _SAME_READING, _FEWEST_GAPS, _OFF_A_MULTIPLE = 1e-9, 20, 0.02
 
 
@@ -32,12 +32,12 @@ class Observations:
     """Measured positions over a motion.
 
     Attributes:
-        motion: what the encoders read.
+        motion: the encoder readings.
         x: measured positions (n, 3) [m].
-        stated: covariance (n, 3, 3) [m²] of the instrument, right but for one factor.
-        rounding: covariance (n, 3, 3) [m²] that comes from readings in whole ticks.
-        stated_factor: by how much the instrument's standard deviations are larger than stated.
-        doubtful: rows (n,) at which something is not known that the simulation would need; None for none.
+        stated: covariance (n, 3, 3) [m²] of the instrument, known up to one factor.
+        rounding: covariance (n, 3, 3) [m²] from encoder quantisation.
+        stated_factor: factor of the instrument's standard deviations over the stated ones.
+        doubtful: rows (n,) at which the simulation lacks a state it needs; None for no such rows.
     """
 
     motion: Motion
@@ -49,7 +49,7 @@ class Observations:
 
     @classmethod
     def of(cls, recording: Recording, simulation: Simulation) -> Observations:
-        """The positions of a recording; the instrument's noise is its own, else the stereo camera's, else round."""
+        """Read the positions of a recording; noise is the recording's, else the stereo camera's, else isotropic."""
         calibration = simulation.robot.calibration
         if recording.cov is not None:
             stated = _bounded(recording.cov)
@@ -63,32 +63,34 @@ class Observations:
 
     @cached_property
     def whitening(self) -> FloatArray:
-        """(n, 3, 3): W (x - truth) has equal and independent noise in all coordinates, but for one factor."""
+        """W (n, 3, 3) such that W (x - truth) has equal and independent noise in all coordinates, up to one factor."""
         covariances = self.stated_factor**2 * self.stated + self.rounding
         return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)), dtype=np.float64)
 
     def without(self, doubtful: NDArray[np.bool_]) -> Observations:
-        """The same with rows (n,) that count nothing."""
+        """Return the same observations with rows (n,) that are ignored."""
         return replace(self, doubtful=doubtful)
 
     def with_factor(self, stated_factor: float) -> Observations:
-        """The same with another size of the instrument's noise beside that of the rounding."""
+        """Return the same observations with another factor on the instrument's noise."""
         return replace(self, stated_factor=stated_factor)
 
     def __len__(self) -> int:
         return len(self.x)
 
     def whitened(self, columns: FloatArray) -> FloatArray:
-        """Columns (n, 3, p) [m] in units of the noise."""
+        """Return columns (n, 3, p) [m] in units of the noise."""
         return self.whitening @ columns
 
     def residuals(self, predicted: FloatArray) -> FloatArray:
-        """Measured minus predicted (n, 3), in units of the noise."""
+        """Return measured minus predicted (n, 3), in units of the noise."""
         return np.einsum("nij,nj->ni", self.whitening, self.x - predicted)
 
     @cached_property
     def trusted(self) -> NDArray[np.bool_]:
-        """Rows (n,) of which the way there was seen: where a run begins, what has a memory is not known."""
+        """Rows (n,) whose preceding path was observed; at the start of a run the state of joints with memory is
+        unknown.
+        """
         begins = self.motion.begins
         if begins.sum() * _ROWS_A_RUN > len(self):
             begins = np.zeros(len(self), dtype=np.bool_)
@@ -96,14 +98,14 @@ class Observations:
 
     @cached_property
     def outlier_density(self) -> FloatArray:
-        """Logarithm of the density (n,) of a fix that is not the marker, per unit volume of whitened space."""
+        """Log density (n,) of an outlier, per unit volume of whitened space."""
         spread = _OUTLIER_SPREAD * np.linalg.norm(self.x - np.median(self.x, axis=0), axis=1).max()
         volume = 4.0 / 3.0 * np.pi * max(float(spread), _UNIT_M) ** 3
         return -np.log(volume) - np.linalg.slogdet(self.whitening)[1]
 
 
 def ticks(q: FloatArray) -> FloatArray:
-    """The step (d,) [rad, m] in which each joint is read; 0 where its readings (n, d) are no multiples of any."""
+    """Return the encoder step (d,) [rad, m] of each joint; 0 where readings (n, d) are no multiples of a step."""
     steps = np.zeros(q.shape[1])
     for k, column in enumerate(q.T):
         gaps: FloatArray = np.diff(np.unique(column))
@@ -117,7 +119,7 @@ def ticks(q: FloatArray) -> FloatArray:
 
 
 def stereo_covariances(x: FloatArray, calibration: StereoCalibration) -> FloatArray:
-    """Covariance (n, 3, 3) [m²] of triangulated points (n, 3) whose image coordinates are `pixel_sigma` uncertain."""
+    """Return covariances (n, 3, 3) [m²] of triangulated points (n, 3), whose pixel noise is `pixel_sigma`."""
     f, b = calibration.focal_px, calibration.baseline_m
     depth = np.maximum(np.abs(x[:, 2]), 1e-3)
     by_left, by_right, by_row = np.zeros((3, len(x), 3))
@@ -134,6 +136,6 @@ def stereo_covariances(x: FloatArray, calibration: StereoCalibration) -> FloatAr
 
 
 def _bounded(covariances: FloatArray) -> FloatArray:
-    """With a floor under each variance, so that no row counts for all."""
+    """Add a floor to each variance, so that no row dominates."""
     floor = _SMALLEST_VARIANCE * float(np.median(np.trace(covariances, axis1=1, axis2=2))) / 3.0
     return covariances + (floor if floor > 0.0 else _UNIT_M**2) * np.eye(3)

@@ -1,7 +1,7 @@
-"""Normal equations of many hypotheses beside what a fit has, and beside what it has without one of its causes.
+"""Form normal equations of many hypotheses, beside a fit and beside that fit without each of its causes.
 
-The columns of a hypothesis are the same in all these places. What differs is what is left, and the few directions that
-a cause alone could change: they are given back.
+The columns of a hypothesis are the same in all these places. Only the residuals differ, and the few directions that a
+cause alone could change; these are freed again.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from bodyschema.interfaces.records import FloatArray
 
 from .fit import ROUNDED, Fit
 
-# Of directions that all others can change, too, a smaller part than this is rounding.
+# Relative size below which a direction that all others can change is rounding error.
 _ROUNDED_OFF = 1e-9
 
 
@@ -26,11 +26,11 @@ class System:
     """Normal equations of m choices of k columns each.
 
     Attributes:
-        inner: products (m, k, k) beside all that is fitted.
-        onto: with what the fitted amounts can change (m, k, r).
-        toward: with what is left (m, k, s), in each of the s places.
-        raw: squares (m, k) of the columns themselves.
-        freed: which directions (r, f) are given back, in each of the places.
+        inner: products (m, k, k), after projecting out the fitted parameters.
+        onto: products with the directions that the fitted amounts can change (m, k, r).
+        toward: products with the residuals (m, k, s), in each of the s places.
+        raw: squares (m, k) of the unprojected columns.
+        freed: directions (r, f) that are freed, in each of the places.
     """
 
     inner: FloatArray
@@ -41,12 +41,12 @@ class System:
 
     @classmethod
     def of(cls, inner: FloatArray, onto: FloatArray, toward: FloatArray, freed: Sequence[FloatArray]) -> System:
-        """From products (m, k, k) of the columns themselves."""
+        """Build the system from products (m, k, k) of the unprojected columns."""
         raw = np.einsum("maa->ma", inner).copy()
         return cls(inner - onto @ np.swapaxes(onto, 1, 2), onto, toward, raw, freed)
 
     def at(self, place: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Inner products (m, k, k) beside what is fitted, gradients (m, k) and raw squares (m, k) in a place."""
+        """Return projected products (m, k, k), gradients (m, k) and raw squares (m, k) in a place."""
         free = self.freed[place]
         if not free.shape[1]:
             return self.inner, self.toward[:, :, place], self.raw
@@ -55,14 +55,14 @@ class System:
 
 
 class Products:
-    """Products of columns with what a fit can change and with what it leaves.
+    """Products of columns with the directions that a fit can change and with its residuals.
 
     Args:
-        besides: causes of the fit; each is a place of its own, in which it is not there. The fit itself is the first.
+        besides: causes of the fit; each adds a place in which it is absent. The first place is the fit itself.
 
     Attributes:
-        rows: how many fixes are the marker.
-        squares: sum of the squares that are left in each place.
+        rows: number of fixes that are the marker.
+        squares: sum of squared residuals in each place.
     """
 
     def __init__(self, fit: Fit, besides: Sequence[Effect] = ()) -> None:
@@ -74,9 +74,9 @@ class Products:
         for place, free in enumerate(freed):
             seen = flat.T @ lefts[:, place]
             lefts[:, place] -= flat @ (seen - free @ (free.T @ seen))
-        # A simulation's own output leaves nothing, or what is rounded.
+        # The simulation's own output leaves no residuals except rounding.
         self.squares = np.maximum(np.square(lefts).sum(axis=0), 3.0 * self.rows * ROUNDED**2)
-        # What is tested is not `unshared` itself, as its rows are scaled one by one: all else is, twice.
+        # Tested columns are not `unshared`, since their rows are scaled one by one; apply it twice to the rest instead.
         directions, shares = fit.absorbed
         basis = np.concatenate([directions * np.sqrt(shares), fit.unshared(flat)], axis=1)
         self._basis = basis.reshape(*fit.left.shape, -1)
@@ -86,26 +86,28 @@ class Products:
         self._kept: dict[tuple[object, ...], System] = {}
 
     def kept(self, effect: Effect, made: Callable[[], System]) -> System:
-        """The system of an effect; it is made where it is not known yet."""
+        """Return the system of an effect, built on first use."""
         key = (*effect.key, effect.values.tobytes())
         if key not in self._kept:
             self._kept[key] = made()
         return self._kept[key]
 
     def of(self, columns: FloatArray) -> System:
-        """Of weighted columns (n, 3, k), which are one choice."""
+        """Return the system of weighted columns (n, 3, k), as a single choice."""
         flat, left = columns.reshape(self._fit.left.size, -1), self._lefts.reshape(self._fit.left.size, -1)
         onto = flat.T @ self._basis.reshape(len(flat), -1)
         return System.of((flat.T @ flat)[None], onto[None], (flat.T @ left)[None], self._freed)
 
     def port(self, joint: int) -> Rows:
-        """How the weighted prediction moves with a joint."""
+        """Return the derivative of the weighted prediction with respect to a joint, row by row."""
         if joint not in self._ports:
             self._ports[joint] = self.rows_of(self._fit.weighted(self._fit.run.by_joint[:, :, [joint]]))
         return self._ports[joint]
 
     def since(self, columns: FloatArray, moments: range) -> System:
-        """Of weighted columns (n, 3, k) from each of some rows on, the last of which is before the end."""
+        """Return systems of weighted columns (n, 3, k) that begin at each of some rows, the last of which is before the
+        end.
+        """
         parts = [columns, self._basis, self._lefts]
         step, last = moments.step, moments[-1]
         between = [part[moments[0] : last].reshape(len(moments) - 1, 3 * step, -1) for part in parts]
@@ -116,18 +118,18 @@ class Products:
         return System.of(inner, onto, toward, self._freed)
 
     def rows_of(self, columns: FloatArray) -> Rows:
-        """What each row of weighted columns (n, 3, k) adds."""
+        """Return the contribution of each row of weighted columns (n, 3, k)."""
         turned = np.swapaxes(columns, 1, 2)
         return Rows(turned @ columns, turned @ self._basis, turned @ self._lefts, self._freed)
 
     def _left_without(self, cause: Effect) -> FloatArray:
-        """What is left (3 n,) without a cause, all others as they are, weighted and `unshared`."""
+        """Return the residuals (3 n,) without a cause, all others unchanged, weighted and `unshared`."""
         fit = self._fit
         others = [effect for effect in fit.simulation.effects if effect is not cause]
         return fit.left_by(fit.simulation.with_effects(others).positions(fit.observations.motion)).ravel()
 
     def _only_of(self, cause: Effect, flat: FloatArray) -> FloatArray:
-        """The directions (r, f) of the basis (3 n, r) that no other effect can change."""
+        """Return the directions (r, f) of the basis (3 n, r) that no other effect can change."""
         places = set(self._fit.places(cause))
         columns = self._fit.effect_columns.reshape(len(flat), -1)
         others = [k for k in range(columns.shape[1]) if k not in places]
@@ -139,13 +141,13 @@ class Products:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """What each row adds to the normal equations of columns (n, 3, k).
+    """Contributions of each row to the normal equations of columns (n, 3, k).
 
     Attributes:
         inner: products with one another (n, k, k).
-        onto: with what the fitted amounts can change (n, k, r).
-        toward: with what is left (n, k, s), in each of the places.
-        freed: as `System` has them.
+        onto: products with the directions that the fitted amounts can change (n, k, r).
+        toward: products with the residuals (n, k, s), in each of the places.
+        freed: as in `System`.
     """
 
     inner: FloatArray
@@ -154,7 +156,7 @@ class Rows:
     freed: Sequence[FloatArray]
 
     def scaled(self, factors: FloatArray) -> System:
-        """Of rows times factors (n, m)."""
+        """Return the system of rows times factors (n, m)."""
         return System.of(
             _summed(np.square(factors), self.inner),
             _summed(factors, self.onto),
@@ -163,20 +165,20 @@ class Rows:
         )
 
     def mixed(self, factors: FloatArray) -> System:
-        """The one system of k columns that are each this single column times factors (n, k), row by row."""
+        """Return the system of k columns, each this single column times factors (n, k), row by row."""
         inner = factors.T @ (self.inner[:, 0] * factors)
         return System.of(
             inner[None], (factors.T @ self.onto[:, 0])[None], (factors.T @ self.toward[:, 0])[None], self.freed
         )
 
     def waved(self, waves: NDArray[np.complex128]) -> System:
-        """Of sine and cosine of each of some waves (n, m), by which this single column is multiplied."""
+        """Return the system of this single column times sine and cosine of waves (n, m)."""
         count, square = waves.shape[1], self.inner[:, 0, 0]
         doubled = square @ np.square(waves)
         inner = np.empty((count, 2, 2))
         inner[:, 0, 0], inner[:, 1, 1] = 0.5 * (square.sum() - doubled.real), 0.5 * (square.sum() + doubled.real)
         inner[:, 0, 1] = inner[:, 1, 0] = 0.5 * doubled.imag
-        # Cosines and sines take turns.
+        # Cosines and sines alternate.
         flat = waves.view(np.float64)
         onto, toward = (
             (flat.T @ part[:, 0]).reshape(count, 2, part.shape[2])[:, ::-1] for part in (self.onto, self.toward)
@@ -185,5 +187,5 @@ class Rows:
 
 
 def _summed(factors: FloatArray, rows: FloatArray) -> FloatArray:
-    """Sums (m, ...) of rows (n, ...) times factors (n, m)."""
+    """Return sums (m, ...) of rows (n, ...) times factors (n, m)."""
     return (factors.T @ rows.reshape(len(rows), -1)).reshape(factors.shape[1], *rows.shape[1:])

@@ -1,4 +1,4 @@
-"""What to do about each cause, with numbers: ticks to write, lines of robot.toml and URDF, screws to tighten."""
+"""Advise what to do about each cause, with numbers: ticks to write, lines of robot.toml and URDF, screws to tighten."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from .numbers import named, rival_named
 from .result import Cause, DiagnosisFile
 
 _DEG = math.degrees(1.0)
-# Ticks that fill a turn to less than this are counted by the turn.
+# Ticks that divide a turn to within this share are counted per turn.
 _WHOLE_TURN = 0.01
-# A drift is over, and a move has ended, when this share of it is left.
+# Remaining share at which a drift is over, and at which a move has ended.
 _OVER, _ENDED = 0.05, 0.001
 _TURN_ORIGIN = "turn the origin of joint {} by as much about"
-# A scale error beyond which a joint turns the other way.
+# A scale error below this reverses the joint's direction.
 _BACKWARDS = -1.0
-# A cause that is less sure is made sure of first.
+# A less probable cause is to be confirmed first.
 _SURE = 0.9
 
 
 def remedies(
     diagnosis: DiagnosisFile, robot: RobotDescription, steps: FloatArray, torques: FloatArray | None
 ) -> list[str]:
-    """What to do about each cause, the one that explains most first.
+    """Return advice on each cause, the one that explains most first.
 
     Args:
-        steps: in which each joint is read (d,) [rad, m]; 0 where that is not known.
-        torques: the largest torque of gravity on each joint (d,) [N·m, N]; None where masses are not known.
+        steps: encoder step of each joint (d,) [rad, m]; 0 where it is unknown.
+        torques: the largest torque of gravity on each joint (d,) [N·m, N]; None where masses are unknown.
     """
     workshop = _Workshop(robot, steps, torques, {cause.effect: cause for cause in diagnosis.causes})
     causes = sorted(diagnosis.causes, key=lambda cause: -cause.share_of_gain_percent)
@@ -44,7 +44,7 @@ def remedies(
 
 
 def _if_sure(cause: Cause, remedy: str) -> str:
-    """The remedy, with what to make sure of before anything is changed."""
+    """Return the remedy, preceded by what to confirm before any change."""
     open_ones = [rival for rival in cause.rivals if rival.by == "this_motion"]
     if cause.probability >= _SURE or not open_ones:
         return remedy

@@ -1,4 +1,4 @@
-"""`diagnosis.json`: what was found, for machines."""
+"""Define `diagnosis.json`, the machine-readable result of a diagnosis."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Interval(msgspec.Struct, frozen=True):
 
 
 class Gain(msgspec.Struct, frozen=True, rename={"from_": "from"}):
-    """By how much the RMS falls on rows that were not fitted, counted from the aligned simulation [%]."""
+    """Reduction of the RMS on held-out rows, relative to the aligned simulation [%]."""
 
     held_out_percent: float
     ci95: tuple[float, float]
@@ -25,13 +25,13 @@ class Gain(msgspec.Struct, frozen=True, rename={"from_": "from"}):
 
 
 class Indistinguishable(msgspec.Struct, frozen=True):
-    """What a cause cannot be told from.
+    """A rival of a cause.
 
     Attributes:
         effect: its name; "unexplained" where it has none.
-        by: "this_motion" where another motion would tell them apart, "any_motion" where none would.
-        probability: that it is this one.
-        what: in words, where it has no name.
+        by: "this_motion" where another motion would separate them, "any_motion" where none would.
+        probability: probability of this rival.
+        what: description, where it has no name.
     """
 
     effect: str
@@ -46,7 +46,7 @@ class Cause(msgspec.Struct, frozen=True):
     """One cause with its numbers.
 
     Attributes:
-        stability_percent: how often it is named again from resampled blocks of time.
+        stability_percent: share of block resamplings in which it is named again.
     """
 
     effect: str
@@ -63,12 +63,12 @@ class Cause(msgspec.Struct, frozen=True):
 
 
 class Rejected(msgspec.Struct, frozen=True):
-    """A hypothesis that was tested and is not there.
+    """A hypothesis that was tested and rejected.
 
     Attributes:
-        held_out_gain_percent: what it would bring on top of the causes.
-        p_value: of no gain at all, for all hypotheses that were tried together.
-        why: it is no cause although chance hardly brings so much about; nothing where chance may.
+        held_out_gain_percent: gain on top of the causes.
+        p_value: p-value of no gain, corrected for all hypotheses tried.
+        why: reason for rejection despite a small p-value; empty where chance suffices.
     """
 
     effect: str
@@ -80,14 +80,14 @@ class Rejected(msgspec.Struct, frozen=True):
 
 
 class Alike(msgspec.Struct, frozen=True):
-    """Two effects at one joint that share a direction beside the best geometry, each taken alone.
+    """Two confounded effects at one joint, each fitted alone beside the best geometry.
 
     Attributes:
         effect: the one that explains most there.
-        other: what says much the same.
-        explains_percent, other_explains_percent: of the squared error that the best geometry leaves.
-        shared_percent: of what `other` explains, `effect` explains so much too.
-        delta_chi2: by how much more `effect` raises twice the log-likelihood.
+        other: the effect confounded with it.
+        explains_percent, other_explains_percent: explained shares of the squared error that the best geometry leaves.
+        shared_percent: share of what `other` explains that `effect` explains too.
+        delta_chi2: Δχ² of `effect` less that of `other`.
     """
 
     where: str
@@ -100,12 +100,12 @@ class Alike(msgspec.Struct, frozen=True):
 
 
 class Unexplained(msgspec.Struct, frozen=True):
-    """Structure that no effect fits: how large, on which joints it depends (`time` among them), how improbable.
+    """Structure that no effect fits: its size, the joints it depends on (`time` among them), and its p-value.
 
     Attributes:
-        what: what moves, and on what that depends, in words; the joints are named in `depends_on` too.
-        model_joints: whose readings the smooth model in extended.toml takes.
-        not_in_model: what of `what` changes with time, so that it is in no such model.
+        what: descriptions of the erring part and its dependence; the joints are also in `depends_on`.
+        model_joints: joints whose readings are inputs of the smooth model in extended.toml.
+        not_in_model: parts of `what` that change with time and cannot be in that model.
     """
 
     rms_mm: float
@@ -117,14 +117,14 @@ class Unexplained(msgspec.Struct, frozen=True):
 
 
 class Tolerances(msgspec.Struct, frozen=True):
-    """How exactly the arm is made, what was found left aside: 1-sigma, each with its 95 % interval.
+    """Manufacturing tolerances of the arm without the causes found: 1-sigma, each with its 95 % interval.
 
-    Where the lower end is 0 the recording does not show them: they are no larger than the upper one.
+    A lower end of 0 means that the recording does not show them: they are no larger than the upper end.
 
     Attributes:
-        length_mm: of the places of links.
-        angle_deg: of axes and zeros.
-        drive_deg: of the periodic errors of drives.
+        length_mm: tolerance of the positions of links.
+        angle_deg: tolerance of axes and joint offsets.
+        drive_deg: size of the periodic errors of drives.
     """
 
     length_mm: Interval
@@ -133,7 +133,7 @@ class Tolerances(msgspec.Struct, frozen=True):
 
 
 class Pairs(msgspec.Struct, frozen=True):
-    """How many pairs there were, were predicted without having been fitted, and were not the marker."""
+    """Numbers of samples in total, held out, and classified as outliers."""
 
     total: int
     held_out: int
@@ -141,7 +141,7 @@ class Pairs(msgspec.Struct, frozen=True):
 
 
 class Errors(msgspec.Struct, frozen=True):
-    """Errors on rows that were not fitted [mm]."""
+    """Errors on held-out rows [mm]."""
 
     nominal: float
     aligned: float
@@ -151,7 +151,7 @@ class Errors(msgspec.Struct, frozen=True):
 
 
 class Stability(msgspec.Struct, frozen=True):
-    """How often the same causes come out of resampled blocks."""
+    """Number of block resamplings that give the same causes."""
 
     resampled: int
     same_causes: int
@@ -161,7 +161,7 @@ class DiagnosisFile(msgspec.Struct, frozen=True):
     """The contents of `diagnosis.json`.
 
     Attributes:
-        seen_by: what measured the positions: a camera, or an instrument such as a laser tracker.
+        seen_by: the kind of measuring device: a camera, or an instrument such as a laser tracker.
     """
 
     verdict: Verdict

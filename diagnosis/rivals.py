@@ -1,4 +1,4 @@
-"""How sure each cause is, and what else it could be: told apart by this recording, by another motion, or by none."""
+"""Estimate the probability of each cause against its rivals, which this motion, another one, or none can separate."""
 
 from __future__ import annotations
 
@@ -22,18 +22,17 @@ from .unknown import Unknowns
 
 # Signals that differ by less than this, twice the log-likelihood that the right one is expected to gain, are one.
 SAME = 6.0
-# What any motion leaves of a cause's signal, as a share of its chi-square, when a rival that no motion tells from it is
-# in its place: the rest of linear steps.
+# Predictions are the same if their expected Δχ² is smaller.
 _SAME_SHARE = 1e-3
-# A rival less probable than this is none.
+# A less probable rival is not listed.
 PROBABLE = 0.02
-# What explains a smaller share of what a cause explains is none either.
+# Smallest share of a cause's gain that a rival must explain.
 _COMES_NEAR = 0.7
-# What is so much less probable is not fitted to the end [nats].
+# A rival less probable by this is not fitted to convergence [nats].
 _HOPELESS = 40.0
 _Other = tuple[Fit | Nameless, Effect | None, str]
-# Poses of the motion over the whole range of the joints, which stands for any motion, and by how much the logarithms
-# of the times between them scatter there.
+# Number of poses over the whole range of the joints, which stand for any motion, and the scatter of the logarithms of
+# the times between them.
 _POSES, _UNEVEN = 400, 1.0
 # Smallest move there, as a share of a far one.
 _NEXT_TO_IT = 1e-3
@@ -41,17 +40,17 @@ _NEXT_TO_IT = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Rival:
-    """What could be there in the place of a cause.
+    """An alternative to a cause.
 
     Attributes:
-        instead: the causes with it in the place of the cause.
-        effect: with the numbers with which it does best; None where it has no name.
-        described: in a few words.
-        probability: given that one of the rivals is there.
-        difference: twice the log-likelihood that this motion is expected to tell them apart by.
+        instead: the fit with it in the place of the cause.
+        effect: with its best-fitting numbers; None where it has no name.
+        described: short description.
+        probability: given that the cause or one of its rivals is present.
+        difference: Δχ² by which this motion is expected to separate them.
         anywhere: the same for as many poses over the whole range of the joints.
-        signal: what the cause itself brings there.
-        is_one: whether the cause, refitted, is also all that this is on any motion, so that both are one.
+        signal: Δχ² of the cause itself on those poses.
+        is_one: True if the cause, refitted, also covers this rival on any motion, so that both are equivalent.
     """
 
     instead: Fit | Nameless
@@ -65,27 +64,27 @@ class Rival:
 
     @property
     def is_same_here(self) -> bool:
-        """Whether no data of this motion tells it from the cause."""
+        """True if no data of this motion separates it from the cause."""
         return self.difference < SAME
 
     @property
     def is_same_anywhere(self) -> bool:
-        """Whether no motion does."""
+        """True if no motion separates it from the cause."""
         return self.anywhere < _SAME_SHARE * self.signal
 
 
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """How one cause stands against all others.
+    """Assessment of one cause against all rivals.
 
     Attributes:
-        itself: the cause as it would explain most there.
-        probability: of the cause, or of what is one with it.
-        worth: how much more probable the causes are with it than without any in its place [nats].
-        dof: how many of its amounts the data tell.
-        gain: twice the log-likelihood that it brings.
+        itself: the cause with its best first-order fit.
+        probability: probability of the cause or its equivalents.
+        worth: evidence gain of the cause over leaving it out [nats].
+        dof: number of its amounts that the data determine.
+        gain: its Δχ².
         rivals: the probable ones, the most probable first.
-        again: in which of some resamplings of the blocks of time it would be named again.
+        again: True for block resamplings in which it would be named again.
     """
 
     itself: Candidate
@@ -98,10 +97,10 @@ class Standing:
 
 
 def standings(fit: Fit, search: Search, blocks: Blocks, seed: int, unknowns: Unknowns | None = None) -> list[Standing]:
-    """One for each cause of a fit.
+    """Assess each cause of a fit.
 
     Args:
-        unknowns: what has no name and may be a cause as well.
+        unknowns: unnamed families that may be rivals as well.
     """
     return [_standing(fit, cause, search, blocks, seed, unknowns) for cause in fit.causes]
 
@@ -160,7 +159,7 @@ def _standing(
 
 
 def _is_no_more(other: Fit | Nameless, fit: Fit, without: Fit, wide: Motion) -> bool:
-    """Whether the cause of a fit, refitted, is all that a rival is on any motion: one of more numbers may be more."""
+    """Return True if the cause, refitted, covers all that a rival can do on any motion."""
     if not isinstance(other, Fit):
         return True
     return apart_on(other, fit, wide) < _SAME_SHARE * apart_on(other, without, wide)
@@ -172,17 +171,17 @@ def _as_fitted(fit: Fit, effect: Effect) -> _Other:
 
 
 def _difference(one: Fit, other: Fit | Nameless) -> float:
-    """Twice the log-likelihood by which the predictions of two fits differ over their observations."""
+    """Return the Δχ² by which the predictions of two fits differ over their observations."""
     predicted = other.predicted
     apart = one.observations.whitened((one.predicted - predicted)[:, :, None])[:, :, 0]
     return float((one.noise.weights[:, None] * np.square(apart)).sum() / one.noise.sigma**2)
 
 
 def widened(fit: Fit, joints: Iterable[int], uneven: float = 0.0) -> Motion:
-    """Some rows of a fit's motion over the same time, with some joints anywhere in their range, in runs of two.
+    """Return some rows of a fit's motion in runs of two, with some joints anywhere in their range.
 
     Args:
-        uneven: by how much the logarithms of the times between rows scatter.
+        uneven: scatter of the logarithms of the times between rows.
     """
     motion = fit.observations.motion
     rng = np.random.default_rng(0)
@@ -191,7 +190,7 @@ def widened(fit: Fit, joints: Iterable[int], uneven: float = 0.0) -> Motion:
     q = motion.q[rows].copy()
     for k in joints:
         q[:, k] = rng.uniform(*whole_range(fit, k), len(rows))
-        # The second of each run is anywhere from next to the first to far off: what has a memory differs there.
+        # The second pose of each run is near to far from the first, which separates effects with memory.
         firsts, seconds = q[: len(rows) // 2 * 2 : 2, k], q[1::2, k]
         seconds[:] = firsts + np.exp(rng.uniform(np.log(_NEXT_TO_IT), 0.0, len(seconds))) * (seconds - firsts)
     clock = motion.clock
@@ -201,7 +200,7 @@ def widened(fit: Fit, joints: Iterable[int], uneven: float = 0.0) -> Motion:
 
 
 def whole_range(fit: Fit, joint: int) -> tuple[float, float]:
-    """Return where a joint can be moved [rad, m]: a turn at most; a slide three times as far as in the recording."""
+    """Return the range of a joint [rad, m]: at most a turn; for a prismatic joint, three times the recorded range."""
     robot, q = fit.simulation.robot, fit.observations.motion.q[:, joint]
     low, high, reach = float(robot.lower[joint]), float(robot.upper[joint]), float(np.ptp(q))
     if not robot.chain.prismatic[joint]:
@@ -210,7 +209,7 @@ def whole_range(fit: Fit, joint: int) -> tuple[float, float]:
 
 
 def apart_on(one: Fit, other: Fit | Nameless, motion: Motion) -> float:
-    """Twice the log-likelihood by which two fits differ on a motion as long as theirs, the other refitted to it."""
+    """Return the Δχ² by which two fits differ on a motion as long as theirs, the other refitted to it."""
     there = other.simulation.positions(motion) if isinstance(other, Fit) else other.positions(motion)
     left = _beside(one.simulation.positions(motion) - there, _columns(other, motion))
     scale = float(np.median(np.linalg.det(one.observations.whitening))) ** (1.0 / 3.0)
@@ -219,14 +218,14 @@ def apart_on(one: Fit, other: Fit | Nameless, motion: Motion) -> float:
 
 
 def _columns(fit: Fit | Nameless, motion: Motion) -> FloatArray:
-    """Derivatives (n, 3, p) [m] of what is measured on a motion by the amounts of a fit."""
+    """Return derivatives (n, 3, p) [m] of predictions on a motion by the amounts of a fit."""
     if isinstance(fit, Nameless):
         return fit.columns(motion)
     return amount_columns(fit.simulation.run(motion), fit.simulation.effects)
 
 
 def _beside(apart: FloatArray, columns: FloatArray) -> FloatArray:
-    """What of `apart` (n, 3) columns (n, 3, p) cannot follow."""
+    """Return the part of `apart` (n, 3) that columns (n, 3, p) cannot follow."""
     flat = columns.reshape(apart.size, -1)
     scales = np.linalg.norm(flat, axis=0)
     flat = flat / np.where(scales > 0.0, scales, 1.0)

@@ -1,6 +1,6 @@
-"""How much each hypothesis would explain of what a fit has left, to first order: moments and periods searched in full.
+"""Scan all hypotheses against the residuals of a fit, to first order, with full search over moments and periods.
 
-With what the fitted amounts can change projected out, a column c explains (c·r)² / (c·c) of the squared residuals r.
+With the directions of the fitted amounts projected out, a column c explains (c·r)² / (c·c) of the squared residuals r.
 """
 
 from __future__ import annotations
@@ -19,45 +19,45 @@ from bodyschema.interfaces.records import FloatArray
 from .fit import LARGEST, SHORTEST_DRIFT, Fit
 from .products import Products, System
 
-# Ripples of up to so many cycles a turn are looked for at every whole number, and finer ones, of a strain wave twice a
-# turn of the fastest common gear of 120, as coarsely as they can be told apart.
+# Ripples are searched at every whole number of cycles per turn up to the first limit. Finer ones, up to twice per turn
+# of a strain wave gear of 120, are searched as coarsely as they can be resolved.
 _MOST_CYCLES, FINEST = 100, 240
-# Half way between two shapes that are tried one explains so many times less at most: waves one over sinc² of a half.
+# Largest loss factor halfway between two shapes tried: for waves, one over sinc² of a half.
 _BETWEEN = 2.5
-# Widths of a play that are tried [rad, m], and time constants as shares of the recording's time.
+# Backlash widths tried [rad, m], and time constants as shares of the recording's duration.
 _WIDTHS = np.geomspace(2e-4, 0.15, 14)
 _TIME_CONSTANTS = np.geomspace(SHORTEST_DRIFT, 4.0, 24)
-# How much of what was missing is still missing at the next reading.
+# Shares of a lag that remain at the next reading.
 _MEMORIES = np.linspace(0.0, 0.9, 19)
-# Lengths of a hysteresis [rad, m], and frictions that keep a loaded play on its flank, as shares of the largest load.
+# Hysteresis lengths tried [rad, m], and frictions that hold a loaded backlash, as shares of the largest load.
 _LENGTHS = np.geomspace(5e-4, 0.3, 14)
 _HOLDS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35)
-# As so many independent shapes those of a smooth family count.
+# Effective number of independent shapes of a smooth family.
 _COARSE = 5
-# So many moments are tried, and all those beside the best of them.
+# Number of moments tried first, before all those next to the best.
 _MOST_MOMENTS = 1000
-# Rows that have to lie on either side of a moment.
+# Minimum of rows on either side of a moment.
 _BESIDE = 8
-# Twice the fall of the log-likelihood at the ends of a 95 % interval.
+# Δχ² at the ends of a 95 % interval.
 _AT_95 = 3.841
-# A column of which so little is left beside what is fitted tells nothing.
+# A column with a smaller share left beside the fit is not identifiable.
 _TOLD_APART = 1e-7
 
 
-# Which choice is the best, gains (m,), its amounts (k,) and degrees of freedom.
+# Index of the best choice, gains (m,), its amounts (k,) and degrees of freedom.
 _Tried = tuple[int, FloatArray, FloatArray, int]
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A hypothesis as it would explain most.
+    """A hypothesis with its best first-order fit.
 
     Attributes:
         effect: with the amounts of the linear fit, and the moment or period found.
-        gain: twice the rise of the log-likelihood.
-        dof: how many amounts of it the data tell.
-        trials: among how many moments or periods it was chosen.
-        interval: where else the moment may be, at 95 %; None for an effect that has none.
+        gain: Δχ².
+        dof: number of its amounts that the data determine.
+        trials: number of moments or periods tried.
+        interval: 95 % interval of the moment; None for an effect that has none.
     """
 
     effect: Effect
@@ -68,10 +68,10 @@ class Candidate:
 
 
 class Scan:
-    """All hypotheses against one fit, as it is or without one of its causes.
+    """First-order tests of all hypotheses against one fit, complete or without one of its causes.
 
     Args:
-        besides: causes without each of which the fit is to be scanned, too; most of the work is the same.
+        besides: causes to leave out one at a time; these scans share most of the work.
     """
 
     def __init__(self, fit: Fit, besides: Sequence[Effect] = ()) -> None:
@@ -80,21 +80,20 @@ class Scan:
         self._before = {0: fit.run.measured}
 
     def without(self, cause: Effect) -> Scan:
-        """The scan of the fit without one of `besides`, all others refitted to first order."""
+        """Return the scan of the fit without one of `besides`, all others refitted to first order."""
         scan = copy(self)
         scan._state = 1 + self._besides.index(cause.identity)
         return scan
 
     def tolerates(self, effect: Effect) -> bool:
-        """Whether the fit's background has such errors as well."""
+        """Return True if the fit's background already contains such errors."""
         return self._fit.background.tolerates(effect)
 
     def candidates(self, hypotheses: Iterable[Effect], near: float = 0.0) -> list[Candidate]:
-        """One for each hypothesis of which this data tell anything.
+        """Return a candidate for each hypothesis that the data can test.
 
         Args:
-            near: periods and time constants of what cannot explain so large a share of what the best of the others does
-                are not sought finely.
+            near: share of the best gain below which periods and time constants are not refined.
         """
         found, most = [], 0.0
         for effect in sorted(hypotheses, key=lambda effect: len(effect.shapes)):
@@ -105,10 +104,10 @@ class Scan:
         return found
 
     def candidate(self, effect: Effect, least: float = 0.0) -> Candidate | None:
-        """The hypothesis as it would explain most; None where nothing of it can be told.
+        """Return the hypothesis with its best first-order fit; None if nothing of it is identifiable.
 
         Args:
-            least: the gain from which on its period or time constant is wanted as exactly as it can be told.
+            least: gain from which its period or time constant is refined fully.
         """
         match effect.name:
             case "joint_ripple":
@@ -125,7 +124,7 @@ class Scan:
                 return self._finely(effect, _MEMORIES, least)
             case "hysteresis":
                 found = self._finely(effect, _LENGTHS, least)
-                # It has a length where a play has none: that has to be worth it.
+                # It has one shape parameter more than a backlash, which must pay for itself.
                 return None if found is None else replace(found, trials=_COARSE * len(_WIDTHS))
             case "gravity_backlash":
                 return self._hung(effect)
@@ -136,9 +135,9 @@ class Scan:
                 return Candidate(_with_amounts(effect, amounts[0]), float(gains[0]), int(dofs[0]))
 
     def in_full(self, candidate: Candidate) -> Candidate:
-        """Return the candidate with the gain of its amounts themselves, where that is more than to first order.
+        """Return the candidate with the gain at its actual amounts, where that exceeds the first-order gain.
 
-        A turn of some degrees beside noise of a tenth of a millimetre is more than its tangent.
+        A turn of some degrees beside noise of a tenth of a millimetre is not linear.
         """
         effects = [effect for effect in self._fit.simulation.effects if effect.identity != self._left_out]
         simulation, motion = self._fit.simulation, self._fit.observations.motion
@@ -157,9 +156,9 @@ class Scan:
         return self._besides[self._state - 1] if self._state else None
 
     def best_pair(self, hypotheses: Iterable[Effect]) -> tuple[Candidate, Candidate] | None:
-        """The two effects of one amount each that would explain most together; None where there are not two.
+        """Return the two effects of one amount each that explain most together; None where there are not two.
 
-        What begins at a moment does so where it would explain most alone.
+        The moment of an effect is the one at which it explains most alone.
         """
         alone = [self._alone(effect) for effect in hypotheses if len(effect.amounts) == 1 and not effect.shapes]
         singles = [one for one in alone if one is not None]
@@ -168,7 +167,7 @@ class Scan:
         run = self._fit.run
         columns = np.concatenate([run.columns(one.effect)[:, :, one.effect.amounts] for one in singles], axis=2)
         inner, toward, raw = (part[0] for part in self._products.of(self._fit.weighted(columns)).at(self._state))
-        # In units of each one's length beside what is fitted; two that are one are left out.
+        # Normalise by each column's length beside the fit; collinear pairs are left out.
         lengths = np.sqrt(np.maximum(np.diag(inner), 0.0))
         told = lengths > np.sqrt(_TOLD_APART * raw)
         lengths = np.where(told, lengths, np.inf)
@@ -192,14 +191,14 @@ class Scan:
         return pair[0], pair[1]
 
     def _alone(self, effect: Effect) -> Candidate | None:
-        """An effect of one amount as one of a pair: with its moment where it has one; None where none is told."""
+        """Return an effect of one amount as one of a pair, with its moment if any; None if not identifiable."""
         if effect.kind.begins:
             return self._moment(effect)
         return None if effect.name == "backlash" else Candidate(effect, 0.0, 1)
 
     def _finely(self, effect: Effect, shapes: FloatArray, least: float) -> Candidate | None:
-        """The best of an effect whose last number is its shape, over increasing shapes (m,), then between them."""
-        # Without each cause the same coarse shapes are tried.
+        """Return the best of an effect with one shape parameter, over increasing shapes (m,), then between them."""
+        # Each place without a cause uses the same coarse shapes.
         gains, amounts, dofs = self._solved(self._products.kept(effect, lambda: self._each(effect, shapes)), effect)
         if not dofs.any():
             return None
@@ -213,7 +212,7 @@ class Scan:
         return Candidate(effect.with_values(values), float(gains[best]), int(dofs[best]), _COARSE)
 
     def _each(self, effect: Effect, shapes: FloatArray) -> System:
-        """For each shape (m,), which scales the same columns row by row."""
+        """Return the system of each shape (m,), which scales the same columns row by row."""
         run = self._fit.run
         if effect.name == "thermal_drift":
             constant = np.broadcast_to(np.eye(3), (len(run.motion), 3, 3))
@@ -228,7 +227,7 @@ class Scan:
         return rows.scaled(np.stack(factors, axis=1))
 
     def _play(self, effect: Effect) -> Candidate | None:
-        """Over widths: the shape's own size is the amount."""
+        """Return the best backlash over widths; the amount is the width itself."""
         place, encoder = self._fit.simulation.place(effect), effect.kind.encoder
         assert encoder is not None
 
@@ -237,7 +236,7 @@ class Scan:
             return self._products.port(place.joint).scaled(np.stack(by_width, axis=1))
 
         gains, amounts, dofs = self._solved(self._products.kept(effect, bent), effect)
-        # The width that the shape was made with, and the one that it would take.
+        # Compare the width used to build the shape with the fitted one.
         off = np.abs(np.log(np.maximum(amounts[:, 0], 1e-12) / _WIDTHS))
         gains = np.where(dofs > 0, np.where(off < np.log(3.0), gains, 0.5 * gains), -np.inf)
         best = int(np.argmax(gains))
@@ -246,7 +245,7 @@ class Scan:
         return Candidate(effect.with_values(amounts[best]), float(gains[best]), int(dofs[best]), len(_WIDTHS))
 
     def _hung(self, effect: Effect) -> Candidate | None:
-        """A play under weight, over frictions; nothing where the weight never changes sides."""
+        """Return the best loaded backlash over frictions; None where the load never changes sides."""
         run = self._fit.run
         k = self._fit.simulation.place(effect).joint
         torque = run.torques[:, k]
@@ -263,12 +262,12 @@ class Scan:
         return Candidate(effect.with_values(values), float(gains[best]), dof, len(holds))
 
     def _ripple(self, effect: Effect, least: float) -> Candidate | None:
-        """Over all whole numbers of cycles a turn, then beside the best; of a slide, over those its path can tell."""
+        """Return the best ripple over whole cycles per turn, then near the best; prismatic joints use their path."""
         place = self._fit.simulation.place(effect)
         span = max(float(np.ptp(self._fit.run.readings.q[:, place.joint])), 1e-6)
         first, step = (2.0, 1.0) if not place.prismatic else (1.0 / span, 1.0 / span)
         coarse: FloatArray = np.asarray(first + step * np.arange(_MOST_CYCLES - 1), dtype=np.float64)
-        # A peak is as wide as what turns the phase by one over the range.
+        # The width of a peak is the change that shifts the phase by one turn over the range.
         width = 1.0 / span if place.prismatic else 2.0 * np.pi / span
         bands = [coarse]
         if not place.prismatic:
@@ -286,20 +285,20 @@ class Scan:
         return Candidate(effect.with_values(values), float(gains[best]), dof, 2 * sum(map(len, bands)))
 
     def _times(self, gain: float, factor: float) -> float:
-        """The gain of what explains so many times the squares of what has this gain."""
+        """Return the gain that corresponds to explaining `factor` times the squares."""
         share = -np.expm1(-gain / (3.0 * self._products.rows))
         return float(-3.0 * self._products.rows * np.log1p(-min(factor * share, 0.999999)))
 
     def _rippled_best(self, effect: Effect, cycles: FloatArray) -> _Tried:
-        """The best of a band of numbers of cycles, which is tried in the place of each cause."""
+        """Return the best of a band of cycles, which is tried in the place of each cause."""
         begun = effect.with_values(np.append(effect.values[:-1], cycles[0]))
         return self._best(self._products.kept(begun, lambda: self._rippled(effect, cycles)), effect)
 
     def _rippled(self, effect: Effect, cycles: FloatArray) -> System:
-        """For each of equally spaced numbers of cycles (m,)."""
+        """Return the system of equally spaced numbers of cycles (m,)."""
         place = self._fit.simulation.place(effect)
         angle = self._fit.run.readings.q[:, place.joint] * (2.0 * np.pi if place.prismatic else 1.0)
-        # exp(i cycles angle), each from the one before.
+        # Compute exp(i cycles angle), each from the one before.
         waves = np.empty((len(angle), len(cycles)), dtype=np.complex128)
         waves[:, 0] = np.exp(1j * cycles[0] * angle)
         waves[:, 1:] = np.exp(1j * (cycles[1] - cycles[0]) * angle)[:, None]
@@ -307,7 +306,7 @@ class Scan:
         return self._products.port(place.joint).waved(waves)
 
     def _moment(self, effect: Effect) -> Candidate | None:
-        """Over moments between two rows: some of them, then all beside the best."""
+        """Return the best moment between two rows: a coarse search, then all near the best."""
         n = len(self._fit.left)
         if n < 2 * _BESIDE + 1:
             return None
@@ -335,7 +334,7 @@ class Scan:
         return Candidate(effect.with_values(values), float(gains.max()), dof, n - 2 * _BESIDE, interval)
 
     def _linear(self, effect: Effect) -> System:
-        """The system of an effect that has amounts alone."""
+        """Return the system of an effect that has amounts only."""
 
         def linear() -> System:
             encoder = effect.kind.encoder
@@ -348,23 +347,23 @@ class Scan:
         return self._products.kept(effect, linear)
 
     def as_it_is(self, effect: Effect) -> float:
-        """`Candidate.gain` of an effect with the moment, period or width that it has."""
+        """Return the `Candidate.gain` of an effect with its present moment, period or width."""
         columns = self._fit.weighted(self._fit.run.columns(effect)[:, :, effect.amounts])
         return float(self._solved(self._products.of(columns), effect)[0][0])
 
     def _solved(self, system: System, effect: Effect) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Gains (m,), amounts (m, k) and degrees of freedom (m,) of m systems."""
+        """Return gains (m,), amounts (m, k) and degrees of freedom (m,) of m systems."""
         inner, gradient, raw = system.at(self._state)
         gains, amounts = self._gains(inner, gradient, effect)
         dofs = self._dofs(inner, raw, effect)
         return np.where(dofs > 0, gains, 0.0), amounts, dofs
 
     def _best(self, system: System, effect: Effect) -> _Tried:
-        """As `_solved`, of many systems: which is the best, gains (m,), its amounts (k,) and degrees of freedom."""
+        """Return the index of the best of many systems, gains (m,), its amounts (k,) and degrees of freedom."""
         inner, gradient, raw = system.at(self._state)
         gains, amounts = self._gains(inner, gradient, effect)
         best = int(np.argmax(gains))
-        # Only where the data tell nothing of the best are all others asked whether they tell more.
+        # Other systems need checking only if the best is not identifiable.
         if not (dof := int(self._dofs(inner[[best]], raw[[best]], effect)[0])):
             dofs = self._dofs(inner, raw, effect)
             gains = np.where(dofs > 0, gains, 0.0)
@@ -373,7 +372,7 @@ class Scan:
         return best, gains, amounts[best], dof
 
     def _gains(self, inner: FloatArray, gradient: FloatArray, effect: Effect) -> tuple[FloatArray, FloatArray]:
-        """Gains (m,) and amounts (m, k)."""
+        """Return gains (m,) and amounts (m, k)."""
         sigma2, unit = self._fit.noise.sigma**2, _units(effect)
         scaled = inner * unit[:, None] * unit
         if len(unit) == 1:
@@ -386,7 +385,7 @@ class Scan:
         return -3.0 * self._products.rows * np.log1p(-explained / square), amounts
 
     def _dofs(self, inner: FloatArray, raw: FloatArray, effect: Effect) -> FloatArray:
-        """Degrees of freedom (m,)."""
+        """Return degrees of freedom (m,)."""
         unit = _units(effect)
         shares = _eigenvalues(inner / np.sqrt(np.maximum(raw[:, :, None] * raw[:, None, :], 1e-300)))
         told = _eigenvalues(inner * unit[:, None] * unit) > 10.0 * self._fit.noise.sigma**2
@@ -394,18 +393,18 @@ class Scan:
 
 
 def _units(effect: Effect) -> FloatArray:
-    """Of an effect's amounts (k,): each as large as can be expected."""
+    """Return the largest expected size of each of an effect's amounts (k,)."""
     return LARGEST * np.array([effect.parameters[j].usual for j in effect.amounts])
 
 
 def _eigenvalues(matrices: FloatArray) -> FloatArray:
-    """Of symmetric matrices (m, k, k), increasing (m, k)."""
+    """Return the eigenvalues (m, k) of symmetric matrices (m, k, k), in increasing order."""
     values = matrices[:, 0] if matrices.shape[1] == 1 else np.linalg.eigvalsh(matrices)
     return np.asarray(values, dtype=np.float64)
 
 
 def _interval(shapes: FloatArray, gains: FloatArray) -> tuple[float, float]:
-    """The first and the last of the shapes (m,) that are not less probable than 95 % of the best allow."""
+    """Return the first and the last of the shapes (m,) within the 95 % drop of the best gain."""
     near = np.flatnonzero(gains > gains.max() - _AT_95)
     return float(shapes[near[0]]), float(shapes[near[-1]])
 

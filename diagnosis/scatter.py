@@ -1,4 +1,4 @@
-"""What the scatter of single readings makes of a joint that seems to remember its way."""
+"""Keep noise of single encoder readings from looking like backlash or lag."""
 
 from __future__ import annotations
 
@@ -11,33 +11,33 @@ from bodyschema.interfaces.records import FloatArray
 
 from .fit import Fit
 
-# Beside a move of how many times the readings' scatter that does not matter: to a play it is which way the joint came,
-# to anything else how far.
+# Move beyond which the readings' noise does not matter, in multiples of it: a backlash needs only the direction of the
+# move, other effects its size.
 _PLAY_FAR, _FAR = 4.0, 20.0
-# What one row may say for one memory and against another [nats].
+# Largest evidence of one row for one memory effect over another [nats].
 _MOST_OF_A_ROW = 1.0
 
 
 def remembers(effect: Effect) -> bool:
-    """Whether an effect says where a joint is by its last readings, so that their scatter looks like it."""
+    """Return True if an effect derives a joint's position from past readings, so that reading noise looks like it."""
     return effect.kind.encoder is not None and effect.kind.encoder.remembers
 
 
 def instruments(fit: Fit, effect: Effect) -> FloatArray:
-    """Weighted columns (n, 3, k) of an effect's amounts, by which a test of it does not fall for readings' scatter.
+    """Return weighted columns (n, 3, k) of an effect's amounts as instruments that are robust to reading noise.
 
-    A play or a lag takes a joint to be nearer to the reading before, which is right of a reading that is off by itself,
-    and a gain that no gear has. What an effect does at a row is therefore worked out from its neighbours' readings and
-    not from its own, which is in the row's residual: an instrumental variable (Durbin 1954), whose product with the
-    residual has no expectation where there is no such effect, however large the scatter, as long as readings are off
-    independently. Only where the joint has come from far, its own reading tells the way as well.
+    A backlash or a lag puts a joint nearer to the previous reading. Noise of the reading itself looks the same. So the
+    columns of a row are computed from its neighbours' readings and not from its own, which is in the row's residual: an
+    instrumental variable (Durbin 1954). Where there is no such effect, its product with the residual has zero
+    expectation, however large the noise, as long as the noise is independent between rows. Only where the joint has
+    come from far does its own reading tell the direction as well.
     """
     if not remembers(effect):
         return fit.weighted(fit.run.columns(effect)[:, :, effect.amounts])
     motion, joint = fit.observations.motion, fit.simulation.robot.joints.index(str(effect.where))
     between = _between(fit, motion, joint, _PLAY_FAR if effect.name in ("backlash", "hysteresis") else _FAR)
     columns = np.empty((len(motion), 3, len(effect.amounts)))
-    # Of each two rows one is replaced at a time, so that its neighbours are as they were read.
+    # Replace alternate rows, so that each row's neighbours keep their own readings.
     for every_other in (slice(0, None, 2), slice(1, None, 2)):
         q = motion.q.copy()
         q[every_other, joint] = between[every_other]
@@ -47,17 +47,17 @@ def instruments(fit: Fit, effect: Effect) -> FloatArray:
 
 
 def beyond_single_rows(one: Fit, other: Fit) -> float:
-    """Return what to add to the log-likelihood of `other` over `one` so that no row counts more than it may [nats].
+    """Return the correction to the log-likelihood of `other` over `one` that limits the weight of each row [nats].
 
-    Which memory a joint has only rows after a short move tell, and of those few one that is off by itself decides
-    easily: the first row after a bump, a joint that another one's swing pushed across its play.
+    Only rows after a short move distinguish the memory effects of a joint. They are few, so a single outlier decides
+    easily: the first row after a bump, or a joint that the motion of another one pushed across its backlash.
     """
     ratios = other.row_log_likelihoods - one.row_log_likelihoods
     return float((np.clip(ratios, -_MOST_OF_A_ROW, _MOST_OF_A_ROW) - ratios).sum())
 
 
 def _between(fit: Fit, motion: Motion, joint: int, far: float) -> FloatArray:
-    """Where a joint is by the readings before and after each (n,) [rad, m]; its own where it has come from far."""
+    """Return a joint's position by the readings before and after each (n,) [rad, m]; its own after a long move."""
     q, after = motion.q[:, joint], np.append(~motion.begins[1:], False)
     before = np.where(motion.begins, q, np.roll(q, 1))
     before = np.where(motion.begins & after, np.roll(q, -1), before)
@@ -66,7 +66,7 @@ def _between(fit: Fit, motion: Motion, joint: int, far: float) -> FloatArray:
 
 
 def _most_scatter(fit: Fit, joint: int) -> float:
-    """What a joint's readings can scatter at most, 1-sigma [rad, m]: as if all that is left came from it."""
+    """Return the upper bound of a joint's reading noise, 1-sigma [rad, m]: all residuals attributed to it."""
     by_joint = fit.weighted(fit.run.by_joint[:, :, [joint]])[:, :, 0]
     lengths = np.square(by_joint).sum(axis=1)
     along = np.einsum("ni,ni->n", by_joint, fit.left)

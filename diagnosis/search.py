@@ -1,4 +1,4 @@
-"""Which causes: added one by one, taken away again when a better one makes them redundant, exchanged for rivals."""
+"""Search the causes: add them one by one, remove redundant ones, and exchange causes for rivals."""
 
 from __future__ import annotations
 
@@ -16,44 +16,44 @@ from .held_out import Blocks, block_p_value
 from .scan import Candidate, Scan
 from .scatter import beyond_single_rows, instruments, remembers
 
-# A cause has to be so much more probable than its absence [nats].
+# Smallest evidence gain of a cause [nats].
 NAMED = 3.0
-# Candidates within this share of the best gain are refitted in full, so many at most.
+# Candidates within this share of the best gain are refitted, up to this number.
 _NEAR, _MOST = 0.4, 6
-# ... and within this share their gain is worth knowing beyond first order.
+# Candidates within this share of the best gain are evaluated beyond first order.
 _WORTH_IN_FULL = 0.2
 _MOST_CAUSES = 20
-# After so many causes more it is asked whether these are enough.
+# Check for completeness each time after this many further causes.
 _ASKED_EACH = 3
-# So many sets of causes are looked at, and none twice.
+# Maximum of sets of causes to examine; none is examined twice.
 _MOST_SETS = 80
 Key = tuple[str, str | None, str | None]
 Named = frozenset[tuple[Key, int]]
-# Of what begins at a moment, and of ripples, which differ in their periods, there are so many at one place at most.
+# Maximum of effects at one place that begin at a moment, and of ripples, which differ in their periods.
 _MOST_MOMENTS, _MOST_RIPPLES = 2, 4
-# What a number costs at least [nats].
+# Minimum cost of a parameter [nats], and the fixed-point rounds of `rise_for`.
 _CHEAPEST, _ROUNDS = 1.5, 30
-# What explains a smaller share of what a cause explains is no rival of it; within so much two are as probable [nats].
+# A rival must explain this share of a cause's gain; differences within this count as equal [nats].
 _COMES_NEAR, _EQUAL = 0.8, 0.3
-# So much of the evidence for one memory of a joint instead of another may lie in a few rows [nats].
+# Largest part of the evidence between two memory effects of a joint that may lie in a few rows [nats].
 _OF_SINGLE_ROWS = 10.0
-# A moment or a period that seems to explain so much more than that of the fit is tried in its place.
+# A moment or a period that promises this much more than the fitted one is tried.
 _ELSEWHERE = 1.0
-# A period that explains less than it did by this has gone astray [nats].
+# A period that explains less than before by this has diverged [nats].
 _ASTRAY = 5.0
-# An exchange that loses no more than this may be worth it with one cause more [nats].
+# An exchange with a smaller loss may pay off with one further cause [nats].
 _WITH_ONE_MORE = 100.0
-# Fewer blocks of time than this cannot say how improbable a chance is; what is worth more is beyond doubt [nats].
+# With fewer blocks of time, p-values are too coarse; a gain above this needs no p-value [nats].
 _FEW_BLOCKS, _BEYOND_DOUBT = 20, 30.0
-# The camera's pose and the marker's place are simpler than the link next to them.
+# The camera's pose and the marker's position are simpler than the adjacent link.
 _OF_A_LINK = 1
 
 
 def nats(gain: float, dof: int) -> float:
-    """How much more probable `dof` more numbers are, which raise twice the log-likelihood by `gain`, than none.
+    """Return the evidence gain of `dof` more parameters that raise twice the log-likelihood by `gain` [nats].
 
-    What explains the gain best is taken as their usual size: a Gaussian prior, scaled by empirical Bayes (George and
-    Foster 2000, equation 5), but never so narrow that a number costs less than `_CHEAPEST`.
+    The prior is Gaussian and scaled by empirical Bayes: the size that best explains the gain (George and Foster 2000,
+        equation 5). It is never so narrow that a parameter costs less than `_CHEAPEST`.
     """
     if dof < 0:
         return -nats(-gain, -dof)
@@ -63,7 +63,7 @@ def nats(gain: float, dof: int) -> float:
 
 
 def rise_for(worth: float, dof: int) -> float:
-    """By how much the log-likelihood has to rise for `dof` more numbers to be worth so much by `nats` [nats]."""
+    """Return the rise of the log-likelihood for which `dof` more parameters are worth `worth` by `nats` [nats]."""
     if dof < 0:
         return -rise_for(-worth, -dof)
     rise = worth + _CHEAPEST * dof
@@ -73,12 +73,12 @@ def rise_for(worth: float, dof: int) -> float:
 
 
 class Beside:
-    """A fit without one of its causes, and what would take its place.
+    """A fit without one of its causes, with the candidates for its place.
 
     Attributes:
-        itself: the cause as it would explain most there.
-        gain: what it explains as it is, to first order: twice the rise of the log-likelihood.
-        candidates: those of the hypotheses that no cause is, the most probable first.
+        itself: the cause with its best first-order fit.
+        gain: its present first-order gain, Δχ².
+        candidates: hypotheses that are not yet causes, the most probable first.
     """
 
     def __init__(
@@ -92,20 +92,20 @@ class Beside:
 
     @cached_property
     def without(self) -> Fit:
-        """The fit without the cause."""
+        """Return the fit without the cause."""
         return improved(self._fit.starting(self._others))
 
     def is_lost_for(self, worth: float) -> bool:
-        """Whether the cause is worth less than that [nats]."""
+        """Return True if the cause is worth less than `worth` [nats]."""
         least = self._fit.log_likelihood - rise_for(worth, self.itself.dof)
         return improved(self._fit.starting(self._others), least).log_likelihood > least
 
     def with_instead(self, *effects: Effect, least: float = -np.inf) -> Fit:
-        """With others in the place of the cause, given up where they cannot become so probable [nats]."""
+        """Refit with others in the place of the cause; give up where `least` is out of reach [nats]."""
         return improved(self._fit.starting([*self._others, *effects]), least)
 
     def exchanged(self, candidate: Candidate, least: float) -> Fit:
-        """With a candidate in the place of the cause, as it is known best."""
+        """Refit with a candidate in the place of the cause; the best such fit is kept."""
         effect = candidate.effect
         known = self._tried.get(effect.identity)
         if known is None or known.log_likelihood < least:
@@ -116,11 +116,11 @@ class Beside:
 
 
 class Search:
-    """Greedy, with second thoughts.
+    """Greedy search with backtracking.
 
     Args:
-        hypotheses: what could be the cause.
-        tell: is told what happens, in a few words.
+        hypotheses: the possible causes.
+        tell: called with short messages on progress.
     """
 
     def __init__(self, hypotheses: Sequence[Effect], tell: Callable[[str], None]) -> None:
@@ -132,13 +132,12 @@ class Search:
         self.ended_early = False
 
     def run(self, start: Fit, enough: Callable[[Sequence[Fit], float], bool] = lambda *_: False) -> Fit:
-        """The causes on top of what `start` has fitted.
+        """Find the causes on top of the parameters that `start` has fitted.
 
-        `ended_early` says afterwards whether the number of steps ended the search, and not that nothing was better.
+        Afterwards `ended_early` is True if the number of steps ended the search before it converged.
 
         Args:
-            enough: is asked now and then, where one more cause would be worth something [nats], whether the fits on the
-                way show that no further cause is called for.
+            enough: called with the fits so far and the worth of one more cause [nats]; True ends the search.
         """
         fit, self.ended_early, asked = start, False, 0
         self._seen: set[Named] = set()
@@ -167,7 +166,7 @@ class Search:
         return fit
 
     def _added(self, fit: Fit) -> tuple[Fit | None, float]:
-        """With one more cause, and what that is worth [nats]; None where nothing is probable enough."""
+        """Add one more cause and return its worth [nats]; None if no candidate is probable enough."""
         best, most = None, NAMED
         known = self._known[1] if self._known[0] is fit else None
         for candidate in self.shortlist(known or Scan(fit), self._open(fit)):
@@ -184,11 +183,11 @@ class Search:
         return best, most
 
     def is_complete(self, fit: Fit) -> bool:
-        """Whether no further cause is worth naming."""
+        """Return True if no further cause is worth naming."""
         return self._added(fit)[0] is None
 
     def _two_in_place_of_one(self, fit: Fit) -> Fit | None:
-        """With two causes of one number each in the place of one of many; None where none is worth it."""
+        """Replace a cause of many parameters by two causes of one parameter each; None if it does not pay."""
         for cause in fit.causes:
             beside = self.beside(fit, cause)
             if beside.itself.dof <= 2:
@@ -209,7 +208,7 @@ class Search:
         return None
 
     def _with_moments(self, fit: Fit, pair: tuple[Candidate, Candidate]) -> tuple[Candidate, Candidate]:
-        """Two candidates, each that begins at a moment as it would explain most beside the other."""
+        """Return two candidates; the moment of each is the best one beside the other."""
         one, other = pair
         if one.effect.kind.begins:
             one = Scan(fit.with_causes([*fit.causes, other.effect])).candidate(one.effect) or one
@@ -218,9 +217,9 @@ class Search:
         return one, other
 
     def _simpler_and_one_more(self, fit: Fit) -> Fit | None:
-        """With a simpler rival in the place of a cause and another cause beside it; None where none is worth it.
+        """Replace a cause by a simpler rival and add another cause; None if it does not pay.
 
-        A cause of many numbers may stand for a simpler one and a small one together.
+        A cause of many parameters may stand for a simpler one and a small one together.
         """
         for cause in fit.causes:
             beside = self.beside(fit, cause)
@@ -238,7 +237,7 @@ class Search:
         return None
 
     def _exchanged(self, fit: Fit, beside: Beside, candidate: Candidate, least: float) -> tuple[Fit, float]:
-        """With a candidate in the place of a cause, and what that is worth [nats]; roughly where below `least`."""
+        """Exchange a cause for a candidate, and return the evidence gain [nats]; approximate if below `least`."""
         doubts, dof = self.doubt(beside.itself) - self.doubt(candidate), candidate.dof - beside.itself.dof
         alike = remembers(beside.itself.effect) and remembers(candidate.effect)
         least -= _OF_SINGLE_ROWS if alike else 0.0
@@ -247,7 +246,7 @@ class Search:
         return tried, worth + (beyond_single_rows(fit, tried) if alike else 0.0)
 
     def _open(self, fit: Fit) -> list[Effect]:
-        """The hypotheses that no cause of a fit is, and one more of those that begin at a moment."""
+        """Return the hypotheses that are not causes of a fit, with one more of each that begins at a moment."""
         present = Counter(effect.key for effect in fit.causes)
         taken = {effect.identity for effect in fit.causes}
         others = []
@@ -261,33 +260,33 @@ class Search:
         return others
 
     def doubt(self, candidate: Candidate) -> float:
-        """What having looked for it in so many places costs [nats]."""
+        """Return the multiplicity penalty for the number of places searched [nats]."""
         self._trials[candidate.effect.key] = candidate.trials
         return float(self._doubt + np.log(candidate.trials))
 
     def doubt_of(self, effect: Effect) -> float:
-        """The same of an effect that was a candidate."""
+        """Return the multiplicity penalty of an effect that was a candidate [nats]."""
         return float(self._doubt + np.log(self._trials.get(effect.key, 1)))
 
     def agreed(self, fit: Fit, candidate: Candidate) -> float:
-        """What a candidate is worth by the agreement of blocks of time, which need not be white inside [nats]."""
+        """Return the worth of a candidate by the agreement of blocks of time, which may be correlated inside [nats]."""
         effect, blocks = candidate.effect, Blocks.cut(len(fit.observations))
         columns = instruments(fit, effect)
         chance = block_p_value(fit, columns, blocks)
         gain = float(stats.chi2.isf(max(chance, 1e-290), candidate.dof))
         worth = nats(gain, candidate.dof) - self.doubt(candidate)
         if blocks.count < _FEW_BLOCKS and worth < NAMED:
-            # Of so few blocks none is improbable enough; what explains so much needs no such witness.
+            # Few blocks cannot give a small p-value; a large gain counts without them.
             plain = nats(fit.independence * candidate.gain, candidate.dof) - self.doubt(candidate)
             worth = max(worth, plain) if plain > _BEYOND_DOUBT else worth
         return worth
 
     def _counted(self, fit: Fit, effect: Effect) -> float:
-        """Which share of a gain counts: noise that wanders looks like what changes with time."""
+        """Return the share of a gain that counts: correlated noise looks like a change with time."""
         return fit.independence if effect.kind.begins or effect.name == "thermal_drift" else 1.0
 
     def shortlist(self, scan: Scan, hypotheses: Sequence[Effect]) -> list[Candidate]:
-        """The candidates that may be the best when all is refitted, the most probable first."""
+        """Return the candidates that may be best after a refit, the most probable first."""
         scanned = [one for one in scan.candidates(hypotheses, _NEAR) if not scan.tolerates(one.effect)]
         most = max((one.gain for one in scanned), default=0.0)
         scanned = [scan.in_full(one) if one.gain >= _WORTH_IN_FULL * most else one for one in scanned]
@@ -298,7 +297,7 @@ class Search:
         return [c for c in ranked[: 3 * _MOST] if c.gain >= floor][:_MOST]
 
     def _reviewed(self, fit: Fit) -> Fit:
-        """Without what has become redundant, and with better ones in the place of others."""
+        """Remove redundant causes and exchange others for better ones."""
         changed = len(fit.causes) > 0
         while changed and len(self._seen) < _MOST_SETS:
             fit, changed = self._second_thoughts(fit)
@@ -308,7 +307,7 @@ class Search:
         return fit
 
     def _scan(self, fit: Fit) -> Scan:
-        """Of a fit and what it is without each of its causes. That of the fit last asked about is kept."""
+        """Return the scan of a fit and of the fit without each of its causes; the last one is kept."""
         known, scan, _ = self._known
         if known is not fit or scan is None:
             scan = Scan(fit, fit.causes)
@@ -316,7 +315,7 @@ class Search:
         return scan
 
     def beside(self, fit: Fit, cause: Effect) -> Beside:
-        """What there is in the place of a cause."""
+        """Return the fit without a cause and the candidates for its place."""
         scan, known = self._scan(fit).without(cause), self._known[2]
         if cause.identity not in known:
             rivals = [effect for effect in self._open(fit) if effect.key != cause.key]
@@ -350,15 +349,15 @@ class Search:
 
 
 def _rise(worth: float, dof: int, counted: float) -> float:
-    """What a cause has to be worth in full where only a share of its gain counts [nats]."""
+    """Return the full worth that a cause needs if only a share of its gain counts [nats]."""
     return nats(2.0 * rise_for(worth, dof) / counted, dof)
 
 
 def joined(start: Fit, sought: Effect, least: float, expected: float) -> Fit:
-    """A fit with one more cause refitted, whose period or time constant may have gone astray as it moved along.
+    """Refit with one more cause; guard against divergence of its period or time constant.
 
     Args:
-        least, expected: what makes it worth while, and how probable it would be to first order [nats].
+        least, expected: required and first-order expected log-likelihood [nats].
     """
     tried = improved(start, least)
     if not sought.shapes or (tried.log_likelihood < least and tried.log_likelihood > expected - _ASTRAY):
@@ -373,23 +372,23 @@ def joined(start: Fit, sought: Effect, least: float, expected: float) -> Fit:
 
 
 def named(causes: Sequence[Effect]) -> Named:
-    """Which causes these are, whatever their numbers: how many of each kind at each place."""
+    """Return the identity of a set of causes without their parameters: the count of each kind at each place."""
     return frozenset(Counter(effect.key for effect in causes).items())
 
 
 def most_of_a_kind(effect: Effect) -> int:
-    """How many effects of a kind there may be at one place."""
+    """Return the maximum of effects of a kind at one place."""
     if effect.kind.begins:
         return _MOST_MOMENTS
     return _MOST_RIPPLES if effect.name == "joint_ripple" else 1
 
 
 def simplicity(effect: Effect) -> int:
-    """The smaller, the simpler: of causes that are as probable the simplest is named."""
+    """Return a complexity score; of equally probable causes the one with the lowest is named."""
     return len(effect.amounts) + len(effect.shapes) + (_OF_A_LINK if effect.name == "link_geometry" else 0)
 
 
 def describe(effect: Effect) -> str:
-    """An effect and its place in a few words."""
+    """Return an effect and its place in a few words."""
     place = "" if effect.where is None else f" at {effect.where}"
     return f"{effect.name}{place}{'' if effect.source is None else f' from {effect.source}'}"

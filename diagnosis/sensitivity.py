@@ -1,4 +1,4 @@
-"""On which joints an error without a name depends."""
+"""Find the joints on which an unnamed error depends."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from bodyschema.interfaces.records import FloatArray
 
 from .families import Family
 
-# From this share of its variance on an error depends on a joint: what holds less leads nobody to its cause.
+# Smallest share of the variance at which an error counts as depending on a joint.
 _SHOWS = 0.05
-# What goes farther beyond all that was seen than this share of its range is not judged.
+# Limit of extrapolation beyond the observed range, as a share of it.
 _BEYOND = 0.1
 _SEED = 0
 
 
 def joints_of(family: Family, numbers: FloatArray, run: Simulated) -> frozenset[int]:
-    """The joints that err or on which the error depends, by their places in q.
+    """Return the joints that err or on which the error depends, by their indices in q.
 
     Args:
-        numbers: of the family (p,).
+        numbers: parameters of the family (p,).
     """
     own = frozenset[int]() if family.joint is None else frozenset({family.joint})
     if family.over_time:
@@ -31,19 +31,19 @@ def joints_of(family: Family, numbers: FloatArray, run: Simulated) -> frozenset[
 
 
 def shares(family: Family, numbers: FloatArray, run: Simulated) -> FloatArray:
-    """Which share of the error's variance each joint holds, the others given (d,).
+    """Return the share of the error's variance due to each joint, the others given (d,).
 
-    Half the mean square change when this joint alone is taken from another row (Jansen 1999).
+    It is half the mean square change when only this joint is taken from another row (Jansen 1999).
 
     Args:
-        numbers: of the family (p,).
+        numbers: parameters of the family (p,).
     """
     rng = np.random.default_rng(_SEED)
     amounts, moves = family.amounts(run), family.moves(run)
     low, high = amounts.min(axis=0), amounts.max(axis=0)
     margin = _BEYOND * (high - low) + 1e-12
     by = family.moved_by(run, numbers)
-    # Where each row's moves are and stay: how a joint carries the error along to the marker does not count.
+    # Keep each row's directions fixed: the leverage of a joint on the marker does not count.
     lengths = np.einsum("nia,nib->nab", moves, moves)
     variance = _square(lengths, by - by.mean(axis=0))
     found = np.zeros(run.motion.q.shape[1])
@@ -60,5 +60,5 @@ def shares(family: Family, numbers: FloatArray, run: Simulated) -> FloatArray:
 
 
 def _square(lengths: FloatArray, by: FloatArray) -> float:
-    """Mean square of how far moves by (n, a) take the marker [m²]; `lengths` (n, a, a) are the moves' products."""
+    """Return the mean square displacement by moves (n, a) [m²]; `lengths` (n, a, a) are their products."""
     return float(np.einsum("na,nab,nb->n", by, lengths, by).mean())

@@ -1,7 +1,7 @@
-"""A smooth model of what has no name: by how much of each function, and what can be stored of it.
+"""Fit a smooth model of the unnamed errors, and store the part that depends on readings alone.
 
-What is fitted are the functions of the families that were found, together with the causes' numbers. Those that depend
-on the readings alone become a KB-Map; what changes with time cannot be one.
+It fits the functions of the families found, together with the parameters of the causes. Functions of the readings
+become a KB-Map; changes with time cannot be stored.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ from .fit import Fit, solved
 from .held_out import Blocks
 from .unknown import Apart
 
-# How far a function may move the marker anywhere, in units of the noise; what predicts rows best is taken.
+# Prior sizes of a function's displacement, in units of the noise; held-out rows choose among them.
 _SIZES = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 _WIDE = 400
-# Of the angle of one joint, and of each of two.
+# Harmonics of one joint's angle, and of each of two joints' angles.
 _HARMONICS = {1: 14, 2: 4}
-# Rounds in which the arcs of joints that err are followed.
+# Maximum of rounds for the curvature of erring joints.
 _ROUNDS = 3
-# Arcs that predict rows worse than this, as a multiple of what they did before, are followed no further.
+# Stop following the curvature if held-out errors grow by more than this factor.
 _WORSE = 1.05
-# What is left out of a stored model, of the noise; what is farther off what it should be is not stored.
+# Tolerance of a stored model, and its largest acceptable error, in units of the noise.
 _LEFT_OUT, _TOO_FAR_OFF = 0.02, 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothModel:
-    """What families say of what the causes of a fit leave.
+    """Smooth functions of families, fitted to the residuals of the causes.
 
     Attributes:
-        fit: the causes beside what could be stored, which is in its simulation.
-        stored: the model that has been learnt; None where all changes with time, or what seemed to last does not.
-        explained: what is said of the rows (n, 3) [m].
-        unstored: the part of it that is not in the fit's simulation, since it changes with time.
-        unseen: by how much the stored simulation predicts each row otherwise for having been fitted to it (n, 3) [m].
+        fit: the causes beside the stored part, which is in its simulation.
+        stored: the learnt model; None where everything changes with time or no lasting part remains.
+        explained: prediction of the functions at the rows (n, 3) [m].
+        unstored: the time-dependent part of it, which is not in the fit's simulation.
+        unseen: change of each row's prediction by the stored simulation due to that row being fitted (n, 3) [m].
     """
 
     fit: Fit
@@ -61,11 +61,11 @@ def smooth_model(alone: Fit, apart: Apart, families: Sequence[Family], blocks: B
     """
     said = apart.predicted - alone.predicted
     lasting = [family for family in families if not family.over_time]
-    # Whatever depends on the place in the image is learnt by the same functions: one family stands for all.
+    # All families of image position share the same functions, so one stands for all.
     places = [family for family in lasting if family.kind == "place"]
     lasting = [family for family in lasting if family.kind != "place"] + places[:1]
     timed = [family for family in families if family.over_time]
-    # What the causes are is found from where they are by themselves, and from where they are beside the families.
+    # Try the causes as fitted alone and as fitted beside the families.
     starts = [replace(fit, noise=apart.fit.noise) for fit in (alone, alone.at(apart.fit.simulation))]
     learnt = [_learnt(fit, lasting, timed, blocks) for fit in starts]
     fit, functions, amounts = min(learnt, key=lambda one: one[2].lasting_missed)
@@ -86,7 +86,7 @@ def smooth_model(alone: Fit, apart: Apart, families: Sequence[Family], blocks: B
 def _learnt(
     fit: Fit, lasting: Sequence[Family], timed: Sequence[Family], blocks: Blocks
 ) -> tuple[Fit, _Functions, _Amounts]:
-    """How much of each function, following the arcs of joints that err as long as that predicts rows well."""
+    """Fit the amounts of all functions, following the curvature of erring joints while held-out errors allow."""
     functions = _Functions(fit, lasting)
     amounts = _Amounts(fit, functions.columns, _timed(fit, timed), blocks)
     for _ in range(_ROUNDS if any(family.kind == "joint" for family in lasting) else 0):
@@ -99,13 +99,13 @@ def _learnt(
 
 
 def _noise_m(fit: Fit) -> float:
-    """RMS length of the noise [m]."""
+    """Return the RMS length of the noise [m]."""
     roots = np.linalg.inv(fit.observations.whitening)
     return fit.noise.sigma * float(np.sqrt(np.square(roots).sum(axis=(1, 2)).mean()))
 
 
 def _timed(fit: Fit, families: Sequence[Family]) -> FloatArray:
-    """Columns (n, 3, p), each of an RMS of one, of what changes with time."""
+    """Return the columns (n, 3, p) of time-dependent families, each with an RMS of one."""
     columns = _beside([family.columns(fit.run) for family in families], len(fit.residuals))
     return columns / np.maximum(np.sqrt(3.0 * np.square(columns).mean(axis=(0, 1))), 1e-300)
 
@@ -115,15 +115,14 @@ def _beside(columns: Sequence[FloatArray], rows: int) -> FloatArray:
 
 
 class _Functions:
-    """The functions of families that depend on the readings alone, each moving the marker by 1 m (RMS) all over.
+    """Functions of the readings of some families, each scaled to move the marker by 1 m (RMS) over all postures.
 
-    They are taken along the rigid chain with the effects that it can have, so that they are functions of the readings
-    and of nothing else.
+    They are computed along the rigid chain with the effects that it can hold, so they depend on the readings alone.
     """
 
     def __init__(self, fit: Fit, families: Sequence[Family]) -> None:
         self._simulation, self.given = fit.simulation, fit.observations.motion.q
-        # A slide's functions reach from its lowest reading to its highest.
+        # A prismatic joint's functions cover the range of its readings.
         ends = [f(self.given[:, k]) for k in range(self.given.shape[1]) for f in (np.argmin, np.argmax)]
         self._ends = self.given[ends]
         self._robot = fit.simulation.robot
@@ -135,14 +134,14 @@ class _Functions:
 
     @cached_property
     def columns(self) -> FloatArray:
-        """At the rows of the fit (n, 3, p)."""
+        """Functions at the rows of the fit (n, 3, p)."""
         return self._at(self.given) / self._scales
 
     def stored(self, amounts: FloatArray, tolerance_m: float) -> tuple[Unexplained, float]:
-        """The functions times amounts (p,), and what the simulation has already, as a model.
+        """Build a model of the functions times amounts (p,) plus what the simulation already has.
 
         Returns:
-            It, and how far it is off them at the rows of the fit (RMS) [m].
+            The model, and its RMS error at the rows of the fit [m].
         """
         before, shares = self._simulation.residual, amounts / self._scales
 
@@ -158,7 +157,7 @@ class _Functions:
         return model, float(np.sqrt(np.square(off).sum(axis=1).mean()))
 
     def shift(self, q: FloatArray, amounts: FloatArray) -> FloatArray:
-        """What the functions times amounts (p,) say at readings (n, d), with joints that err turned (n, 3) [m]."""
+        """Return the displacement (n, 3) [m] at readings (n, d) by amounts (p,), with erring joints actually turned."""
         run = self._run(q)
         shares, errors = amounts / self._scales, np.zeros_like(run.motion.q)
         shift, first = np.zeros((len(errors), 3)), 0
@@ -175,7 +174,7 @@ class _Functions:
         return shift[len(self._ends) :]
 
     def bent(self, amounts: FloatArray) -> FloatArray:
-        """How far the path of joints that err is off a straight one at the rows of the fit (n, 3) [m]."""
+        """Return the nonlinear part (n, 3) [m] of the displacement by erring joints at the rows of the fit."""
         return self.shift(self.given, amounts) - self.columns @ amounts
 
     def _run(self, q: FloatArray) -> Simulated:
@@ -193,7 +192,7 @@ class _Functions:
         return family.columns(run)
 
     def _turns(self, family: Family, run: Simulated) -> FloatArray:
-        """What the error of a joint may depend on (n, p): periodic, and finer than how its family is found."""
+        """Return the functions (n, p) of a joint's error: periodic, and finer than those that detect its family."""
         if not family.drivers:
             return family.amounts(run)
         first, *others = (self._periodic(run, k, _HARMONICS[len(family.drivers)]) for k in family.drivers)
@@ -202,14 +201,16 @@ class _Functions:
         return first
 
     def _periodic(self, run: Simulated, joint: int, count: int) -> FloatArray:
-        """Harmonics of a joint's reading (n, 2 count + 1); of a slide, of its path as half a turn."""
+        """Return harmonics of a joint's reading (n, 2 count + 1); a prismatic joint's range counts as half a turn."""
         low, high = self.given[:, joint].min(), self.given[:, joint].max()
         scale = np.pi / (high - low) if self._robot.chain.prismatic[joint] else 1.0
         angles = scale * run.motion.q[:, [joint]] * np.arange(count + 1)
         return np.concatenate([np.cos(angles), np.sin(angles[:, 1:])], axis=1)
 
     def _of_place(self, x: FloatArray) -> FloatArray:
-        """Any cubic function (n, 3, 60) of where the marker is: one of its rays has poles, which no map can have."""
+        """Return cubic functions (n, 3, 60) of the marker's position; those of its rays have poles and cannot be
+        stored.
+        """
         place = (x - self._centre) / self._spread
         products = [np.ones((len(x), 1)), place]
         for degree in (2, 3):
@@ -219,7 +220,7 @@ class _Functions:
         return (np.eye(3)[:, :, None] * amounts[:, None, None, :]).reshape(len(x), 3, -1)
 
     def _wide(self) -> FloatArray:
-        """Postures all over the joints' range; of slides, over that of the recording."""
+        """Return postures over the joints' range; for prismatic joints, over that of the recording."""
         robot, q = self._robot, self.given
         slides = robot.chain.prismatic
         low = np.where(slides, q.min(axis=0), np.maximum(robot.lower, -np.pi))
@@ -228,7 +229,7 @@ class _Functions:
 
 
 class _Amounts:
-    """How much of each function, with the causes' numbers free beside them."""
+    """Amounts of each function, with the causes' parameters free beside them."""
 
     def __init__(
         self, fit: Fit, functions: FloatArray, timed: FloatArray, blocks: Blocks, bent: FloatArray | None = None
@@ -247,30 +248,30 @@ class _Amounts:
 
     @property
     def of_functions(self) -> FloatArray:
-        """Of the functions that last (p,)."""
+        """Amounts of the functions that last (p,)."""
         return self._all[self._causes :][: self._lasting]
 
     @property
     def in_time(self) -> FloatArray:
-        """What those that change with time say of the rows (n, 3) [m], with what the causes' numbers then do."""
+        """Time-dependent prediction (n, 3) [m], with the accompanying change of the causes' parameters."""
         lasting = slice(self._causes, self._causes + self._lasting)
         return self._columns @ self._all - self._columns[:, :, lasting] @ self._all[lasting]
 
     @property
     def lasting_missed(self) -> float:
-        """What causes and lasting functions leave (sum of squares, whitened) of rows that were not fitted."""
+        """Held-out sum of squares, whitened, left by causes and lasting functions."""
         left = self._fit.weighted((self._left_m - self.said + self.unseen)[:, :, None])
         return float(np.square(left).sum())
 
     @property
     def said(self) -> FloatArray:
-        """What causes and lasting functions say more of the rows (n, 3) [m]."""
+        """Change of the prediction (n, 3) [m] by causes and lasting functions."""
         lasting = slice(0, self._causes + self._lasting)
         return self._columns[:, :, lasting] @ self._all[lasting]
 
     @cached_property
     def unseen(self) -> FloatArray:
-        """By how much causes and lasting functions say more of rows (n, 3) [m] than if these had not been fitted."""
+        """Change of each row's prediction (n, 3) [m] due to that row being in the fit."""
         more = np.zeros_like(self._fit.residuals)
         lasting = slice(0, self._causes + self._lasting)
         for fold in np.unique(self._blocks.fold):
@@ -280,7 +281,7 @@ class _Amounts:
         return more
 
     def _missed(self, size: float) -> float:
-        """What is left (sum of squares) of rows that were not fitted."""
+        """Return the sum of squares left on held-out rows."""
         total = 0.0
         for fold in np.unique(self._folds):
             rows = self._folds == fold

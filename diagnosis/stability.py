@@ -1,4 +1,4 @@
-"""Whether a cause would be named again from other data of the same kind: blocks of time drawn anew."""
+"""Test by block resampling how reliably a cause is named again."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from .held_out import Blocks
 from .search import NAMED, nats
 
 RESAMPLED = 50
-# Of rivals that are as probable as that, none is the better one [nats].
+# Rivals within this margin count as equally probable [nats].
 _EQUAL = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class Instead:
-    """What would be there in the place of a cause.
+    """A fit with an alternative in the place of a cause.
 
     Attributes:
-        fit: with it, or with nothing.
-        dof: how many more numbers it has than the cause.
-        doubt: how much more it costs to have looked for it [nats].
+        fit: with the alternative, or with nothing.
+        dof: number of its parameters less those of the cause.
+        doubt: its multiplicity penalty less that of the cause [nats].
     """
 
     fit: Fit
@@ -33,9 +33,9 @@ class Instead:
 
 
 def named_again(fit: Fit, nothing: Instead, rivals: Sequence[Instead], blocks: Blocks, seed: int) -> NDArray[np.bool_]:
-    """In which of `RESAMPLED` draws of the blocks a cause of `fit` is worth naming, and more than each rival.
+    """Return True for each of `RESAMPLED` block resamplings in which a cause is worth naming and beats each rival.
 
-    No draw is fitted anew: the rows' likelihoods are drawn (Kishino, Miyata and Hasegawa 1990).
+    The rows' likelihoods are resampled, without refitting (Kishino, Miyata and Hasegawa 1990).
     """
     drawn = np.random.default_rng(seed).multinomial(blocks.count, np.full(blocks.count, 1.0 / blocks.count), RESAMPLED)
     again = _worths(fit, nothing, blocks, drawn) < -NAMED
@@ -45,6 +45,6 @@ def named_again(fit: Fit, nothing: Instead, rivals: Sequence[Instead], blocks: B
 
 
 def _worths(fit: Fit, instead: Instead, blocks: Blocks, drawn: NDArray[np.int64]) -> NDArray[np.float64]:
-    """How much more probable something else is than the cause (draws,) [nats]."""
+    """Return the evidence gain of an alternative over the cause (draws,) [nats]."""
     gains = 2.0 * (drawn @ blocks.sums(instead.fit.row_log_likelihoods - fit.row_log_likelihoods))
     return np.array([nats(float(gain), instead.dof) for gain in gains]) - instead.doubt

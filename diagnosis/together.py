@@ -1,10 +1,10 @@
-"""Causes that only together explain what is wrong: sets of them, compared by their evidence beside the background.
+"""Compare sets of causes by their evidence beside the background, since some explain the error only together.
 
-With one of four wrong zeros in the model, tolerances still have to be ten times a workshop's, and it seems worth
-nothing; with all four they fall, and that is worth much. So sets of causes are begun from nothing, from all zeros, and
-from all effects of one kind, and what is not worth its numbers is taken away, added and exchanged, with the scales of
-tolerances fitted to each set. Everything is linear about one fit: a set costs what its normal equations cost, not what
-rows do (MacKay 1992, "Bayesian interpolation"; Tipping and Faul 2003, "Fast marginal likelihood maximisation").
+With one of four wrong joint offsets freed, the tolerances still have to be ten times a workshop's, and this offset
+seems worth nothing. With all four freed they fall, which is worth much. So the search starts from nothing, from all
+offsets, and from all effects of each kind; it removes, adds and exchanges causes. The scales of the tolerances are
+fitted to each set. Everything is linearised about one fit: a set costs its normal equations, whatever the number of
+rows (MacKay 1992, "Bayesian interpolation"; Tipping and Faul 2003, "Fast marginal likelihood maximisation").
 """
 
 from __future__ import annotations
@@ -26,30 +26,29 @@ from .fit import Fit
 from .scan import Candidate, Scan
 from .search import Key
 
-# What naming a cause costs beside what having looked for so many does [nats].
+# Cost of naming a cause beside the multiplicity penalty [nats].
 _NAMED = 3.0
-# Rounds in which scales and noise are found, from afar and beside a like set, until their logarithms move by less.
+# Rounds for scales and noise, from afar and beside a similar set; stop when their logarithms change by less.
 _ROUNDS, _ROUNDS_NEAR, _STILL = 25, 8, 0.02
-# No step of a logarithm is larger.
+# Limit of a step in the logarithms.
 _FARTHEST = 1.0
-# No arm is made worse than the largest scale, nor better than the smallest; the noise is sought from this share of that
-# of the fit on.
+# Limits of the scales, and the lower limit of the noise as a share of that of the fit.
 _SMALLEST, _LARGEST, _QUIETEST = 1e-3, 10.0, 1e-3
-# So many of the most promising moves are tried with scales of their own.
+# Number of the most promising moves that are tried with their own scales.
 _TRIED = 4
-# Where all scales are smaller than this the arm may also be exactly as described, as a simulated one is.
+# With all scales below this, also try an arm exactly as described, such as a simulated one.
 _MAY_BE_EXACT = 0.5
-# What of squares is rounding, and more of it where columns are one beyond that.
+# Relative rounding of squares, and of columns that are collinear up to rounding.
 _ROUNDED_OFF, _ONE_BEYOND_ROUNDING = 1e-13, 1e-8
-# Tolerances without which the data are so much less probable show in them [nats].
+# Evidence loss without a scale's tolerances from which they show in the data [nats].
 _SHOWN = 3.0
-# Sets of causes are changed so many times at most.
+# Maximum of changes to a set of causes.
 _MOST_MOVES = 60
-# So many sets are refitted at most, while one promises to be no less probable than the best by more than this [nats].
+# Maximum of refitted sets, and the margin to the best within which a set is refitted [nats].
 _MOST_REFITTED, _COMES_NEAR = 8, 15.0
-# What is wrong at one joint often is at others: zeros are set in one session. So much each costs but the first [nats].
+# Cost of each further joint with the same kind of error, which is often set in one session [nats].
 _ANOTHER = 2.0
-# To first order it looks like a play: the search takes it up in the place of one.
+# To first order it looks like backlash; the search tries it in place of one.
 _LEFT_TO_THE_SEARCH = ("hysteresis",)
 
 dpotrf, dpotri, dpotrs = get_lapack_funcs(("potrf", "potri", "potrs"), dtype=np.float64)
@@ -57,12 +56,12 @@ dpotrf, dpotri, dpotrs = get_lapack_funcs(("potrf", "potri", "potrs"), dtype=np.
 
 @dataclass(frozen=True, eq=False)
 class Tolerated:
-    """How large tolerances are.
+    """Estimated sizes of the tolerances.
 
     Attributes:
         scales: the most probable ones.
-        unsure: how far their logarithms may be off, 1-sigma (3,).
-        seen: which of them show in the data (3,); the others are what the data still allow.
+        unsure: standard deviations of their logarithms (3,).
+        seen: True for scales that show in the data (3,); the others are upper bounds.
     """
 
     scales: Scales
@@ -72,17 +71,17 @@ class Tolerated:
 
 @dataclass(frozen=True, eq=False)
 class Together:
-    """A set of causes as it stands by its evidence.
+    """A set of causes with its evidence.
 
     Attributes:
-        chosen: which of the candidates.
-        worth: its evidence less what its causes cost to name [nats]; it counts only beside that of other sets.
-        scales: of the tolerances.
-        sigma: of the noise, in units of the stated one.
-        spent: how many numbers of the data say how large each scale is (3,).
-        amounts: of all columns that it has (p,).
-        factor: of their precision, as `cho_factor` has it.
-        columns: which they are (p,).
+        chosen: indices of its candidates.
+        worth: its evidence less the cost of naming its causes [nats]; comparable only with that of other sets.
+        scales: scales of the tolerances.
+        sigma: size of the noise, in units of the stated one.
+        spent: effective number of data that determine each scale (3,).
+        amounts: amounts of all its columns (p,).
+        factor: factor of their precision, from `cho_factor`.
+        columns: indices of its columns (p,).
     """
 
     chosen: tuple[int, ...]
@@ -99,9 +98,9 @@ class Sets:
     """Sets of causes beside one fit, to first order.
 
     Args:
-        fit: with a background.
-        candidates: what may be a cause, each with the amounts, periods and moments about which it is linear.
-        doubt: what naming one of them costs at least [nats].
+        fit: a fit with a background.
+        candidates: possible causes, each with the amounts, periods and moments about which it is linearised.
+        doubt: minimum cost of naming one of them [nats].
     """
 
     def __init__(self, fit: Fit, candidates: Sequence[Candidate], doubt: float) -> None:
@@ -136,13 +135,13 @@ class Sets:
         return np.asarray(scales if scales is not None else Scales())[self._fit.background.group]
 
     def climbed(self, starts: Iterable[tuple[int, ...]]) -> list[Together]:
-        """The sets that are reached from some starts."""
+        """Improve each start by single changes, and return the sets reached."""
         seen: dict[frozenset[int], Together] = {}
         reached = {one.chosen: one for one in (self._climbed(start, seen) for start in starts)}
         return list(reached.values())
 
     def starts(self, own: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
-        """Where to begin: with the fit's causes, with nothing, with all zeros, and with all effects of each kind."""
+        """Yield the starting sets: the fit's causes, none, all joint offsets, and all effects of each kind."""
         yield own
         yield ()
         kinds = dict.fromkeys(effect.name for effect in self.effects if effect.kind.at_joint and not effect.source)
@@ -164,7 +163,7 @@ class Sets:
         return here
 
     def _without_one(self, here: Together) -> Together | None:
-        """With one cause fewer, where that is more probable."""
+        """Remove one cause, where that is more probable."""
         for k in sorted(here.chosen, key=lambda k: self._loss(here, k))[:_TRIED]:
             if better := _better([self.of(tuple(j for j in here.chosen if j != k), here)], here):
                 return better
@@ -174,7 +173,7 @@ class Sets:
         return _better([self.of((*here.chosen, k), here) for k in self._promising(here)[:_TRIED]], here)
 
     def _exchanged(self, here: Together) -> Together | None:
-        """With another in the place of a cause."""
+        """Exchange one cause for another, where that is more probable."""
         tried = []
         for k in here.chosen:
             without = self.of(tuple(j for j in here.chosen if j != k), here)
@@ -182,7 +181,7 @@ class Sets:
         return _better(tried, here)
 
     def _loss(self, here: Together, k: int) -> float:
-        """What a cause is worth where scales and noise stay as they are [nats]."""
+        """Return the worth of a cause with scales and noise held fixed [nats]."""
         places = np.searchsorted(here.columns, self._places[k])
         unit = np.zeros((len(here.columns), len(places)))
         unit[places, np.arange(len(places))] = 1.0
@@ -192,12 +191,12 @@ class Sets:
         return gained + 0.5 * float(np.linalg.slogdet(covariance)[1]) - self._doubt_beside(k, here.chosen)
 
     def _doubt_beside(self, k: int, others: Sequence[int]) -> float:
-        """What naming a cause costs where others are named [nats]."""
+        """Return the cost of naming a cause beside others [nats]."""
         kinds = {self.effects[j].name for j in others if j != k}
         return self._trials[k] + (min(self._first, _ANOTHER) if self.effects[k].name in kinds else self._first)
 
     def _promising(self, here: Together) -> list[int]:
-        """The candidates that are worth most where scales and noise stay as they are, the best first."""
+        """Return the candidates worth most with scales and noise held fixed, the best first."""
         open_ones = [k for k in range(len(self._places)) if k not in here.chosen]
         if not open_ones:
             return []
@@ -217,7 +216,7 @@ class Sets:
         return [open_ones[k] for k in ranked]
 
     def of(self, chosen: tuple[int, ...], near: Together | None = None) -> Together:
-        """A set of causes with the scales and the noise that give it the most evidence."""
+        """Fit the scales and the noise of a set of causes by maximum evidence."""
         own = [self._places[k] for k in chosen]
         columns = np.sort(np.concatenate([np.arange(self._nuisances + self._tolerances), *own]).astype(np.intp))
         group = self._group(columns)
@@ -229,7 +228,7 @@ class Sets:
             factor, variances, amounts = self._solved(inner, toward, group, logs, sigma)
             inverse = dpotri(factor[0], lower=True)[0]
             told = 1.0 - np.diag(inverse) / variances
-            # What a scale's tolerances say of it, and what workshops do (MacKay 1992, equation 4.10).
+            # Update from a scale's tolerances and its prior (MacKay 1992, equation 4.10).
             spent = np.array([told[one].sum() for one in members])
             squares = np.array([(np.square(amounts) / variances)[one].sum() for one in members])
             steps = (squares - spent - logs / SPREAD**2) / (2.0 * np.maximum(spent, 0.5) + 1.0 / SPREAD**2)
@@ -252,7 +251,7 @@ class Sets:
         return Together(chosen, worth, scales, sigma, spent, amounts, factor, columns)
 
     def shown(self, here: Together) -> NDArray[np.bool_]:
-        """Without which scale's tolerances the data would be much less probable (3,)."""
+        """Return True for each scale without whose tolerances the data would be much less probable (3,)."""
         inner, toward = self._inner[np.ix_(here.columns, here.columns)], self._toward[here.columns]
         group = self._group(here.columns)
         whole = self._worth(inner, toward, group, np.log(here.scales), here.sigma)[0]
@@ -264,7 +263,7 @@ class Sets:
         return whole - np.array(without) > _SHOWN
 
     def _group(self, columns: NDArray[np.intp]) -> NDArray[np.int64]:
-        """Of which scale some columns are (p,); -1 where they are no tolerance."""
+        """Return the scale of each column (p,); -1 where it is not a tolerance."""
         group = np.full(len(columns), -1)
         group[self._nuisances : self._nuisances + self._tolerances] = self._fit.background.group
         return group
@@ -272,7 +271,7 @@ class Sets:
     def _worth(
         self, inner: FloatArray, toward: FloatArray, group: np.ndarray, logs: FloatArray, sigma: float
     ) -> tuple[float, tuple[FloatArray, bool], FloatArray]:
-        """The evidence of scales and noise [nats], the factor of the precision, and the amounts (p,)."""
+        """Return the evidence of scales and noise [nats], the factor of the precision, and the amounts (p,)."""
         factor, variances, amounts = self._solved(inner, toward, group, logs, sigma)
         left = self._square - float(amounts @ toward)
         evidence = -0.5 * left / sigma**2 - self._rows * float(np.log(sigma))
@@ -282,7 +281,7 @@ class Sets:
     def _solved(
         self, inner: FloatArray, toward: FloatArray, group: np.ndarray, logs: FloatArray, sigma: float
     ) -> tuple[tuple[FloatArray, bool], FloatArray, FloatArray]:
-        """Factor of the precision, variances beforehand (p,) and amounts (p,), in units of `_units`."""
+        """Return the factor of the precision, prior variances (p,) and amounts (p,), in units of `_units`."""
         variances = np.where(group >= 0, np.exp(2.0 * logs)[group], 1.0)
         precision = inner / sigma**2
         squares, places = np.diag(precision).copy(), np.diag_indices_from(precision)
@@ -294,7 +293,7 @@ class Sets:
         return (factor, True), variances, dpotrs(factor, toward / sigma**2, lower=True)[0]
 
     def effect(self, here: Together, k: int) -> Effect:
-        """One of the causes of a set, with its amounts."""
+        """Return one of the causes of a set, with its amounts."""
         effect, places = self.effects[k], self._places[k]
         values = effect.values.copy()
         values[effect.amounts] = here.amounts[np.searchsorted(here.columns, places)] * self._units[places]
@@ -307,9 +306,9 @@ def _better(tried: Sequence[Together], here: Together) -> Together | None:
 
 
 def together(start: Fit, hypotheses: Sequence[Effect]) -> Fit:
-    """The causes that together have the most evidence beside tolerances everywhere, fitted.
+    """Fit the set of causes with the most evidence beside tolerances everywhere.
 
-    What is best to first order is refitted, and compared about its own numbers, until nothing else comes near.
+    The best sets to first order are refitted and compared again about their own parameters, until no other is near.
 
     Args:
         start: without a background.
@@ -328,7 +327,7 @@ def together(start: Fit, hypotheses: Sequence[Effect]) -> Fit:
 
 
 def tolerated(fit: Fit) -> Tolerated:
-    """The scales of tolerances that have the most evidence beside the causes of a fit."""
+    """Return the scales of tolerances with the most evidence beside the causes of a fit."""
     if fit.background.scales is None:
         return Tolerated(Scales(), np.full(3, SPREAD), np.zeros(3, dtype=np.bool_))
     causes = [Candidate(cause, 0.0, 1) for cause in fit.causes]
@@ -338,7 +337,7 @@ def tolerated(fit: Fit) -> Tolerated:
 
 
 class _Place:
-    """A fit with its causes, and the sets of causes that are reached from it."""
+    """A fit with its causes, and the sets of causes reached from it."""
 
     def __init__(self, fit: Fit, hypotheses: Sequence[Effect]) -> None:
         self.fit = fit
@@ -351,22 +350,22 @@ class _Place:
         self.here = self._sets.of(own)
         self.reached = self._sets.climbed(self._sets.starts(own))
         self.name = self.name_of(self.here)
-        # Without what it has worked out, which is large where rows are many.
+        # Drop cached results, which are large for many rows.
         self.fit = replace(fit)
 
     def name_of(self, one: Together) -> frozenset[Key]:
-        """Which causes a set has, whatever their numbers."""
+        """Return the keys of the causes of a set, without their parameters."""
         return frozenset(self._sets.effects[k].key for k in one.chosen)
 
     def refitted(self, one: Together) -> Fit:
-        """One of the sets, about its own numbers."""
+        """Refit one of the sets about its own parameters."""
         causes = [self._sets.effect(one, k) for k in one.chosen]
         possible = [cause for cause in causes if cause.is_possible]
         return self.fit.with_causes(possible).tolerating(one.scales).tolerating(one.scales)
 
 
 def _at_rest(candidate: Candidate) -> Candidate:
-    """The candidate about no amount at all where it is linear in its amounts."""
+    """Return the candidate at zero amounts, where it is linear in them."""
     effect = candidate.effect
     if effect.name in ("backlash",):
         return candidate

@@ -1,6 +1,6 @@
-"""What has no name beside what has: families of linear functions that compete with the named effects.
+"""Fit unnamed families of linear functions that compete with the named effects.
 
-So an effect is not named where something else is at work.
+An effect is then not named where another error is at work.
 """
 
 from __future__ import annotations
@@ -23,36 +23,36 @@ from .low_rank import low_rank, numbers_of
 from .observations import Observations
 from .search import nats
 
-# What has no name has to be so much more probable than what has one, and what is as specific as that [nats].
+# Prior penalty of an unnamed family, and of one as specific as a named effect [nats].
 _NO_NAME, SPECIFIC = 8.0, 5.0
-# What one of its numbers costs [nats].
+# Cost of one of its parameters [nats].
 _NUMBER = 2.0
-# Directions of a family's columns of which less is left, as a share of the strongest and of the whole, tell nothing.
+# Shares of the strongest direction and of the whole below which a direction is not identifiable.
 _TOLD, _LEFT = 1e-6, 1e-7
-# Whether blocks of time agree is asked of so many of a family's directions.
+# Number of a family's strongest directions tested for agreement of blocks of time.
 _STRONGEST = 4
-# Rounds in which families and causes are fitted in turn, until the likelihood rises by less than this [nats].
+# Maximum of alternating rounds between families and causes, and the convergence limit [nats].
 _ROUNDS, _ENOUGH = 5, 0.1
 
 
-# Moves of a body may follow so many functions together, and need not follow each its own.
+# Ranks to try: motions of a body that share one or two functions.
 _RANKS = (1, 2)
-# What has no name may predict rows that were not fitted worse by no more than this factor.
+# Largest factor by which an unnamed family may worsen held-out errors.
 _NO_WORSE = 1.02
-# So many ways are the nearest to the best, if to first order they are worth so large a share of it.
+# Number of best families considered, and the share of the best first-order worth that they need.
 _NEAREST, _NEAR = 3, 0.9
 
 
 @dataclass(frozen=True, eq=False)
 class Way:
-    """A family, or a part of one, as it stands beside fits of the same observations.
+    """A family, or a part of one, prepared for fits of the same observations.
 
     Attributes:
-        family: which.
-        moved: what moves (n, 3, m), whitened and about as long as one.
-        functions: on which functions (n, a), about as large as one, each move depends.
-        scales: how long the columns were (p,): those of the moves times those of what they depend on.
-        choice: how many more numbers were spent on choosing the part.
+        family: the family.
+        moved: displacements (n, 3, m), whitened and scaled to about unit length.
+        functions: functions (n, a) of each motion, scaled to about one.
+        scales: lengths of the columns (p,): those of the motions times those of the functions.
+        choice: number of further parameters spent on choosing the part.
     """
 
     family: Family
@@ -63,10 +63,10 @@ class Way:
 
     @classmethod
     def of(cls, family: Family, start: Fit) -> Way:
-        """The whole family."""
+        """Prepare the whole family."""
         functions = family.functions(start.run)
         moved = start.observations.whitened(family.moved(start.run))
-        # Lengths (m, a) of the columns, which are moves times functions.
+        # Lengths (m, a) of the columns, which are products of motions and functions.
         lengths = np.sqrt(np.square(moved).sum(axis=1).T @ np.square(functions))
         of_moves = np.maximum(np.sqrt(np.square(lengths).mean(axis=1, keepdims=True)), 1e-100)
         of_functions = np.maximum(np.sqrt(np.square(lengths / of_moves).mean(axis=0)), 1e-100)
@@ -74,7 +74,7 @@ class Way:
 
     @property
     def columns(self) -> FloatArray:
-        """What its numbers change (3 n, p); made when they are asked for, as those of all ways are many."""
+        """Columns (3 n, p) of its parameters, computed on demand to save memory."""
         columns = self.moved[:, :, :, None] * self.functions[:, None, None, :]
         return columns.reshape(3 * len(self.moved), -1)
 
@@ -86,16 +86,16 @@ class Way:
 
     @property
     def moves(self) -> int:
-        """How many there are."""
+        """Number of motions."""
         return self.moved.shape[2]
 
     @property
     def amounts(self) -> int:
-        """On how many functions each move depends."""
+        """Number of functions of each motion."""
         return self.functions.shape[1]
 
     def along(self, functions: FloatArray) -> Way:
-        """The part whose moves follow some functions (b, r), in units of the scales."""
+        """Return the part whose motions follow given functions (b, r), in units of the scales."""
         rank = functions.shape[1]
         scales = self.scales.reshape(self.moves, self.amounts)
         mix = functions / (scales[0] / scales[0].max())[:, None]
@@ -106,14 +106,14 @@ class Way:
 
 @dataclass(frozen=True, eq=False)
 class Apart:
-    """A fit to what is left of the observations when what has no name has been taken away.
+    """A fit of the causes to the observations after removing the unnamed errors.
 
     Attributes:
-        observations: all that was observed.
-        chosen: which ways to differ.
-        numbers: of each of them (p,).
-        fit: of the causes.
-        precision: of these numbers beforehand, in units in which their columns are as long as one.
+        observations: the complete observations.
+        chosen: the unnamed families.
+        numbers: parameters of each of them (p,).
+        fit: the fit of the causes.
+        precision: prior precision of these parameters, in units in which their columns have unit length.
     """
 
     observations: Observations
@@ -124,19 +124,19 @@ class Apart:
 
     @property
     def predicted(self) -> FloatArray:
-        """What is measured (n, 3) [m] by causes and families together."""
+        """Predicted measurements (n, 3) [m] by causes and families together."""
         return self.fit.predicted + (self.observations.x - self.fit.observations.x)
 
     @property
     def choice(self) -> int:
-        """How many more numbers were spent on choosing parts of families."""
+        """Number of further parameters spent on choosing parts of families."""
         return sum(way.choice for way in self.chosen)
 
 
 class Unknowns:
-    """All families as they stand beside fits of the same observations.
+    """All families, prepared for fits of the same observations.
 
-    Their columns are those of the aligned simulation: what is unknown is small, and so is what the causes change.
+    Their columns are those of the aligned simulation, since unnamed errors and changes by the causes are small.
     """
 
     def __init__(self, start: Fit) -> None:
@@ -149,11 +149,11 @@ class Unknowns:
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """Number of families."""
         return len(self._ways)
 
     def beside(self, fit: Fit, others: Sequence[Way] = ()) -> tuple[FloatArray, FloatArray]:
-        """An orthonormal basis (3 n, r) of what `fit` and some ways can change, and what they leave (3 n,)."""
+        """Return an orthonormal basis (3 n, r) of the changes by `fit` and some families, and the residuals (3 n,)."""
         basis = basis_of(fit)
         for way in others:
             basis = np.concatenate([basis, self._fresh(fit, basis, way)], axis=1)
@@ -161,7 +161,7 @@ class Unknowns:
         return basis, left - basis @ (basis.T @ left)
 
     def nearest(self, fit: Fit, others: Sequence[Way] = ()) -> list[tuple[Way, float]]:
-        """The ways that may be the best beside a fit and others, and their worth to first order [nats]."""
+        """Return the families that may be best beside a fit and others, with their first-order worth [nats]."""
         known = self._near.setdefault(fit, {})
         if tuple(others) not in known:
             known[tuple(others)] = self._ranked(fit, others)
@@ -200,10 +200,10 @@ class Unknowns:
         return [(way if part is None else way.along(part), worth) for worth, way, part in ranked]
 
     def specific(self, fit: Fit, least: float) -> list[Way]:
-        """The ways as specific as an effect with a name that explain most beside a fit, the most first.
+        """Return the families as specific as a named effect that explain most beside a fit, the best first.
 
         Args:
-            least: twice the log-likelihood that they have to bring, to first order.
+            least: smallest first-order Δχ².
         """
         basis, left = basis_of(fit), fit.evident.ravel() / fit.noise.sigma
         ranked = [
@@ -214,20 +214,20 @@ class Unknowns:
         return [self._ways[k] for gain, k in sorted(ranked, reverse=True)[:_NEAREST] if gain >= least]
 
     def _doubt_of(self, way: Way) -> float:
-        """What having looked for it among all others costs [nats]."""
+        """Return the multiplicity and prior penalty of a family [nats]."""
         return float(np.log(self.count)) + (SPECIFIC if way.family.is_specific else _NO_NAME)
 
     def apart(self, fit: Fit, chosen: Sequence[Way], start: Apart | None = None) -> Apart:
-        """The causes of a fit and ways to differ, fitted in turn to what the others leave.
+        """Fit the causes and unnamed families alternately, each to the residuals of the other.
 
-        A joint that errs is turned in the readings, so that large errors are as exact as small ones.
+        An error of a joint is applied to its readings, so that large errors are exact too.
 
         Args:
-            start: with some of the ways.
+            start: a fit with some of the families.
         """
         known = {} if start is None else dict(zip(start.chosen, start.numbers, strict=True))
         numbers = tuple(known.get(way, np.zeros(len(way.scales))) for way in chosen)
-        # No function is expected to be larger than twice all that is left.
+        # No function is expected to exceed twice the whole residual.
         precision = 0.25 / max(float(np.square(fit.left).sum()), 1e-300)
         here = Apart(fit.observations, tuple(chosen), numbers, fit if start is None else start.fit, precision)
         for _ in range(_ROUNDS):
@@ -242,12 +242,12 @@ class Unknowns:
         return here
 
     def cost(self, apart: Apart) -> float:
-        """What the ways and their numbers cost [nats]."""
+        """Return the cost of the families and their parameters [nats]."""
         numbers = self._beside(apart)[0].shape[0] + apart.choice
         return sum(self._doubt_of(way) for way in apart.chosen) + _NUMBER * numbers
 
     def told(self, apart: Apart) -> FloatArray:
-        """What ways can change beside the causes (n, 3, r) [m], in directions that the data tell."""
+        """Return the identifiable directions (n, 3, r) [m] that families change beside the causes."""
         fit = apart.fit
         values, mix = self._beside(apart)
         columns = np.concatenate([way.columns for way in apart.chosen], axis=1)
@@ -255,24 +255,24 @@ class Unknowns:
         return np.asarray(np.linalg.solve(fit.observations.whitening, directions), dtype=np.float64)
 
     def _beside(self, apart: Apart) -> tuple[FloatArray, FloatArray]:
-        """Squared lengths (r,) of what ways change beside the causes, and by which of their numbers (p, r)."""
+        """Return squared lengths (r,) of the changes beside the causes, and their mixtures of parameters (p, r)."""
         fit = apart.fit
         basis = basis_of(fit)
         return _directions(np.concatenate([way.columns for way in apart.chosen], axis=1), fit, basis)[1:]
 
     def predicts(self, apart: Apart, alone: Fit) -> bool:
-        """Whether ways to differ predict rows that they were not fitted to as well as a fit without them does."""
+        """Return True if unnamed families predict held-out rows as well as a fit without them."""
         rows = len(alone.observations)
-        # What changes with time says nothing of a longer time that nobody has seen.
+        # Functions of time cannot be extrapolated over long blocks.
         timed = any(way.family.over_time for way in apart.chosen)
         blocks = Blocks.cut(rows, rows // FEWEST_ROWS_A_BLOCK) if timed else Blocks.cut(rows)
         return self._missed(apart.fit, blocks, apart) <= _NO_WORSE * self._missed(alone, blocks)
 
     def _missed(self, fit: Fit, blocks: Blocks, apart: Apart | None = None) -> float:
-        """Mean square of what causes, and ways, leave of rows that they were not fitted to, whitened."""
+        """Return the mean squared residual of causes and families on held-out rows, whitened."""
         columns, precision = fit.columns, fit.precision
         if apart is not None:
-            # Held to what a number of each may be, as they were found: what few rows tell is not followed beyond them.
+            # Apply the prior of the fit to each parameter, so that few rows are not extrapolated.
             more = [way.columns.reshape(*fit.left.shape, -1) * fit.root_weights[:, :, None] for way in apart.chosen]
             more = np.concatenate(more, axis=2)
             columns = np.concatenate([columns, more], axis=2)
@@ -281,7 +281,7 @@ class Unknowns:
         return square / max(float(fit.noise.weights.sum()), 1.0)
 
     def _step(self, here: Apart) -> tuple[FloatArray, ...]:
-        """The numbers of families that explain most of what the causes leave and are not larger than they can be."""
+        """Return the parameters of families that best explain the residuals of the causes, under their prior."""
         fit, counts = here.fit, [len(number) for number in here.numbers]
         basis = basis_of(fit)
         weights = np.repeat(fit.root_weights[:, 0], 3)[:, None]
@@ -297,7 +297,7 @@ class Unknowns:
     def _without(
         self, observations: Observations, chosen: Sequence[Way], numbers: Sequence[FloatArray]
     ) -> Observations:
-        """Without what families account for: a joint's error in the readings, all else in the positions."""
+        """Remove the families' part: a joint's error from the readings, others from the positions."""
         q, x = observations.motion.q.copy(), observations.x.copy()
         for family, own in ((way.family, own) for way, own in zip(chosen, numbers, strict=True)):
             if family.kind == "joint":
@@ -309,30 +309,30 @@ class Unknowns:
         return replace(observations, motion=replace(observations.motion, q=q), x=x)
 
     def agreed(self, fit: Fit, others: Sequence[Way], way: Way) -> float:
-        """What a way is worth by the agreement of blocks of time [nats]."""
+        """Return the worth of a family by the agreement of blocks of time [nats]."""
         basis, left = self.beside(fit, others)
         fresh = self._fresh(fit, basis, way)
         strongest = np.argsort(-np.abs(fresh.T @ left))[:_STRONGEST]
         columns = fresh[:, strongest].reshape(*fit.left.shape, -1)
         chance = scores_p_value(columns, left.reshape(fit.left.shape), Blocks.cut(len(fit.left)))
-        # The strongest of so many were chosen: each costs as one among all.
+        # The strongest directions were selected; each costs one choice among all.
         gain = float(stats.chi2.isf(max(chance, 1e-290), len(strongest)))
         choice = len(strongest) * float(np.log(fresh.shape[1])) + _NUMBER * way.choice
         return nats(gain, len(strongest)) - choice - self._doubt_of(way)
 
     def _fresh(self, fit: Fit, basis: FloatArray, way: Way) -> FloatArray:
-        """An orthonormal basis (3 n, r) of what a way changes beside a basis."""
+        """Return an orthonormal basis (3 n, r) of the changes by a family beside a basis."""
         columns, values, mix = _directions(way.columns, fit, basis)
         return columns @ (mix / np.sqrt(values))
 
 
 def basis_of(fit: Fit) -> FloatArray:
-    """An orthonormal basis (3 n, r) of what the amounts of a fit can change."""
+    """Return an orthonormal basis (3 n, r) of the changes by the amounts of a fit."""
     return fit.orthogonal.reshape(fit.left.size, -1)
 
 
 def _directions(columns: FloatArray, fit: Fit, basis: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Columns (3 n, p) weighted and beside a basis, and the squared lengths (r,) and mixtures (p, r) that are told."""
+    """Return weighted columns (3 n, p) beside a basis, and identifiable squared lengths (r,) and mixtures (p, r)."""
     weighted = fit.unshared(columns * np.repeat(fit.root_weights[:, 0], 3)[:, None])
     weighted = weighted - basis @ (basis.T @ weighted)
     values, vectors = np.linalg.eigh(weighted.T @ weighted)
@@ -341,5 +341,5 @@ def _directions(columns: FloatArray, fit: Fit, basis: FloatArray) -> tuple[Float
 
 
 def _nats(explained: float, rss: float, rows: float) -> float:
-    """By how much the log-likelihood rises when so much of a sum of squares is explained."""
+    """Return the rise of the log-likelihood when part of a sum of squares is explained [nats]."""
     return -1.5 * rows * float(np.log1p(-min(explained / max(rss, 1e-300), 0.999999)))

@@ -1,4 +1,4 @@
-"""Causes in words that a mechanic understands."""
+"""Describe causes in words that a mechanic understands."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from .result import Alike, Cause, Errors, Gain, Interval, Tolerances, Unexplaine
 from .rivals import Standing
 
 _DEG = 180.0 / np.pi
-# A scale error beyond which a joint turns the other way.
+# A scale error below this reverses the joint's direction.
 _BACKWARDS = -1.0
-# Where tolerances leave no more than this share of the error, it is said.
+# Tolerances that leave at most this share of the error are mentioned.
 _BY_TOLERANCES = 0.95
-# A size whose ends are farther apart than this factor is told by its larger end.
+# An interval with a larger ratio of its ends is given by its upper end.
 _UNTOLD = 10.0
-# A headline names so many causes and counts the others: it fits two lines.
+# A headline names this many causes and counts the others, to fit two lines.
 _TOLD = 2
-# A cause that is less sure than this leaves the verdict open.
+# A less probable cause leaves the verdict open.
 SURE = 0.9
 
 
@@ -32,8 +32,8 @@ def finding(
     """Return one cause as a clause: what is wrong, where, by how much.
 
     Args:
-        numbers: of shifts and turns only those given count.
-        seen_by: what measures, as in `DiagnosisFile`.
+        numbers: only the shifts and turns given count.
+        seen_by: the kind of measuring device, as in `DiagnosisFile`.
     """
     at = f"joint {where}"
 
@@ -129,9 +129,9 @@ def sentence(
     """Return the verdict in one or two short sentences.
 
     Args:
-        named_mm: RMS with the causes alone [mm], where there is a smooth model of what has no name beside them.
+        named_mm: RMS with the causes alone [mm], where there is also a smooth model of unnamed causes.
         tolerated_mm: RMS with small errors everywhere and no cause [mm], where such errors show.
-        seen_by: what measures, as in `DiagnosisFile`.
+        seen_by: the kind of measuring device, as in `DiagnosisFile`.
     """
     figures = f"{rms.aligned:.3g} → {rms.extended:.3g} mm on held-out data"
     if verdict == "nothing_found" and rms.extended < _BY_TOLERANCES * rms.aligned:
@@ -158,7 +158,7 @@ def sentence(
 
 
 def _open(verdict: Verdict, causes: Sequence[Cause]) -> str:
-    """What a verdict leaves open, to be added to its sentence."""
+    """Return the part of a verdict's sentence on what remains open."""
     if verdict == "unexplained":
         return ". Part of the error remains unexplained"
     unsure = [cause for cause in causes if is_unsure(cause)]
@@ -179,7 +179,7 @@ def _share(gain: Gain) -> str:
 
 
 def made_to(tolerances: Tolerances) -> str:
-    """How exactly an arm is made, in one sentence; of what the recording cannot tell, how large it is at most."""
+    """Return one sentence on the manufacturing tolerances of an arm; upper bounds where they do not show."""
 
     def told(size: Interval, unit: str, sign: str = "") -> str:
         low, high = size.ci95
@@ -193,7 +193,7 @@ def made_to(tolerances: Tolerances) -> str:
 
 
 def beside_geometry(rms: Errors, alike: Sequence[Alike]) -> list[str]:
-    """What the best geometry explains, and which other effects then say much the same; nothing where none do."""
+    """Return sentences on what the best geometry explains and which effects are confounded; empty if there are none."""
     if rms.geometry is None or not alike:
         return []
     told = [
@@ -210,7 +210,7 @@ def beside_geometry(rms: Errors, alike: Sequence[Alike]) -> list[str]:
 
 
 def modelled(left: Unexplained) -> str:
-    """What extended.toml has of what no effect fits, in one or two sentences; none where nothing is left."""
+    """Return one or two sentences on the smooth model in extended.toml; empty if no structure is left."""
     told = []
     if left.model_joints:
         over = "the marker's place" if left.model_joints == PLACE else f"the readings of {', '.join(left.model_joints)}"
@@ -227,7 +227,7 @@ def modelled(left: Unexplained) -> str:
 
 
 def evidence(standing: Standing) -> str:
-    """Why a cause was named, in one sentence."""
+    """Return the evidence for a cause in one sentence."""
     text = (
         f"Without it the fit is worse by Δχ² = {standing.gain:.0f} for {standing.dof} number{'s' * (standing.dof > 1)}"
     )

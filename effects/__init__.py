@@ -1,6 +1,6 @@
-"""The simulation as a pipeline of stages, and the ways in which reality differs from it.
+"""Simulate a robot as a pipeline of stages, with the effects by which reality differs from the nominal model.
 
-What `diagnosis` fits is what `sim_backend` applies.
+`diagnosis` fits the same effects that `sim_backend` applies.
 """
 
 from .corrected import corrected_file, write_corrected

@@ -1,6 +1,6 @@
-"""The URDF with what a URDF can say of a simulation's effects: for other programs, which know of no effects.
+"""Write a corrected URDF with the effects that a URDF can hold, for programs that know no effects.
 
-extended.toml names the nominal URDF and has the effects beside it, so that nothing is applied twice.
+extended.toml names the nominal URDF and lists the effects beside it, so that nothing is applied twice.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from .simulation import RIGID, Simulation
 
 
 def corrected_file(robot: RobotDescription) -> str:
-    """The name of a robot's corrected URDF."""
+    """Return the file name of a robot's corrected URDF."""
     return f"{robot.tree.file.stem}_corrected.urdf"
 
 
 def corrected_geometry(simulation: Simulation) -> CalibratedGeometry | None:
-    """Joint origins, the camera's pose and the marker's place with the effects that these can have in them.
+    """Return joint origins, camera pose and marker position with the effects that these can hold.
 
-    None where there is no such effect, what the description calls not known aside.
+    None where there is no such effect besides the parameters that the description marks as unknown.
     """
     simulation = simulation.placed
     robot = simulation.robot
@@ -36,7 +36,7 @@ def corrected_geometry(simulation: Simulation) -> CalibratedGeometry | None:
     if not rigid:
         return None
     origins: dict[str, FloatArray] = {}
-    # A zero turns about the axis of the frame where the link's own correction has put it.
+    # An offset turns about the axis as corrected by the link's own effect, so it is applied last.
     for effect in sorted(rigid, key=lambda effect: effect.name == "joint_offset"):
         if effect.where is not None:
             origin = origins.get(effect.where, robot.tree.joint(effect.where).T_parent_joint)
@@ -49,16 +49,16 @@ def corrected_geometry(simulation: Simulation) -> CalibratedGeometry | None:
 
 
 def write_corrected(simulation: Simulation, folder: Path, heading: str) -> Path | None:
-    """Write the URDF of the simulation's robot with `corrected_geometry` into `folder`, beside what else is there.
+    """Write the URDF of the simulation's robot with `corrected_geometry` into `folder`.
 
-    Meshes stay where they are; their relative names are made to lead there. One that an earlier simulation left in the
-    folder is replaced, or taken away where nothing is to be corrected.
+    Meshes stay where they are; relative names are rewritten to point to them. A corrected URDF of an earlier simulation
+    is replaced, or removed where nothing is to be corrected.
 
     Returns:
         The file; None where nothing is to be corrected.
 
     Raises:
-        ConfigError: it cannot be written.
+        ConfigError: the file cannot be written.
     """
     geometry = corrected_geometry(simulation)
     file = folder / corrected_file(simulation.robot)
@@ -74,7 +74,7 @@ def write_corrected(simulation: Simulation, folder: Path, heading: str) -> Path 
 
 
 def _moved(robot: RobotDescription, effect: Effect) -> FloatArray:
-    """By how much an effect moves its joint's frame (4, 4)."""
+    """Return the transform (4, 4) by which an effect moves its joint's frame."""
     if effect.name == "link_geometry":
         return transforms(effect.values[None])[0]
     along = effect.values[0] * robot.tree.joint(str(effect.where)).axis

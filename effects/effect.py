@@ -1,4 +1,4 @@
-"""One effect at its place with its numbers, as it stands in `extended.toml`."""
+"""Define one effect with its place and numbers, as in `extended.toml`."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from bodyschema.interfaces.suggest import did_you_mean
 from .kinds import KINDS, Kind
 from .parameter import Parameter
 
-# A play, a spring or a rate that is negative is none.
+# Parameters that must be positive.
 _POSITIVE = frozenset({"cycles_per_turn", "cycles_per_m", "time_constant_s", "length_rad", "length_m"})
 
-# Name, where, source, and which of several of one kind at one place.
+# Name, where, source, and ordinal among effects of one kind at one place.
 Identity = tuple[str, str | None, str | None, int]
 
 
@@ -29,10 +29,10 @@ class Effect:
 
     Attributes:
         kind: its row of the table.
-        where, source: the joint it sits at, and the one that causes it; None where there is none.
+        where, source: the joint it acts on, and the joint that causes it; None where there is none.
         values: its numbers (p,), in the order of `parameters`.
-        prismatic: whether the joint slides.
-        ordinal: which of several of one kind at one place, counted from 0.
+        prismatic: True for a prismatic joint.
+        ordinal: number among several of one kind at one place, counted from 0.
     """
 
     kind: Kind
@@ -51,10 +51,10 @@ class Effect:
         source: str | None = None,
         values: Mapping[str, float] | Sequence[float] | FloatArray | None = None,
     ) -> Self:
-        """The effect called `name`; without `values` it does nothing yet.
+        """Create the effect called `name`; without `values` it has no influence yet.
 
         Raises:
-            RobotError: there is no such effect, joint or number, or the effect cannot sit there.
+            RobotError: the effect, joint or number does not exist, or the effect cannot act there.
         """
         if name not in KINDS:
             raise RobotError(f"there is no effect {name!r}", remedy=did_you_mean(name, KINDS))
@@ -80,56 +80,56 @@ class Effect:
 
     @property
     def name(self) -> str:
-        """The name of its row of the table."""
+        """Name of its row of the table."""
         return self.kind.name
 
     @property
     def key(self) -> tuple[str, str | None, str | None]:
-        """What it is, whatever its numbers: name, where, source."""
+        """Identity without numbers: name, where, source."""
         return self.kind.name, self.where, self.source
 
     @property
     def identity(self) -> Identity:
-        """What it is among the effects of one simulation: `key` and `ordinal`."""
+        """Identity among the effects of one simulation: `key` and `ordinal`."""
         return *self.key, self.ordinal
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """What its values are."""
+        """Parameters of its values."""
         return self.kind.parameters(self.prismatic)
 
     @property
     def amounts(self) -> list[int]:
-        """The places of the values that say how much."""
+        """Indices of the values that are amounts."""
         return [k for k, parameter in enumerate(self.parameters) if parameter.is_amount]
 
     @property
     def shapes(self) -> list[int]:
-        """The places of the values that smoothly say how: periods and time constants."""
+        """Indices of the smooth shape values: periods and time constants."""
         return [k for k, parameter in enumerate(self.parameters) if parameter.smooth]
 
     @property
     def is_possible(self) -> bool:
-        """Whether none of its numbers is negative that cannot be."""
+        """True if no value is negative that must not be."""
         return not any(p.never_negative and value < 0.0 for p, value in zip(self.parameters, self.values, strict=True))
 
     def with_values(self, values: FloatArray) -> Effect:
-        """The same effect with other numbers (p,)."""
+        """Return the same effect with other values (p,)."""
         return replace(self, values=frozen_array(values))
 
     def one_more(self, ordinal: int) -> Effect:
-        """Another one of its kind at its place, with the same numbers."""
+        """Return another effect of the same kind and place, with the same numbers."""
         return replace(self, ordinal=ordinal)
 
     def value(self, name: str) -> float:
-        """The number called `name`; KeyError when it has none."""
+        """Return the value called `name`; raise KeyError if there is none."""
         for parameter, value in zip(self.parameters, self.values, strict=True):
             if parameter.name == name:
                 return float(value)
         raise KeyError(name)
 
     def table(self) -> dict[str, Any]:
-        """The effect as a table of `extended.toml`."""
+        """Return the effect as a table of `extended.toml`."""
         head = {"effect": self.name, "where": self.where, "source": self.source}
         numbers = {p.name: float(value) for p, value in zip(self.parameters, self.values, strict=True)}
         return {key: value for key, value in head.items() if value is not None} | numbers

@@ -1,4 +1,4 @@
-"""First stage: from a reading to the joint's angle. Each effect here gives the true angle minus the reading."""
+"""Model encoder errors, the first stage; each effect gives the joint's true angle minus the reading."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from bodyschema.interfaces.records import FloatArray, frozen_array
 from .motion import Motion
 from .parameter import Parameter
 
-# Of the numerical derivative of a play by its width [rad, m].
+# Step of the numerical derivative by the width of a backlash [rad, m].
 _WIDTH_STEP = 1e-6
 _PLAYS_KEPT, _MEMORIES_KEPT = 256, 256
 _LAGS_KEPT = 256
-# What is left of a move when it is forgotten.
+# Share of a past move below which it is ignored.
 _FORGOTTEN = 1e-17
-# A magnet farther off its axis, as a share of its radius, is none that could be read.
+# Upper limit of a magnet's eccentricity as a share of its radius; beyond it the encoder cannot be read.
 _FARTHEST_OFF = 0.95
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where an effect sits: a joint and, for a coupling, the joint that causes it, by their places in q."""
+    """Indices in q of an effect's joint and, for a coupling, of the joint that causes it."""
 
     joint: int
     prismatic: bool
@@ -39,9 +39,9 @@ class EncoderEffect(ABC):
 
     Attributes:
         name: as in `diagnosis.json`.
-        takes_source: whether another joint causes it.
-        remembers: whether what it does to a reading depends on the readings before.
-        turns_only: whether only a joint that turns can have it.
+        takes_source: True if another joint causes it.
+        remembers: True if it depends on earlier readings.
+        turns_only: True if only a revolute joint can have it.
     """
 
     name: ClassVar[str]
@@ -51,28 +51,28 @@ class EncoderEffect(ABC):
 
     @abstractmethod
     def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
-        """Its numbers at a joint that turns, or slides."""
+        """Return its parameters at a revolute or prismatic joint."""
 
     @abstractmethod
     def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
-        """Derivative (n, p) of the true angle by `values` (p,); zeros for those that are no amounts."""
+        """Return derivatives (n, p) of the true angle by `values` (p,); zeros for those that are not amounts."""
 
     def correction(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
-        """True angle minus reading (n,) [rad, m]."""
+        """Return true angle minus reading (n,) [rad, m]."""
         return self.columns(motion, place, values) @ values
 
     def finding(self, at: str, numbers: Mapping[str, float]) -> str:
-        """What is wrong, in a clause, where no sentence is known for it. `at` names the joint."""
+        """Describe the error in a clause, where no specific sentence exists. `at` names the joint."""
         amounts = ", ".join(f"{name} = {value:.3g}" for name, value in numbers.items())
         return f"{at} has {self.name.replace('_', ' ')} ({amounts})"
 
     def remedy(self, at: str) -> str:
-        """What to do about it, where nothing is known for it."""
+        """Return a remedy, where no specific one exists."""
         return f"See what could cause it at {at}; extended.toml takes it into account"
 
 
 class JointOffset(EncoderEffect):
-    """The zero is elsewhere: true angle = reading + offset."""
+    """Constant joint offset: true angle = reading + offset."""
 
     name = "joint_offset"
 
@@ -96,9 +96,9 @@ class JointScale(EncoderEffect):
 
 
 class JointEccentricity(EncoderEffect):
-    """The magnet of the encoder sits off the axis by (sine, -cosine) of its radius.
+    """Encoder magnet off the axis by (sine, -cosine) of its radius.
 
-    The field's direction is that of (cos θ, sin θ) + e, so true angle = reading + asin(sine · sin + cosine · cos).
+    The field has the direction of (cos θ, sin θ) + e, so true angle = reading + asin(sine · sin + cosine · cos).
     """
 
     name = "joint_eccentricity"
@@ -123,7 +123,7 @@ class JointEccentricity(EncoderEffect):
 
 
 class JointRipple(EncoderEffect):
-    """Gear teeth, strain wave, pole pairs: an error whose period is a fraction of a turn (of a slide: a length)."""
+    """Periodic error of gear teeth, strain wave or pole pairs; its period is a fraction of a turn, or a length."""
 
     name = "joint_ripple"
 
@@ -140,7 +140,7 @@ class JointRipple(EncoderEffect):
 
 
 class JointCoupling(EncoderEffect):
-    """One joint moves with another: true angle = reading + ratio · (reading of the other)."""
+    """Coupling of a joint to another: true angle = reading + ratio · (reading of the other)."""
 
     name = "joint_coupling"
     takes_source = True
@@ -154,7 +154,7 @@ class JointCoupling(EncoderEffect):
 
 
 class EncoderJump(EncoderEffect):
-    """The zero changes at a moment: true angle = reading + jump from then on."""
+    """Change of the joint offset at a moment: true angle = reading + jump from then on."""
 
     name = "encoder_jump"
 
@@ -170,7 +170,7 @@ class EncoderJump(EncoderEffect):
 
 
 class Backlash(EncoderEffect):
-    """Play between encoder and joint: the joint rests until the reading has crossed the width of the play."""
+    """Backlash between encoder and joint: the joint rests until the reading has crossed its width."""
 
     name = "backlash"
     remembers = True
@@ -191,7 +191,7 @@ class Backlash(EncoderEffect):
 
 
 class Settling(EncoderEffect):
-    """Read before the joint has come to rest: what is missing is a fraction of the last move, and of what was before.
+    """Lag of a joint read before it has settled: a fraction of the last move, plus the decayed earlier lag.
 
     true angle = reading - e, with e_i = fraction · move_i + memory^(dt_i / usual dt) · e_{i-1}.
     """
@@ -208,7 +208,7 @@ class Settling(EncoderEffect):
 
 
 class Hysteresis(EncoderEffect):
-    """Friction behind an elastic drive: the joint lags behind the reading, against the way it went (Dahl 1968).
+    """Friction behind an elastic drive: the joint lags behind the reading, against the last direction (Dahl 1968).
 
     true angle = reading - lag · z, where z moves towards the direction of motion over `length`:
     dz = (sign(dq) - z) · |dq| / length.
@@ -228,10 +228,10 @@ class Hysteresis(EncoderEffect):
 
 
 class Bristle:
-    """How far friction is strained, from -1 to 1, driven reading by reading.
+    """Friction strain from -1 to 1, driven reading by reading.
 
     Args:
-        length: way [rad, m] over which it turns round.
+        length: travel [rad, m] over which it reverses.
     """
 
     def __init__(self, length: float) -> None:
@@ -240,11 +240,11 @@ class Bristle:
         self.strained = 0.0
 
     def begin(self, reading: float, leading: float) -> None:
-        """The reading stands at `reading` and has come in the direction of `leading`; 0: from nowhere."""
+        """Start at `reading`, reached in the direction of `leading`; 0 for no direction."""
         self._last, self.strained = reading, float(np.sign(leading))
 
     def follow(self, reading: float) -> float:
-        """How far it is strained at the next reading."""
+        """Return the strain at the next reading."""
         move = 0.0 if self._last is None else reading - self._last
         kept = float(np.exp(-abs(move) / self._length))
         self._last, self.strained = reading, float(np.sign(move)) * (1.0 - kept) + kept * self.strained
@@ -253,9 +253,9 @@ class Bristle:
 
 @lru_cache(maxsize=_LAGS_KEPT)
 def _strained(motion: Motion, joint: int, length: float) -> FloatArray:
-    """How far a joint's friction is strained (n,), from -1 to 1; it begins in the direction of the first move.
+    """Return the strain of a joint's friction (n,), from -1 to 1; it begins in the direction of the first move.
 
-    Between two runs it is driven straight, as a play is.
+    Between two runs it is driven straight, as a backlash is.
     """
     moves = np.diff(motion.q[:, joint], prepend=motion.q[0, joint])
     leading = moves[np.flatnonzero(moves)[:1]]
@@ -266,9 +266,9 @@ def _strained(motion: Motion, joint: int, length: float) -> FloatArray:
 
 
 def _carried_on(added: FloatArray, kept: FloatArray) -> FloatArray:
-    """Solve e_i = added_i + kept_i e_{i-1} for all rows (n,); nothing is kept of what is before the first."""
+    """Solve e_i = added_i + kept_i e_{i-1} for all rows (n,); nothing is kept from before the first."""
     total, kept, back = added.copy(), kept.copy(), 1
-    # Of so many rows back, then of twice as many: `kept` is what is left of a row's own so far before.
+    # Doubling: `kept` is the share of a row that remains after `back` rows.
     while back < len(total) and np.abs(kept).max() > _FORGOTTEN:
         total[back:] += kept[back:] * total[:-back]
         kept[back:] *= kept[:-back]
@@ -278,7 +278,7 @@ def _carried_on(added: FloatArray, kept: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=_MEMORIES_KEPT)
 def _missing(motion: Motion, joint: int, memory: float) -> FloatArray:
-    """What is missing of the last move and of what was before (n,); a search asks for the same ones again and again."""
+    """Return the lag after the last and earlier moves (n,); cached, since a search repeats the same values."""
     moves = motion.moves[:, joint]
     if memory == 0.0:
         return moves
@@ -288,22 +288,22 @@ def _missing(motion: Motion, joint: int, memory: float) -> FloatArray:
 
 
 class Play:
-    """A play of a width [rad, m], driven reading by reading: its output follows when the input has crossed it."""
+    """A backlash of a width [rad, m], driven reading by reading; its output moves once the input has crossed it."""
 
     def __init__(self, width: float) -> None:
         self._half = 0.5 * width
         self._output: float | None = None
 
     def begin(self, reading: float, leading: float) -> None:
-        """The input stands at `reading` and leads by half the width, in the direction of `leading`; 0: centred."""
+        """Start with the input at `reading`, leading by half the width in the direction of `leading`; 0: centred."""
         self._output = reading - self._half * float(np.sign(leading))
 
     def follow(self, reading: float) -> float:
-        """The output for the next reading."""
+        """Return the output for the next reading."""
         return self.followed([reading])[0]
 
     def followed(self, readings: Sequence[float]) -> list[float]:
-        """The outputs for the next readings."""
+        """Return the outputs for the next readings."""
         half, outputs = self._half, []
         output = readings[0] if self._output is None else self._output
         for reading in readings:
@@ -317,10 +317,10 @@ class Play:
 
 
 def played(q: FloatArray, width: float) -> FloatArray:
-    """Output minus input (n,) of a play of `width` that is driven by q (n,), which leads in its first direction.
+    """Return output minus input (n,) of a backlash of `width` driven by q (n,), leading in its first direction.
 
-    Between two runs it is driven straight from the last reading of one to the first of the next: on which side it was
-    left is known, and what goes far ends on the side to which it went.
+    Between two runs it is driven straight from the last reading of one to the first of the next: the side at the end of
+        the run is known, and a long move ends on its own side.
     """
     moves = np.diff(q)
     leading = moves[np.flatnonzero(moves)[:1]]
@@ -331,7 +331,7 @@ def played(q: FloatArray, width: float) -> FloatArray:
 
 @lru_cache(maxsize=_PLAYS_KEPT)
 def _played(motion: Motion, joint: int, width: float) -> FloatArray:
-    """`played` of one joint; a search asks for the same widths again and again."""
+    """Return `played` of one joint; cached, since a search repeats the same widths."""
     return frozen_array(played(motion.q[:, joint], width))
 
 

@@ -1,19 +1,19 @@
-"""extended.toml: a robot.toml with `[[effects]]`, and perhaps `[unexplained]`, in it.
+"""Read and write extended.toml: a robot.toml with `[[effects]]`, and optionally `[unexplained]`.
 
 [[effects]]
 effect = "joint_compliance"
 where = "shoulder"
 compliance_rad_per_Nm = 0.0031
 
-[[background]]                  # small errors everywhere, within what its makers tolerate; the same keys
+[[background]]                  # manufacturing tolerances, with the same keys
 effect = "link_geometry"
 where = "elbow"
 x_m = 0.0002
 
 [unexplained]
 model = "unexplained.kbmap"     # relative to this file
-joints = ["shoulder", "elbow"]  # whose readings it takes
-factors = [1.0, 1.0]            # what it takes them times; 1 where it is not given
+joints = ["shoulder", "elbow"]  # inputs: readings of these joints
+factors = [1.0, 1.0]            # factor on each input; 1 by default
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ from .unexplained import Unexplained, stored_model
 EXTENDED_FILE = "extended.toml"
 MODEL_FILE = "unexplained.kbmap"
 EFFECTS, BACKGROUND, UNEXPLAINED = "effects", "background", "unexplained"
-# A map of ten joints takes 1.4 MB, one of the largest nets that are learnt 100 MB.
+# A map of ten joints takes 1.4 MB, one of the largest learnt networks 100 MB.
 MOST_MODEL_BYTES = 2**28
 _HEAD = ("effect", "where", "source")
-# By the end of a number's name: what no sane one exceeds, the unit that it then looks like, and what to do.
+# By suffix of a number's name: largest plausible value, the unit it then seems to be in, and the remedy.
 _UNITS: tuple[tuple[str, float, str, str], ...] = (
     ("_kgm", 100.0, "g·m", "Give kg·m"),
     ("_kg", 500.0, "grams", "Give kilograms"),
@@ -65,14 +65,14 @@ _UNITS: tuple[tuple[str, float, str, str], ...] = (
 
 
 class _Placement(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [unexplained.placement]: where camera and marker are taken to be when a place is meant."""
+    """The table [unexplained.placement]: camera and marker poses assumed by a model of the marker's position."""
 
     camera_xyz: Vector3
     camera_rpy: Vector3
     marker_xyz: Vector3
 
     def of(self, robot: RobotDescription) -> RobotDescription:
-        """The robot with its camera and marker there."""
+        """Return the robot with its camera and marker at these poses."""
         camera = msgspec.structs.replace(robot.camera, xyz=self.camera_xyz, rpy=self.camera_rpy)
         return robot.with_placement(camera.pose, np.array(self.marker_xyz))
 
@@ -87,17 +87,17 @@ class _UnexplainedTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
 
 
 def load_simulation(file: Path) -> Simulation:
-    """The robot of robot.toml, or extended.toml, with the effects that it names.
+    """Load the robot of robot.toml, or extended.toml, with the effects that it names.
 
     Raises:
-        ConfigError: as `RobotDescription.load`, `read_effects` and `read_unexplained`.
+        ConfigError: see `RobotDescription.load`, `read_effects` and `read_unexplained`.
     """
     tables, text = read_toml(file)
     return simulation_of(RobotDescription.from_tables(tables, text, file), tables, text)
 
 
 def simulation_of(robot: RobotDescription, tables: Mapping[str, Any], text: str) -> Simulation:
-    """As `load_simulation`, from the tables and the text of the robot's file."""
+    """Load the simulation as `load_simulation` does, from the tables and the text of the robot's file."""
     effects, background = (read_effects(robot, tables, text, robot.file, key) for key in (EFFECTS, BACKGROUND))
     return Simulation(robot, effects, read_unexplained(robot, tables, text, robot.file), background)
 
@@ -105,10 +105,10 @@ def simulation_of(robot: RobotDescription, tables: Mapping[str, Any], text: str)
 def read_effects(
     robot: RobotDescription, tables: Mapping[str, Any], text: str, file: Path, key: str = EFFECTS
 ) -> tuple[Effect, ...]:
-    """The effects in `[[effects]]`, or another list `key` of the same form, in their order; none without it.
+    """Read the effects in `[[effects]]`, or another list `key` of the same form, in order; empty without it.
 
     Raises:
-        ConfigError: an effect, a joint or a number is unknown, missing, or of another unit; names line and remedy.
+        ConfigError: an effect, a joint or a number is unknown, missing, or in another unit; names line and remedy.
     """
     entries = tables.get(key, [])
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
@@ -127,10 +127,10 @@ def read_effects(
 
 
 def read_unexplained(robot: RobotDescription, tables: Mapping[str, Any], text: str, file: Path) -> Unexplained | None:
-    """The model that `[unexplained]` names; None without it.
+    """Read the model that `[unexplained]` names; None without it.
 
     Raises:
-        ConfigError: a key or a joint is unknown, or the model's file is missing, damaged, or of other joints.
+        ConfigError: a key or a joint is unknown, or the model's file is missing, damaged, or for other joints.
     """
     if UNEXPLAINED not in tables:
         return None
@@ -156,14 +156,14 @@ def read_unexplained(robot: RobotDescription, tables: Mapping[str, Any], text: s
 
 
 def write_extended(simulation: Simulation, folder: Path, heading: str, *, replace: bool = False) -> Path:
-    """Write the simulation as `EXTENDED_FILE` into `folder`, which is made if need be.
+    """Write the simulation as `EXTENDED_FILE` into `folder`, which is created if needed.
 
-    The URDF stays where it is and is named relative to `folder`. The robot.toml's other tables are kept; store and
-    checkpoint will be in a folder of their own. Where robot.toml does not know the camera's pose or the marker's place,
-    those of the simulation are written in their place, and stay not known.
+    The URDF stays where it is and is named relative to `folder`. Other tables of robot.toml are kept; store and
+    checkpoint go to a folder of their own. Where robot.toml does not know the camera's pose or the marker's position,
+    those of the simulation are written in their place and stay marked as unknown.
 
     Args:
-        heading: one line for the top: where it comes from.
+        heading: one line for the top that names the origin.
         replace: replace an extended.toml that is there.
 
     Returns:
@@ -171,7 +171,7 @@ def write_extended(simulation: Simulation, folder: Path, heading: str, *, replac
 
     Raises:
         ConfigError: the file is there already, or cannot be written.
-        ValueError: the simulation's residual is none that can be stored.
+        ValueError: the simulation's residual cannot be stored.
     """
     file = folder / EXTENDED_FILE
     simulation = simulation.placed
@@ -208,7 +208,7 @@ def _unexplained_table(residual: Unexplained) -> dict[str, Any]:
 
 
 class _WrongEntry(Exception):
-    """What is wrong with one effect, and at which of its keys."""
+    """Raised for an invalid effect, with the key that is wrong."""
 
     def __init__(self, what: str, key: str | None = None, remedy: str = "") -> None:
         self.what, self.key, self.remedy = what, key, remedy
@@ -239,7 +239,7 @@ def _effect(robot: RobotDescription, entry: Mapping[str, Any]) -> Effect:
 
 
 def _blamed(what: str) -> str | None:
-    """The key of the head that a message about an effect's place names."""
+    """Return the key that a message about an effect's place refers to."""
     return next((key for key in ("source", "where") if f"{key} " in what or f"no {key}" in what), "where")
 
 

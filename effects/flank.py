@@ -1,4 +1,4 @@
-"""A joint with play that bears weight: it hangs on the flank to which gravity pulls it."""
+"""Model a joint with backlash under load: it rests on the flank to which gravity pulls it."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from bodyschema.interfaces.records import FloatArray
 
 
 def flanks(torque: FloatArray, hold: float, before: float = 0.0) -> FloatArray:
-    """Return on which flank of its play a joint hangs (n,): 1 or -1, the sign of the torque on it.
+    """Return the flank of its backlash on which a joint rests (n,): 1 or -1, the sign of its torque.
 
-    It falls over when the torque exceeds `hold` the other way: friction in the gear keeps it where it is until then.
+    It changes sides when the opposite torque exceeds `hold`: until then friction in the gear keeps it in place.
 
     Args:
-        torque: of gravity about the joint, in the order of the rows [N·m or N], shape (n,).
+        torque: gravity's torque about the joint, in the order of the rows [N·m or N], shape (n,).
         hold: friction [N·m or N].
-        before: flank before the first row; 0 if that is not known, then the sign of the first torque counts.
+        before: flank before the first row; 0 if unknown, then the sign of the first torque counts.
     """
     sides = np.where(torque < 0.0, -1.0, 1.0)
     decided = np.abs(torque) > hold

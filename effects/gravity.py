@@ -1,4 +1,4 @@
-"""The torque that gravity exerts about each joint, from the masses that the URDF states."""
+"""Compute gravity's torque about each joint, from the masses in the URDF."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ GRAVITY_M_S2 = 9.80665  # down the root link's z axis, as simulators load a URDF
 
 @dataclass
 class Body:
-    """The links between one joint that is read and the next: they move as one.
+    """Links between one read joint and the next, which move as one body.
 
     Attributes:
         joint: the joint that carries it; None for the base.
-        carrier: the joint, by its place in q, that carries that joint; None for the base.
+        carrier: index in q of the joint that carries that joint; None for the base.
         T_carrier_joint: pose (4, 4) of the joint's frame in its carrier's body, at zero.
         mass_kg, moment: its mass and mass times centre of mass [kg·m] (3,), in the frame of the joint's child link.
     """
@@ -34,12 +34,12 @@ class Body:
 
 
 class GravityLoad:
-    """Gravity's torques about the joints of a robot, whatever holds them.
+    """Gravity's torques about the joints of a robot, independent of what holds them.
 
-    Joints that are not read stand where robot.toml holds them. The tool's mass is not known and not counted.
+    Joints that are not read stand where robot.toml holds them. The mass of the tool is unknown and not included.
 
     Args:
-        masses: of links; those of the URDF by default.
+        masses: masses of the links; those of the URDF by default.
     """
 
     def __init__(self, robot: RobotDescription, masses: Mapping[str, PointMass] | None = None) -> None:
@@ -62,23 +62,23 @@ class GravityLoad:
 
     @property
     def bodies(self) -> Mapping[int | None, Body]:
-        """What moves as one, by the place in q of the joint that carries it; None is the base."""
+        """Bodies by the index in q of the joint that carries them; None is the base."""
         return self._bodies
 
     @property
     def outwards(self) -> Sequence[int]:
-        """Places in q of the joints, each after the one that carries it."""
+        """Indices in q of the joints, each after the one that carries it."""
         return self._outwards
 
     @property
     def known(self) -> bool:
-        """Whether the URDF states any mass that a joint bears."""
+        """True if the URDF states a mass that a joint bears."""
         return any(body.mass_kg > 0.0 for k, body in self._bodies.items() if k is not None)
 
     def in_supports(self, k: int) -> list[FloatArray]:
-        """Poses (4, 4) of a joint's frame in the links that carry it as one: its parent link first, the farthest last.
+        """Return poses (4, 4) of a joint's frame in the links that carry it as one: parent link first, farthest last.
 
-        The farthest is the link of the next joint that is read, or the root link. Frames that are the same are one.
+        The farthest is the link of the next joint that is read, or the root link. Equal frames are listed once.
         """
         robot = self._robot
         joint, poses = robot.tree.joints[robot.joints[k]], list[FloatArray]()
@@ -89,7 +89,7 @@ class GravityLoad:
         return poses
 
     def torques(self, q: FloatArray) -> FloatArray:
-        """Torque of gravity about each joint, in the direction in which it counts [N·m, or N] (n, d), at q (n, d)."""
+        """Return gravity's torque about each joint, positive in its direction [N·m, or N] (n, d), at q (n, d)."""
         moments, forces = self.loads(q)
         torques = np.zeros_like(q)
         for k in self._outwards:
@@ -99,13 +99,13 @@ class GravityLoad:
         return torques
 
     def loads(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What gravity does to all that each joint carries: moments about its origin [N·m] and forces [N], (n, d, 3).
+        """Return gravity's load on what each joint carries: moments about its origin [N·m] and forces [N], (n, d, 3).
 
-        In the joint's frame on its parent link, at q (n, d). Vectors are handed from frame to frame: gravity outwards,
-        mass times centre of mass back.
+        Vectors are in the joint's frame on its parent link, at q (n, d). They pass from frame to frame: gravity
+        outwards, mass times centre of mass back.
         """
         turns = {k: _Turn.of(body.joint, q[:, k]) for k, body in self._bodies.items() if body.joint is not None}
-        # Components first: what is done to a component of all rows is done at once.
+        # Components come first in memory, so that each operation covers all rows.
         down: dict[int | None, FloatArray] = {None: np.array([[0.0], [0.0], [-GRAVITY_M_S2]])}
         for k in self._outwards:
             body = self._bodies[k]
@@ -149,7 +149,7 @@ def _bodies(robot: RobotDescription, masses: Mapping[str, PointMass]) -> dict[in
 def carried(
     tree: UrdfTree, link: str, joints: tuple[str, ...], held_at: dict[str, float]
 ) -> tuple[int | None, FloatArray]:
-    """The read joint that carries `link`, None for the base, and the link's pose (4, 4) in that joint's child link."""
+    """Return the read joint that carries `link`, None for the base, and the link's pose (4, 4) in its child link."""
     *_, (joint, T) = _borne(tree, link, joints, held_at)
     return None if joint is None else joints.index(joint.name), T
 
@@ -157,9 +157,9 @@ def carried(
 def _borne(
     tree: UrdfTree, link: str, joints: tuple[str, ...], held_at: dict[str, float]
 ) -> Iterator[tuple[UrdfJoint | None, FloatArray]]:
-    """The joint above `link` and the link's pose (4, 4) in itself, then the same of each link that bears it as one.
+    """Yield the joint above `link` and the link's pose (4, 4) in itself, then the same for each link that bears it.
 
-    The last joint is one that is read, or None where the base bears the link.
+    The last joint is a read one, or None where the base bears the link.
     """
     above = {joint.child: joint for joint in tree.joints.values()}
     T = np.eye(4)
@@ -174,12 +174,12 @@ def _borne(
 
 @dataclass(frozen=True, eq=False)
 class _Turn:
-    """A joint's own motion: a turn about a fixed axis, and a slide (3, n).
+    """Motion of a joint: a rotation about a fixed axis, and a translation (3, n).
 
     Attributes:
-        across, over: the matrices (3, 3) of a product with the axis, once and twice.
+        across, over: the cross-product matrix (3, 3) of the axis, and its square.
         sine, versine: sin and 1 - cos of the angle (n,).
-        slide: along the axis [m] (3, n).
+        slide: translation along the axis [m] (3, n).
     """
 
     across: FloatArray
@@ -190,21 +190,21 @@ class _Turn:
 
     @classmethod
     def of(cls, joint: UrdfJoint, q: FloatArray) -> _Turn:
-        """At q (n,)."""
+        """Build the motion at q (n,)."""
         across = cross_matrix(joint.axis)
         if joint.kind in REVOLUTE:
             return cls(across, across @ across, np.sin(q), 1.0 - np.cos(q), np.zeros((3, 1)))
         return cls(across, across @ across, np.zeros(1), np.zeros(1), joint.axis[:, None] * q)
 
     def apply(self, vectors: FloatArray) -> FloatArray:
-        """Vectors (3, n) turned (Rodrigues)."""
+        """Return vectors (3, n) rotated (Rodrigues)."""
         return vectors + self.sine * (self.across @ vectors) + self.versine * (self.over @ vectors)
 
     def inverse(self, vectors: FloatArray) -> FloatArray:
-        """Vectors (3, n) turned back."""
+        """Return vectors (3, n) rotated back."""
         return vectors - self.sine * (self.across @ vectors) + self.versine * (self.over @ vectors)
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """a × b (3, n)."""
+    """Return a × b (3, n)."""
     return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

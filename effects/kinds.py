@@ -1,4 +1,4 @@
-"""The table of effects: every way in which reality may differ from the simulation, each once."""
+"""Define the table of effects: each way in which reality may differ from the simulation, once."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ class Kind:
 
     Attributes:
         name: as in `diagnosis.json`.
-        stage: where in the simulation it acts.
-        at_joint: whether it sits at a joint.
-        turning, sliding: its numbers at a joint that turns, or slides; the same where it sits at none.
-        encoder: what it does to a reading, for those of the first stage.
-        begins: whether it begins at a moment, its parameter `t0`.
-        needs_times: whether it needs times, not only an order.
-        needs_stereo: whether it needs the stereo calibration.
-        needs_weight: whether it needs joints that bear the arm's weight, and its masses.
+        stage: the stage of the simulation at which it acts.
+        at_joint: True if it acts at a joint.
+        turning, sliding: its parameters at a revolute or prismatic joint; equal where it acts at no joint.
+        encoder: its encoder error, for effects of the first stage.
+        begins: True if it begins at a moment, its parameter `t0`.
+        needs_times: True if it needs times, not only an order.
+        needs_stereo: True if it needs the stereo calibration.
+        needs_weight: True if it needs joints that bear the arm's weight, and its masses.
     """
 
     name: str
@@ -42,17 +42,17 @@ class Kind:
     needs_weight: bool = False
 
     def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
-        """Its numbers at a joint that turns, or slides."""
+        """Return its parameters at a revolute or prismatic joint."""
         return self.sliding if prismatic else self.turning
 
     @property
     def takes_source(self) -> bool:
-        """Whether another joint causes it."""
+        """True if another joint causes it."""
         return self.encoder is not None and self.encoder.takes_source
 
     @property
     def turns_only(self) -> bool:
-        """Whether only a joint that turns can have it."""
+        """True if only a revolute joint can have it."""
         return self.encoder is not None and self.encoder.turns_only
 
 
@@ -79,7 +79,7 @@ def _of_encoder(effect: EncoderEffect) -> Kind:
 
 
 def _of_plugins() -> list[EncoderEffect]:
-    """The effects of other packages; those of the table keep their names. One that cannot be loaded is left out."""
+    """Return the effects of other packages that load; built-in names take precedence."""
     names = {effect.name for effect in ENCODER_EFFECTS}
     found: list[EncoderEffect] = []
     for entry in installed("bodyschema.effects"):

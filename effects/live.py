@@ -1,4 +1,4 @@
-"""The first stage while the robot moves: what `Simulation.run` gives for a whole motion, reading by reading."""
+"""Apply the first stage reading by reading while the robot moves, equal to `Simulation.run` on a whole motion."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from .simulation import Simulation
 
 
 class LiveEncoders:
-    """True joint angles from what the encoders read, in the order in which they read it.
+    """True joint angles from encoder readings, in the order of the readings.
 
-    A play is driven by every reading, and begins where the readings lead first: before any has changed, it is centred.
+    Every reading drives a backlash. It starts on the side of the first change; before any change, it is centred.
 
     Args:
-        row_readings: how many readings later the next row comes: what an effect remembers of the row before.
+        row_readings: number of readings between rows, for effects that depend on the row before.
     """
 
     def __init__(self, simulation: Simulation, row_readings: int = 1) -> None:
@@ -35,10 +35,10 @@ class LiveEncoders:
         self._others = [effect for effect in encoder if effect not in (*plays, *settling, *lags)]
 
     def true_angles(self, q: FloatArray, t: float, move: FloatArray) -> FloatArray:
-        """True joint angles (d,) [rad, m] at the readings q (d,) and the time t [s].
+        """Return true joint angles (d,) [rad, m] at the readings q (d,) and the time t [s].
 
         Args:
-            move: the move (d,) since the row before, for what has not come to rest.
+            move: the move (d,) since the row before, for joints that have not settled.
         """
         angles = q.copy()
         motion = Motion.at(q, t)
@@ -58,7 +58,7 @@ class LiveEncoders:
 
 
 class _LiveSettling:
-    """What a joint that is read too soon still has to go, of the last move and of those before."""
+    """Remaining lag of a joint that is read before it has settled."""
 
     def __init__(self, place: Place, effect: Effect, row_readings: int) -> None:
         self.joint = place.joint
@@ -66,13 +66,13 @@ class _LiveSettling:
         self._missing: deque[float] = deque([0.0] * row_readings, maxlen=row_readings)
 
     def missing(self, move: float) -> float:
-        """How far it has to go [rad, m] after the move since the row before."""
+        """Return the remaining lag [rad, m] after the move since the row before."""
         self._missing.append(self._fraction * move + self._memory * self._missing[0])
         return self._missing[-1]
 
 
 class _LivePlay:
-    """A play at a joint, whose first move says where in it the joint began."""
+    """A backlash at a joint; the first move determines its initial side."""
 
     def __init__(self, place: Place, width: float) -> None:
         self.joint = place.joint
@@ -82,7 +82,7 @@ class _LivePlay:
         self._moved = False
 
     def lag(self, reading: float) -> float:
-        """Output minus input [rad, m] at the next reading."""
+        """Return output minus input [rad, m] at the next reading."""
         if self._first is None:
             self._first = reading
         if not self._moved and reading != self._first:
@@ -92,7 +92,7 @@ class _LivePlay:
 
 
 class _LiveHysteresis:
-    """Friction behind an elastic drive, whose first move says how it was strained."""
+    """Friction behind an elastic drive; the first move determines its initial strain."""
 
     def __init__(self, place: Place, effect: Effect) -> None:
         self.joint = place.joint
@@ -102,7 +102,7 @@ class _LiveHysteresis:
         self._moved = False
 
     def behind(self, reading: float) -> float:
-        """How far the joint lags [rad, m] at the next reading."""
+        """Return the lag of the joint [rad, m] at the next reading."""
         if self._first is None:
             self._first = reading
         if not self._moved and reading != self._first:

@@ -1,4 +1,4 @@
-"""What begins at a moment, and what grows from one on."""
+"""Handle effects that begin at a moment, or grow from it."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from .motion import Motion
 
 
 def settled(motion: Motion, time_constant_s: float) -> FloatArray:
-    """How much of a drift has come (n,), from 0 when the motion began towards 1."""
+    """Return the share of a drift that has developed (n,), from 0 at the start of the motion towards 1."""
     return -np.expm1(-(motion.clock - motion.began) / time_constant_s)
 
 
 def after(motion: Motion, effect: Effect) -> NDArray[np.bool_]:
-    """Which rows (n,) come after the moment at which an effect begins."""
+    """Return True for rows (n,) after the moment at which an effect begins."""
     return motion.clock >= effect.values[-1]

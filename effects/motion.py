@@ -1,4 +1,4 @@
-"""Encoder readings in the order in which they were taken: what an effect with a memory has to know."""
+"""Hold encoder readings in the order in which they were taken, as effects with memory require."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ _EARLIER_KEPT = 16
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Readings of all encoders, one row a measurement.
+    """Readings of all encoders, one row per measurement.
 
     Attributes:
         q: joint angles as read [rad] (m for a prismatic joint), shape (n, d).
-        t: increasing times [s], shape (n,); None when nothing is known of them.
-        segment: numbers of the runs, shape (n,): what lies between two of them was not seen.
-        begun_at: when whatever drifts began to [s]; None: at the first row.
+        t: increasing times [s], shape (n,); None if unknown.
+        segment: run numbers, shape (n,); the motion between two runs was not observed.
+        begun_at: start of all drifts [s]; None for the first row.
     """
 
     q: FloatArray
@@ -32,18 +32,18 @@ class Motion:
 
     @classmethod
     def of(cls, recording: Recording) -> Motion:
-        """The motion of a recording; without a column `segment` it is one run."""
+        """Return the motion of a recording; without a column `segment` it is one run."""
         segment = np.zeros(len(recording), dtype=np.int64) if recording.segment is None else recording.segment
         return cls(recording.q, None if recording.t is None else recording.play_times, segment)
 
     @classmethod
     def at(cls, q: FloatArray, t: float, begun_at: float | None = None) -> Motion:
-        """One row: the readings q (d,) at the time t [s]."""
+        """Return a motion of one row: the readings q (d,) at the time t [s]."""
         return cls(q[None], np.array([t]), np.zeros(1, dtype=np.int64), begun_at)
 
     @classmethod
     def still(cls, q: FloatArray) -> Motion:
-        """Postures q (n, d) that have nothing to do with each other, at no known times."""
+        """Return unrelated postures q (n, d) without times."""
         return cls(q, None, np.arange(len(q), dtype=np.int64))
 
     def __len__(self) -> int:
@@ -51,22 +51,22 @@ class Motion:
 
     @property
     def began(self) -> float:
-        """When whatever drifts began to, by the `clock`."""
+        """Start of all drifts, by the `clock`."""
         return float(self.clock[0]) if self.begun_at is None else self.begun_at
 
     @property
     def clock(self) -> FloatArray:
-        """When each row was measured (n,): times [s], or the numbers of the rows where there are none."""
+        """Time of each row (n,): times [s], or row numbers where there are none."""
         return np.arange(len(self.q), dtype=np.float64) if self.t is None else self.t
 
     @cached_property
     def begins(self) -> NDArray[np.bool_]:
-        """Which rows are the first of their run (n,)."""
+        """True for rows that are the first of their run (n,)."""
         return np.append(True, self.segment[1:] != self.segment[:-1])
 
     @cached_property
     def moves(self) -> FloatArray:
-        """The move that ended at each row (n, d) [rad, m]; none at the first of a run."""
+        """Move that ended at each row (n, d) [rad, m]; 0 at the first of a run."""
         moves = np.zeros_like(self.q)
         moves[1:] = np.diff(self.q, axis=0)
         moves[self.begins] = 0.0
@@ -74,7 +74,7 @@ class Motion:
 
     @cached_property
     def pace(self) -> FloatArray:
-        """How long each row came after the one before (n,), as a multiple of the usual time; 1 where a run begins."""
+        """Time since the row before (n,), as a multiple of the usual time; 1 at the start of a run."""
         usual = ~self.begins
         pace = np.ones(len(self.q))
         if usual.any():
@@ -90,7 +90,9 @@ class Motion:
 
     @cached_property
     def cubics(self) -> FloatArray:
-        """The path from each row to the next of its run (4, n, d), by powers of the time since, the highest first."""
+        """Path from each row to the next of its run (4, n, d), as coefficients of powers of the time since, highest
+        first.
+        """
         from scipy.interpolate import PchipInterpolator
 
         cubics = np.zeros((4, *self.q.shape))
@@ -101,10 +103,10 @@ class Motion:
         return frozen_array(cubics)
 
     def earlier(self, lag_s: float) -> Motion:
-        """The readings that the encoders gave `lag_s` before each row, interpolated without overshoot.
+        """Return the readings that the encoders gave `lag_s` before each row, interpolated without overshoot.
 
-        Before the first row of a run, and after its last, the nearest rate goes on. Rows that stand alone, and all
-        where there are no times, stay as they are (Fritsch and Butland 1984).
+        Before the first row of a run, and after its last, the nearest rate continues. Single rows, and all rows where
+        there are no times, stay unchanged (Fritsch and Butland 1984).
         """
         if lag_s == 0.0 or self.t is None:
             return self
@@ -113,7 +115,7 @@ class Motion:
 
 @lru_cache(maxsize=_EARLIER_KEPT)
 def _earlier(motion: Motion, lag_s: float) -> Motion:
-    """A search asks for the same lags of the same motion again and again."""
+    """Return the earlier readings; cached, since a search repeats the same lags."""
     assert motion.t is not None
     t, cubics = motion.t, motion.cubics
     lengths = [end - first for first, end in motion.runs]

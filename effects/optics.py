@@ -1,4 +1,4 @@
-"""The cameras' own errors: what a stereo pair whose lenses differ from its calibration reports of a point."""
+"""Model the cameras' own errors: the points that a stereo pair reports if its lenses differ from the calibration."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bodyschema.interfaces.records import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Optics:
-    """How the true cameras differ from the calibration.
+    """Differences of the true cameras from the calibration.
 
     Attributes:
         scale_error: measured over true distances, minus one: the nominal baseline over the true one.
@@ -28,13 +28,14 @@ class Optics:
 
     @property
     def inside(self) -> bool:
-        """Whether it takes a stereo calibration to say what they do."""
+        """True if the errors require a stereo calibration."""
         return (self.focal_error, self.k1, self.k2) != (0.0, 0.0, 0.0)
 
     def reported(self, x: FloatArray, calibration: StereoCalibration | None) -> FloatArray:
-        """What the nominal calibration makes (n, 3) [m] of points (n, 3) [m] in the true left optical frame.
+        """Return points (n, 3) [m] by the nominal calibration, of points (n, 3) [m] in the true left optical frame.
 
-        Two eyes triangulate; one takes the depth from the marker's size, which `scale_error` is an error of then.
+        A stereo pair triangulates. A single camera takes the depth from the marker's size, whose error is
+        `scale_error`.
         """
         if not self.inside:
             return x * (1.0 + self.scale_error)
@@ -47,9 +48,9 @@ class Optics:
         return np.stack([left[:, 0] * depth, 0.5 * (left[:, 1] + right[:, 1]) * depth, depth], axis=1)
 
     def rays(self, x: FloatArray, calibration: StereoCalibration) -> tuple[FloatArray, FloatArray]:
-        """Where the left and the right eye see points (n, 3) [m]: (n, 2) each, as the nominal calibration reads it.
+        """Return the rays on which both cameras see points (n, 3) [m]: (n, 2) each, by the nominal calibration.
 
-        A ray (a, b) is that along (a, b, 1) in the eye's own optical frame.
+        A ray (a, b) runs along (a, b, 1) in the camera's own optical frame.
         """
         true_baseline = calibration.baseline_m / (1.0 + self.scale_error)
         left = self._seen(x[:, 0] / x[:, 2], x[:, 1] / x[:, 2])
@@ -57,9 +58,9 @@ class Optics:
         return left, right
 
     def _magnified(self, x: FloatArray) -> FloatArray:
-        """By how much larger small things at x (n, 3) [m] seem to one camera, which tells their depth (n,).
+        """Return the magnification (n,) of small objects at x (n, 3) [m] in one camera, from which it infers depth.
 
-        Distortion makes them larger by one factor along the radius and by another across it: the geometric mean.
+        Distortion magnifies differently along the radius and across it: this is the geometric mean.
         """
         r2 = np.square(x[:, :2] / x[:, 2:]).sum(axis=1)
         across = 1.0 + r2 * (self.k1 + self.k2 * r2)
@@ -67,7 +68,7 @@ class Optics:
         return (1.0 + self.focal_error) * np.sqrt(across * along)
 
     def _seen(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Nominal rays (n, 2) of what the true camera sees along the rays (x, y, 1)."""
+        """Return the nominal rays (n, 2) of points that lie on true rays (x, y, 1)."""
         r2 = x * x + y * y
         factor = (1.0 + self.focal_error) * (1.0 + r2 * (self.k1 + self.k2 * r2))
         return np.stack([x * factor, y * factor], axis=1)

@@ -1,4 +1,4 @@
-"""What an effect is described by: numbers with a name, a unit and a usual size."""
+"""Define the parameters of effects: numbers with a name, a unit and a usual size."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ class Parameter:
 
     Attributes:
         name: with its unit, as in `extended.toml` and `diagnosis.json`.
-        usual: the size that it has where the effect is there [the parameter's unit]: what a search begins with.
-        nominal: its value where it does nothing; None for a number that only says when or how (a moment, a period).
-        never_negative: a play, a spring or a lag that is negative is none.
-        smooth: of one that only says when or how, whether the measured position depends on it smoothly: a period or a
-            time constant, and no moment.
+        usual: typical size of an effect that is present [the parameter's unit]; start of a search.
+        nominal: value without influence; None for a number of time or shape (a moment, a period).
+        never_negative: True for a backlash, a spring or a lag, which cannot be negative.
+        smooth: True for a shape on which the measured position depends smoothly: a period or a time constant, but not a
+            moment.
     """
 
     name: str
@@ -26,5 +26,5 @@ class Parameter:
 
     @property
     def is_amount(self) -> bool:
-        """Whether it says how much: the measured position depends on it smoothly, and at `nominal` nothing happens."""
+        """True for an amount: the measured position depends on it smoothly, and `nominal` has no influence."""
         return self.nominal is not None

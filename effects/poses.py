@@ -1,4 +1,4 @@
-"""Poses by their numbers: a shift and a rotation vector."""
+"""Convert poses given as a shift and a rotation vector."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from kbmaps.rotations import exponentials
 
 
 def transforms(values: FloatArray) -> FloatArray:
-    """Transforms (n, 4, 4) of shifts [m] and rotation vectors [rad] (n, 6)."""
+    """Return transforms (n, 4, 4) of shifts [m] and rotation vectors [rad] (n, 6)."""
     T = np.tile(np.eye(4), (len(values), 1, 1))
     T[:, :3, :3] = exponentials(values[:, 3:6])[0]
     T[:, :3, 3] = values[:, :3]
@@ -17,6 +17,6 @@ def transforms(values: FloatArray) -> FloatArray:
 
 
 def rotation(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The rotation (3, 3) of a pose's values (6, ...), and by how much it turns for a change of its numbers (3, 3)."""
+    """Return the rotation (3, 3) of a pose's values (6, ...), and the rotation per change of its numbers (3, 3)."""
     turns, jacobians = exponentials(values[None, 3:6])
     return turns[0], jacobians[0]

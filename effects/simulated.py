@@ -1,4 +1,4 @@
-"""One run of the simulation, and how its outcome changes with the effects' numbers."""
+"""Hold one run of the simulation, with derivatives by the effects' parameters."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ from .poses import rotation
 if TYPE_CHECKING:
     from .simulation import Simulation
 
-# Of the numerical derivatives by the optics' numbers and by a point.
+# Step of numerical derivatives by the optics' parameters and by a point.
 _STEP = 1e-6
-# ... and by a latency [s].
+# Step by a latency [s].
 _STEP_S = 1e-5
-# ... and by a period or a time constant, as a share of it.
+# Relative step by a period or a time constant.
 _SHAPE_STEP = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Simulated:
-    """One run of the pipeline, and how its outcome changes with each effect's numbers.
+    """One run of the pipeline, with its derivatives by each effect's parameters.
 
     Attributes:
-        readings: what the encoders read at the time of the images.
+        readings: encoder readings at the time of the images.
         q: true joint angles (n, d) [rad, m].
-        frames: of the joints and the marker (n, d + 1, 4, 4) in the nominal camera's frame.
-        x_true, x_placed, x_camera: the marker (n, 3) [m] as the nominal camera sees it, the camera where it was set up,
-            and the camera where it is.
-        measured: what would be measured (n, 3) [m].
+        frames: frames of the joints and the marker (n, d + 1, 4, 4) in the nominal camera's frame.
+        x_true, x_placed, x_camera: the marker (n, 3) [m] seen by the nominal camera, by the camera as it was set up,
+            and by the camera at its present pose.
+        measured: simulated measurements (n, 3) [m].
     """
 
     simulation: Simulation
@@ -57,7 +57,7 @@ class Simulated:
 
     @cached_property
     def by_joint(self) -> FloatArray:
-        """Derivative (n, 3, d) of what is measured by the true joint angles [m/rad, m/m]."""
+        """Derivatives (n, 3, d) of the measurements by the true joint angles [m/rad, m/m]."""
         chain, frames = self.chain, self.frames
         axes = np.einsum("nkij,kj->nki", frames[:, :-1, :3, :3], chain.axes)
         levers = self.x_true[:, None] - frames[:, :-1, :3, 3]
@@ -66,19 +66,21 @@ class Simulated:
 
     @cached_property
     def torques(self) -> FloatArray:
-        """Gravity's torques (n, d) [N·m, N]."""
+        """Torques of gravity (n, d) [N·m, N]."""
         return self.simulation.torques(self.q)
 
     @cached_property
     def wrenches(self) -> FloatArray:
-        """What gravity does to all that each joint carries (n, d, 6), in the joint's frame on its parent link.
+        """Loads of gravity on what each joint carries (n, d, 6), in the joint's frame on its parent link.
 
-        Moments about its origin [N·m], then forces [N].
+        These are moments about its origin [N·m], then forces [N].
         """
         return np.concatenate(self.simulation.gravity.loads(self.q), axis=2)
 
     def columns(self, effect: Effect) -> FloatArray:
-        """Derivative (n, 3, p) of what is measured by the effect's values, at its values; zeros for no amounts."""
+        """Return derivatives (n, 3, p) of the measurements by the effect's values; zeros for values that are not
+        amounts.
+        """
         simulation = self.simulation
         if effect.kind.encoder is not None:
             place = simulation.place(effect)
@@ -87,7 +89,7 @@ class Simulated:
         return self._BY_NAME[effect.name](self, effect)
 
     def by_shape(self, effect: Effect) -> FloatArray:
-        """Derivative (n, 3, s) of what is measured by the effect's `shapes`, at its values."""
+        """Return derivatives (n, 3, s) of the measurements by the effect's `shapes`."""
         derivatives = []
         for k in effect.shapes:
             step = np.zeros(len(effect.values))
@@ -123,7 +125,7 @@ class Simulated:
         k = simulation.place(effect).joint
         turn, by_turn = rotation(effect.values)
         if simulation.upward[k]:
-            # The frame after the joint's own motion, in which the link above it begins.
+            # Frame after the joint's own motion, in which the link above begins.
             frame = self.frames[:, k + 1] @ inverse(self.chain.fixed[k + 1])
             axes = -frame[:, :3, :3] @ turn.T
         else:
@@ -155,7 +157,7 @@ class Simulated:
         return np.stack(columns, axis=2)
 
     def _latency(self, effect: Effect) -> FloatArray:
-        # Through the encoders' own errors: they too are those of the moment before.
+        # Include the encoder errors: they too are those of the earlier moment.
         latency = self.simulation.latency_s
         later, sooner = (self.simulation.unloaded(self.motion.earlier(latency + s)) for s in (_STEP_S, -_STEP_S))
         return np.einsum("nij,nj->ni", self.by_joint, (later - sooner) / (2.0 * _STEP_S))[:, :, None]
@@ -167,21 +169,21 @@ class Simulated:
         return after(self.motion, effect)[:, None, None].astype(np.float64)
 
     def _seen(self, moved: FloatArray) -> FloatArray:
-        """What is measured of moves (n, 3, p) [m] of the point that the nominal camera sees."""
+        """Return the change of the measurements by moves (n, 3, p) [m] of the point in the nominal camera's frame."""
         for effect in self.simulation.effects:
             if effect.name == "camera_pose":
                 moved = rotation(effect.values)[0].T @ moved
         return self._optical(self._since_moved(moved))
 
     def _since_moved(self, moved: FloatArray) -> FloatArray:
-        """Moves (n, 3, p) in the frame of the camera where it is, of moves in its frame where it was set up."""
+        """Return moves (n, 3, p) in the present camera frame, from moves in the frame where it was set up."""
         for effect in self.simulation.effects:
             if effect.name == "camera_moved":
                 moved = np.where(self._after(effect) > 0.0, rotation(effect.values)[0].T @ moved, moved)
         return moved
 
     def _optical(self, moved: FloatArray) -> FloatArray:
-        """What is measured of moves (n, 3, p) of the point in the camera's frame [m]."""
+        """Return the change of the measurements by moves (n, 3, p) of the point in the camera's frame [m]."""
         optics = self.simulation.optics
         if not optics.inside:
             return moved * (1.0 + optics.scale_error)
@@ -189,7 +191,7 @@ class Simulated:
 
     @cached_property
     def _by_point(self) -> FloatArray:
-        """Derivative (n, 3, 3) of what the optics report by the point."""
+        """Derivatives (n, 3, 3) of the reported position by the point."""
         optics, calibration = self.simulation.optics, self.simulation.robot.calibration
         changes = [
             optics.reported(self.x_camera + step, calibration) - optics.reported(self.x_camera - step, calibration)
@@ -215,18 +217,18 @@ class Simulated:
 
 
 def _of_camera(effect: Effect, x: FloatArray) -> FloatArray:
-    """Moves (n, 3, 6) of points x (n, 3) in the frame of a camera, by the numbers of its pose."""
+    """Return moves (n, 3, 6) of points x (n, 3) in a camera's frame, by the parameters of its pose."""
     turn, by_turn = rotation(effect.values)
     axes = np.broadcast_to(-turn.T, (len(x), 3, 3))
     return _moved_and_turned(axes, axes @ by_turn, x)
 
 
 def _moved_and_turned(shifts: FloatArray, axes: FloatArray, lever: FloatArray) -> FloatArray:
-    """Moves (n, 3, 6): shifts (n, 3, 3), and turns about the columns of axes (n, 3, 3), of what is at lever (n, 3)."""
+    """Return moves (n, 3, 6) at levers (n, 3): shifts (n, 3, 3), and turns about the columns of axes (n, 3, 3)."""
     turned = np.cross(np.swapaxes(axes, 1, 2), lever[:, None, :])
     return np.concatenate([shifts, np.swapaxes(turned, 1, 2)], axis=2)
 
 
 def _with_moment(columns: FloatArray) -> FloatArray:
-    """Derivatives (n, 3, p) with zeros for the number that says when."""
+    """Return derivatives (n, 3, p) with zeros appended for the moment."""
     return np.concatenate([columns, np.zeros_like(columns[:, :, :1])], axis=2)

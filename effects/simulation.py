@@ -1,4 +1,4 @@
-"""The simulation as a pipeline: encoder, structure, tool, camera, time; the nominal one with effects added.
+"""Simulate a robot as a pipeline: encoder, structure, tool, camera, time; the nominal model with effects added.
 
 x_measured = drift(t) + residual(q(t)) + optics(camera(tool(structure(encoder(q(t - latency))))))
 """
@@ -27,33 +27,33 @@ from .optics import Optics
 from .poses import transforms
 from .simulated import Simulated
 
-# A spring's deflection changes its own load: each round brings the next order.
+# A spring's deflection changes its own load; each round adds the next order.
 _SPRING_ROUNDS = 3
-# Effects that a rigid chain can have in it.
+# Effects that a rigid chain can hold.
 RIGID = ("joint_offset", "link_geometry", "tool_offset", "camera_pose")
-# What an effect with a moment is after it; what is not there when nothing moves.
+# Permanent form of effects with a moment; effects that exist only in motion.
 _STAYS = {"encoder_jump": "joint_offset", "tool_slip": "tool_offset", "camera_moved": "camera_pose"}
 _OF_MOTION = ("backlash", "settling", "hysteresis", "camera_latency", "thermal_drift")
 
 
 class Residual(Protocol):
-    """What no effect explains, as a smooth function of the readings."""
+    """A smooth function of the readings for errors that no effect explains."""
 
     def predict(self, q: FloatArray) -> FloatArray:
-        """How far (n, 3) [m] what is measured is from what the effects give, at the readings q (n, d) [rad, m]."""
+        """Return the difference (n, 3) [m] of measurements from the effects, at the readings q (n, d) [rad, m]."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """A robot with effects: what its cameras would report.
+    """A robot with effects, and the measurements that its cameras would report.
 
     Attributes:
         robot: the robot as described.
-        effects: what is added to it.
-        residual: what is added to what is measured; None for nothing. It depends on the readings alone, so no effect
+        effects: effects added to it.
+        residual: correction added to the measurements; None for none. It depends on the readings alone, so no effect
             changes it.
-        background: small errors everywhere, within what the arm's makers tolerate: none of them is a finding.
+        background: small errors everywhere, within manufacturing tolerances; never a finding.
     """
 
     robot: RobotDescription
@@ -68,24 +68,24 @@ class Simulation:
 
     @cached_property
     def gravity(self) -> GravityLoad:
-        """Gravity's torques about the joints."""
+        """Torques of gravity about the joints."""
         return GravityLoad(self.robot)
 
     def with_effects(self, effects: Sequence[Effect]) -> Simulation:
-        """The same robot and residual with these effects in the place of its own."""
+        """Return the same robot and residual with other effects."""
         changed = replace(self, effects=tuple(effects))
         changed.__dict__["gravity"] = self.gravity
         return changed
 
     def with_background(self, background: Sequence[Effect]) -> Simulation:
-        """The same with other small errors everywhere."""
+        """Return the same simulation with another background."""
         changed = replace(self, background=tuple(background))
         changed.__dict__["gravity"] = self.gravity
         return changed
 
     @cached_property
     def rigid(self) -> Simulation:
-        """With those of its effects alone that a rigid chain can have in it, and without the residual."""
+        """The simulation with only the effects that a rigid chain can hold, and without the residual."""
         own, background = (
             tuple(effect for effect in effects if effect.name in RIGID) for effects in (self.effects, self.background)
         )
@@ -95,16 +95,16 @@ class Simulation:
 
     @property
     def since(self) -> Simulation:
-        """The arm as it is since all moments have passed, standing still and cold.
+        """The arm after all moments have passed, at rest and cold.
 
-        What jumped, slipped or was bumped stays where it is; what comes of motion or of warming up is not there.
+        Jumps, slips and bumps stay; effects of motion or of warming up are removed.
         """
         stayed = self.after_moments
         return replace(stayed, effects=tuple(effect for effect in stayed.effects if effect.name not in _OF_MOTION))
 
     @property
     def after_moments(self) -> Simulation:
-        """The same with what jumped, slipped or was bumped where it stays."""
+        """The same simulation with jumps, slips and bumps made permanent."""
         own = [effect for effect in self.effects if effect.name not in _STAYS]
         later = [
             Effect.at(self.robot, _STAYS[effect.name], effect.where, values=effect.values[:-1].tolist())
@@ -115,9 +115,9 @@ class Simulation:
 
     @property
     def placed(self) -> Simulation:
-        """The same, with what the description calls not known in the description and no more among the effects.
+        """The same simulation, with fitted values of unknown parameters moved from the effects to the description.
 
-        The camera's pose and the marker's place go there exactly: both are the frames at the ends of the chain.
+        This is exact for the camera's pose and the marker's position: both are the frames at the ends of the chain.
         """
         robot, gone = self.robot, set[str]()
         pose, marker = robot.camera.pose, np.array(robot.robot.marker_xyz)
@@ -131,11 +131,11 @@ class Simulation:
         return replace(self, robot=robot.with_placement(pose, marker), effects=effects)
 
     def positions(self, motion: Motion) -> FloatArray:
-        """What would be measured (n, 3) [m] in the measurement frame."""
+        """Return the simulated measurements (n, 3) [m] in the measurement frame."""
         return self.run(motion).measured
 
     def run(self, motion: Motion) -> Simulated:
-        """The pipeline, with all that is on the way."""
+        """Run the pipeline, keeping all intermediate results."""
         readings = motion.earlier(self.latency_s)
         q = self.unloaded(readings)
         q += self.given_way(q)
@@ -152,7 +152,7 @@ class Simulation:
         return Simulated(self, motion, readings, q, chain, frames, x_true, x_placed, x_camera, measured)
 
     def unloaded(self, readings: Motion) -> FloatArray:
-        """True joint angles (n, d) [rad, m] where no weight bends the joints."""
+        """Return true joint angles (n, d) [rad, m] without deflection under weight."""
         q = readings.q.copy()
         for effect in self.all_effects:
             if effect.kind.encoder is not None:
@@ -161,14 +161,14 @@ class Simulation:
         return q
 
     def place(self, effect: Effect) -> Place:
-        """Where an effect of the first stage sits."""
+        """Return the place of an effect of the first stage."""
         assert effect.where is not None
         source = None if effect.source is None else self.robot.joints.index(effect.source)
         return Place(self.robot.joints.index(effect.where), effect.prismatic, source)
 
     @cached_property
     def optics(self) -> Optics:
-        """The cameras' errors."""
+        """Errors of the cameras."""
         return Optics(
             sum(e.value("scale_error") for e in self._of("camera_scale")),
             sum(e.value("focal_error") for e in self._of("camera_focal")),
@@ -178,7 +178,7 @@ class Simulation:
 
     @property
     def latency_s(self) -> float:
-        """How late the images' time stamps are [s]."""
+        """Delay of the images' time stamps [s]."""
         return sum(e.value("latency_s") for e in self._of("camera_latency"))
 
     def _of(self, name: str) -> list[Effect]:
@@ -186,14 +186,15 @@ class Simulation:
 
     @property
     def bears_weight(self) -> bool:
-        """Whether the joints bear the arm's weight; where they are torque-free, the guiding hand does."""
+        """True if the joints bear the arm's weight; torque-free joints leave it to the guiding hand."""
         return self.robot.robot.hold != "torque_free"
 
     def given_way(self, q: FloatArray, hung: dict[Identity, float] | None = None) -> FloatArray:
-        """How far the joints give under the arm's weight (n, d) [rad, m], their springs unloaded at q (n, d).
+        """Return the deflection of the joints under the arm's weight (n, d) [rad, m], their springs unloaded at q (n,
+        d).
 
         Args:
-            hung: on which flank each loaded play hung before the first row, updated to the last; None if not known.
+            hung: flank of each loaded backlash before the first row, updated to the last; None if unknown.
         """
         given = np.zeros_like(q)
         if not self.bears_weight:
@@ -212,14 +213,14 @@ class Simulation:
 
     @cached_property
     def springs(self) -> FloatArray:
-        """How far each joint gives for each newton metre (d,) [rad/(N·m), m/N]."""
+        """Compliance of each joint (d,) [rad/(N·m), m/N]."""
         springs = np.zeros(len(self.robot.joints))
         for effect in self._of("joint_compliance"):
             springs[self.place(effect).joint] += effect.values[0]
         return springs
 
     def torques(self, q: FloatArray) -> FloatArray:
-        """Torques of gravity about the joints (n, d) [N·m, N], payloads counted, at q (n, d)."""
+        """Return torques of gravity about the joints (n, d) [N·m, N], with payloads, at q (n, d)."""
         return sum((load.torques(q) for load in self._payloads), self.gravity.torques(q))
 
     @cached_property
@@ -232,7 +233,7 @@ class Simulation:
 
     @property
     def rigid_chain(self) -> RigidChain:
-        """The chain from camera to marker with the effects that it can have in it, over the readings."""
+        """Chain from camera to marker with the effects that it can hold, over the readings."""
         rigid = self.rigid
         chain = rigid._chain()
         fixed = chain.fixed.copy()
@@ -246,13 +247,13 @@ class Simulation:
         return RigidChain(fixed, chain.axes, chain.prismatic)
 
     def _turned(self, joint: int, value: float) -> FloatArray:
-        """A joint's own motion (4, 4) along the way from camera to marker."""
+        """Return a joint's own motion (4, 4) along the path from camera to marker."""
         chain, none = self.robot.chain, np.zeros(3)
         along = value * chain.axes[joint]
         return transforms(np.concatenate([along, none] if chain.prismatic[joint] else [none, along])[None])[0]
 
     def _chain(self) -> RigidChain:
-        """The chain with its links as they are."""
+        """Return the chain with corrected links."""
         chain = self.robot.chain
         fixed = chain.fixed.copy()
         for k, moved in self.link_moves:
@@ -264,17 +265,17 @@ class Simulation:
 
     @cached_property
     def link_moves(self) -> list[tuple[int, FloatArray]]:
-        """By how much joints' frames are moved: the place in q, and the pose (4, 4) in the frame of the drawing."""
+        """Corrections of joint frames: the index in q, and the pose (4, 4) in the nominal frame."""
         return [(self.place(effect).joint, transforms(effect.values[None])[0]) for effect in self._of("link_geometry")]
 
     @cached_property
     def upward(self) -> list[bool]:
-        """Which joints are walked from child to parent on the way from camera to marker (d,)."""
+        """True for joints passed from child to parent on the path from camera to marker (d,)."""
         way = self.robot.tree.path(self.robot.camera.parent_link, self.robot.robot.marker_link)
         return [upward for joint, upward in way if joint.name in self.robot.joints]
 
     def tool_shift(self, motion: Motion) -> FloatArray:
-        """How far the marker is from its place (n, 3) [m], in its link."""
+        """Return the displacement of the marker from its nominal position (n, 3) [m], in its link."""
         shift = np.zeros((len(motion), 3))
         for effect in self._of("tool_offset"):
             shift += effect.values
@@ -284,21 +285,21 @@ class Simulation:
 
     @property
     def camera_pose(self) -> FloatArray:
-        """Where the camera was set up (4, 4), in the frame that the description gives it."""
+        """Initial camera pose (4, 4), in the frame that the description gives it."""
         T = np.eye(4)
         for effect in self._of("camera_pose"):
             T = T @ transforms(effect.values[None])[0]
         return T
 
     def camera_moves(self, motion: Motion) -> FloatArray:
-        """Where the camera is (n, 4, 4) in its frame where it was set up."""
+        """Return the camera's pose (n, 4, 4) in its initial frame."""
         T = np.tile(np.eye(4), (len(motion), 1, 1))
         for effect in self._of("camera_moved"):
             T[after(motion, effect)] @= transforms(effect.values[None, :6])[0]
         return T
 
     def added(self, motion: Motion) -> FloatArray:
-        """What is added to what the cameras report (n, 3) [m]: drift and residual."""
+        """Return the shift added to the camera's report (n, 3) [m]: drift and residual."""
         shift = np.zeros((len(motion), 3)) if self.residual is None else self.residual.predict(motion.q)
         for effect in self._of("thermal_drift"):
             shift = shift + settled(motion, effect.values[3])[:, None] * effect.values[:3]

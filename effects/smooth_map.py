@@ -1,7 +1,7 @@
-"""Smooth functions of the readings as KB-Maps, some of whose joints count more than once.
+"""Store smooth functions of the readings as KB-Maps, in which a joint may appear several times.
 
-A KB-Map has {1, cos θ, sin θ} of each joint. With columns θ, 2θ, 4θ and 8θ, as of four joints, it has all harmonics up
-to the fifteenth; and what is a sum of products of harmonics, as what moves a rigid chain is, it has exactly.
+A KB-Map has {1, cos θ, sin θ} of each joint. With columns θ, 2θ, 4θ and 8θ, as if of four joints, it has all harmonics
+up to the fifteenth. Sums of products of harmonics, such as the displacements of a rigid chain, are then exact.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from kbmaps import JointBasis, KBMap
 from .unexplained import PLACE, Unexplained
 
 Shift = Callable[[FloatArray], FloatArray]
-# Harmonics above this are left out; a net has so many control points at most.
+# Maximum of harmonics, and of control points of a net.
 _MOST_HARMONICS, _LARGEST_NET = 15, 3**12
-# Points along an axis and lines on which the harmonics of a function are looked for; rows at once.
+# Points along an axis and lines on which harmonics are sought; rows per batch.
 _POINTS, _LINES, _ROWS = 64, 12, 4096
-# How many points a grid may have.
+# Maximum of grid points.
 _LARGEST_GRID = 400_000
 
 
 @dataclass(frozen=True)
 class _Axis:
-    """One joint's functions: harmonics of a turn; of a slide, of twice its stroke, and each of them times the path.
+    """Functions of one joint: harmonics of a turn; for a prismatic joint, of twice its stroke, also times the path.
 
     Attributes:
-        low, high: of a slide, where the function is wanted [m].
-        harmonics: how many; none of a joint that turns says that it does not matter.
+        low, high: range of a prismatic joint for the function [m].
+        harmonics: number of harmonics; 0 for a revolute joint means no dependence on it.
     """
 
     slides: bool
@@ -43,11 +43,11 @@ class _Axis:
 
     @property
     def scale(self) -> float:
-        """From readings to angles."""
+        """Factor from readings to angles."""
         return np.pi / (self.high - self.low) if self.slides else 1.0
 
     def spread(self, count: int) -> FloatArray:
-        """So many readings that tell the functions apart."""
+        """Return `count` readings spread to separate the functions."""
         if self.slides:
             return 0.5 * (
                 self.low + self.high - (self.high - self.low) * np.cos(np.pi * np.arange(count) / (count - 1))
@@ -56,11 +56,11 @@ class _Axis:
 
     @property
     def grid(self) -> FloatArray:
-        """As few readings as tell all functions."""
+        """Smallest set of readings that determines all functions."""
         return self.spread(4 * self.harmonics + 4 if self.slides else 2 * self.harmonics + 1)
 
     def functions(self, q: FloatArray) -> FloatArray:
-        """(n, functions) at readings q (n,): by harmonics, the lowest first."""
+        """Return the functions (n, functions) at readings q (n,), ordered by harmonic, the lowest first."""
         angles = self.scale * q[:, None] * np.arange(1, self.harmonics + 1)
         both = np.stack([np.cos(angles), np.sin(angles)], axis=2).reshape(len(q), -1)
         waves = np.concatenate([np.ones((len(q), 1)), both], axis=1)
@@ -71,24 +71,24 @@ class _Axis:
 
     @property
     def last(self) -> int:
-        """How many functions the highest harmonic has."""
+        """Number of functions of the highest harmonic."""
         return 4 if self.slides else 2
 
     @property
     def factors(self) -> list[float]:
-        """By which the readings are multiplied for the columns of a map."""
+        """Factors on the readings for the columns of a map."""
         waves = [self.scale * 2.0**k for k in range(int(self.harmonics).bit_length())]
         return [1.0, *waves] if self.slides else waves
 
     @property
     def bases(self) -> list[JointBasis]:
-        """Of these columns."""
+        """Bases of these columns."""
         waves = [JointBasis.trigonometric()] * int(self.harmonics).bit_length()
         return [JointBasis.prismatic(self.low, self.high), *waves] if self.slides else waves
 
     @property
     def in_columns(self) -> FloatArray:
-        """(functions, m, ..., m): what the functions are in the bases of the columns."""
+        """Functions in terms of the column bases (functions, m, ..., m)."""
         q = self.spread(4 * _POINTS)
         columns = [basis.weights(factor * q) for basis, factor in zip(self.bases, self.factors, strict=True)]
         products = reduce(
@@ -99,18 +99,18 @@ class _Axis:
 
 
 def smooth_map(robot: RobotDescription, shift: Shift, q: FloatArray, tolerance_m: float) -> Unexplained:
-    """A smooth function of the readings as a model that can be stored.
+    """Fit a storable model to a smooth function of the readings.
 
     Args:
-        shift: positions' shifts (n, 3) [m] at readings (n, d); of joints that turn, for any angle.
+        shift: function of readings (n, d) that returns shifts (n, 3) [m]; for revolute joints, at any angle.
         q: readings (n, d) where the function is wanted.
-        tolerance_m: parts smaller than this (RMS) are left out, and with them the joints that do not matter.
+        tolerance_m: parts smaller than this (RMS) are left out, and with them joints without influence.
     """
     return _learnt(robot, robot.joints, robot.chain.prismatic.tolist(), shift, q, tolerance_m)
 
 
 def place_map(robot: RobotDescription, shift: Shift, x: FloatArray, tolerance_m: float) -> Unexplained:
-    """The same of a function of where the robot as described has its marker, wanted at x (n, 3) [m]."""
+    """Fit a storable model to a function of the described robot's marker position, wanted at x (n, 3) [m]."""
     return _learnt(robot, PLACE, [True] * len(PLACE), shift, x, tolerance_m)
 
 
@@ -133,7 +133,7 @@ def _learnt(
 
 
 def _axis(slides: bool, shift: Shift, q: FloatArray, joint: int, tolerance_m: float) -> _Axis:
-    """How many harmonics of one joint there are, on some lines through readings."""
+    """Find the number of harmonics of one joint, on some lines through readings."""
     low, high = float(q[:, joint].min()), float(q[:, joint].max())
     if slides and high - low < 1e-6:
         low, high = low - 0.5, low + 0.5
@@ -153,7 +153,7 @@ def _axis(slides: bool, shift: Shift, q: FloatArray, joint: int, tolerance_m: fl
 
 
 def _amounts(axes: Sequence[_Axis], shift: Shift) -> FloatArray:
-    """Of all products of the axes' functions (functions, ..., functions, 3)."""
+    """Return amounts of all products of the axes' functions (functions, ..., functions, 3)."""
     grids = [axis.grid for axis in axes]
     q = np.stack(np.meshgrid(*grids, indexing="ij"), axis=-1).reshape(-1, len(axes))
     values = np.concatenate([shift(q[first : first + _ROWS]) for first in range(0, len(q), _ROWS)])
@@ -165,14 +165,14 @@ def _amounts(axes: Sequence[_Axis], shift: Shift) -> FloatArray:
 
 
 def _pruned(axes: list[_Axis], amounts: FloatArray, tolerance_m: float) -> tuple[list[_Axis], FloatArray]:
-    """Without the highest harmonics that do not matter; and, where the net would be too large, that matter least."""
+    """Remove the highest harmonics without influence; if the net is still too large, also the least important ones."""
     squared = 0.0
     while True:
         parts = {}
         for k, axis in enumerate(axes):
             if axis.harmonics:
                 part = np.take(amounts, range(amounts.shape[k] - axis.last, amounts.shape[k]), axis=k)
-                # Of a wave the mean square is half of its amplitude's.
+                # The mean square of a wave is half of its squared amplitude.
                 parts[k] = 0.5 * float(np.square(part).sum())
         if not parts:
             return axes, amounts
@@ -188,7 +188,7 @@ def _pruned(axes: list[_Axis], amounts: FloatArray, tolerance_m: float) -> tuple
 def _stored(robot: RobotDescription, names: Sequence[str], axes: Sequence[_Axis], amounts: FloatArray) -> Unexplained:
     net = np.moveaxis(amounts, -1, 0)
     for axis in axes:
-        # The first axis of functions is always the next: what it becomes goes to the end.
+        # Each round converts the first axis and moves it to the end.
         net = np.tensordot(net, axis.in_columns, axes=(1, 0))
     joints = [joint for joint, axis in zip(names, axes, strict=True) for _ in axis.bases]
     factors = [factor for axis in axes for factor in axis.factors]

@@ -1,4 +1,4 @@
-"""What no effect explains, as a learnt map from some joints' readings to a shift of what is measured."""
+"""Hold a learnt map from joint readings to a shift of the measurements, for errors that no effect explains."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from bodyschema.interfaces.robot import RobotDescription
 from bodyschema.interfaces.suggest import did_you_mean
 from kbmaps import KBMap, KBMapsError, KernelLearner, ModelFormatError, ResidualModel, TensorTrain
 
-# The marker's coordinates, in the place of a joint.
+# Coordinates of the marker, in place of a joint.
 PLACE = ("marker.x", "marker.y", "marker.z")
 
 
 class StoredModel(Protocol):
-    """A map of kbmaps that predicts and can be stored."""
+    """A KB-Map that predicts and can be stored."""
 
     @property
     def joints(self) -> int:
@@ -28,11 +28,11 @@ class StoredModel(Protocol):
         ...
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Outputs (n, 3) at q (n, d)."""
+        """Return outputs (n, 3) at q (n, d)."""
         ...
 
     def to_bytes(self) -> bytes:
-        """The map as one self-describing byte string."""
+        """Return the map as one self-describing byte string."""
         ...
 
 
@@ -46,14 +46,14 @@ _READERS: tuple[Callable[[bytes], StoredModel], ...] = (
 
 @dataclass(frozen=True, eq=False)
 class Unexplained:
-    """A model of what no effect explains.
+    """A model of the errors that no effect explains.
 
     Attributes:
-        model: any map of kbmaps; its outputs are shifts of what is measured [m], in the measurement frame.
-        joints: the joints whose readings it takes, in its order; among them may be `PLACE`, the coordinates [m]
-            at which the robot as described has its marker at the readings.
-        factors: what it takes each of these numbers times.
-        robot: whose joints they are.
+        model: any KB-Map; its outputs are shifts of the measurements [m], in the measurement frame.
+        joints: joints whose readings are its inputs, in order; among them may be `PLACE`, the marker's coordinates [m]
+            by the described robot at the readings.
+        factors: factor on each of these inputs.
+        robot: the robot of these joints.
     """
 
     model: StoredModel
@@ -69,14 +69,14 @@ class Unexplained:
         joints: tuple[str, ...],
         factors: tuple[float, ...] | None = None,
     ) -> Unexplained:
-        """The model over these joints of a robot.
+        """Create the model over these joints of a robot.
 
         Args:
-            factors: what it takes each reading times, one for each joint; 1 where it is not given. So a joint can be
-                there more than once, and a map have its double angle, too.
+            factors: factor on each reading, one per joint; 1 by default. So a joint can appear twice, for instance with
+                its double angle.
 
         Raises:
-            RobotError: a joint is unknown, or named twice with the same factor, or the model is not one of so many
+            RobotError: a joint is unknown, or named twice with the same factor, or the model has another number of
                 joints, or has learnt nothing.
         """
         for joint in joints:
@@ -101,11 +101,11 @@ class Unexplained:
 
     @property
     def is_of_place(self) -> bool:
-        """Whether it takes a coordinate of the marker."""
+        """True if it takes a coordinate of the marker."""
         return bool(set(self.joints) & set(PLACE))
 
     def predict(self, q: FloatArray) -> FloatArray:
-        """Shifts (n, 3) [m] at the readings q (n, d) [rad, m] of all joints."""
+        """Return shifts (n, 3) [m] at the readings q (n, d) [rad, m] of all joints."""
         values = q
         if self.is_of_place:
             values = np.concatenate([q, self.robot.chain.positions(q)], axis=1)
@@ -114,10 +114,10 @@ class Unexplained:
 
 
 def stored_model(data: bytes) -> StoredModel:
-    """The map in `data`, of whatever kind.
+    """Read the map in `data`, of any kind.
 
     Raises:
-        ModelFormatError: it is none that predicts by itself, or damaged.
+        ModelFormatError: the data is damaged, or not a map that predicts by itself.
     """
     for reader in _READERS:
         try:

@@ -1,4 +1,4 @@
-"""report.html: a diagnosis to look at, in one file that needs no network."""
+"""Write report.html: a diagnosis in one file that needs no network."""
 
 from .page import About, page
 

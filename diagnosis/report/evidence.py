@@ -1,4 +1,4 @@
-"""Each cause's own plots: what the errors say of it when all other causes are right, and what was fitted."""
+"""Plot the evidence for each cause: residuals with all other causes removed, and the fitted effect."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from .residuals import POINTS, Residuals, binned
 
 _CUT = 0.01
 _FINE = 500
-# A ripple of more cycles than this is drawn over its phase.
+# A ripple with more cycles is plotted over its phase.
 _MANY_CYCLES = 4.0
 
 
 def evidence_panels(residuals: Residuals, effect: Effect) -> list[Panel]:
-    """The plots of one cause."""
+    """Return the plots of one cause."""
     return [_BY_EFFECT.get(effect.name, _measured_against_predicted)(residuals, effect)]
 
 
 def outlier_panel(residuals: Residuals) -> Panel:
-    """Fixes that are not the marker, beside those that are, over time."""
+    """Plot outliers beside the other fixes, over time."""
     length = 1e3 * np.linalg.norm(residuals.after, axis=1)
     away = np.flatnonzero(~residuals.diagnosis.markers)
     plot = Plot(residuals.clock_label, "error [mm]", span(residuals.clock), (0.0, 1.05 * float(length.max())))
@@ -38,7 +38,7 @@ def outlier_panel(residuals: Residuals) -> Panel:
 
 
 def _partial(residuals: Residuals, effect: Effect) -> tuple[FloatArray, FloatArray]:
-    """What is left (n, 3) [m] when all other causes are taken away, and what the effect makes of it."""
+    """Return the residuals (n, 3) [m] with all other causes removed, and the effect's share of them."""
     own = residuals.contribution(effect)
     return residuals.after + own, own
 
@@ -51,7 +51,7 @@ def _drawn(
     title: str,
     axes: tuple[str, str],
 ) -> Panel:
-    """Single pairs, their means, and the fitted curve."""
+    """Plot single samples, their means, and the fitted curve."""
     x, y = points
     some = residuals.some(POINTS, rows)
     bins = binned(x[rows], y[rows])
@@ -66,7 +66,7 @@ def _drawn(
 
 
 def _of_encoder(residuals: Residuals, effect: Effect) -> Panel:
-    """A correction that is a function of one joint's reading."""
+    """Plot a correction that is a function of one joint's reading."""
     place = residuals.run.simulation.place(effect)
     k = place.joint
     over = k if place.source is None else place.source
@@ -90,14 +90,14 @@ def _of_encoder(residuals: Residuals, effect: Effect) -> Panel:
 
 
 def _cycles(effect: Effect) -> float | None:
-    """How often a ripple comes for each radian or metre."""
+    """Return the cycles of a ripple per radian or metre; None for other effects."""
     if effect.name != "joint_ripple":
         return None
     return float(effect.values[2]) / (1.0 if effect.prismatic else 2.0 * np.pi)
 
 
 def _over(residuals: Residuals, effect: Effect, x: FloatArray, label: str, correction: FloatArray) -> Panel:
-    """A joint's error over something that is no reading, with the fitted correction (n,) [rad, m]."""
+    """Plot a joint's error over a quantity that is not a reading, with the fitted correction (n,) [rad, m]."""
     k = residuals.run.simulation.place(effect).joint
     factor, unit = residuals.unit(k)
     partial, _ = _partial(residuals, effect)
@@ -110,7 +110,7 @@ def _over(residuals: Residuals, effect: Effect, x: FloatArray, label: str, corre
 
 
 def _remembered(residuals: Residuals, effect: Effect) -> FloatArray:
-    """The correction (n,) of an effect that depends on the order of the readings."""
+    """Return the correction (n,) of an effect that depends on the order of the readings."""
     assert effect.kind.encoder is not None
     place = residuals.run.simulation.place(effect)
     return effect.kind.encoder.correction(residuals.run.readings, place, effect.values)
@@ -129,7 +129,7 @@ def _settling(residuals: Residuals, effect: Effect) -> Panel:
 
 
 def _hysteresis(residuals: Residuals, effect: Effect) -> Panel:
-    """Over how far friction is strained."""
+    """Plot over the strain of the friction."""
     correction = _remembered(residuals, effect)
     strained = -correction / max(float(effect.values[0]), 1e-12)
     return _over(residuals, effect, strained, f"direction of the last moves of {effect.where}", correction)
@@ -151,7 +151,7 @@ def _gravity_backlash(residuals: Residuals, effect: Effect) -> Panel:
 
 
 def _backlash(residuals: Residuals, effect: Effect) -> Panel:
-    """Both directions of motion apart."""
+    """Plot both directions of motion separately."""
     k = residuals.run.simulation.place(effect).joint
     partial, _ = _partial(residuals, effect)
     rows, x, y = residuals.telling(k), residuals.angles(k), residuals.as_angle(k, partial)
@@ -179,7 +179,7 @@ def _backlash(residuals: Residuals, effect: Effect) -> Panel:
 
 
 def _since(residuals: Residuals, effect: Effect) -> Panel:
-    """Along the way that a jump takes each pair, over time."""
+    """Plot the displacement along a jump, over time."""
     begins = float(residuals.clock[0]) - 1.0
     always = residuals.instead(effect, np.append(effect.values[:-1], begins))
     partial, _ = _partial(residuals, effect)
@@ -214,7 +214,7 @@ def _latency(residuals: Residuals, effect: Effect) -> Panel:
 
 
 def _by_distance(residuals: Residuals, effect: Effect) -> Panel:
-    """Along the line of sight, over the distance."""
+    """Plot along the line of sight, over the distance."""
     partial, own = _partial(residuals, effect)
     x = residuals.diagnosis.extended.observations.x
     distance = np.linalg.norm(x, axis=1)
@@ -227,7 +227,7 @@ def _by_distance(residuals: Residuals, effect: Effect) -> Panel:
 
 
 def _by_radius(residuals: Residuals, effect: Effect) -> Panel:
-    """Radially in the image, over the distance from its middle."""
+    """Plot radially in the image, over the distance from its centre."""
     assert residuals.calibration is not None
     partial, own = _partial(residuals, effect)
     x = residuals.diagnosis.extended.observations.x
@@ -245,7 +245,7 @@ def _by_radius(residuals: Residuals, effect: Effect) -> Panel:
 
 
 def _measured_against_predicted(residuals: Residuals, effect: Effect) -> Panel:
-    """Coordinates of the displacements that were measured, over those that the effect predicts."""
+    """Plot coordinates of the measured displacements over those that the effect predicts."""
     partial, own = _partial(residuals, effect)
     x, y = 1e3 * own.ravel(), 1e3 * partial.ravel()
     rows = (3 * residuals.rows[:, None] + np.arange(3)).ravel()

@@ -1,4 +1,4 @@
-"""One self-contained page: verdict, figures, causes with their evidence, what was looked for, what was done."""
+"""Write the report as one self-contained page: verdict, figures, causes with evidence, hypotheses, and method."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ _VERDICTS: dict[Verdict, tuple[str, str]] = {
         "nothing on the robot because of them alone.",
     ),
 }
-# So many rows that are not the marker are named.
+# Maximum of outlier rows listed by number.
 _NAMED_ROWS = 40
-# So many causes are opened out with their plots; more are one under the other in a list to open.
+# Number of causes shown with their plots; further ones are in a collapsed list.
 _OPEN = 4
 
 
 @dataclass(frozen=True)
 class About:
-    """What a report is of: names of the recording and the robot, and the version that made it."""
+    """Names of the recording and the robot, and the version that made the report."""
 
     recording: str
     robot: str
@@ -53,7 +53,7 @@ class About:
 
 
 def page(diagnosis: Diagnosis, file: DiagnosisFile, remedies: Sequence[str], about: About) -> str:
-    """The page.
+    """Return the page as HTML.
 
     Args:
         remedies: what to do about each cause, in the order of `remedies()`.
@@ -127,7 +127,7 @@ def _glance(residuals: Residuals, file: DiagnosisFile) -> str:
 def _causes(residuals: Residuals, file: DiagnosisFile, remedies: Sequence[str]) -> str:
     if not file.causes:
         return ""
-    # Outliers come last and are no effect.
+    # Outliers come last and have no effect.
     fitted = zip_longest(file.causes, residuals.diagnosis.causes)
     ordered = sorted(fitted, key=lambda pair: -pair[0].share_of_gain_percent)
     articles = [

@@ -1,4 +1,4 @@
-"""Errors before and after against all that they may depend on, the telling ones first."""
+"""Plot errors before and after against everything they may depend on, the most informative first."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from bodyschema.interfaces.records import FloatArray
 from .plot import ASPECT, Plot, round_up, span
 from .residuals import POINTS, Residuals, binned, structure
 
-# Of the variance of the errors, so much has to go with something to be shown at first sight.
+# Share of the error variance that a plot must explain to be shown at first.
 _TELLING = 0.02
-# Of single errors, so many at each end do not set the range of a plot.
+# Share of single errors at each end that does not set the range of a plot.
 _CUT = 0.01
 _CELLS = (10, 6)
 _FEWEST_IN_A_CELL = 3
-# So much of a cell the longest mean arrow is long.
+# Length of the longest mean arrow, as a share of a cell.
 _OF_A_CELL = 1.0
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One plot.
+    """A plot with its title.
 
     Attributes:
-        title: what it shows.
+        title: description of the plot.
         svg: the plot.
-        tells: which share of the variance before goes with what it is plotted against.
+        tells: share of the variance before that depends on the plotted quantity.
     """
 
     title: str
@@ -40,16 +40,16 @@ class Panel:
 
     @property
     def is_telling(self) -> bool:
-        """Whether there is anything to see."""
+        """True if the plot shows a clear dependence."""
         return self.tells >= _TELLING
 
     def html(self) -> str:
-        """The plot with its title."""
+        """Return the plot with its title."""
         return f"<figure><figcaption>{escape(self.title)}</figcaption>{self.svg}</figure>"
 
 
 def panels(residuals: Residuals) -> list[Panel]:
-    """All of them, the most telling first; those by time are last, as they tell of moments."""
+    """Return all panels, the most informative first; those over time come last, as they show moments."""
     found = [*_by_joint(residuals), *_by_torque(residuals), *_by_image(residuals)]
     direction = _by_direction(residuals)
     return [*sorted([*found, direction], key=lambda panel: -panel.tells), *_by_time(residuals)]
@@ -58,7 +58,7 @@ def panels(residuals: Residuals) -> list[Panel]:
 def _compared(
     residuals: Residuals, x: FloatArray, before: FloatArray, after: FloatArray, title: str, axes: tuple[str, str]
 ) -> Panel:
-    """Before and after: single errors pale, their means with 95 % intervals."""
+    """Plot single errors, pale, with their means and 95 % intervals, before and after."""
     rows = residuals.rows
     some = residuals.some(POINTS)
     means = [(binned(x[rows], y[rows]), look) for y, look in ((before, "before"), (after, "after"))]
@@ -91,7 +91,7 @@ def _by_torque(residuals: Residuals) -> Iterator[Panel]:
 
 
 def _by_direction(residuals: Residuals) -> Panel:
-    """For each joint, how far the means of both directions of motion lie apart."""
+    """Plot for each joint the distance between the means of both directions of motion."""
     joints, rows = residuals.robot.joints, residuals.rows
     apart: dict[str, list[tuple[float, float, float]]] = {"before": [], "after": []}
     tells = 0.0
@@ -147,7 +147,7 @@ def _with_moments(residuals: Residuals, svg: str) -> str:
 
 
 def _by_image(residuals: Residuals) -> Iterator[Panel]:
-    """Mean errors in the cells of the part of the image where the marker was."""
+    """Plot mean errors in cells over the image area that the marker covered."""
     if residuals.calibration is None:
         return
     x = residuals.diagnosis.extended.observations.x[residuals.rows]
@@ -169,14 +169,14 @@ def _by_image(residuals: Residuals) -> Iterator[Panel]:
 
 
 def _framed(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Corners (2,) [px] of an area around points, in which both axes have the same scale."""
+    """Return corners (2,) [px] of an area around points, with the same scale on both axes."""
     middle, size = 0.5 * (low + high), 1.08 * (high - low)
     size = np.maximum(size, [ASPECT * size[1], size[0] / ASPECT])
     return middle - 0.5 * size, middle + 0.5 * size
 
 
 def _cell_means(cells: NDArray[np.intp], at: FloatArray, error: FloatArray) -> FloatArray:
-    """Middles of the cells and mean errors in them (c, 4) [px]."""
+    """Return centres of the cells and mean errors in them (c, 4) [px]."""
     inside = [cells == k for k in np.unique(cells)]
     arrows = [
         np.concatenate([at[rows].mean(axis=0), error[rows].mean(axis=0)])

@@ -1,4 +1,4 @@
-"""Plots as inline SVG that follow the page's light or dark colours."""
+"""Draw plots as inline SVG that follow the page's light or dark colours."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class Plot:
     Attributes:
         x_label, y_label: with units.
         x, y: their ranges; from high to low where the axis runs the other way.
-        names: of whole numbers on the x axis, in the place of figures.
-        log_y: the y axis is logarithmic; its range is positive.
+        names: labels for whole numbers on the x axis, instead of figures.
+        log_y: True for a logarithmic y axis; its range is positive.
     """
 
     x_label: str
@@ -38,7 +38,7 @@ class Plot:
     log_y: bool = False
 
     def svg(self, *marks: str) -> str:
-        """The plot with marks, the first at the back."""
+        """Return the plot with marks, the first at the back."""
         label = escape(f"{self.y_label} against {self.x_label}", quote=True)
         box = (_LEFT, _TOP, WIDTH - _LEFT - _RIGHT, HEIGHT - _TOP - _BOTTOM)
         place = " ".join(f'{name}="{value}"' for name, value in zip(("x", "y", "width", "height"), box, strict=True))
@@ -46,17 +46,17 @@ class Plot:
         return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{label}">{self._grid()}{inside}</svg>'
 
     def dots(self, x: FloatArray, y: FloatArray, look: str) -> str:
-        """Points that are inside; one path, so that hundreds are small."""
+        """Draw the points inside the axes, as one path to keep the file small."""
         return f'<path class="dots {look}" d="{self._points(x, y)}"/>'
 
     def line(self, x: FloatArray, y: FloatArray, look: str) -> str:
-        """A curve through points in their order."""
+        """Draw a curve through points in their order."""
         left, top = self._at(x, y)
         points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(left, top, strict=True))
         return f'<polyline class="line {look}" points="{points}"/>'
 
     def bars(self, x: FloatArray, y: FloatArray, half: FloatArray, look: str) -> str:
-        """Means with their 95 % intervals."""
+        """Draw means with their 95 % intervals."""
         left, top = self._at(x, y)
         _, upper = self._at(x, y + half)
         _, lower = self._at(x, y - half)
@@ -67,14 +67,14 @@ class Plot:
         return f'<path class="bars {look}" d="{path}"/><path class="means {look}" d="{middle}"/>'
 
     def area(self, x: FloatArray, y: FloatArray, look: str) -> str:
-        """Down to the x axis."""
+        """Fill the area down to the x axis."""
         left, top = self._at(x, y)
         points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(left, top, strict=True))
         bottom = HEIGHT - _BOTTOM
         return f'<polygon class="area {look}" points="{left[0]:.1f},{bottom} {points} {left[-1]:.1f},{bottom}"/>'
 
     def arrows(self, x: FloatArray, y: FloatArray, dx: FloatArray, dy: FloatArray, look: str) -> str:
-        """Arrows from their feet."""
+        """Draw arrows from their feet."""
         left, top = self._at(x, y)
         right, end = self._at(x + dx, y + dy)
         path = "".join(
@@ -83,7 +83,7 @@ class Plot:
         return f'<path class="arrows {look}" d="{path}"/><path class="feet {look}" d="{self._points(x, y)}"/>'
 
     def moment(self, x: float, text: str) -> str:
-        """An upright line with a name."""
+        """Draw a labelled vertical line."""
         left, _ = self._at(np.array([x]), np.array([self.y[0]]))
         side = "end" if x > 0.5 * sum(self.x) else "start"
         shift = -4 if side == "end" else 4
@@ -132,7 +132,7 @@ class Plot:
 
 
 def ticks(low: float, high: float) -> list[float]:
-    """Round figures in a range."""
+    """Return round figures in a range."""
     step = round_up((high - low) / _TICKS)
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
     return [k * step for k in range(first, last + 1)]
@@ -150,17 +150,17 @@ def log_ticks(low: float, high: float) -> list[float]:
 
 
 def round_up(value: float) -> float:
-    """The next figure of 1, 2, 2.5, 5 times a power of ten."""
+    """Return the next figure of 1, 2, 2.5, 5 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(max(value, 1e-12)))
     return next(factor * power for factor in _STEPS if factor * power >= value * (1.0 - 1e-9))
 
 
 def span(*values: FloatArray, cut: float = 0.0, around_zero: bool = False) -> tuple[float, float]:
-    """A range for values, with a margin.
+    """Return a range for values, with a margin.
 
     Args:
         cut: share of the values to leave out at each end.
-        around_zero: as far up as down.
+        around_zero: True for a range symmetric about zero.
     """
     together = np.concatenate([np.ravel(v) for v in values])
     low, high = (float(v) for v in np.quantile(together, [cut, 1.0 - cut]))

@@ -1,4 +1,4 @@
-"""What a report plots: errors before and after, and what they are plotted against."""
+"""Compute the quantities that a report plots: errors before and after, and their possible dependences."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from bodyschema.effects import Effect, Simulation
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
 
-# So many points are drawn in a plot, and arrows in a projection.
+# Maximum of points in a plot, and of arrows in a projection.
 POINTS, ARROWS = 450, 220
-# A joint that hardly moves the marker in some pose, beside how it does in others, says nothing there.
+# A joint's rows count if it moves the marker by this share of its median effect.
 _TELLS = 0.5
 _BINS, _FEWEST_IN_A_BIN = 16, 8
-# Structure that chance brings about more often than this is none.
+# Structure with a larger p-value counts as chance.
 _SIGNIFICANT = 1e-3
 
 
 @dataclass(frozen=True)
 class Bins:
-    """Means of equally many rows each: x (b,), y (b,), and half the 95 % interval of y (b,)."""
+    """Means of bins with equal numbers of rows: x (b,), y (b,), and half the 95 % interval of y (b,)."""
 
     x: FloatArray
     y: FloatArray
@@ -33,7 +33,7 @@ class Bins:
 
 
 class Residuals:
-    """Errors (n, 3) [m] on rows that were not fitted, before and after, and the rows (n,) that are the marker."""
+    """Held-out errors (n, 3) [m] before and after, and the rows (n,) that are the marker."""
 
     def __init__(self, diagnosis: Diagnosis) -> None:
         self.diagnosis = diagnosis
@@ -44,16 +44,16 @@ class Residuals:
 
     @cached_property
     def before(self) -> FloatArray:
-        """Of the aligned simulation."""
+        """Errors of the aligned simulation."""
         return self.diagnosis.errors["aligned"]
 
     @cached_property
     def after(self) -> FloatArray:
-        """Of the extended simulation."""
+        """Errors of the extended simulation."""
         return self.diagnosis.errors["extended"]
 
     def some(self, count: int, rows: NDArray[np.intp] | None = None) -> NDArray[np.intp]:
-        """At most so many of the rows, in their order, drawn with the diagnosis' seed."""
+        """Return at most `count` of the rows, in order, sampled with the diagnosis' seed."""
         rows = self.rows if rows is None else rows
         if len(rows) <= count:
             return rows
@@ -61,64 +61,64 @@ class Residuals:
 
     @property
     def calibration(self) -> StereoCalibration | None:
-        """The stereo pair."""
+        """Calibration of the stereo pair."""
         return self.robot.calibration
 
     @property
     def timed(self) -> bool:
-        """Whether there are times."""
+        """True if the recording has times."""
         return self.motion.t is not None
 
     @cached_property
     def clock(self) -> FloatArray:
-        """Times [s] or numbers of rows (n,)."""
+        """Times [s] or row numbers (n,)."""
         return self.motion.clock
 
     @property
     def clock_label(self) -> str:
-        """What an axis of the clock is called."""
+        """Axis label of the clock."""
         return "time [s]" if self.timed else "row"
 
     def slides(self, joint: int) -> bool:
-        """Whether a joint is prismatic."""
+        """Return True if a joint is prismatic."""
         return bool(self.robot.chain.prismatic[joint])
 
     def angles(self, joint: int) -> FloatArray:
-        """What a joint reads (n,) [°, mm]."""
+        """Return a joint's readings (n,) [°, mm]."""
         return self.motion.q[:, joint] * self.unit(joint)[0]
 
     def unit(self, joint: int) -> tuple[float, str]:
-        """Factor and name of what a joint is shown in."""
+        """Return factor and name of a joint's display unit."""
         return (1e3, "mm") if self.slides(joint) else (np.degrees(1.0), "°")
 
     def amount(self, way: FloatArray, errors: FloatArray) -> FloatArray:
-        """How many times `way` (n, 3) errors (n, 3) [m] most probably go (n,), given the shape of the noise."""
+        """Return the most probable multiple of `way` (n, 3) in errors (n, 3) [m], given the shape of the noise (n,)."""
         expected, seen = (np.einsum("nij,nj->ni", self.whitening, vectors) for vectors in (way, errors))
         return np.einsum("ni,ni->n", expected, seen) / np.maximum(np.square(expected).sum(axis=1), 1e-300)
 
     @property
     def whitening(self) -> FloatArray:
-        """(n, 3, 3): makes the noise round."""
+        """Whitening (n, 3, 3) that makes the noise isotropic."""
         return self.diagnosis.extended.observations.whitening
 
     def along(self, joint: int, errors: FloatArray) -> FloatArray:
-        """Errors (n,) [mm] along the way on which a joint moves the marker."""
+        """Return errors (n,) [mm] along the direction in which a joint moves the marker."""
         way = self.run.by_joint[:, :, joint]
         return 1e3 * self.amount(way, errors) * np.linalg.norm(way, axis=1)
 
     def as_angle(self, joint: int, errors: FloatArray) -> FloatArray:
-        """By how much a joint would have to be elsewhere (n,) [°, mm] for errors (n, 3)."""
+        """Return the joint error (n,) [°, mm] that best explains errors (n, 3)."""
         return self.unit(joint)[0] * self.amount(self.run.by_joint[:, :, joint], errors)
 
     def telling(self, joint: int) -> NDArray[np.intp]:
-        """The rows in which a joint moves the marker well."""
+        """Return the rows in which a joint moves the marker well."""
         way = np.einsum("nij,nj->ni", self.whitening, self.run.by_joint[:, :, joint])
         arm = np.linalg.norm(way, axis=1)[self.rows]
         return self.rows[arm >= _TELLS * np.median(arm)]
 
     @cached_property
     def direction(self) -> NDArray[np.intp]:
-        """Which way each joint went last (n, d): 1, -1, or 0 where it has not moved in its run."""
+        """Last direction of each joint (n, d): 1, -1, or 0 where it has not moved in its run."""
         signs = np.sign(self.motion.moves).astype(np.intp)
         for first, end in self.motion.runs:
             for k in range(first + 1, end):
@@ -126,11 +126,11 @@ class Residuals:
         return signs
 
     def contribution(self, effect: Effect) -> FloatArray:
-        """What an effect changes of what is measured (n, 3) [m]."""
+        """Return the change of the measurements by an effect (n, 3) [m]."""
         return self.run.measured - self._simulated([e for e in self.run.simulation.effects if e is not effect])
 
     def instead(self, effect: Effect, values: FloatArray) -> FloatArray:
-        """The same with other numbers of the effect."""
+        """Return the change of the measurements by an effect with other parameters (n, 3) [m]."""
         others = [e for e in self.run.simulation.effects if e is not effect]
         return self._simulated([*others, effect.with_values(values)]) - self._simulated(others)
 
@@ -139,13 +139,13 @@ class Residuals:
         return simulation.positions(self.motion)
 
     def pixels(self, x: FloatArray) -> FloatArray:
-        """Where the left camera sees points (n, 3), (n, 2) [px]; it has to be described."""
+        """Return positions in the left image (n, 2) [px] of points (n, 3); needs a calibration."""
         assert self.calibration is not None
         return self.calibration.project(x)[:, :2]
 
 
 def binned(x: FloatArray, y: FloatArray) -> Bins:
-    """Means of y where x is about the same."""
+    """Return means of y in bins of x."""
     member = _members(x)
     count = np.bincount(member).astype(np.float64)
     mean_x, mean_y = np.bincount(member, x) / count, np.bincount(member, y) / count
@@ -154,7 +154,7 @@ def binned(x: FloatArray, y: FloatArray) -> Bins:
 
 
 def structure(x: FloatArray, y: FloatArray) -> float:
-    """Which share of the variance of y goes with x, beyond chance; 0 where it may be chance (analysis of variance)."""
+    """Return the share of the variance of y that x explains, beyond chance; 0 if not significant (ANOVA)."""
     member = _members(x)
     n, groups = len(y), int(member.max()) + 1
     if groups < 2 or n <= groups:
@@ -170,7 +170,7 @@ def structure(x: FloatArray, y: FloatArray) -> float:
 
 
 def _members(x: FloatArray) -> NDArray[np.intp]:
-    """The bin of each row (n,): of equally many rows each; where x has few values, one for each."""
+    """Return the bin of each row (n,): equal numbers of rows per bin, or one bin per value where x has few."""
     values, member = np.unique(np.round(x, 9), return_inverse=True)
     if len(values) <= _BINS:
         return member

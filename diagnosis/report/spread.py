@@ -1,4 +1,4 @@
-"""How large the errors are before and after, and where they point."""
+"""Plot the size of the errors before and after, and their directions."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from .plot import Plot, round_up
 from .residuals import ARROWS, Residuals
 
 _MOST_COLUMNS, _FEWEST_COLUMNS, _PAIRS_A_COLUMN = 48, 12, 12
-# The range of the histogram ends where so many of the errors before do; noise is drawn this many times for each row.
+# Quantile of the errors at which the histogram ends, and noise samples per row.
 _SHOWN, _DRAWN = 0.99, 20
 _SIDE, _MARGIN = 300, 26
-# Of the largest span, so long is the arrow that this share of those before are shorter than.
+# Arrow length as a share of the largest span, for the given quantile of the errors before.
 _LONG, _SHORTER = 0.1, 0.9
 _VIEWS_OF_CAMERA = (("as the camera sees it", 0, 1, 1), ("from above the camera", 0, 2, -1), ("from its side", 2, 1, 1))
 _VIEWS = (("x and y", 0, 1, -1), ("x and z", 0, 2, -1), ("y and z", 1, 2, -1))
 
 
 def histogram(residuals: Residuals) -> Panel:
-    """Lengths of the errors before and after, beside those of noise alone."""
+    """Plot lengths of the errors before and after, beside those of noise alone."""
     before, after = (1e3 * np.linalg.norm(e[residuals.rows], axis=1) for e in (residuals.before, residuals.after))
     noise = 1e3 * _noise(residuals)
     end = float(np.quantile(np.concatenate([before, after]), _SHOWN)) or 1.0
@@ -42,7 +42,7 @@ def histogram(residuals: Residuals) -> Panel:
 
 
 def _noise(residuals: Residuals) -> FloatArray:
-    """Lengths of errors that are noise and nothing else."""
+    """Return lengths of errors due to noise alone."""
     fit = residuals.diagnosis.extended
     spread = np.linalg.inv(fit.observations.whitening[residuals.rows])
     rng = np.random.default_rng(residuals.diagnosis.seed)
@@ -51,7 +51,7 @@ def _noise(residuals: Residuals) -> FloatArray:
 
 
 def arrows(residuals: Residuals) -> tuple[list[Panel], float]:
-    """Three projections before, three after, to the same scale; and by how much the arrows are stretched."""
+    """Return three projections before and three after at the same scale, and the stretch of the arrows."""
     rows = residuals.some(ARROWS)
     at = residuals.diagnosis.extended.observations.x[rows]
     extent = float(np.ptp(at, axis=0).max()) or 1.0
@@ -69,7 +69,7 @@ def arrows(residuals: Residuals) -> tuple[list[Panel], float]:
 def _projection(
     at: FloatArray, errors: FloatArray, stretch: float, axes: tuple[int, int], sign: int, extent: float, look: str
 ) -> str:
-    """From where the simulation expects the marker to where it was measured, stretched."""
+    """Draw arrows from the predicted to the measured marker position, stretched."""
     flip = np.array([1.0, sign])
     middle = 0.5 * (at.min(axis=0) + at.max(axis=0))
     scale = (_SIDE - 2 * _MARGIN) / extent

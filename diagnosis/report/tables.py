@@ -1,4 +1,4 @@
-"""The tables of a report."""
+"""Write the tables of a report."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from html import escape
 from bodyschema.diagnosis.numbers import Number, chance, mm, numbers_of, percent, place, rival_named, share, telling
 from bodyschema.diagnosis.result import Cause, DiagnosisFile, Indistinguishable, Rejected
 
-# What says nothing new where it is the same as another.
+# Rows to omit where they equal another.
 _SAME_AS = {"aligned": "nominal", "extended": "aligned"}
-# So many of the rejected hypotheses are shown at first sight.
+# Number of rejected hypotheses shown at first.
 NEAREST = 12
 _ERRORS = (
     ("nominal", "The simulation as it is"),
@@ -22,7 +22,7 @@ _ERRORS = (
 
 
 def errors(diagnosis: DiagnosisFile) -> str:
-    """RMS and mean of each simulation."""
+    """Return a table of RMS and mean of each simulation."""
     rms, mean = diagnosis.rms_mm, diagnosis.mean_mm
     longest = max(value for name, _ in _ERRORS[1:] if (value := getattr(rms, name)) is not None) or 1.0
     rows = []
@@ -37,7 +37,7 @@ def errors(diagnosis: DiagnosisFile) -> str:
 
 
 def causes(diagnosis: DiagnosisFile, *, timed: bool) -> str:
-    """Every cause with those of its numbers that are not zero."""
+    """Return a table of every cause with its non-zero numbers."""
     rows = []
     for cause in sorted(diagnosis.causes, key=lambda c: -c.share_of_gain_percent):
         figures = (
@@ -50,7 +50,7 @@ def causes(diagnosis: DiagnosisFile, *, timed: bool) -> str:
 
 
 def numbers(cause: Cause, *, timed: bool) -> str:
-    """All numbers of a cause, a line each, and which the recording does not tell."""
+    """Return all numbers of a cause, one per line, and name those that are not identifiable."""
     every = numbers_of(cause, timed=timed)
     hidden = ", ".join(n.label for n in every if not n.is_told)
     untold = f"<br><small>not told by this motion: {escape(hidden)}</small>" if hidden else ""
@@ -62,7 +62,7 @@ def _lines(shown: Iterable[Number]) -> str:
 
 
 def rivals(cause: Cause) -> str:
-    """What a cause could be instead; nothing where it can be nothing else."""
+    """Return a list of a cause's rivals; empty if there are none."""
     if not cause.rivals:
         return ""
     items = "".join(f"<li>{_rival(rival)}" for rival in cause.rivals)
@@ -76,7 +76,7 @@ def _rival(rival: Indistinguishable) -> str:
 
 
 def hypotheses(rejected: Sequence[Rejected]) -> str:
-    """What was looked for and is not there, the nearest first, the rest folded away."""
+    """Return a table of the rejected hypotheses, the nearest first, the rest collapsed."""
     rows = [
         f"<tr><td>{escape(place(row))}<td>{row.held_out_gain_percent:+.2f} %<td>{chance(row.p_value)}"
         f"<td>{escape(row.why)}</tr>"

@@ -1,4 +1,4 @@
-"""The simulation in the formats of other programs, with a list of what each of them cannot hold."""
+"""Export the simulation to formats of other programs, with a list of what each of them cannot hold."""
 
 from .correction import write_correction
 from .mjcf import write_mjcf

@@ -1,4 +1,4 @@
-"""correction.json: what a controller needs to turn readings into true joint angles and the marker's pose.
+"""Write correction.json, from which a controller computes true joint angles and the marker's pose.
 
 docs/exporting.md has the format, examples/correction its readers. Every joint's frame is turned so that its axis is z.
 """
@@ -21,7 +21,7 @@ from .geometry import geometry_without_zeros
 from .joint_errors import LeftOut, moment_notes, residual_note, sentences, why_not
 
 FORMAT, VERSION = "bodyschema correction", 1
-# Values as in extended.toml; a ripple's cycles become radians for each unit of the reading.
+# Values as in extended.toml; a ripple's cycles become radians per unit of the reading.
 _OF_READINGS = (
     "joint_offset",
     "joint_scale",
@@ -35,7 +35,7 @@ _HELD = {*_OF_READINGS, *RIGID, "joint_compliance"}
 
 
 def held_by_correction(simulation: Simulation) -> Simulation:
-    """Return the simulation with those of its effects alone that correction.json holds."""
+    """Return the simulation with only the effects that correction.json holds."""
     stayed = simulation.after_moments
     own, background = (
         tuple(effect for effect in effects if effect.name in _HELD) for effects in (stayed.effects, stayed.background)
@@ -47,13 +47,13 @@ def write_correction(simulation: Simulation, file: Path, heading: str) -> list[s
     """Write the simulation's correction of readings to `file`.
 
     Args:
-        heading: one line: where it comes from.
+        heading: one line that names the origin.
 
     Returns:
-        Sentences on what the file does not hold, or holds in another way.
+        Sentences on what the file does not hold, or holds in another form.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     kept, left_out = held_by_correction(simulation), []
     for effect in simulation.after_moments.all_effects:
@@ -83,13 +83,13 @@ def _entry(simulation: Simulation, effect: Effect) -> dict[str, Any]:
     place, values = simulation.place(effect), effect.values.tolist()
     if effect.name == "joint_ripple" and effect.prismatic:
         values[2] *= 2.0 * np.pi
-    # Settling and backlash remember; nothing is known before the first reading.
+    # Settling and backlash have a state; it is unknown before the first reading.
     entry = {"effect": effect.name, "joint": place.joint, "values": values, "state": []}
     return entry if place.source is None else entry | {"source": place.source}
 
 
 def _chain(simulation: Simulation, springs: FloatArray) -> dict[str, Any]:
-    """The joints, in the order of the readings, and the frames of camera and marker."""
+    """Return the joints, in the order of the readings, and the frames of camera and marker."""
     robot, gravity, geometry = simulation.robot, simulation.gravity, geometry_without_zeros(simulation)
     aligned: dict[int | None, FloatArray] = {None: np.eye(4)}
     for k, name in enumerate(robot.joints):
@@ -127,7 +127,7 @@ def _chain(simulation: Simulation, springs: FloatArray) -> dict[str, Any]:
 
 
 def _onto_z(axis: FloatArray) -> FloatArray:
-    """A pose (4, 4) whose z is `axis`."""
+    """Return a pose (4, 4) whose z is `axis`."""
     across = np.eye(3)[int(np.argmin(np.abs(axis)))]
     x = np.cross(across, axis)
     x /= np.linalg.norm(x)
@@ -141,5 +141,5 @@ def _numbered(carrier: int | None) -> int:
 
 
 def _numbers(T: FloatArray) -> list[float]:
-    """The upper three rows of a pose, row by row."""
+    """Return the upper three rows of a pose, row by row."""
     return T[:3].ravel().tolist()

@@ -1,4 +1,4 @@
-"""Where a simulation has its joints, its camera and its marker."""
+"""Return the geometry of a simulation: joint origins, camera pose and marker position."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from bodyschema.interfaces.calibrated import CalibratedGeometry
 
 
 def geometry_of(simulation: Simulation) -> CalibratedGeometry:
-    """Return the geometry with all effects that it can have in it, the described one where there are none."""
+    """Return the geometry with all effects that it can hold; the described one where there are none."""
     robot = simulation.robot
     described = CalibratedGeometry({}, robot.camera.pose, np.array(robot.robot.marker_xyz))
     return corrected_geometry(simulation) or described
 
 
 def geometry_without_zeros(simulation: Simulation) -> CalibratedGeometry:
-    """Return the same with the joints' zeros as they are described."""
+    """Return the geometry without joint offsets."""
     own, background = (
         [effect for effect in effects if effect.name != "joint_offset"]
         for effects in (simulation.effects, simulation.background)

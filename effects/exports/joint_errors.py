@@ -1,4 +1,4 @@
-"""What is wrong with each joint, in the terms in which a rigid-body simulator can say it."""
+"""Collect the errors of each joint in the terms of a rigid-body simulator."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _UNKNOWN = "this effect has no counterpart there"
 
 
 def why_not(effect: Effect) -> str:
-    """Return why an effect is in no model of the arm."""
+    """Return the reason why an effect is in no model of the arm."""
     return _WHY_NOT.get(effect.name, _UNKNOWN)
 
 
@@ -33,10 +33,10 @@ class Wave:
     """A periodic error: amplitude · cos(frequency · reading - phase).
 
     Attributes:
-        name: of the effect.
+        name: name of the effect.
         amplitude: [rad, m].
         phase: [rad].
-        frequency: radians for each unit of the reading.
+        frequency: radians per unit of the reading.
     """
 
     name: str
@@ -47,7 +47,7 @@ class Wave:
 
 @dataclass
 class JointErrors:
-    """What stands between a joint's reading and its true angle.
+    """Errors between a joint's reading and its true angle.
 
     Attributes:
         offset: added to the reading [rad, m].
@@ -64,7 +64,7 @@ class JointErrors:
     compliance: float = 0.0
 
     def take(self, effect: Effect) -> str | None:
-        """Add an effect; return why it cannot be added, None where it was."""
+        """Add an effect; return the reason if it cannot be added, else None."""
         match effect.name:
             case "joint_offset":
                 self.offset += float(effect.values[0])
@@ -92,14 +92,14 @@ class JointErrors:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """An effect that a format cannot hold, and why."""
+    """An effect that a format cannot hold, with the reason."""
 
     effect: Effect
     why: str
 
 
 def sentences(left_out: Iterable[LeftOut]) -> list[str]:
-    """One sentence for each kind of effect that is left out."""
+    """Return one sentence for each kind of effect that is left out."""
     places: dict[tuple[str, str], list[str]] = {}
     for each in left_out:
         effect = each.effect
@@ -113,18 +113,18 @@ def sentences(left_out: Iterable[LeftOut]) -> list[str]:
 
 
 def numbers(effect: Effect) -> str:
-    """The values of an effect with their names, for a person to read."""
+    """Return the values of an effect with their names, in readable form."""
     return ", ".join(f"{p.name} = {value:.4g}" for p, value in zip(effect.parameters, effect.values, strict=True))
 
 
 @dataclass(frozen=True)
 class ArmErrors:
-    """All effects of a simulation after its moments have passed, sorted.
+    """Effects of a simulation after its moments have passed, sorted by joint.
 
     Attributes:
-        joints: by joint, every one of the robot's.
+        joints: errors of every joint of the robot.
         left_out: effects that a rigid-body simulator cannot hold.
-        notes: sentences on what is held in another way than it was found.
+        notes: sentences on effects that are held in another form than found.
     """
 
     simulation: Simulation
@@ -152,13 +152,13 @@ class ArmErrors:
         return cls(stayed, joints, tuple(left_out), tuple(moment_notes(simulation)))
 
     def told(self) -> list[str]:
-        """Sentences on what is not in the file, or in another way."""
+        """Return sentences on effects that are not in the file, or in another form."""
         told = sentences(self.left_out)
         return [*told, *residual_note(self.simulation), *self.notes]
 
 
 def residual_note(simulation: Simulation) -> list[str]:
-    """Return a sentence on what no effect explains, where there is such a thing."""
+    """Return a sentence on the unexplained part, if there is one."""
     if simulation.residual is None:
         return []
     return ["not in the file: [unexplained]: a learnt map of the readings has no counterpart there"]

@@ -1,4 +1,4 @@
-"""The visual shapes of a URDF as MuJoCo has them. Meshes stay where they are."""
+"""Convert the visual shapes of a URDF to MuJoCo's form. Meshes stay where they are."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.interfaces.rpy import rotation_of
 from kbmaps.rotations import quaternions
 
-# What MuJoCo reads, and the most triangles of an STL file for it.
+# Mesh formats that MuJoCo reads, and its limit of triangles in an STL file.
 _MESHES = (".stl", ".obj", ".msh")
 _MOST_TRIANGLES = 200_000
 _STL_HEADER, _STL_TRIANGLE = 84, 50
-# The shape of a link that has none: a rod from its joint to the next one [m].
+# A link without a shape becomes a rod from its joint to the next one [m].
 _ROD_RADIUS, _SHORTEST_ROD = 0.02, 0.01
-# A moment of inertia below this [kg·m²] is next to none; MuJoCo needs one.
+# Floor of a moment of inertia [kg·m²]; MuJoCo needs a positive one.
 _LEAST_INERTIA = 1e-9
 _GREY = "0.7 0.7 0.72 1"
 
 
 @dataclass(frozen=True)
 class LinkParts:
-    """What only a simulator needs of a URDF.
+    """Parts of a URDF that only a simulator needs.
 
     Attributes:
         meshes: attributes of the assets.
         geoms: attributes of the geoms, by link.
         inertias: (3, 3) [kg·m²] about the centres of mass, along the links' axes, by link.
-        mimics: by joint that moves with another: that one, the factor, and the offset [rad, m].
-        unreadable: mesh files that are missing, or that MuJoCo does not read.
+        mimics: for each mimic joint: the joint it follows, the factor, and the offset [rad, m].
+        unreadable: mesh files that are missing, or that MuJoCo cannot read.
     """
 
     meshes: list[dict[str, str]]
@@ -49,7 +49,7 @@ class LinkParts:
 
     @classmethod
     def of(cls, urdf: Path, folder: Path) -> LinkParts:
-        """Of a URDF that has been checked, for a file in `folder`."""
+        """Read the parts of a checked URDF, for a file in `folder`."""
         from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
         parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False)
@@ -103,7 +103,7 @@ class LinkParts:
             return None
         name = f"mesh_{len(self.meshes)}"
         path = Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
-        # MuJoCo refuses to weigh a mesh that is not closed; as a shell it can be.
+        # MuJoCo computes no mass for a mesh that is not closed; a shell needs no closed mesh.
         mesh = {"name": name, "file": path, "inertia": "shell"}
         if shape.get("scale"):
             mesh["scale"] = shape.get("scale")
@@ -112,26 +112,26 @@ class LinkParts:
 
 
 def rod(end: FloatArray) -> dict[str, str] | None:
-    """A rod from a link's origin to `end` (3,) [m] in its frame; None where that is next to nothing."""
+    """Return a rod from a link's origin to `end` (3,) [m] in its frame; None where it would be too short."""
     if np.linalg.norm(end) < _SHORTEST_ROD:
         return None
     return {"type": "capsule", "fromto": f"0 0 0 {texts(end)}", "size": texts(np.array([_ROD_RADIUS])), "rgba": _GREY}
 
 
 def placed(T: FloatArray) -> dict[str, str]:
-    """The attributes of a pose (4, 4)."""
+    """Return the attributes of a pose (4, 4)."""
     x, y, z, w = quaternions(T[None, :3, :3])[0]
     return {"pos": texts(T[:3, 3]), "quat": texts(np.array([w, x, y, z]))}
 
 
 def texts(values: FloatArray) -> str:
-    """Numbers as an attribute, exactly."""
+    """Return numbers as an attribute, exactly."""
     return " ".join(map(repr, (np.atleast_1d(values) + 0.0).tolist()))  # no minus before a zero
 
 
 @contextmanager
 def _blamed_on(element: Any, urdf: Path) -> Iterator[None]:
-    """RobotError where an attribute in `element` is no number."""
+    """Raise RobotError if an attribute in `element` is not a number."""
     try:
         yield
     except ValueError as error:
@@ -145,7 +145,7 @@ def _coloured(material: Any) -> bool:
 
 
 def _origin(element: Any) -> FloatArray:
-    """The pose (4, 4) of an element's <origin>."""
+    """Return the pose (4, 4) of an element's <origin>."""
     origin, T = element.find("origin"), np.eye(4)
     if origin is not None:
         T[:3, :3] = rotation_of(_floats(origin.get("rpy", "0 0 0")))
@@ -154,7 +154,7 @@ def _origin(element: Any) -> FloatArray:
 
 
 def _inertia(inertial: Any) -> FloatArray:
-    """The tensor (3, 3) along the link's axes, made one that a body can have."""
+    """Return the inertia tensor (3, 3) along the link's axes, corrected to be physically possible."""
     element = inertial.find("inertia")
     xx, yy, zz, xy, xz, yz = (float(element.get(key, "0")) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
     moments, axes = np.linalg.eigh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
@@ -167,7 +167,7 @@ def _floats(text: str) -> FloatArray:
 
 
 def _found(name: str, urdf: Path) -> Path | None:
-    """The file of a mesh: relative to the URDF, or in a package whose folder is above the URDF or beside it."""
+    """Return the file of a mesh: relative to the URDF, or in a package whose folder is above the URDF or beside it."""
     scheme, _, rest = name.rpartition("://")
     places = [urdf.parent / name.removeprefix("file://")]
     if scheme == "package":

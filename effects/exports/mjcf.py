@@ -1,8 +1,8 @@
-"""The simulation as MJCF: the value of a joint is what its encoder reads, and further joints have its errors.
+"""Export the simulation as MJCF: a joint's value is its encoder reading, and further joints hold its errors.
 
 | error | in MJCF |
 | --- | --- |
-| zero | `ref` of the joint |
+| joint offset | `ref` of the joint |
 | scale, coupling, periodic errors | a second joint about the same axis, tied to the readings that cause them |
 | backlash | a second joint with a range, and friction between the link and its parent |
 | compliance | a second joint with a stiffness |
@@ -30,16 +30,16 @@ from .link_parts import LinkParts, placed, rod, texts
 
 MARKER, MEASUREMENT = "marker", "measurement_frame"
 _STEP_S = 0.001
-# Added to the inertia of each joint [kg·m²], for joints about one axis in a row; of what turns nothing less.
+# Inertia added to each joint [kg·m²], for joints about one axis in a row; a joint without load needs little.
 _ARMATURE, _IDLE_ARMATURE = 0.05, 1e-6
-# Rates [rad/s] of the actuators and of springs without a load: well below 1/_STEP_S, so that the integrator follows.
+# Rates [rad/s] of actuators and of unloaded springs: well below 1/_STEP_S, so that the integrator follows.
 _SERVO_RATE, _SPRING_RATE = 100.0, 60.0
-# Backlash shows only if the weight does not close it: friction, as a multiple of gravity's largest torque.
+# Friction as a multiple of gravity's largest torque: backlash shows only if the weight does not close it.
 _FRICTION_MARGIN, _LEAST_FRICTION = 2.0, 0.1
 _POSTURES = 256
-# A point so far [m] from a circle of this radius [m] is at a distance that is a sine of the angle, to 1 in 2,000.
+# The distance of a point this far [m] from a circle of this radius [m] is a sine of the angle, to 1 in 2,000.
 _WAVE_ANCHOR, _WAVE_RADIUS = 1.0, 0.001
-# Constraints that give less than 1e-4 of what pulls at them.
+# Constraint settings that yield by less than 1e-4 of the load.
 _STIFF = {"solref": f"{4 * _STEP_S:g} 1", "solimp": "0.9999 0.9999 0.001 0.5 2"}
 _HIDDEN, _WORLD = "5", "world"
 
@@ -48,14 +48,14 @@ def write_mjcf(simulation: Simulation, file: Path, heading: str) -> list[str]:
     """Write the simulation as MJCF to `file`.
 
     Args:
-        heading: one line for the top: where it comes from.
+        heading: one line for the top that names the origin.
 
     Returns:
-        Sentences on what the file does not hold, or holds in another way.
+        Sentences on what the file does not hold, or holds in another form.
 
     Raises:
-        RobotError: two joints would have one name.
-        OSError: it cannot be written.
+        RobotError: two joints would have the same name.
+        OSError: the file cannot be written.
     """
     document = _Document(simulation, file.parent)
     told = document.told
@@ -65,11 +65,11 @@ def write_mjcf(simulation: Simulation, file: Path, heading: str) -> list[str]:
 
 @dataclass
 class _Document:
-    """One MJCF file in the making.
+    """Builder of one MJCF file.
 
     Attributes:
-        simulation: what it says.
-        folder: where it will be.
+        simulation: the simulation to export.
+        folder: folder of the file.
         joints: names of the joints in it.
     """
 
@@ -85,7 +85,7 @@ class _Document:
         self._robot, self._tree = robot, robot.tree
         self._errors = ArmErrors.of(self.simulation)
         self._parts = LinkParts.of(robot.tree.file, self.folder)
-        self._geometry = geometry_without_zeros(self._errors.simulation)  # zeros go into `ref`
+        self._geometry = geometry_without_zeros(self._errors.simulation)  # offsets go into `ref`
         self._root = etree.Element("mujoco", model=robot.name)
         self._settings()
         self._asset = self._add(self._root, "asset")
@@ -105,7 +105,7 @@ class _Document:
 
     @property
     def told(self) -> list[str]:
-        """Sentences on what is not in the file, or in another way."""
+        """Sentences on what is not in the file, or in another form."""
         told = self._errors.told()
         if self._parts.unreadable:
             some = ", ".join(self._parts.unreadable[:3]) + (", ..." if len(self._parts.unreadable) > 3 else "")
@@ -115,7 +115,7 @@ class _Document:
         return told
 
     def written(self, told: list[str]) -> bytes:
-        """The file, with sentences at its top."""
+        """Return the file's content, with sentences at its top."""
         etree = self._etree
         lines = [
             *told,
@@ -124,7 +124,8 @@ class _Document:
             "At rest the arm stands as found. Armature, damping, gains and friction were chosen, not measured.",
         ]
         text = "\n".join(lines)
-        self._root.insert(0, etree.Comment(re.sub("-(?=-)", "- ", f"\n{text}\n")))  # no comment may have two in a row
+        # XML comments must not contain two in a row
+        self._root.insert(0, etree.Comment(re.sub("-(?=-)", "- ", f"\n{text}\n")))
         for group in (self._tendon, self._equality, self._actuator, self._custom):
             if not len(group):
                 self._root.remove(group)
@@ -153,8 +154,8 @@ class _Document:
         self._add(default, "tendon", group=_HIDDEN)
 
     def _link(self, parent: Any, link: str, T: FloatArray, above: UrdfJoint | None) -> None:
-        """Add a link at the pose T (4, 4) in `parent`, and all that hangs on it."""
-        # MuJoCo keeps the name of the world for itself.
+        """Add a link at the pose T (4, 4) in `parent`, and everything attached to it."""
+        # MuJoCo reserves the name of the world.
         is_world = link == _WORLD and parent is self._world
         body = parent if is_world else self._add(parent, "body", name=link, **placed(T))
         mass = self._tree.masses.get(link)
@@ -177,7 +178,7 @@ class _Document:
                 self._link(body, joint.child, standing(joint, False, held), None)
 
     def _moves(self, joint: UrdfJoint) -> bool:
-        """Whether a joint is one in the file: those that robot.toml holds somewhere stand there."""
+        """Return True if a joint moves in the file: joints held by robot.toml are fixed."""
         name, robot = joint.name, self._robot
         return joint.kind in MOVING and (name in robot.joints or name not in robot.robot.held_at)
 
@@ -192,7 +193,7 @@ class _Document:
         if camera.focal_px is None or camera.image_size_px is None or camera.principal_point_px is None:
             return
         size = np.array(camera.image_size_px, dtype=np.float64)
-        # MuJoCo's cameras look along -z; their principal point counts from the middle, to the right and up.
+        # MuJoCo's cameras look along -z; their principal point counts from the centre, to the right and up.
         centre = (np.array(camera.principal_point_px) - 0.5 * size) * [1.0, -1.0]
         self._add(
             body,
@@ -206,13 +207,13 @@ class _Document:
         )
 
     def _joints(self, body: Any, joint: UrdfJoint) -> None:
-        """Add the joint that is read, then those that have its errors."""
+        """Add the joint that is read, then those that hold its errors."""
         errors = self._errors.joints.get(joint.name, JointErrors())
         kind = {"type": "slide" if joint.kind == "prismatic" else "hinge", "axis": texts(joint.axis)}
         limits = {} if joint.kind == "continuous" else {"range": texts(np.array([joint.lower, joint.upper]))}
         zero = {"ref": repr(-errors.offset)} if errors.offset else {}
         inertia = self._inertia(joint) + _ARMATURE
-        # MuJoCo's friction and limits are as soft as the joints in the row are light: a play needs them hard.
+        # MuJoCo's friction and limits are softer the lighter the joints in the row are; a backlash needs them hard.
         heavy = {"armature": f"{inertia:.4g}"} if errors.play else {}
         self._joint(body, joint.name, **kind, **limits, **zero, **heavy)
         gain = f"{_SERVO_RATE**2 * inertia:.4g}"
@@ -248,9 +249,9 @@ class _Document:
         self._add(body, "joint", name=name, **attributes)
 
     def _tie(self, name: str, source: str, factor: float, offset: float = 0.0) -> None:
-        """A joint whose value is offset + factor · (reading of another)."""
+        """Tie a joint to offset + factor · (reading of another)."""
         errors = self._errors.joints.get(source, JointErrors())
-        # MuJoCo counts the reading from where its joint stands in the file, which is -offset.
+        # MuJoCo counts the reading from the joint's initial value in the file, which is -offset.
         at_rest = offset - factor * errors.offset
         polynomial = texts(np.array([at_rest, factor, 0.0, 0.0, 0.0]))
         self._add(self._equality, "joint", joint1=name, joint2=source, polycoef=polynomial)
@@ -262,7 +263,7 @@ class _Document:
         constant, factor, ends = 0.0, 0.0, {"tendon1": name}
         for source, ratio in errors.ratios.items():
             self._add(rest, "joint", joint=source, coef=repr(-ratio))
-            # MuJoCo counts the reading from where its joint stands in the file, which is minus its offset.
+            # MuJoCo counts the reading from the joint's initial value in the file, which is minus its offset.
             constant -= ratio * self._errors.joints[source].offset
         if errors.waves:
             # The largest error has the largest hand.
@@ -273,12 +274,12 @@ class _Document:
         self._add(self._equality, "tendon", polycoef=polynomial, **ends)
 
     def _wave_dials(self, name: str, joint: UrdfJoint, waves: list[Wave], scale: float) -> float:
-        """A tendon from a fixed point to one hand for each periodic error, which turns as the reading goes on.
+        """Add a tendon from a fixed point to one hand for each periodic error, which turns with the reading.
 
-        The way from (a, 0) to r · (cos, sin) of an angle is a - r · cos to first order in r/a.
+        The distance from (a, 0) to r · (cos, sin) of an angle is a - r · cos to first order in r/a.
 
         Returns:
-            By how much it is longer [m] than the ways to the hands' axes where the joint stands in the file.
+            Its length less the distances to the hands' axes [m], at the joint's initial value in the file.
         """
         still, length, longer = self._wave_base(), self._add(self._tendon, "spatial", name=name), 0.0
         for count, wave in enumerate(waves):
@@ -296,7 +297,7 @@ class _Document:
         return longer
 
     def _wave_base(self) -> Any:
-        """The body of the points that turn with readings."""
+        """Return the body of the points that turn with readings."""
         still = self._world.find("body[@name='periodic_errors']")
         if still is None:
             still = self._add(self._world, "body", name="periodic_errors")
@@ -304,7 +305,7 @@ class _Document:
         return still
 
     def _play(self, body: Any, joint: UrdfJoint, kind: dict[str, str], width: float) -> None:
-        """A joint that is loose over the width of the play, and friction that keeps the link where it was left."""
+        """Add a joint that is loose over the width of the backlash, with friction that keeps the link in place."""
         name = f"{joint.name}_backlash"
         stiff = {f"{key}limit": value for key, value in _STIFF.items()}
         reach = texts(np.array([-0.5 * width, 0.5 * width]))
@@ -318,15 +319,15 @@ class _Document:
 
     @cached_property
     def _largest_torques(self) -> FloatArray:
-        """Gravity's largest torque or force (d,) about each joint that is read, over its range."""
+        """Return gravity's largest torque or force (d,) about each joint that is read, over its range."""
         lower, upper = np.maximum(self._robot.lower, -np.pi), np.minimum(self._robot.upper, np.pi)
         q = np.random.default_rng(0).uniform(lower, upper, (_POSTURES, len(lower)))
         return np.abs(self.simulation.gravity.torques(q)).max(axis=0)
 
     def _inertia(self, joint: UrdfJoint) -> float:
-        """Inertia about a joint, of point masses where they are at zero [kg·m²]; of a slide the mass [kg]."""
+        """Return the inertia about a joint, of point masses at zero [kg·m²]; for a prismatic joint the mass [kg]."""
         total, ends = 0.0, [(joint.child, np.eye(4))]
-        for link, T in ends:  # grows on the way
+        for link, T in ends:  # grows during the loop
             mass = self._tree.masses.get(link)
             if mass is not None:
                 arm = np.cross(joint.axis, T[:3, :3] @ mass.centre + T[:3, 3])
@@ -336,7 +337,7 @@ class _Document:
         return total
 
     def _keep_left_out(self) -> None:
-        """The numbers of what the file cannot hold, for programs that know what to do with them."""
+        """Store the numbers of effects that the file cannot hold, for programs that know them."""
         for count, left_out in enumerate(self._errors.left_out):
             effect = left_out.effect
             name = f"{'_'.join(filter(None, effect.key))}_{count}"

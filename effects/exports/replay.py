@@ -1,4 +1,4 @@
-"""An exported file, replayed by MuJoCo: where its marker comes to rest at the readings of a recording."""
+"""Replay an exported file in MuJoCo: the marker's rest position at each reading of a recording."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from bodyschema.interfaces.records import FloatArray
 
 from .mjcf import MARKER, MEASUREMENT
 
-# A spring's deflection changes its own load: each round brings the next order.
+# A spring's deflection changes its own load; each round adds the next order.
 _SPRING_ROUNDS = 5
 
 
 def mujoco_version() -> str | None:
-    """The installed MuJoCo; None without it."""
+    """Return the version of the installed MuJoCo; None without it."""
     try:
         import mujoco
     except ImportError:
@@ -28,13 +28,13 @@ def mujoco_version() -> str | None:
 
 
 def replayed(file: Path, joints: Sequence[str], motion: Motion) -> FloatArray:
-    """Positions (n, 3) [m] of the marker in the measurement frame, of an MJCF file alone.
+    """Return positions (n, 3) [m] of the marker in the measurement frame, from an MJCF file alone.
 
-    At each row the arm stands still: constraints are met, springs bear what gravity pulls at them, and what has
-    backlash is dragged along by the rest of its joint.
+    At each row the arm is at rest: constraints are met, springs balance gravity, and a joint with backlash is dragged
+        along by the rest of its joint.
 
     Raises:
-        ConfigError: MuJoCo is not installed, or does not load the file.
+        ConfigError: MuJoCo is not installed, or cannot load the file.
     """
     import mujoco
 
@@ -46,7 +46,7 @@ def replayed(file: Path, joints: Sequence[str], motion: Motion) -> FloatArray:
 
 
 class _Statics:
-    """MuJoCo's model at rest."""
+    """A MuJoCo model at rest."""
 
     def __init__(self, mujoco: Any, file: Path, joints: Sequence[str]) -> None:
         self._mujoco = mujoco
@@ -60,13 +60,13 @@ class _Statics:
             for k, a, b in tied
             if model.eq_type[k] == types.mjEQ_JOINT
         ]
-        # The first joint of a tied tendon is the one that has the errors.
+        # The first joint of a tied tendon is the one that holds the errors.
         self._errors = [
             (model.jnt_qposadr[model.wrap_objid[model.tendon_adr[a]]], a, b, model.eq_data[k, :5])
             for k, a, b in tied
             if model.eq_type[k] == types.mjEQ_TENDON
         ]
-        # The joints of a tendon with friction: the one that is read, and the loose one.
+        # The joints of a tendon with friction: the read one, and the loose one.
         self._plays = [
             tuple(model.wrap_objid[model.tendon_adr[k] + i] for i in range(2))
             for k in range(model.ntendon)
@@ -75,7 +75,7 @@ class _Statics:
         self._springs = np.flatnonzero(model.jnt_stiffness > 0.0)
 
     def positions(self, readings: FloatArray) -> FloatArray:
-        """At readings (n, d), in their order."""
+        """Return positions at readings (n, d), in their order."""
         mujoco, model, data = self._mujoco, self._model, self._data
         qpos, springs = data.qpos, model.jnt_qposadr[self._springs]
         loads, stiffness = model.jnt_dofadr[self._springs], model.jnt_stiffness[self._springs]
@@ -104,7 +104,7 @@ class _Statics:
         return found
 
     def _first_output(self, read: int, loose: int, readings: FloatArray) -> float:
-        """Where a play begins: on the side to which the first move leads."""
+        """Return the initial output of a backlash: on the side to which the first move leads."""
         model = self._model
         column = readings[:, int(np.flatnonzero(self._read == model.jnt_qposadr[read])[0])]
         moves = np.diff(column)
@@ -114,7 +114,7 @@ class _Statics:
 
 
 def _polynomial(coefficients: FloatArray, x: float) -> float:
-    """A polynomial with the constant first, as MuJoCo's equalities have it."""
+    """Evaluate a polynomial with the constant first, as in MuJoCo's equalities."""
     value = 0.0
     for coefficient in coefficients[::-1]:
         value = value * x + coefficient

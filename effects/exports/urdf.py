@@ -1,4 +1,4 @@
-"""The simulation as a URDF, as far as a URDF can say it."""
+"""Export the simulation as a URDF, as far as a URDF can hold it."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ _WHY_NOT = "a URDF has zeros, links and fixed frames alone"
 
 
 def write_urdf(simulation: Simulation, file: Path, heading: str) -> list[str]:
-    """Write the URDF of the simulation's robot, corrected where a URDF can be, to `file`.
+    """Write the URDF of the simulation's robot, with the corrections that a URDF can hold, to `file`.
 
     Args:
-        heading: one line for the top: where it comes from.
+        heading: one line for the top that names the origin.
 
     Returns:
         Sentences on what the file does not hold.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     robot, stayed = simulation.robot, simulation.after_moments
     geometry = geometry_of(stayed)
