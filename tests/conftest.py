@@ -47,19 +47,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def free_endpoint() -> Callable[[], str]:
-    """A function that gives zenoh endpoints on this machine that nobody listens on."""
+    """Return a function that returns unused zenoh endpoints on this machine."""
     return free_ports.free_endpoint
 
 
 @pytest.fixture
 def endpoint(free_endpoint: Callable[[], str]) -> str:
-    """A zenoh endpoint on this machine that nobody listens on."""
+    """Return an unused zenoh endpoint on this machine."""
     return free_endpoint()
 
 
 @pytest.fixture
 def mount_small_disk(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
-    """A function that mounts an empty tmpfs with the options given; needs root."""
+    """Return a function that mounts an empty tmpfs with the options given; needs root."""
     if os.geteuid() != 0:
         pytest.skip("no small disk can be mounted; to run it: be root")
     folder = tmp_path / "disk"

@@ -164,7 +164,7 @@ def test_a_hands_pose_follows_from_three_markers():
 
 
 def cross(x: np.ndarray) -> np.ndarray:
-    """The test function of Schaal and Atkeson 1998, and of Vijayakumar, D'Souza and Schaal 2005."""
+    """Return the test function of Schaal and Atkeson 1998, and of Vijayakumar, D'Souza and Schaal 2005."""
     ridges = np.stack([np.exp(-10.0 * x[:, 0] ** 2), np.exp(-50.0 * x[:, 1] ** 2)])
     return np.maximum(ridges.max(axis=0), 1.25 * np.exp(-5.0 * np.square(x).sum(axis=1)))
 

@@ -37,7 +37,7 @@ class Joint:
 
     @property
     def moves(self) -> bool:
-        """Whether it is no fixed joint."""
+        """True if the joint is not fixed."""
         return self.kind != "fixed"
 
 
@@ -85,7 +85,7 @@ class Arm:
     marker_xyz: Vector
 
     def joint(self, name: str) -> Joint:
-        """The joint called `name`."""
+        """Return the joint called `name`."""
         return next(joint for joint in self.joints if joint.name == name)
 
     def mass(self, link: str) -> Mass:
@@ -103,7 +103,7 @@ class Arm:
         return whole / self.ticks[name]
 
     def with_joint(self, joint: Joint) -> Arm:
-        """The same arm with the joint of that name replaced."""
+        """Return the same arm with the joint of that name replaced."""
         return replace(self, joints=tuple(joint if old.name == joint.name else old for old in self.joints))
 
 
@@ -138,7 +138,7 @@ def _masses(joints: tuple[Joint, ...], kilograms: list[float], rng: np.random.Ge
 
 
 def _standing_camera(rng: np.random.Generator, eye: Vector, target: Vector) -> tuple[Vector, Vector, Eyes]:
-    """A camera beside the arm: where it stands, how it looks, what it is."""
+    """Draw a camera beside the arm: return its position, its orientation and its optics."""
     at = np.array(eye) + rng.uniform(-0.15, 0.15, 3)
     rpy = look_at(at, np.array(target) + rng.uniform(-0.08, 0.08, 3), rng.uniform(-0.1, 0.1))
     eyes = Eyes(
@@ -159,7 +159,7 @@ def _beside(
     target: Vector,
     mount: Joint | None = None,
 ) -> Arm:
-    """An arm on its mount with a stereo camera standing beside it."""
+    """Return an arm on its mount with a stereo camera standing beside it."""
     xyz, rpy, eyes = _standing_camera(rng, eye, target)
     read = tuple(joint.name for joint in chain)
     return Arm(
@@ -282,7 +282,7 @@ ARMS: dict[str, Callable[[np.random.Generator], Arm]] = {
 
 
 def urdf(arm: Arm) -> str:
-    """The arm as a URDF, every number with all its digits."""
+    """Return the arm as a URDF, every number with all its digits."""
     links = [FLOOR, *(joint.child for joint in arm.joints)]
     lines = [f'<robot name="{arm.name}">', *(_link(name, arm.mass(name)) for name in links)]
     return "\n".join([*lines, *map(_joint, arm.joints), "</robot>", ""])

@@ -1,4 +1,4 @@
-"""Where pybullet says that the marker is, and which torques bear the arm's weight."""
+"""The marker's position and the joint torques under gravity, computed by pybullet."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Body:
         return np.einsum("nij,ni->nj", R_world_camera, x - eye), np.einsum("nij,nik->njk", R_world_camera, R)
 
     def balance(self, q: FloatArray, compliance: FloatArray) -> FloatArray:
-        """Where springs in the joints come to rest under the arm's weight, shape as q.
+        """Return the joint positions at which compliant joints come to rest under the arm's weight, shape as q.
 
         Args:
             q: positions with no load [rad or m], shape (n, number of moving joints).
@@ -105,13 +105,13 @@ class Bullet:
         self._client, self._folder = client, folder
 
     def load(self, arm: Arm) -> Body:
-        """The arm as a body of this client."""
+        """Load the arm as a body of this client."""
         return Body(self._client, arm, self._folder / "arm.urdf")
 
 
 @contextmanager
 def bullet() -> Iterator[Bullet]:
-    """A client for as long as the context lasts."""
+    """Yield a pybullet client that is closed when the context ends."""
     client = pybullet.connect(pybullet.DIRECT)
     try:
         pybullet.setGravity(0.0, 0.0, -GRAVITY, physicsClientId=client)

@@ -31,7 +31,7 @@ Size = float | str | Sequence[float]
 
 @dataclass(frozen=True)
 class Encoders:
-    """What becomes of shaft positions.
+    """Encoders that turn shaft positions into readings.
 
     Attributes:
         ticks: of each joint [rad or m], shape (d,).
@@ -47,7 +47,7 @@ class Encoders:
         return cls(np.array([arm.quantum(name) for name in arm.read]), scatter, rng)
 
     def read(self, shaft: FloatArray) -> FloatArray:
-        """Readings (n, d) in whole ticks."""
+        """Return readings (n, d) in whole ticks."""
         exact = shaft / self.ticks
         if self.scatter:
             exact = exact + self.scatter * self.rng.normal(size=exact.shape)
@@ -205,7 +205,7 @@ def _hidden(
     arm: Arm,
     rng: np.random.Generator,
 ) -> tuple[Hidden, ...]:
-    """The effects with their places and parameters."""
+    """Return the effects with their places and parameters."""
     truth: list[Hidden] = []
     for index, wish in enumerate(wished):
         if wish.effect == "outliers":
@@ -262,7 +262,7 @@ def _finished(hidden: Hidden, site: Site, sizer: Sizer) -> Hidden:
 
 
 def _rough(rng: np.random.Generator, *, marker_known: bool, pose_known: bool) -> tuple[Hidden, ...]:
-    """What is wrong with a marker and a camera pose that are only roughly known."""
+    """Return the errors of a marker and a camera pose that are only roughly known."""
     nuisances = []
     if not marker_known:
         shift: Parameters = dict(zip(SHIFT, (0.015 * direction(rng)).tolist(), strict=True))
@@ -285,7 +285,7 @@ def _taken(
     *,
     rendered: bool,
 ) -> Taken:
-    """The first `pairs` pairs that the true cameras see, with noise, ticks and false fixes."""
+    """Return the first `pairs` pairs that the true cameras see, with noise, ticks and outliers."""
     arm, sight = world.arm, world.measure(motion)
     width, height = arm.eyes.image_size_px
     inside = (sight.pixels > 0.0).all(axis=1) & (sight.pixels < [width, height, width, height]).all(axis=1)
@@ -313,7 +313,7 @@ def _taken(
 
 
 def _fixed(world: World, points: FloatArray, rng: np.random.Generator) -> tuple[BoolArray, FloatArray, FloatArray]:
-    """Fixes from noisy pixel centres: all are found; positions and covariances."""
+    """Return fixes from noisy pixel centres: a mask that is all true, positions and covariances."""
     eyes = world.arm.eyes
     pixels = world.eyes.project(points)
     pixels = pixels + rng.normal(0.0, eyes.pixel_sigma, pixels.shape)

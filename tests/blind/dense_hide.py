@@ -235,7 +235,7 @@ def written(cause: Cause) -> str:
 
 
 def sealed(case: DenseCase) -> dict[str, Any]:
-    """The truth, for a file."""
+    """Return the ground truth for a file."""
     return {
         "seed": case.seed,
         "joints": list(case.arm.read),
@@ -277,7 +277,7 @@ class _Robot:
     causes: Sequence[Cause]
 
     def readings(self, shaft: FloatArray, clock: FloatArray) -> FloatArray:
-        """Encoder readings (n, d), in whole ticks."""
+        """Return encoder readings (n, d), in whole ticks."""
         read = shaft.copy()
         for index, name in enumerate(self.arm.read):
             column = read[:, index]
@@ -288,7 +288,7 @@ class _Robot:
         return read
 
     def outputs(self, motion: Motion) -> FloatArray:
-        """True positions of the joints (n, d) when the rows are read, before their springs give."""
+        """Return the joints' true positions (n, d) when the rows are read, before their compliance."""
         rows = np.searchsorted(motion.t, motion.stamps)
         shaft = motion.shaft[rows]
         out = np.empty_like(shaft)
@@ -304,7 +304,7 @@ class _Robot:
         return out
 
     def positions(self, motion: Motion, clock: FloatArray) -> FloatArray:
-        """Of the marker in the measurement frame (n, 3) [m], free of noise."""
+        """Return positions of the marker in the measurement frame (n, 3) [m], free of noise."""
         frames, soft = self.made.frames.copy(), np.zeros(len(self.arm.read))
         marker = np.tile(self.plain.marker, (len(clock), 1))
         out = self.outputs(motion)

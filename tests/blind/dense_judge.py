@@ -114,7 +114,7 @@ def _alternatives(cause: Json) -> set[str]:
 
 
 def _place(hidden: str) -> str:
-    """The joint of a cause; `time` for one that has none."""
+    """Return the joint of a cause; `time` for one that has no joint."""
     return hidden.partition("@")[2].partition(":")[0] or "time"
 
 
@@ -141,7 +141,7 @@ _NUMBERS: dict[str, tuple[str, float]] = {"joint_offset": ("offset_", -1.0), "ba
 
 
 def placed(nominal: Built, q: FloatArray, x: FloatArray, *, pose_known: bool, marker_known: bool) -> Built:
-    """The nominal arm with what is not known of instrument and marker fitted to x (n, 3) [m] at q (n, d)."""
+    """Return the nominal arm with the unknown parameters of camera and marker fitted to x (n, 3) [m] at q (n, d)."""
     built = nominal
     if not pose_known:
         built = _turned(built, q, x)
@@ -185,12 +185,12 @@ def _shifted(built: Built, step: FloatArray) -> Built:
 
 
 def rms_mm(off: FloatArray) -> float:
-    """Of distances (n, 3) [m]."""
+    """Return the RMS of distances (n, 3) [m] in millimetres."""
     return float(1e3 * np.sqrt(np.square(off).sum(axis=1).mean()))
 
 
 def line(record: DenseJudgement) -> str:
-    """A record in a line."""
+    """Return a record as one line of text."""
     there = ", ".join(f"{t} ({n:.0f})" for t, n in zip(record.truth, record.nats, strict=True)) or "nothing"
     named = ", ".join(record.named) or "nothing"
     hard = "" if record.decidable else " (not decidable)"

@@ -65,7 +65,7 @@ class Observer:
         amounts: Sequence[FloatArray],
         costs: FloatArray,
     ) -> Observer:
-        """An observer of whitened columns, rows of noise 1.
+        """Return an observer of whitened columns, rows of noise 1.
 
         Args:
             flat: of what is not known at all (r, f).
@@ -153,7 +153,7 @@ class Observer:
         return gains
 
     def _data(self, truth: Sequence[int]) -> FloatArray:
-        """Expected data (p,) in the presence of the true causes."""
+        """Return the expected data (p,) in the presence of the true causes."""
         columns = self._columns(truth)
         return self.told + self.G[:, columns] @ self.amounts[columns]
 

@@ -32,7 +32,7 @@ class TrueEyes:
 
     @classmethod
     def as_described(cls, eyes: Eyes) -> TrueEyes:
-        """A pair that is what it is described to be."""
+        """Return a camera pair that is exactly as described."""
         return cls(eyes, eyes.focal_px, eyes.baseline_m)
 
     def project(self, x: FloatArray) -> FloatArray:
@@ -70,7 +70,7 @@ def covariance(eyes: Eyes, pixels: FloatArray) -> FloatArray:
 
 
 def in_view(eyes: Eyes, x: FloatArray, margin_px: float, nearest_m: float = 0.15) -> BoolArray:
-    """Whether both eyes see points in the left optical frame [m] this far inside their images, shape (n,)."""
+    """Return a mask (n,) of the points in the left optical frame [m] that both cameras see with this margin."""
     width, height = eyes.image_size_px
     front = x[:, 2] > nearest_m
     pixels = TrueEyes.as_described(eyes).project(np.where(front[:, None], x, [0.0, 0.0, 1.0]))

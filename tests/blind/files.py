@@ -65,7 +65,7 @@ def write_recording(
     x: FloatArray,
     covariance: FloatArray | None,
 ) -> None:
-    """A recording as CSV with all digits; columns whose values are None are left out."""
+    """Write a recording as CSV with all digits; columns whose values are None are left out."""
     names = [*joints, "x", "y", "z"]
     columns: list[list[float] | list[int]] = [*q.T.tolist(), *x.T.tolist()]
     if t is not None:

@@ -1,4 +1,4 @@
-"""What was hidden, and of which size it is drawn."""
+"""Hidden effects and the sizes that they are given."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Hidden:
 
 @dataclass(frozen=True)
 class Site:
-    """Where and when an effect is drawn."""
+    """Joints and motion for which an effect is generated."""
 
     arm: Arm
     motion: Motion
@@ -57,7 +57,7 @@ class Site:
 
     @property
     def prismatic(self) -> bool:
-        """Whether the joint slides."""
+        """True if the joint is prismatic."""
         return self.where is not None and self.arm.joint(self.where).kind == "prismatic"
 
     @property
@@ -99,7 +99,7 @@ class Kind:
     beside_only: bool = False
 
     def scaled(self, parameters: Parameters, factor: float) -> tuple[Parameters, bool]:
-        """The parameters with amplitudes `factor` times as large, and whether the largest value stopped them."""
+        """Return the parameters with amplitudes scaled by `factor`, and True if the upper limit was reached."""
         largest = max(abs(parameters[name]) for name in self.amplitudes if name in parameters)
         allowed = min(factor, self.most / largest)
         scaled = {name: value * (allowed if name in self.amplitudes else 1.0) for name, value in parameters.items()}
@@ -107,7 +107,7 @@ class Kind:
 
 
 def moment(site: Site, rng: np.random.Generator) -> float:
-    """A moment in the middle three fifths of the recording, between two pairs [s]."""
+    """Return a random time in the middle three fifths of the recording, between two pairs [s]."""
     count = len(site.motion.stamps)
     index = int(rng.integers(max(1, count // 5), max(2, 4 * count // 5)))
     return float(site.motion.stamps[index - 1 : index + 1].mean())
@@ -119,6 +119,6 @@ def sign(rng: np.random.Generator) -> float:
 
 
 def direction(rng: np.random.Generator, size: int = 3) -> FloatArray:
-    """A unit vector of any direction."""
+    """Return a random unit vector."""
     v = rng.normal(size=size)
     return v / np.linalg.norm(v)

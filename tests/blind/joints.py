@@ -1,4 +1,4 @@
-"""What lies between an encoder's reading and a joint's true position, each by its mechanism.
+"""Mechanisms between an encoder's reading and a joint's true position.
 
 The *shaft* is the joint's position as its motor drives it. The encoder reads the shaft; the output may lag behind it.
 """
@@ -36,8 +36,10 @@ def play(shaft: FloatArray, width: float) -> FloatArray:
 
 
 def lagging(t: FloatArray, shaft: FloatArray, tau_s: float) -> FloatArray:
-    """Output of a first-order lag dy/dt = (shaft − y)/τ along a path (f,), exact for a shaft that runs straight
-    between the instants."""
+    """Return the output (f,) of a first-order lag dy/dt = (shaft − y)/τ along a path.
+
+    The result is exact for a shaft that moves linearly between the times.
+    """
     lasts = np.diff(t)
     keeps = np.exp(-lasts / tau_s)
     slope = np.diff(shaft) / lasts
@@ -72,7 +74,7 @@ def lag_that_leaves(left: float, move_s: float, rest_s: float) -> float:
 
 
 def wandering(t: FloatArray, normals: FloatArray, interval_s: float) -> FloatArray:
-    """A slow random walk with smooth turns: unit steps `normals` every `interval_s`, at the times `t`, RMS 1."""
+    """Return a slow random walk with smooth turns: unit steps `normals` every `interval_s`, at the times `t`, RMS 1."""
     corners = np.cumsum(normals)
     corners = (corners - corners.mean()) / corners.std()
     phase = np.clip(t / interval_s, 0.0, len(corners) - 1.001)

@@ -35,7 +35,7 @@ TELLS_LITTLE = 10.0  # usual sizes: a wider interval says that the motion does n
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What is hidden in a case, in the words of the table, and what an oracle knows of it.
+    """Ground truth of a case in the terms of the effects table, and what an oracle knows of it.
 
     Attributes:
         scene: the measured motion.
@@ -73,7 +73,7 @@ class Truth:
 
     @cached_property
     def effects(self) -> tuple[Effect, ...]:
-        """Of `fitted`, without the nuisances."""
+        """Effects of `fitted`, without the nuisances."""
         return self.fitted.effects[len(self.nuisances) :]
 
     @cached_property
@@ -86,7 +86,7 @@ class Truth:
         return (*self.nuisances, *(e for k, e in enumerate(self.effects) if k != index))
 
     def same_anywhere(self, index: int, other: Effect) -> bool:
-        """Whether no motion tells another effect from a true one, since it can be all that this is."""
+        """Return True if no motion can distinguish a true effect from another one."""
         others = self.beside(index)
         target = self.wide.positions([*others, self.effects[index]])
         signal = self.wide.fitted(target, others).chi2
@@ -98,7 +98,7 @@ class Truth:
         return self.scene.replaced(self.target, others, self.effects[index], other).chi2
 
     def judged(self, index: int, found_as: Key | None, among_rivals: bool) -> TruthJudged:
-        """How well an oracle sees one of the true effects, and tells it from its best rival."""
+        """Judge how well an oracle sees one of the true effects, and distinguishes it from its best alternative."""
         hidden, effect = self.hidden[index], self.effects[index]
         others = self.beside(index)
         rivals = self.scene.rivals(self.target, others, [effect])
@@ -118,7 +118,7 @@ class Truth:
         )
 
     def strange_judged(self, hidden: Hidden) -> TruthJudged:
-        """How far the best single effect of the table stays behind one that is outside of it."""
+        """Judge how far the best single effect of the table falls short of one outside the table."""
         others = self.beside(-1)
         target = self.case.measured.x_noise_free
         floor = self.fitted_strange_floor
@@ -192,7 +192,7 @@ def judge(case: HiddenCase, scenario: str = "", command: str = "") -> Judgement:
 
 
 def compared(truth: Truth, file: DiagnosisFile) -> tuple[tuple[TruthJudged, ...], tuple[CauseJudged, ...], Outcome]:
-    """The hidden effects, the named causes, and what comes of both."""
+    """Return the judged hidden effects, the judged causes and the outcome."""
     named = [n for cause in file.causes if (n := Named.of(cause, truth.robot)) is not None]
     found = matched(truth, named)
     rivals = {(r.effect, r.where, r.source) for n in named for r in (*n.cause.rivals, *n.cause.indistinguishable_from)}
@@ -212,7 +212,7 @@ def compared(truth: Truth, file: DiagnosisFile) -> tuple[tuple[TruthJudged, ...]
 
 
 def matched(truth: Truth, named: Sequence[Named]) -> dict[int, Named]:
-    """Which cause names which true effect: by the same name, or by one that is as simple and the same in any motion."""
+    """Match causes to true effects: by the same name, or by one that is as simple and the same in any motion."""
     found: dict[int, Named] = {}
     for k, effect in enumerate(truth.effects):
         same = [n for n in named if n.effect.key == effect.key]
@@ -227,12 +227,12 @@ def matched(truth: Truth, named: Sequence[Named]) -> dict[int, Named]:
 
 
 def _rank(effect: Effect) -> tuple[int, bool]:
-    """The simpler comes first: fewer numbers, then no joint."""
+    """Return a sort key that puts the simpler effect first: fewer numbers, then no joint."""
     return len(effect.parameters), effect.where is not None
 
 
 def _is_camera_pose(truth: Truth, index: int) -> bool:
-    """Whether a link's geometry is no more than the camera's pose, which is its simpler name."""
+    """Return True if a link's geometry is equivalent to the camera's pose, which is its simpler name."""
     return truth.robot.camera.pose_known and truth.same_anywhere(index, Effect.at(truth.robot, "camera_pose"))
 
 
@@ -263,7 +263,7 @@ def cause_judged(truth: Truth, named: Named, index: int | None, whole: bool) -> 
 
 
 def _may_be_strange(truth: Truth, cause: Cause) -> bool:
-    """Whether a cause is said to be perhaps something without a name, where there is such a thing."""
+    """Return True if something is hidden outside the table and the cause allows for an unnamed alternative."""
     return bool(truth.strange) and any(rival.what for rival in cause.rivals)
 
 
@@ -288,7 +288,7 @@ def _wrong_reach(truth: Truth, index: int, member: Indistinguishable) -> list[st
 
 
 def judged_numbers(truth: Truth, named: Named, index: int) -> tuple[tuple[Number, ...], dict[str, str]]:
-    """The numbers of a cause beside the true ones."""
+    """Return the numbers of a cause with the true ones, and reasons for those left out."""
     meaning = truth.meanings[index]
     # Of these the mechanism has the numbers to first order only: where they come nearest to it is the truth.
     near = truth.effects[index] if meaning.effect.name in FIRST_ORDER else meaning.effect
@@ -308,14 +308,14 @@ def judged_numbers(truth: Truth, named: Named, index: int) -> tuple[tuple[Number
 
 
 def _between_rows(motion: Motion, moment: Interval) -> tuple[float, float]:
-    """The interval of a moment from row to row: all moments between two rows are one."""
+    """Return the interval of a moment widened to whole rows: moments between two rows cannot be distinguished."""
     low, high = moment.ci95
     before, after = motion.clock[motion.clock <= low], motion.clock[motion.clock >= high]
     return float(before.max(initial=-np.inf)), float(after.min(initial=np.inf))
 
 
 def judged_false_fixes(case: HiddenCase, file: DiagnosisFile) -> CauseJudged | None:
-    """The cause that says that some fixes are not the marker; None where it is not named."""
+    """Judge the cause that reports outliers; return None if it is not named."""
     for cause in file.causes:
         if cause.effect == "outliers":
             count = int(case.measured.outlier.sum())
@@ -329,7 +329,7 @@ def judged_false_fixes(case: HiddenCase, file: DiagnosisFile) -> CauseJudged | N
 def outcome(
     file: DiagnosisFile, hidden: Sequence[TruthJudged], causes: Sequence[CauseJudged], missed_fixes: bool
 ) -> Outcome:
-    """What the diagnosis as a whole is."""
+    """Return the outcome of the diagnosis as a whole."""
     false = [cause for cause in causes if not cause.is_right]
     if any(truth.outside for truth in hidden):
         if file.verdict == "unexplained":
@@ -346,7 +346,7 @@ def outcome(
 
 
 def gains(truth: Truth, diagnosis: Diagnosis, fresh: Recording) -> tuple[float | None, float | None]:
-    """How much of the error on a fresh recording goes with the causes found, and with the true ones."""
+    """Return the shares of the error on a fresh recording that the found and the true causes remove."""
     if not truth.effects and not truth.strange:
         return None, None
     motion, there = Motion.of(fresh), truth.case.fresh.x_noise_free
@@ -361,7 +361,7 @@ def gains(truth: Truth, diagnosis: Diagnosis, fresh: Recording) -> tuple[float |
 
 
 def joints_right(hidden: Hidden, depends_on: Sequence[str]) -> bool:
-    """Whether the joint that errs is named, and those that drive it and on which it clearly shows, but no idle one.
+    """Return True if the named joints are the erring one and those on which it clearly depends, without an idle one.
 
     An error that changes with time alone has to be named by time.
     """

@@ -1,4 +1,4 @@
-"""What the judge says of one case, as it is kept."""
+"""Judgement of one case, in the form in which it is stored."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Number(msgspec.Struct, frozen=True):
 
     @property
     def is_inside(self) -> bool:
-        """Whether its interval holds the truth."""
+        """True if the interval contains the true value."""
         return self.ci95[0] <= self.truth <= self.ci95[1]
 
 
@@ -118,12 +118,12 @@ class Judgement(msgspec.Struct, frozen=True, tag="judged"):
 
     @property
     def told_chi2(self) -> float:
-        """Of the hidden effect that is hardest to tell."""
+        """Smallest `told_chi2` of the hidden effects."""
         return min((truth.told_chi2 for truth in self.truth), default=float("inf"))
 
     @property
     def false_causes(self) -> list[CauseJudged]:
-        """What is named and not there."""
+        """Causes that are named and not there."""
         return [cause for cause in self.causes if not cause.is_right]
 
 
@@ -144,7 +144,7 @@ class Crash(msgspec.Struct, frozen=True, tag="crashed"):
 
 
 def told(record: Judgement | Crash) -> str:
-    """A record in a line."""
+    """Return a record as one line of text."""
     if isinstance(record, Crash):
         return f"{record.scenario} {record.seed} crashed: {record.error.strip().splitlines()[-1]}"
     effects = [f"{written((t.effect, t.where, t.source))} ({t.size:.2g})" for t in record.truth]

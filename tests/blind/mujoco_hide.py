@@ -457,7 +457,7 @@ def _range(urdf: Urdf) -> tuple[FloatArray, FloatArray]:
 
 
 def _levers(world: World, postures: FloatArray) -> FloatArray:
-    """How far the marker moves by each joint (d,) [m/rad], RMS over postures (n, d)."""
+    """Return the marker's RMS displacement per joint (d,) [m/rad] over postures (n, d)."""
 
     def marker(q: FloatArray) -> FloatArray:
         places, turns = world.poses(q)

@@ -1,4 +1,4 @@
-"""What one who knows the truth could tell from a motion: how far apart effects are, in units of the noise.
+"""Distinguishability of effects for an observer who knows the truth, in units of the noise.
 
 All is done on positions free of noise. How far a rival stays behind the truth is the rise of chi-square when, in the
 place of the true effect, the rival is fitted along with all that is free.
@@ -52,7 +52,7 @@ class Scene:
 
     @classmethod
     def of(cls, robot: RobotDescription, motion: Motion, covariance: FloatArray, scatter: float) -> Scene:
-        """A motion seen with noise of this covariance (n, 3, 3) [m²], and that of readings.
+        """Return a motion measured with this noise covariance (n, 3, 3) [m²] and this noise of the readings.
 
         Args:
             scatter: 1-sigma of readings before they are rounded to whole ticks [ticks].
@@ -63,7 +63,7 @@ class Scene:
         return cls(simulation, motion, np.linalg.inv(np.linalg.cholesky(covariance + rounding)), rounding)
 
     def positions(self, effects: Sequence[Effect]) -> FloatArray:
-        """What would be measured (n, 3) [m]."""
+        """Return the noise-free measured positions (n, 3) [m]."""
         return self.simulation.with_effects(effects).positions(self.motion)
 
     def whitened(self, x: FloatArray) -> FloatArray:
@@ -73,11 +73,11 @@ class Scene:
         return flat[:, 0] if x.ndim == 2 else flat
 
     def chi2(self, target: FloatArray, effects: Sequence[Effect]) -> float:
-        """How far effects as they are stay from the target (n, 3) [m]."""
+        """Return chi-square of the difference between the effects' positions and the target (n, 3) [m]."""
         return float(np.square(self.whitened(target - self.positions(effects))).sum())
 
     def fitted(self, target: FloatArray, effects: Sequence[Effect]) -> Fitted:
-        """The amounts with which the effects come nearest to the target, by Gauss-Newton steps."""
+        """Fit the amounts of the effects to the target by Gauss-Newton steps."""
         best = Fitted(tuple(effects), self.chi2(target, effects))
         for _ in range(ROUNDS):
             columns = self.columns(best.effects)
@@ -96,20 +96,20 @@ class Scene:
         return best
 
     def columns(self, effects: Sequence[Effect]) -> FloatArray:
-        """Derivatives (3 n, p) of what is measured by all amounts, whitened."""
+        """Return the whitened derivatives (3 n, p) of the measured positions with respect to all amounts."""
         run = self.simulation.with_effects(effects).run(self.motion)
         parts = [run.columns(effect)[:, :, effect.amounts] for effect in effects]
         return self.whitened(np.concatenate(parts, axis=2) if parts else np.empty((len(self.motion), 3, 0)))
 
     def replaced(self, target: FloatArray, others: Sequence[Effect], true: Effect, effect: Effect) -> Fitted:
-        """An effect in the place of a true one, with the moment, period, width or time constant that comes nearest."""
+        """Fit an effect in place of a true one, at the moment, period, width or time constant that fits best."""
         starts = [effect, self._nearest(target, others, [effect])[0][1]]
         if all(e.parameters[-1].name == "t0" for e in (true, effect)):
             starts.append(effect.with_values(np.append(effect.values[:-1], true.values[-1])))
         return min((self.fitted(target, [*others, start]) for start in starts), key=lambda fit: fit.chi2)
 
     def rivals(self, target: FloatArray, others: Sequence[Effect], but: Iterable[Effect]) -> list[Fitted]:
-        """The single effects that come nearest to the target beside others, fitted in full, the nearest first."""
+        """Return the single effects that fit the target best beside others, fully fitted, the best first."""
         excluded = {effect.key for effect in (*but, *others)}
         ranked = self._nearest(target, others, [e for e in hypotheses(self.simulation) if e.key not in excluded])
         tried = [self.fitted(target, [*others, effect]) for _, effect in ranked[:NEAREST]]
@@ -139,7 +139,7 @@ class Scene:
         return sorted(found, key=lambda pair: pair[0])
 
     def _shapes(self, effect: Effect, left: FloatArray, basis: FloatArray) -> list[Effect]:
-        """The effect with all moments, periods, widths or time constants that are worth a try."""
+        """Return the effect with each moment, period, width or time constant worth a try."""
         clock = self.motion.clock
         match effect.name:
             case "joint_ripple":
@@ -198,7 +198,7 @@ def hypotheses(simulation: Simulation) -> list[Effect]:
 
 
 def wide(scene: Scene) -> Scene:
-    """A way through the joints' whole range, which stands for any motion: with stops, turns and uneven times."""
+    """Return a path through the joints' whole range, standing for any motion: with stops, turns and uneven times."""
     robot, motion = scene.simulation.robot, scene.motion
     rng = np.random.default_rng(0)
     lower, upper = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
@@ -223,7 +223,7 @@ def solved(columns: FloatArray, target: FloatArray) -> FloatArray:
 
 
 def orthonormal(columns: FloatArray) -> FloatArray:
-    """A basis of what columns (m, p) span."""
+    """Return an orthonormal basis of the span of columns (m, p)."""
     if not columns.shape[1]:
         return columns
     scales = np.linalg.norm(columns, axis=0)
@@ -232,7 +232,7 @@ def orthonormal(columns: FloatArray) -> FloatArray:
 
 
 def stepped(effects: Sequence[Effect], step: FloatArray) -> tuple[Effect, ...]:
-    """The effects with their amounts moved by one step (p,)."""
+    """Return the effects with their amounts changed by one step (p,)."""
     moved, first = [], 0
     for effect in effects:
         amounts = effect.amounts
@@ -248,6 +248,6 @@ def _with_amounts(effect: Effect, amounts: FloatArray) -> Effect:
 
 
 def _ticks(q: FloatArray) -> FloatArray:
-    """The smallest step (d,) between readings."""
+    """Return the smallest step (d,) between readings."""
     gaps = [np.diff(np.unique(np.round(column, 12))) for column in q.T]
     return np.array([gap[gap > 1e-9].min() if (gap > 1e-9).any() else 0.0 for gap in gaps])

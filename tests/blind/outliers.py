@@ -16,7 +16,7 @@ TRIES = 60
 
 
 def false_fixes(world: World, sight: Sight, fraction: float, rng: np.random.Generator) -> tuple[FloatArray, BoolArray]:
-    """What is seen [m], in the true left optical frame, a `fraction` of it somewhere else, and which ones those are."""
+    """Return seen points [m] in the true left optical frame, a `fraction` of them outliers, and the outlier mask."""
     count = len(sight.at)
     outlier = _runs(count, round(fraction * count), rng)
     points = sight.at.copy()
@@ -41,7 +41,7 @@ def _runs(count: int, wanted: int, rng: np.random.Generator) -> BoolArray:
 
 
 def _mirror(x: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """A shiny plane beside the places where the marker was: a point and the normal, in the left optical frame."""
+    """Return a reflecting plane beside the marker's positions: a point and the normal, in the left optical frame."""
     normal = direction(rng)
     along = (x - x.mean(axis=0)) @ normal
     return x.mean(axis=0) + normal * (along.min() - NEAREST_M), normal

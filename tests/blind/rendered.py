@@ -59,7 +59,7 @@ class Studio:
         return image
 
     def _with_ball(self, room: FloatArray, left: int, top: int, centre: FloatArray) -> FloatArray:
-        """The part of the image at (left, top) with the ball in it, averaged over the samples of each pixel."""
+        """Return the part of the image at (left, top) with the ball in it, averaged over the samples of each pixel."""
         rows, columns = room.shape[:2]
         inside = (np.arange(SUPERSAMPLING) + 0.5) / SUPERSAMPLING - 0.5
         u = (left + np.arange(columns)[:, None] + inside).ravel()
@@ -75,7 +75,7 @@ class Studio:
         return samples.reshape(rows, SUPERSAMPLING, columns, SUPERSAMPLING, 3).mean(axis=(1, 3))
 
     def _rays(self, u: FloatArray, v: FloatArray) -> FloatArray:
-        """Unit directions that the true lens brings to image points [px]."""
+        """Return unit directions of the rays that the true lens images at points [px]."""
         bent = (np.stack([u, v], axis=-1) - self._eyes.described.principal_point_px) / self._eyes.focal_px
         ideal = bent
         for _ in range(12):
@@ -99,7 +99,7 @@ def _grey_levels(image: FloatArray) -> NDArray[np.uint8]:
 
 
 def tracked(eyes: TrueEyes, at: FloatArray, rng: np.random.Generator) -> tuple[BoolArray, FloatArray, FloatArray]:
-    """What the tracker makes of images of balls at (n, 3) [m] in the true left optical frame.
+    """Track the ball in rendered images of balls at (n, 3) [m] in the true left optical frame.
 
     Returns:
         Which were found (n,), their positions (n, 3) [m] and covariances (n, 3, 3) [m²]; NaN where none was found.

@@ -52,7 +52,7 @@ class Scenario:
     scatter: tuple[float, float] | None = None
 
     def size(self, seed: int) -> float | str:
-        """Of the effects, in units of the noise."""
+        """Return the size of the effects in units of the noise, or "random"."""
         if not self.gross:
             return "random"
         return float(np.exp(np.random.default_rng([seed, 1]).uniform(*np.log(GROSS))))
@@ -88,7 +88,7 @@ class Case:
 
 
 def main() -> None:
-    """The command."""
+    """Run the command."""
     given = _arguments()
     names = list(SCENARIOS) if "all" in given.scenario else given.scenario
     records = read(given.json) if given.json else []
@@ -144,12 +144,12 @@ def run(case: Case) -> Record | None:
 
 
 def encoded(record: Record) -> bytes:
-    """A record as JSON; numpy's numbers as what they are."""
+    """Return a record as JSON; numpy scalars become Python numbers."""
     return msgspec.json.encode(record, enc_hook=lambda number: number.item())
 
 
 def read(file: Path) -> list[Record]:
-    """The records of earlier runs; none where there is no file."""
+    """Return the records of earlier runs; an empty list if the file does not exist."""
     if not file.exists():
         return []
     decoder = msgspec.json.Decoder(Record)

@@ -31,7 +31,7 @@ class Sizer:
         self._noise = noise(nominal, plain.readings, plain.pixels, scatter)
 
     def scaled(self, hidden: Hidden, kind: Kind, size: float) -> Hidden:
-        """The effect with parameters scaled so that the whitened RMS of its residual is about `size`.
+        """Return the effect with parameters scaled so that the whitened RMS of its residual is about `size`.
 
         Raises:
             NoEffect: no amplitude shows.
@@ -51,7 +51,7 @@ class Sizer:
         return best
 
     def sized(self, hidden: Hidden) -> Hidden:
-        """The effect with its size filled in."""
+        """Return the effect with its size filled in."""
         world = World(self._bullet, self._nominal.arm, [hidden])
         try:
             sight = world.measure(self._motion)
@@ -98,6 +98,6 @@ def _next(tried: list[tuple[float, float]]) -> float:
 
 
 def drawn(kind: Kind, effect: str, site: Site, rng: np.random.Generator) -> Hidden:
-    """The effect with parameters of a first amplitude."""
+    """Return the effect with parameters of an initial amplitude."""
     drivers = kind.drivers(site) if kind.drivers is not None else ()
     return Hidden(effect, site.where, site.source, kind.draw(site, rng), kind.sign, kind.outside, drivers)

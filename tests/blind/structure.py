@@ -35,7 +35,7 @@ class Structure:
 
 
 def true_structure(arm: Arm, effects: Iterable[Hidden]) -> Structure:
-    """What the effects make of the described arm and its cameras."""
+    """Return the described arm and cameras as the effects change them."""
     true = Structure(arm, TrueEyes.as_described(arm.eyes))
     for number, hidden in enumerate(effects):
         _apply(true, hidden, f"hidden{number}")
@@ -93,7 +93,7 @@ def pose(p: Parameters) -> tuple[FloatArray, FloatArray]:
 
 
 def _moved(xyz: Vector, rpy: Vector, p: Parameters) -> tuple[Vector, Vector]:
-    """The pose of a frame that is moved within itself."""
+    """Return the pose of a frame after a motion in its own axes."""
     x, R = pose(p)
     was = Rotation.from_euler("xyz", rpy).as_matrix()
     return vector(np.array(xyz) + was @ x), vector(Rotation.from_matrix(was @ R).as_euler("xyz"))
@@ -137,7 +137,7 @@ def _soften_link(true: Structure, where: str, bend: float, prefix: str) -> None:
 
 
 def _grow(true: Structure, where: str, p: Parameters, prefix: str) -> None:
-    """A slide between the joint and its parent."""
+    """Insert a prismatic joint between the joint and its parent."""
     joint, along = true.arm.joint(where), shift(p)
     length = float(np.linalg.norm(along))
     slide = Joint(f"{prefix}_s", "prismatic", joint.parent, f"{prefix}_a", axis=vector(along / length))
@@ -146,7 +146,7 @@ def _grow(true: Structure, where: str, p: Parameters, prefix: str) -> None:
 
 
 def _next_joint(arm: Arm, name: str) -> Joint | None:
-    """The joint that the link of `name` bears, if the way to it is long enough."""
+    """Return the joint carried by the link of `name`, if the link is long enough to bend."""
     link = arm.joint(name).child
     borne = [joint for joint in arm.joints if joint.parent == link]
     far = [joint for joint in borne if np.linalg.norm(joint.xyz) >= SHORTEST_BENDING_LINK_M]

@@ -36,7 +36,7 @@ EFFECTS = (
 
 @pytest.fixture(scope="module")
 def scene() -> tuple[Built, Motion, Way, list[Cause]]:
-    """An arm with a sliding joint and its instrument on a head, a walk, and all causes."""
+    """Return an arm with a prismatic joint and its instrument on a head, a walk, and all causes."""
     rng = np.random.default_rng(3)
     arm = next(a for a in (described(rng, with_masses=True) for _ in range(99)) if "head_pan" in a.read)
     as_made = made(arm, rng)

@@ -49,7 +49,7 @@ BY_CHANCE = 1e-3
 
 
 def _origin() -> str:
-    """What the seeds come from."""
+    """Return the string from which the seeds are derived."""
     asked = ["git", "rev-parse", "HEAD"]
     try:
         done = subprocess.run(asked, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
@@ -59,7 +59,7 @@ def _origin() -> str:
 
 
 def _judged(names: Sequence[str]) -> list[Record]:
-    """The cases of these scenarios; those of one have neighbouring seeds."""
+    """Judge cases of these scenarios; the cases of one have consecutive seeds."""
     origin = _origin()
     first = int.from_bytes(hashlib.sha256(origin.encode()).digest()[:3], "big")
     print(f"seeds from {first}, drawn from {origin}")
@@ -79,7 +79,7 @@ def _allowed(rate: float, cases: int) -> int:
 
 
 def _rate(names: tuple[str, ...]) -> float:
-    """The largest rate of failures that the sealed run leaves room for."""
+    """Return the upper end of the confidence interval of the sealed run's failure rate."""
     return float(binomtest(*SEALED[names]).proportion_ci(method="exact").high)
 
 

@@ -148,14 +148,14 @@ def pendulum(axis: tuple[float, float, float]) -> Arm:
 
 
 def height(world: World, q: FloatArray) -> FloatArray:
-    """Of the marker above the floor [m]."""
+    """Return the height of the marker above the floor [m]."""
     arm = world.arm
     c, R = np.array(arm.camera_xyz), rotation(arm)
     return (c + world.marker(q, np.zeros(len(q))) @ R.T)[:, 2]
 
 
 def rotation(arm: Arm) -> FloatArray:
-    """Of the described left optical frame in the floor's."""
+    """Return the rotation of the described left optical frame in the floor's frame."""
     return Rotation.from_euler("xyz", arm.camera_rpy).as_matrix()
 
 
@@ -196,7 +196,7 @@ def test_a_soft_mount_reads_as_before(bench: Bench) -> None:
 
 
 def moved(bench: Bench, sight: Sight) -> FloatArray:
-    """How far the measured positions moved [m], shape (n,)."""
+    """Return the distances by which the measured positions moved [m], shape (n,)."""
     return np.linalg.norm(sight.x - bench.nominal.x, axis=1)
 
 

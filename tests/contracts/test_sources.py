@@ -100,7 +100,7 @@ class Rig:
             yield self
 
     def read(self, count: int = SOME) -> list[Any]:
-        """The next `count` items of the source."""
+        """Return the next `count` items of the source."""
         items: list[Any] = []
         deadline = time.monotonic() + LIMIT_S
         while len(items) < count:
@@ -193,7 +193,7 @@ class Unrectified:
 
 
 def rig_of(camera: StereoCamera) -> StereoRig:
-    """The simulated camera's calibration, as one of two cameras."""
+    """Return the simulated camera's calibration as a rig of two cameras."""
     true = camera.calibration
     lens = Lens("pinhole", (true.focal_px, true.focal_px), true.principal_point_px, (0.0,) * 5)
     place = np.array([-true.baseline_m, 0.0, 0.0])
@@ -276,7 +276,7 @@ def ideal_camera() -> Iterator[Rig]:
 
 @contextmanager
 def tracked_tags() -> Iterator[Rig]:
-    """The demo's cube in the demo's hand."""
+    """Yield a rig that tracks the demo's cube in the demo's hand."""
     robot = RobotDescription.load(model_file("upper_body"))
     tables = cube_tables(-np.array(robot.robot.marker_xyz))
     vision = msgspec.toml.decode(tables, type=dict[str, VisionConfig])["vision"]
@@ -397,7 +397,7 @@ Shared = Callable[[Make], Rig]
 
 @pytest.fixture(scope="module")
 def shared() -> Iterator[Shared]:
-    """A function that gives a closed source of each kind, one for all laws after which it can still be used."""
+    """Yield a function that returns a closed source of each kind, shared by all laws that leave it usable."""
     with ExitStack() as stack:
         yield cache(lambda make: stack.enter_context(make()))
 
@@ -496,7 +496,7 @@ def frames(request: pytest.FixtureRequest, shared: Shared) -> Iterator[tuple[Ste
 
 
 def is_frozen(array: np.ndarray, shape: tuple[int, ...]) -> bool:
-    """Whether it is a finite, read-only float64 array of this shape."""
+    """Return True for a finite, read-only float64 array of this shape."""
     whole = bool(np.isfinite(array).all()) and not array.flags.writeable
     return whole and (array.shape, array.dtype) == (shape, np.float64)
 

@@ -15,7 +15,7 @@ OPENSSL_S = 500.0
 
 
 def blocks(language: str) -> list[str]:
-    """The page's blocks of code in a language, in order."""
+    """Return the page's code blocks in a language, in order."""
     return re.findall(rf"^```{language}\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
 
 
@@ -35,7 +35,7 @@ def carried_out(folder: Path) -> Path:
 
 
 def table(file: Path, **changed: str) -> str:
-    """A file of deploy/ with some strings in the place of others: `old` of the keyword `new=old`."""
+    """Return a file of deploy/ with some strings replaced: `new=old` replaces `old` by the keyword `new`."""
     text = file.read_text(encoding="utf-8")
     for new, old in changed.items():
         assert old in text

@@ -1,4 +1,4 @@
-"""What `bodyschema calibrate` finds and says, against planted robots."""
+"""Results and messages of `bodyschema calibrate` for planted robots."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Planted:
 
 @functools.cache
 def planted(seed: int, *, pairs: int = 100, sigma: float = SIGMA_M, outliers: int = 0) -> Planted:
-    """An arm made to 0.17° and 1 mm, its inner zeros off by 3°, camera and marker anywhere (1-sigma)."""
+    """Return an arm built to 0.17° and 1 mm, its inner joint offsets 3°, camera and marker anywhere (1-sigma)."""
     rng = np.random.default_rng(seed)
     robot = RobotDescription.load(DESK_ARM)
     parameters = ChainParameters(robot.chain)
@@ -107,7 +107,7 @@ def covered(seeds: range) -> float:
 
 
 def figures_of(arm: Planted) -> np.ndarray:
-    """What a calibration without errors would find."""
+    """Return the figures that an error-free calibration would find."""
     zeros = arm.change[arm.parameters.zeros]
     pose = arm.parameters.base_pose(arm.change)
     chain = arm.parameters.chain(arm.change)
@@ -170,7 +170,7 @@ def test_the_scatter_of_the_pairs_is_not_what_their_source_told() -> None:
 
 @pytest.fixture(scope="module")
 def corner() -> CalibrationReport:
-    """Of twelve pairs within a few degrees."""
+    """Return the calibration from twelve pairs within a few degrees."""
     arm = planted(1)
     q = arm.recording.q[0] + 0.05 * np.random.default_rng(0).normal(size=(12, 4))
     x = arm.parameters.positions(arm.change, q) + SIGMA_M * np.random.default_rng(1).normal(size=(12, 3))
@@ -336,7 +336,7 @@ def test_links_worse_than_any_are_not_written(pairs_file, tmp_path) -> None:
 
 
 def retooled(seed: int, at: int, move_m: float, *, walk: bool = False) -> Planted:
-    """An arm whose tool was changed after `at` of its pairs."""
+    """Return an arm whose tool was changed after `at` of its pairs."""
     arm = planted(seed)
     q, rng = arm.recording.q, np.random.default_rng(seed)
     if walk:

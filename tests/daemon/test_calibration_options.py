@@ -1,4 +1,4 @@
-"""What `bodyschema calibrate` holds, expects on new poses, and tells ROS, against planted robots."""
+"""Options of `bodyschema calibrate`: fixed parameters, expected errors on new poses and the ROS output."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ def sigma(claims: Claims, name: str, q: FloatArray) -> float:
 
 
 def sure_belief(shift_m: float = 0.0) -> ChainBelief:
-    """The drawn chain, moved on each axis, and nothing else is possible."""
+    """Return a belief without uncertainty in the nominal chain, shifted on each axis."""
     shift = np.eye(4)
     shift[:3, 3] = shift_m
     return NOMINAL.belief(NOMINAL.chain.transformed(shift), ChainTolerances())

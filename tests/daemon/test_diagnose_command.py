@@ -73,7 +73,7 @@ def diagnose(*arguments: object, columns: int = 80) -> Ended:
 
 
 def refused(*arguments: object) -> str:
-    """The one line after progress with which the command ends."""
+    """Return the error line after the progress, with which the command fails."""
     ended = diagnose(*arguments)
     assert (ended.code, ended.out) == (1, "")
     line = ended.err.splitlines()[-1]
@@ -243,7 +243,7 @@ class Sampler:
 
 @pytest.fixture
 def live_robot(tmp_path, endpoint, robot) -> Path:
-    """The desk arm with a sampler of its own."""
+    """Return the robot.toml of the desk arm with its own sampler."""
     (tmp_path / robot.robot.urdf).write_bytes(robot.tree.file.read_bytes())
     (tmp_path / "robot.toml").write_text(f'{DESK_ARM.read_text()}\n[zenoh]\nsampler = "{endpoint}"\n')
     return tmp_path / "robot.toml"

@@ -41,7 +41,7 @@ class Ticking:
 
 
 class Slow(Ticking):
-    """Whatever is done between two looks at it takes a while."""
+    """Clock on which everything done between two looks takes a while."""
 
     TICK_S = 0.1
 
@@ -95,7 +95,7 @@ class Planted:
         return known
 
     def covered(self) -> list[bool]:
-        """Which of the figures that are told lie inside their intervals."""
+        """Return a mask of the reported figures whose intervals contain the truth."""
         found, _ = figures(self.robot, self.known())
         off = found.values - figures_of(self)
         off[3:6] = np.remainder(off[3:6] + np.pi, 2.0 * np.pi) - np.pi
@@ -105,7 +105,7 @@ class Planted:
 
 @cache
 def shared(seed: int, pairs: int) -> Planted:
-    """An arm that no test teaches anything more."""
+    """Return an arm that tests share; none of them changes it."""
     return Planted.of(seed, pairs)
 
 

@@ -59,7 +59,7 @@ def learner_of(robot: str, waist: float = 0.0) -> LearnerStatus:
 
 
 def positions(q: FloatArray, waist: float) -> FloatArray:
-    """Of an arm of two links whose waist stands off by so much [rad]; q (n, 2)."""
+    """Return the positions of an arm of two links with this waist offset [rad]; q (n, 2)."""
     waists, shoulders = q[:, 0] + waist, q[:, 1]
     reach = 0.3 + 0.4 * np.cos(shoulders)
     # A hand off the plane of the links: else a turned waist is a turned camera.

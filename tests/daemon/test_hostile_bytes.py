@@ -68,7 +68,7 @@ anything = st.recursive(
 
 @st.composite
 def mangled(draw: st.DrawFn, good: bytes) -> bytes:
-    """A file that was right, changed in a few places."""
+    """Draw a valid file changed in a few places."""
     data = bytearray(good)
     for _ in range(draw(st.integers(1, 5))):
         place = draw(st.integers(0, len(data)))
@@ -78,7 +78,7 @@ def mangled(draw: st.DrawFn, good: bytes) -> bytes:
 
 
 def taken(read: Callable[[], object]) -> object:
-    """What is read, or None where it was refused; any other error is a failure, and so is a lot of memory."""
+    """Return the value read, or None if the data were refused; fail on any other error or on high memory use."""
     tracemalloc.start()
     try:
         return read()
@@ -356,7 +356,7 @@ def stored(tmp_path_factory) -> tuple[dict[str, Any], bytes]:
 
 
 def places(value: object, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """The paths to everything inside."""
+    """Return the paths to all values inside."""
     inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     return [found for key, inner in inside for found in ((*path, key), *places(inner, (*path, key)))]
 

@@ -30,7 +30,7 @@ def config() -> Config:
 
 
 def signs(config: Config, *path: tuple[int, float], begin=(0.0, 0.0, 0.5, 0.0)) -> str:
-    """What is said after the joints were moved by so much [rad], one after the other, with a rest between."""
+    """Return the sign check's output after the joints moved by these angles [rad], one after the other, with rests."""
     check, q, t = SignCheck(config.robot), np.array(begin), 0.0
     for joint, turn in path:
         for step in np.linspace(0.0, turn, 30):

@@ -41,7 +41,7 @@ def wiggle(seed: int, latency_s: float, noise_mm: float = 0.5, joints: int = 4, 
 
 
 def latency_by_speed(wiggle: Wiggle, chain: RigidChain) -> float:
-    """The latency by speeds alone [s]: the shift at which those of `chain`'s marker and of the seen one correlate best.
+    """Return the latency [s] from speeds alone: the shift that best correlates the speeds of chain and marker.
 
     For comparison: the drawn arm's speed is not the real one's, and noise is differentiated.
     """
@@ -197,7 +197,7 @@ def test_too_few_fixes_are_named() -> None:
 
 
 def shown(seed: int = 0, *, every: int = 1, seconds: float = 5.0) -> Wiggle:
-    """A wiggle of which the cameras gave every so manieth fix, for so long [s]."""
+    """Return the first `seconds` [s] of a wiggle with every `every`-th fix of the cameras."""
     whole = wiggle(seed, 0.05)
     joints, fixes = whole.t_joints < seconds, whole.t_marker < seconds
     return Wiggle(whole.t_joints[joints], whole.q[joints], whole.t_marker[fixes][::every], whole.x[fixes][::every])
@@ -222,7 +222,7 @@ def test_joints_that_hardly_moved_are_named(share: float) -> None:
 
 
 def test_joints_that_do_not_move_the_marker_are_named() -> None:
-    """As the wrist that turns a marker on its axis."""
+    """Check, for example, a wrist that turns a marker about its own axis."""
     moved = wiggle(0, 0.05)
     noise = np.random.default_rng(1).normal(0, 5e-4, moved.x.shape)
     with pytest.raises(LatencyError, match=r"the marker moved by [0-9.]+ mm only"):

@@ -52,7 +52,7 @@ def robots(tmp_path: Path, free_endpoint: Callable[[], str]) -> list[Config]:
 
 
 def asked(endpoint: str, robot: str) -> LearnerStatus:
-    """The state of a robot's learner, as soon as it answers."""
+    """Return the state of a robot's learner as soon as it answers."""
     deadline = time.monotonic() + LIMIT_S
     while True:
         try:

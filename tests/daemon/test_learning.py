@@ -105,11 +105,11 @@ class Taught:
 
     @property
     def half(self) -> Scene:
-        """What the learner has seen."""
+        """The pairs that the learner has seen."""
         return self.first(HALF)
 
     def first(self, count: int) -> Scene:
-        """The arm with so many of the pairs."""
+        """Return the arm with the first `count` pairs."""
         return Scene(self.scene.chain, self.scene.q[:count], self.scene.pairs[:count])
 
     def copy(self) -> Learning:

@@ -157,7 +157,7 @@ def test_offsets_stay_within_what_a_servo_keeps() -> None:
 
 
 def planted(file: Path, robot: Config) -> None:
-    """A recording of an arm whose shoulder_lift reads 2° too little."""
+    """Write a recording of an arm whose shoulder_lift reads 2° too little."""
     rng = np.random.default_rng(0)
     q = rng.uniform(robot.robot.lower, robot.robot.upper, (150, 5))
     true = q + np.radians([0, 2.0, 0, 0, 0])

@@ -61,7 +61,7 @@ class PluggedEyes:
 
 @pytest.fixture(scope="module")
 def views() -> list[View]:
-    """Views of all kinds: of a person who did what was asked."""
+    """Return views of all kinds, from a user who followed the instructions."""
     rng = np.random.default_rng(21)
     return corner_views(webcams(rng), rng, 30)
 
@@ -245,7 +245,7 @@ def test_the_check_says_why_no_look_came(views, tmp_path) -> None:
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory) -> Path:
-    """A robot whose cameras show the board, each view for two frames."""
+    """Return a robot whose cameras show the board, each view for two frames."""
     folder = tmp_path_factory.mktemp("robot")
     for k, pair in enumerate(photographed()[1][:9]):
         for eye, image in (("left", pair.left), ("right", pair.right)):

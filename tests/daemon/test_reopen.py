@@ -38,7 +38,7 @@ def reopening(source: Scripted) -> Reopening[JointReading]:
 
 
 def read_until_reading(source: Reopening[JointReading], timeout_s: float = 0.25) -> int:
-    """How many reads gave nothing before the first that gave a reading."""
+    """Count the empty reads before the first that returns a reading."""
     for nothing in range(10_000):
         if source.read(timeout_s) is not None:
             return nothing

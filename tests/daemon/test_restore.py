@@ -56,7 +56,7 @@ class Saved:
 
 
 def scene_with(case: str) -> tuple[Saved, list[Pair], FloatArray]:
-    """A saved learner, further pairs, and poses to compare at."""
+    """Return a saved learner, further pairs, and poses to compare at."""
     rng, scene = np.random.default_rng(1), Scene.draw(0, TAUGHT + LATER)
     q = np.vstack([scene.q, rng.uniform(-np.pi, np.pi, (50, scene.q.shape[1]))])
     pairs = scene.pairs

@@ -1,4 +1,4 @@
-"""What a store lets go, and who notices."""
+"""Deletion of old pairs from a store, and its notifications."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ def sample(config: Config, sources: Sources) -> tuple[list[Pair], SamplerStatus]
 
 @contextmanager
 def running(config: Config, sources: Sources) -> Iterator[Bus]:
-    """A client of a sampler that runs in a thread until the block ends."""
+    """Yield a client of a sampler that runs in a thread until the block ends."""
     with sampling(config, sources) as sampler:
         thread = threading.Thread(target=sampler.run)
         with client(config.tables.zenoh.sampler) as asking:
@@ -79,7 +79,7 @@ def running(config: Config, sources: Sources) -> Iterator[Bus]:
 
 
 def status_when(bus: Bus, true: Callable[[SamplerStatus], bool]) -> SamplerStatus:
-    """The first published status for which `true` holds."""
+    """Return the first published status for which `true` holds."""
     published: Queue[bytes] = Queue()
     bus.subscribe(KEYS.status("sampler"), published.put)
     status = decode(bus.ask_one(KEYS.status("sampler")), SamplerStatus)
@@ -280,7 +280,7 @@ def test_pairs_are_published_in_order(config) -> None:
 
 @pytest.fixture(scope="module")
 def ended(tmp_path_factory, free_endpoint) -> Iterator[Bus]:
-    """A client of a sampler whose 1,200 pairs are all stored."""
+    """Yield a client of a sampler whose 1,200 pairs are all stored."""
     config = small_arm(tmp_path_factory.mktemp("ended"), free_endpoint())
     walk = Walk(config.robot, 1200, step_deg=1.01)
     with running(config, walk.sources()) as bus:

@@ -35,7 +35,7 @@ def port(config) -> str:
 
 @pytest.fixture
 def arm(port) -> list[FoundServo]:
-    """The servos of robot.toml as they should be."""
+    """Return the servos of robot.toml as they should be."""
     return [
         FoundServo(port, 1_000_000, "Dynamixel 2.0", id, model, "46", 12.0, 31.0, False)
         for id, model in enumerate(MODELS, 1)

@@ -1,4 +1,4 @@
-"""Who may do what over zenoh: real sessions as every role and as strangers, with the page's certificates."""
+"""Permissions over zenoh: real sessions in every role and of strangers, with the page's certificates."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ OWNERS = {"viewer": "anna", "operator": "bert", "sampler": "arm.sampler", "learn
 
 @pytest.fixture(scope="module")
 def pki(tmp_path_factory) -> Path:
-    """A folder with certificates, made by the lines of the page; and one of a foreign authority in `foreign/`."""
+    """Return a folder with certificates made by the page's commands, and one of a foreign authority in `foreign/`."""
     folder = tmp_path_factory.mktemp("pki")
     (folder / "foreign").mkdir()
     carried_out(folder / "foreign")
@@ -50,7 +50,7 @@ def identity_of(folder: Path, name: str | None, ca: Path | None = None) -> Ident
 
 
 def write_robot(folder: Path, zenoh_table: str, pki: Path) -> Config:
-    """A robot.toml with this table, among the certificates."""
+    """Write a robot.toml with this table next to the certificates."""
     for file in pki.glob("*.*"):
         if not (folder / file.name).exists():
             (folder / file.name).symlink_to(file)
@@ -74,7 +74,7 @@ class Site:
 
 @pytest.fixture(scope="module")
 def site(pki: Path, tmp_path_factory, free_endpoint) -> Iterator[Site]:
-    """The files of deploy/several_machines on one machine: other endpoints, the same everything else."""
+    """Run the files of deploy/several_machines on one machine, with only the endpoints changed."""
     endpoint = free_endpoint().replace("tcp/", "tls/")
     router_file = pki / "router.toml"
     router_file.write_text((SEVERAL / "router.toml").read_text().replace("tls/192.0.2.10:7450", endpoint))
@@ -120,7 +120,7 @@ def site(pki: Path, tmp_path_factory, free_endpoint) -> Iterator[Site]:
 
 
 def drained(queue: Queue[bytes]) -> list[bytes]:
-    """What arrives until nothing has for a while."""
+    """Return all that arrives until a period of silence."""
     found = []
     while True:
         try:
@@ -254,7 +254,7 @@ def test_programs_on_the_samplers_machine_need_no_certificate(site: Site) -> Non
 
 @pytest.fixture
 def two(pki: Path, tmp_path: Path, free_endpoint) -> Iterator[tuple[Config, Queue[bytes]]]:
-    """The files of deploy/two_machines on one machine: the learner's configuration and what it hears."""
+    """Run the files of deploy/two_machines on one machine; yield the learner's configuration and what it receives."""
     ends = {"tls/192.0.2.20:7447": free_endpoint(), "tls/192.0.2.30:7448": free_endpoint()}
     heard: Queue[bytes] = Queue()
     with ExitStack() as stack:

@@ -35,7 +35,7 @@ def wait_until(true: Callable[[], bool]) -> None:
 
 
 def started(file: Path) -> list[int]:
-    """The process ids that were written so far."""
+    """Return the process ids written so far."""
     return [int(line) for line in file.read_text().splitlines()] if file.exists() else []
 
 
@@ -45,7 +45,7 @@ def gone(pid: int) -> bool:
 
 @pytest.fixture
 def supervise():
-    """A function that supervises children in a thread until the test ends."""
+    """Yield a function that supervises children in a thread until the test ends."""
     running: list[tuple[Supervisor, threading.Thread]] = []
 
     def start(*children: Child) -> Supervisor:

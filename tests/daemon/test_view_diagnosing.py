@@ -41,7 +41,7 @@ class Stored:
 
 
 class Said:
-    """What was told of the diagnoses."""
+    """Recorder of the published states of diagnoses."""
 
     def __init__(self) -> None:
         self.states: list[str] = []

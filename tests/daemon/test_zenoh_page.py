@@ -120,7 +120,7 @@ def learner(tmp_path_factory, free_endpoint) -> Iterator[Config]:
 
 
 def run_example(name: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """The example as a program of its own that cannot import ours."""
+    """Run the example as a separate program that cannot import the project."""
     command = [sys.executable, "-I", str(ROOT / "examples" / name), *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False, cwd=os.sep)
 

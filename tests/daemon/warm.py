@@ -110,7 +110,7 @@ def run(
 
 @functools.cache
 def _server() -> socket.socket:
-    """The way to the process that forks; it ends with this one."""
+    """Return the socket to the forking process, which ends with this one."""
     ours, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     environment = {"OPENBLAS_NUM_THREADS": "1"} | os.environ
     with its:

@@ -1,4 +1,4 @@
-"""What the families of errors without a name move, and by how much."""
+"""Effect of the unnamed error families on the positions, and its size."""
 
 from __future__ import annotations
 

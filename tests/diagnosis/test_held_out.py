@@ -42,7 +42,7 @@ def robot() -> RobotDescription:
 
 
 def converged(fit: Fit) -> Fit:
-    """The fit, fitted again from where it ended."""
+    """Return the fit, fitted again from where it ended."""
     for _ in range(3):
         fit = fitted(fit.observations, fit.simulation, fit.nuisances, fit.noise)
     return fit
@@ -126,7 +126,7 @@ def chances(robot: RobotDescription, starts: list[Fit], name: str, where: str | 
 
 
 def chances_of_independent_rows(robot: RobotDescription, starts: list[Fit], name: str, where: str) -> FloatArray:
-    """The same if each row were a measurement of its own."""
+    """Return the same probabilities if each row were an independent measurement."""
     found = [Scan(fit).candidate(Effect.at(robot, name, where)) for fit in starts]
     return np.array([stats.chi2.sf(candidate.gain, candidate.dof) for candidate in found if candidate is not None])
 
@@ -136,7 +136,7 @@ def is_uniform(p_values: FloatArray) -> bool:
 
 
 def read_in_ticks(robot: RobotDescription, seed: int) -> Fit:
-    """An arm that stands still for some rows and is read in whole ticks: they all have the same error."""
+    """Return a fit of an arm that rests for some rows, read in whole ticks, so that these rows share one error."""
     rows = ALIKE * POSES
     q = np.repeat(scattered(robot, seed, POSES).q, ALIKE, axis=0)
     motion = motion_of(TICK_RAD * np.round(q / TICK_RAD))

@@ -1,4 +1,4 @@
-"""What a hypothesis would explain, and its moment, period or width, before anything is refitted."""
+"""Gain of a hypothesis with its moment, period or width, before any refit."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def robot() -> RobotDescription:
 
 
 def scanned(robot: RobotDescription, planted: Effect, seed: int) -> Candidate:
-    """The effect as it is found again, whatever its numbers are."""
+    """Return the effect as the scan recovers it from its name and place alone."""
     candidate = Scan(start_of(robot, walk(robot, seed), (planted,), seed)).candidate(
         Effect.at(robot, planted.name, planted.where, planted.source)
     )

@@ -1,4 +1,4 @@
-"""What single readings scatter is not taken for a joint's memory of its way; a memory still is."""
+"""Noise of single readings is not mistaken for a joint's hysteresis; real hysteresis is found."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def poses(robot: RobotDescription, rng: np.random.Generator) -> Motion:
 def fit_of(
     robot: RobotDescription, seed: int, *effects: Effect, way: Way = slow_way, scatter_rad: float = SCATTER_RAD
 ) -> Fit:
-    """The simulation without effects, laid on readings that scatter."""
+    """Return the simulation without effects, aligned to noisy readings."""
     rng = np.random.default_rng([seed, 21])
     motion = way(robot, rng)
     x = Simulation(robot, effects).positions(motion) + SIGMA_M * rng.normal(size=(ROWS, 3))
@@ -113,7 +113,7 @@ def test_a_memory_is_seen_on_ways_with_rests_and_from_pose_to_pose(robot, name, 
 
 
 def with_false_play(robot: RobotDescription, seed: int) -> tuple[Fit, Search]:
-    """A play that the joint has not, fitted to readings that scatter: the likelihood speaks for it."""
+    """Return a fit with a backlash that the joint does not have; noisy readings make the likelihood favour it."""
     fit, search = fit_of(robot, seed), Search([Effect.at(robot, "backlash", ELBOW)], lambda _: None)
     false = fit.with_causes([Effect.at(robot, "backlash", ELBOW, values=[0.3 * SCATTER_RAD])])
     assert nats(2.0 * (false.log_likelihood - fit.log_likelihood), 1) > NAMED

@@ -21,7 +21,7 @@ MASSES = {"turret": 0.6, "upper_arm": 0.5, "forearm": 0.35, "wrist": 0.15, "grip
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory) -> RobotDescription:
-    """The desk arm, held by its motors, with masses half way along its links; camera and marker are known."""
+    """Return the desk arm, held by its motors, with masses half way along its links and known camera and marker."""
     folder: Path = tmp_path_factory.mktemp("heavy")
     urdf = DESK_ARM.with_name("desk_arm.urdf").read_text()
     for link, kg in MASSES.items():
@@ -34,7 +34,7 @@ def robot(tmp_path_factory) -> RobotDescription:
 
 
 def moments_about_the_floor(robot: RobotDescription, q: np.ndarray) -> np.ndarray:
-    """Of the arm's weight (n, 3) [N·m], by how much the height of its centre changes as the floor is tilted."""
+    """Return the weight's moments (n, 3) [N·m]: the change of height of its centre as the floor is tilted."""
     moments, forces = Simulation(robot).gravity.loads(q)
     (T, *_) = Simulation(robot).gravity.in_supports(0)
     return moments[:, 0] @ T[:3, :3].T + np.cross(T[:3, 3], forces[:, 0] @ T[:3, :3].T)

@@ -50,7 +50,7 @@ def test_a_joint_that_was_read_at_few_places_has_no_tick(robot) -> None:
 
 
 def noisy(robot: RobotDescription, factor: float, tick: float, seed: int) -> Observations:
-    """An instrument whose noise is `factor` times as large as it says, and encoders that read whole ticks."""
+    """Return observations with `factor` times the stated noise, from encoders that read whole ticks."""
     motion = walk(robot, seed, 400)
     noise = factor * SIGMA_M * np.random.default_rng([seed, 1]).normal(size=(len(motion), 3))
     x = Simulation(robot).positions(motion) + noise

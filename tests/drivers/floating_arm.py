@@ -41,7 +41,7 @@ class Pendulum:
         self.times, self.path = [0.0], [q]
 
     def shaft(self, t: float) -> float:
-        """The servo's angle [rad]; also of the past."""
+        """Return the servo's angle [rad], also in the past."""
         self.move(t)
         place = bisect_right(self.times, t) - 1
         return self.direction * self.path[max(place, 0)]
@@ -74,7 +74,7 @@ class Pendulum:
 
 
 def holding(q: np.ndarray) -> np.ndarray:
-    """What bears the pendulums [N·m]."""
+    """Return the torques that hold the pendulums [N·m]."""
     return WEIGHT_N_M * np.cos(q)
 
 
@@ -143,7 +143,7 @@ class FloatingArm:
         return answer.result()
 
     def let_go(self) -> None:
-        """The hand that held the arm is gone."""
+        """Release the arm from the hand."""
         for pendulum in self.pendulums:
             pendulum.held_until = self.clock.now()
 
@@ -155,14 +155,14 @@ class FloatingArm:
 
     @property
     def q(self) -> list[float]:
-        """Where the pendulums are [rad]."""
+        """Positions of the pendulums [rad]."""
         return [pendulum.q for pendulum in self.pendulums]
 
     @property
     def torque(self) -> list[int]:
-        """Whose torque is on."""
+        """Torque register of each servo."""
         return [servo["torque"] for servo in self.chain.servos]
 
     def currents(self) -> list[float]:
-        """What the servos regulate now [A]."""
+        """Return the currents that the servos regulate now [A]."""
         return [servo.motor_current(self.clock.now()) for servo in self.chain.servos]

@@ -101,18 +101,18 @@ class GazingRobot:
         return np.array(seen)
 
     def q(self) -> np.ndarray:
-        """Where all joints are [rad] (d,)."""
+        """Return the positions of all joints [rad] (d,)."""
         return np.array([servo.angle(self.clock.now()) for servo in self.chain.servos])
 
     def pixel(self) -> np.ndarray:
-        """Where the hand is in the left image [px] (2,)."""
+        """Return the hand's position in the left image [px] (2,)."""
         calibration = self.robot.calibration
         assert calibration is not None
         x, y, z = self.truth.positions(self.q()[None])[0]
         return np.array([x, y]) / z * calibration.focal_px + calibration.principal_point_px
 
     def in_view(self, pixels: np.ndarray) -> np.ndarray:
-        """Which are in the image (n,)."""
+        """Return a mask of the pixels inside the image (n,)."""
         calibration = self.robot.calibration
         assert calibration is not None
         size = np.array(calibration.image_size_px)

@@ -18,7 +18,7 @@ Path = Callable[[float], float]
 
 
 def swing(phase: float) -> Path:
-    """A joint that is moved by hand, at up to 50°/s."""
+    """Return the path of a joint moved by hand, at up to 50°/s."""
     return lambda t: 1.2 * math.sin(0.7 * t + phase)
 
 
@@ -57,7 +57,7 @@ class ServoArm:
         self._latency_s, self._models = latency_s, models
 
     def entries(self, kind: Callable[[str, int, str], Any]) -> tuple[Any, ...]:
-        """The servos as robot.toml would tell of them."""
+        """Return the servos as entries of robot.toml."""
         fitted = zip(self.names, self._models, strict=True)
         return tuple(kind(name, k, model) for k, (name, model) in enumerate(fitted, 1))
 
@@ -71,5 +71,5 @@ class ServoArm:
         return max(abs(q - path(reading.t)) for q, path in zip(reading.q, self.paths, strict=True))
 
     def sampled(self) -> float:
-        """The middle of the times at which the positions were really taken [s]."""
+        """Return the mean time at which the positions were really sampled [s]."""
         return sum(sampling.t for sampling in self.chain.samplings.values()) / len(self.chain.samplings)

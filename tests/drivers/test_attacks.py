@@ -56,7 +56,7 @@ class Wire(OnlyAnswers):
 
 
 def echo(data: bytes, replies: list[Reply], t: float) -> list[Reply]:
-    """The adapter sends back what is sent."""
+    """Prepend the sent bytes to the replies, like an adapter that echoes."""
     return [Reply(0, t, data), *replies]
 
 
@@ -152,7 +152,7 @@ def test_noise_without_end_does_not_hold_the_driver(model) -> None:
 
 
 def once(arm: Any, place: int, value: int) -> Change:
-    """The first answer to a question for torque has another byte, and a checksum that fits."""
+    """Change one byte in the first answer to a torque query, with a valid checksum."""
     state, left = arm.chain.servo(1).model.layout.state, [1]
 
     def change(data: bytes, replies: list[Reply], _t: float) -> list[Reply]:

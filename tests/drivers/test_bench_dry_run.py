@@ -193,7 +193,7 @@ GAZING = msgspec.structs.replace(CONFIG, gaze=GazeConfig(joints=("waist", "shoul
 
 
 def turning(*faults: str) -> DynamixelArm:
-    """An arm whose joints all move with time, but for those that its servos turn."""
+    """Return an arm whose joints all move with time, except those that its servos turn."""
     asked = [AskedFault.parsed(fault, JOINTS, KINDS) for fault in faults]
     return DynamixelArm(GAZING, dict.fromkeys(JOINTS, lambda t: 0.1 * t), faults=asked, now=lambda: 2.0)
 

@@ -72,7 +72,7 @@ class Bench:
         self.shell.unplug()
 
     def ticks(self, id: int) -> int:
-        """Where the servo stands."""
+        """Return the servo's position in ticks."""
         return self.model.zero_ticks + round(ANGLES[IDS.index(id)] / self.model.rad_per_tick)
 
 

@@ -143,7 +143,7 @@ def test_a_port_of_another_group_is_told_with_the_command(machine, monkeypatch) 
 
 
 class Told:
-    """What the doctor says of servos on a bench."""
+    """Doctor's findings about emulated servos."""
 
     def __init__(self, make: str, tmp_path: Path, *faults: str, delay_s: float = 0.0) -> None:
         arm_of, config, the_make, open_port, *_ = MAKES[make]

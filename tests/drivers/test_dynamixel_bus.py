@@ -33,7 +33,7 @@ class TalkingPort:
         self._clock, self._pieces = clock, pieces
 
     def write(self, data: bytes) -> None:
-        """It does not listen."""
+        """Ignore the data."""
 
     def receive(self, until: float) -> bytes:
         next_s = self._clock.now() + 1e-3

@@ -1,4 +1,4 @@
-"""What lost and late answers cost, and that a late one never passes for the answer to a later question."""
+"""Cost of lost and late answers; a late answer is never taken for the answer to a later request."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_a_lost_answer_costs_one_reading(make, missing) -> None:
 
 
 def rig(model: str, angles: list[float]):
-    """A bus with one servo, whose shaft is at the next angle whenever it is asked."""
+    """Return a bus with one servo, whose shaft is at the next angle at each request."""
     bus_of, chain_of, servo_of, models = BUSES[model]
     clock, faults = VirtualClock(), Planned()
     chain = chain_of([servo_of(models[model], 1, lambda t: angles[0], return_delay_s=0.0)], faults)

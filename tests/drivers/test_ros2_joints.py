@@ -24,7 +24,7 @@ SEEN_BY_THE_GATE = (Fault.BIT, Fault.WORD, Fault.SWAPPED_NAMES)
 
 
 def said(name: str, *joints: str, rate_hz: float = 100.0, **settings) -> Node:
-    """A node that publishes some of the joints."""
+    """Return a node that publishes some of the joints."""
     return Node({joint: PATHS[joint] for joint in joints}, rate_hz, name=name, **settings)
 
 

@@ -35,7 +35,7 @@ def joints(endpoint: str, **settings) -> Ros2Joints:
 
 
 def first(source: Ros2Joints):
-    """The first reading that comes."""
+    """Return the first reading that arrives."""
     deadline = time.monotonic() + LIMIT_S
     while time.monotonic() < deadline:
         reading = source.read(0.5)

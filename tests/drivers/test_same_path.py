@@ -49,7 +49,7 @@ class Guided:
     path: FloatArray  # (n, d) [rad]
 
     def angles(self, begin_s: float) -> list[Angle]:
-        """Of each joint its angle at a time, the path beginning at `begin_s`."""
+        """Return the angle of each joint as a function of time, the path beginning at `begin_s`."""
         return played(self.path, CONFIG.encoders.rate_hz, begin_s)
 
     @property
@@ -62,7 +62,7 @@ class Guided:
         return sum(float(np.linalg.norm(T[:3, 3])) for T in self.robot.chain.fixed[1:])
 
     def learnt(self, q: FloatArray, true_q: FloatArray) -> KBMap:
-        """What is learnt of readings `q` and a camera without errors, (n, d) [rad] both."""
+        """Return the map learned from readings `q` and an error-free camera, (n, d) [rad] both."""
         bases = (JointBasis.orthonormal(-1.0, 1.0),) * len(self.robot.joints)
         learner = ExactLearner(KBMap(bases, np.zeros((3,) * (len(bases) + 1))))
         learner.learn(q, self.robot.chain.positions(true_q))

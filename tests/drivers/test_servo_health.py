@@ -1,4 +1,4 @@
-"""What an arm of servos tells of their health, and what is asked when a joint lost its turns."""
+"""Health reports of a servo arm, and the question asked when a joint lost its turn count."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is written to EEPROMs, on the bench in virtual time."""
+"""Writes to servo EEPROMs, on the emulator in virtual time."""
 
 from __future__ import annotations
 

@@ -122,7 +122,7 @@ class Floating:
         return self.process.wait()
 
     def errors(self) -> str:
-        """What it wrote to stderr."""
+        """Return its stderr output."""
         self._errors.seek(0)
         return self._errors.read()
 

@@ -21,7 +21,7 @@ def robot(tmp_path_factory) -> RobotDescription:
 
 
 def seen(robot: RobotDescription, file) -> np.ndarray:
-    """The marker in the camera's frame, by the URDF alone."""
+    """Return the marker in the camera's frame, from the URDF alone."""
     chain = chain_between(
         UrdfTree.load(file),
         robot.joints,

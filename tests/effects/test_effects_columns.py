@@ -44,7 +44,7 @@ def drawn(data, robot):
 
 
 def numerical(simulation, place, number, step):
-    """Derivative (n, 3) by one number of the effect at `place`."""
+    """Return the numerical derivative (n, 3) with respect to one number of the effect at `place`."""
     outcomes = []
     for change in (step, -step):
         effects = list(simulation.effects)
@@ -56,7 +56,7 @@ def numerical(simulation, place, number, step):
 
 
 def sprung(robot, kind):
-    """The spring without which a payload does not show."""
+    """Return the joint compliance without which a payload has no effect."""
     return (sized(robot, ("joint_compliance", "elbow", None), 1.0),) if kind == "payload" else ()
 
 

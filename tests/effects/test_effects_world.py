@@ -34,7 +34,7 @@ def robot(tmp_path_factory):
 
 
 def shown(simulation: Simulation, postures, monkeypatch):
-    """What an ideal tracker would measure in the posed world (n, 3)."""
+    """Return the positions (n, 3) [m] that an ideal tracker would measure in the posed world."""
     monkeypatch.setattr("bodyschema.sim_backend.posed.RenderProcess", NoRenderer)
     with PosedWorld(simulation.robot, SimConfig(errors=NO_ERRORS), postures, simulation) as world:
         return np.array([world.scene(number).x_seen for number in range(len(postures))])

@@ -52,7 +52,7 @@ def effect(robot, name: str) -> Effect:
 
 
 def stepped(file: Path, joints: tuple[str, ...], motion: Motion) -> FloatArray:
-    """Where MuJoCo's own dynamics bring the marker, the joints that are read led from row to row."""
+    """Return the marker positions of MuJoCo's dynamics, with the read joints driven from row to row."""
     spec = mujoco.MjSpec.from_file(str(file))
     for actuator in list(spec.actuators):
         spec.delete(actuator)

@@ -18,7 +18,7 @@ SCRIPTS = sorted((ROOT / "examples").glob("[0-9]_*.py"))
 
 
 def main_of(number: int, *arguments: Path) -> Any:
-    """What the `main` of a script returns."""
+    """Call the `main` of a script and return its result."""
     return runpy.run_path(str(SCRIPTS[number - 1]))["main"](*arguments)
 
 

@@ -36,7 +36,7 @@ CAMERAS = StereoCalibration(
 
 @pytest.fixture(scope="module")
 def packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the example installed in it."""
+    """Return a folder with the example installed in it."""
     folder = tmp_path_factory.mktemp("packages")
     source = shutil.copytree(ROOT / "examples" / "extending", tmp_path_factory.mktemp("source") / "extending")
     options = ["--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--disable-pip-version-check"]
@@ -52,7 +52,7 @@ def installed(packages: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def robot_toml(tmp_path: Path) -> Path:
-    """The desk arm with the lines of the page."""
+    """Copy the desk arm to a folder of its own and return its robot.toml."""
     for name in ("robot.toml", "desk_arm.urdf"):
         shutil.copy(ROOT / "examples" / "desk_arm" / name, tmp_path)
     return tmp_path / "robot.toml"

@@ -29,7 +29,7 @@ ARMS = st.text("RPFH", max_size=4).map(lambda kinds: kinds + "R")
 
 
 def learnt(robot: RobotDescription, rng: np.random.Generator) -> tuple[RigidChain, CalibratedGeometry]:
-    """A chain some degrees and centimetres off the nominal one, a camera far off, and the files' terms for it."""
+    """Return a chain some degrees and centimetres off nominal, a camera far off, and the files' terms for it."""
     parameters = ChainParameters(robot.chain)
     change = 0.05 * rng.normal(size=parameters.size)
     change[parameters.base_turn] = rng.uniform(-1.5, 1.5, 3)
@@ -91,7 +91,7 @@ def without_visuals(urdf: Path) -> Path:
 
 
 def bullet_position(pybullet, client: int, body: int, robot: RobotDescription, q: np.ndarray) -> np.ndarray:
-    """The marker in the camera's frame (3,) as pybullet has it.
+    """Return the marker in the camera's frame (3,) computed by pybullet.
 
     It hands out frames of links in single precision and centres of mass in double; in these two links they coincide.
     """

@@ -42,7 +42,7 @@ def shared_errors(rng: np.random.Generator, count: int, sigma_m: float, memory: 
 
 
 def wrong_prior(chain: RigidChain) -> KBMap:
-    """The map of the chain with its marker and its frame a few centimetres off."""
+    """Return the map of the chain with its marker and its frame a few centimetres off."""
     bases = learning_bases(np.full(chain.joints, -np.pi), np.full(chain.joints, np.pi))
     fixed = chain.fixed.copy()
     fixed[0, :3, 3] += [0.02, -0.03, 0.01]

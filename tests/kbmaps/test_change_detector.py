@@ -56,7 +56,7 @@ class Arm:
         self.x[BEFORE:] += shift[BEFORE:]
 
     def bend(self, size_m: float) -> None:
-        """The joints yield as they will, by about so much at the marker."""
+        """Add a smooth random compliance of the joints, about `size_m` at the marker."""
         waves = self.rng.normal(size=(3, self.q.shape[1])) * 0.7
         self.x += size_m * np.sin(waves @ self.q.T + self.rng.uniform(0.0, 6.0, (3, 1))).T
 
@@ -74,7 +74,7 @@ class Arm:
         detector.add(q, x - self.belief.predict(q), isotropic(SIGMA, len(q)))
 
     def noticed(self) -> tuple[ChangeDetector, int]:
-        """The detector when it raised an alarm, and how many pairs it had seen."""
+        """Return the detector when it raised an alarm, and the number of pairs it had seen."""
         detector = self.detector()
         for k in range(len(self.q)):
             self.feed(detector, slice(k, k + 1))

@@ -11,7 +11,7 @@ TRUSTED = ("rigid", "bent")
 
 
 def squares(measured: np.ndarray, offsets: tuple[float, float]) -> dict[str, float]:
-    """Of two models that are wrong by so much along x."""
+    """Return the squared errors of two models that have these offsets along x."""
     return {
         name: float(np.square(measured + np.array([offset, 0.0, 0.0])).sum())
         for name, offset in zip(TRUSTED, offsets, strict=True)

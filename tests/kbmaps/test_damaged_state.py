@@ -119,7 +119,7 @@ def opened(data: bytes) -> tuple[str, dict[str, Any], dict[str, np.ndarray]]:
 
 
 def closed(kind: str, fields: dict[str, Any], arrays: dict[str, np.ndarray]) -> bytes:
-    """As `kbmaps.packed.pack` writes them, with numbers that JSON has and float64 has not in the place of texts."""
+    """Pack data like `kbmaps.packed.pack`, with numbers valid in JSON but not in float64 in place of texts."""
     shapes = {name: list(array.shape) for name, array in arrays.items()}
     header = json.dumps({"kind": kind, "fields": fields, "arrays": shapes})
     for text in WRONG:
@@ -130,7 +130,7 @@ def closed(kind: str, fields: dict[str, Any], arrays: dict[str, np.ndarray]) -> 
 
 
 def places(value: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Where something is in nested objects and lists."""
+    """Yield the path of each value in nested objects and lists."""
     entries = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for key, entry in entries:
         yield (*place, key)

@@ -35,7 +35,7 @@ class PositionsOnly:
 
 
 def planted(rng: np.random.Generator, kinds: str, *, deg: float = RANGE_DEG) -> tuple[KBMap, np.ndarray]:
-    """A random chain as a map of poses, and its half ranges."""
+    """Return a random chain as a map of poses, and its half ranges."""
     return random_chain(rng, kinds).to_kbmap(bases_for(kinds, deg), orientation=True), half_ranges(kinds, deg)
 
 
@@ -50,7 +50,7 @@ def planar_map(*links_m: float) -> KBMap:
 
 
 def share_converged(joint_kinds: str, *, arms: int, targets: int, pose: bool, deg: float = RANGE_DEG) -> float:
-    """Of poses that random configurations within the limits have, the share that is found again to 1e-6 m (and rad)."""
+    """Return the share of reachable random poses for which a solution is found to 1e-6 m (and rad)."""
     found = []
     for seed in range(arms):
         rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""What `kbmaps.Model` promises, held for every implementation."""
+"""Contract of `kbmaps.Model`, checked for every implementation."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def model(name: str, arm: Arm) -> Model:
 
 @pytest.fixture
 def taught(name: str) -> Model:
-    """A model that all tests share: none of them changes it."""
+    """Return a trained model that all tests share: none of them changes it."""
     return taught_once(name)
 
 

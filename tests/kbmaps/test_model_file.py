@@ -52,7 +52,7 @@ def test_the_reader_in_javascript_gives_the_same_numbers(tmp_path, kinds, orient
 
 @pytest.fixture(scope="session")
 def compiled_reader(tmp_path_factory) -> Path:
-    """The reader in C++."""
+    """Compile the C++ reader."""
     compiler = shutil.which("g++")
     if compiler is None:
         pytest.skip("no g++; to run it: apt-get install g++")

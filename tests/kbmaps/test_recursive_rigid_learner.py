@@ -179,7 +179,7 @@ def test_along_a_path_from_a_crude_drawing_it_ends_where_a_batch_does():
 
 
 def most_apart_from_a_batch(seed: int) -> float:
-    """Of all moments between refits, the largest root mean square difference from a batch in the batch's sigma."""
+    """Return the largest RMS difference from a batch fit between refits, in the batch's sigma."""
     rng = np.random.default_rng(seed)
     arm = rough_arm(rng, "RRRRR", CRUDE)
     q, x = arm.pairs(rng, 210, 5e-4, 60.0)

@@ -32,7 +32,7 @@ def eccentric(q: np.ndarray) -> np.ndarray:
 
 
 def loaded(arm: Arm, q: np.ndarray, weight: float) -> np.ndarray:
-    """The arm with a weight at its marker, each joint a spring: a hundred small steps to equilibrium."""
+    """Return the joint angles under a weight at the marker, each joint a spring, after a hundred small steps."""
     down = np.array([0.2, -0.3, -0.9])
     yielded = q.copy()
     for _ in range(100):

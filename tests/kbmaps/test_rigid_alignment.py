@@ -13,7 +13,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def planted(rng: np.random.Generator, *, pose: bool, marker: bool) -> tuple[np.ndarray, np.ndarray]:
-    """An instrument pose anywhere, and a tool shift of up to 0.3 m."""
+    """Return an arbitrary instrument pose and a tool shift of up to 0.3 m."""
     T_measured_nominal = np.eye(4)
     if pose:
         T_measured_nominal[:3, :3] = Rotation.random(rng=rng).as_matrix()

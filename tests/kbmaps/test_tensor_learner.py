@@ -27,7 +27,7 @@ AT_ONCE = TensorSettings(refit_every=1)
 
 
 def perturbed(chain: RigidChain, rng: np.random.Generator) -> RigidChain:
-    """The chain with every link turned by about 3 degrees and shifted by about 15 mm a component."""
+    """Return the chain with every link turned by about 3 degrees and shifted by about 15 mm per component."""
     turns = [random_small_turn(rng, np.radians(3.0)) for _ in range(len(chain.fixed))]
     fixed = chain.fixed.copy()
     fixed[:, :3, :3] = fixed[:, :3, :3] @ np.array(turns)
@@ -42,7 +42,7 @@ def random_small_turn(rng: np.random.Generator, std: float) -> np.ndarray:
 
 
 def case(kinds: str, n: int, seed: int, sigma: float = 0.0, revolute_deg: float = 80.0):
-    """A true chain, a rough prior of it, and n pairs."""
+    """Return a true chain, a rough prior of it, and n pairs."""
     rng = np.random.default_rng(seed)
     chain = random_chain(rng, kinds)
     q = random_q(rng, kinds, n, revolute_deg)
@@ -139,7 +139,7 @@ def test_the_claimed_sigma_holds_two_thirds_of_the_errors():
 
 
 def stretched(q):
-    """What the joints really do: encoders eccentric by 2 degrees, as joints read them."""
+    """Return the true joint angles: encoders eccentric by 2 degrees."""
     return q + np.radians(2.0) * np.sin(q + np.arange(q.shape[1]))
 
 
@@ -249,7 +249,7 @@ def test_a_given_sigma_weighs_the_pairs():
 
 
 def changed_tool(settings_: TensorSettings | None = None):
-    """A learner that has seen 200 pairs, the chain after its marker moved by 200 mm, and further pairs of that."""
+    """Return a learner that has seen 200 pairs, the chain after its marker moved by 200 mm, and further pairs of it."""
     chain, prior, q, x = case("RRRR", 300, 9, 1e-3)
     learner = TensorLearner.around(prior, bases_for("RRRR"), settings_)
     learner.learn(q[:200], x[:200])

@@ -28,7 +28,7 @@ INIT, EXPORT, DIFFERENCE, WRITE = (
 
 @pytest.fixture
 def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> TypedPage:
-    """The page, with the example's files in the present folder and a robot.toml."""
+    """Return the page, with the example's files in the working directory and a robot.toml."""
     shutil.copytree(SO101, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     return TypedPage(PAGE, capsys)

@@ -29,7 +29,7 @@ COMMANDS = re.findall(r"^\$ (bodyschema .*)$", PAGE, re.MULTILINE)
 
 
 def output_of(command: str) -> str:
-    """What the page shows under a command."""
+    """Return the output that the page shows for a command."""
     return re.search(rf"```console\n\$ {re.escape(command)}\n(.*?)```", PAGE, re.DOTALL)[1]
 
 
@@ -45,7 +45,7 @@ def code(cell: str) -> str:
 
 @pytest.fixture
 def desk(tmp_path: Path) -> Path:
-    """A folder of one's own with the example in it."""
+    """Return a folder of the user's own with the example in it."""
     return Path(shutil.copytree(EXAMPLE, tmp_path / "desk_arm"))
 
 

@@ -19,7 +19,7 @@ from bodyschema.sim_backend.truth import TrueRobot
 
 @dataclass(frozen=True)
 class Run:
-    """What was recorded at 30 Hz.
+    """Recording at 30 Hz.
 
     Attributes:
         q: readings (n, d).
@@ -38,7 +38,7 @@ def shipped() -> RobotDescription:
 
 
 def learning(joints: tuple[str, ...]) -> RobotDescription:
-    """The shipped robot with other joints learnt."""
+    """Return the shipped robot with other joints to learn."""
     file = model_file("upper_body")
     tables, text = read_toml(file)
     tables["robot"]["joints"] = list(joints)
@@ -46,14 +46,14 @@ def learning(joints: tuple[str, ...]) -> RobotDescription:
 
 
 def described(folder: Path, urdf: str, toml: str) -> RobotDescription:
-    """A robot of one's own."""
+    """Write and load a robot of the user's own."""
     (folder / "robot.urdf").write_text(urdf, encoding="utf-8")
     (folder / "robot.toml").write_text(toml, encoding="utf-8")
     return RobotDescription.load(folder / "robot.toml")
 
 
 def in_eye(scene: Scene) -> FloatArray:
-    """The ball (3,) in the left eye [m]."""
+    """Return the ball (3,) in the left eye [m]."""
     return (np.linalg.inv(scene.T_world_camera) @ np.append(scene.x_world, 1.0))[:3]
 
 

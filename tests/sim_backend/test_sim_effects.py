@@ -1,4 +1,4 @@
-"""What the world shows is what `bodyschema.effects.Simulation` says that it shows, effect by effect."""
+"""The rendered world agrees with `bodyschema.effects.Simulation`, effect by effect."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ TOGETHER = (
 
 
 def groups() -> list[list]:
-    """The effects as the guided world tries them: in three groups, and each other one alone."""
+    """Return the groups of effects that the guided world tries together, then each other effect alone."""
     grouped = [[case for case in EFFECTS if case[0] in names] for names in TOGETHER]
     alone = [case for case in EFFECTS if not any(case[0] in names for names in TOGETHER)]
     return grouped + [[case] for case in alone if case[0] != "camera_latency"]  # whose formula is of smooth paths
@@ -82,7 +82,7 @@ def named(case) -> str:
 
 
 def held() -> RobotDescription:
-    """The shipped robot, whose joints bear its weight."""
+    """Return the shipped robot, whose joints hold its weight."""
     file = model_file("upper_body")
     tables, text = read_toml(file)
     tables["robot"]["hold"] = "held"
@@ -95,7 +95,7 @@ def extended(*cases) -> Simulation:
 
 
 def guided(simulation: Simulation, config: SimConfig = CONFIG, seconds: float = 1.5) -> tuple[Motion, np.ndarray]:
-    """Readings at every step from the start, and what an ideal tracker sees in the frames; NaN between them."""
+    """Return readings at every step from the start, and an ideal tracker's positions; NaN between frames."""
     robot = simulation.robot
     assert robot.calibration is not None
     truth = TrueRobot.draw(robot, config, simulation)
@@ -110,7 +110,7 @@ def guided(simulation: Simulation, config: SimConfig = CONFIG, seconds: float = 
 
 
 def frames(motion: Motion) -> Motion:
-    """The rows at which frames were taken."""
+    """Return the rows at which frames were taken."""
     at = slice(FRAME_STEPS, None, FRAME_STEPS)
     assert motion.t is not None
     return Motion(motion.q[at], motion.t[at], motion.segment[at])

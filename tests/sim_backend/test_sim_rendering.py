@@ -22,7 +22,7 @@ RADIUS = CameraConfig().marker_radius_m
 
 @pytest.fixture
 def bullet():
-    """An empty pybullet world and its module."""
+    """Yield an empty pybullet world and its module."""
     module = load_pybullet()
     client = module.connect(module.DIRECT)
     yield module, client

@@ -31,7 +31,7 @@ class Countdown:
 
     @property
     def last(self) -> bool:
-        """Whether the next call kills."""
+        """True if the next call kills."""
         return self._left == 1
 
     def __call__(self) -> None:

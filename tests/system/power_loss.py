@@ -1,4 +1,4 @@
-"""What a disk holds after the power went: what was synced, and of the rest whatever had reached it by then.
+"""Contents of a disk after a power loss: all that was synced, and a random part of the rest.
 
 Of writes that were not synced, each sector is there or not, whatever the others are. Of names (made, renamed, removed)
 that were not synced, the first few are there, as many as by chance: file systems write these down in their order.
@@ -46,7 +46,7 @@ class File:
         self._pending.clear()
 
     def after_power_loss(self, rng: np.random.Generator) -> bytes:
-        """As the disk has it."""
+        """Return the contents that the disk has after a power loss."""
         left, share = bytearray(self._safe), rng.random()
         for done in self._pending:
             if done.operation is Operation.TRUNCATE:

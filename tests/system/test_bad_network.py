@@ -36,7 +36,7 @@ SOME, MORE = 20, 60
 
 
 def over(link: BadLink, config: Config) -> Config:
-    """The configuration of a learner that reaches the sampler over the link."""
+    """Return the configuration of a learner that reaches the sampler over the link."""
     text = config.file.read_text().replace(config.tables.zenoh.sampler, link.endpoint)
     file = config.file.with_name("far.toml")
     file.write_text(text)
@@ -112,7 +112,7 @@ def test_a_learner_that_is_gone_for_a_while_catches_up(tmp_path, free_endpoint) 
 
 
 def in_a_namespace(how: str, folder: Path, pairs: int) -> int:
-    """How many pairs were accepted, and learnt once each, by processes whose kernel makes the network bad."""
+    """Count the pairs accepted, and learned once each, by processes whose kernel degrades the network."""
     if subprocess.run(["unshare", "--net", "true"], capture_output=True, check=False).returncode:
         pytest.skip("no network namespaces; to run it: be root")
     script = Path(__file__).with_name("kernel_network.py")

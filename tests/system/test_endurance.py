@@ -27,7 +27,7 @@ MB = 2**20
 
 
 def tree(pid: int) -> list[int]:
-    """The process and all below it."""
+    """Return the process and all its descendants."""
     below = [
         int(child) for task in Path(f"/proc/{pid}/task").iterdir() for child in (task / "children").read_text().split()
     ]
@@ -47,7 +47,7 @@ def cpu_s(pid: int) -> float:
 
 
 def latency_s(ask: Callable[[], object]) -> float:
-    """How long an answer takes when nothing else is in the way: the quickest quarter."""
+    """Return the answer time without other load: the lower quartile."""
     taken: list[float] = []
     for _ in range(ASKED):
         begun = time.perf_counter()

@@ -78,7 +78,7 @@ direction = {direction}
 
 
 def looking_at_the_hand(robot: RobotDescription) -> FloatArray:
-    """The pose in which the arm waits, its head turned so that the cameras see the hand."""
+    """Return the pose in which the arm waits, its head turned so that the cameras see the hand."""
     assert robot.calibration is not None
     pointing = Pointing(robot.calibration, HEAD, robot.lower[HEAD], robot.upper[HEAD])
     q = MIDDLE[None].copy()
@@ -99,7 +99,7 @@ class Guided:
 
 @dataclass(frozen=True)
 class Watched:
-    """What was so for a while.
+    """Observations over a while.
 
     Attributes:
         t, q: where the joints were, and when [s], shapes (n,) and (n, d) [rad].
@@ -139,18 +139,18 @@ class Stage:
         self.head = [bench.arm.servo(joint) for joint in config.robot.joints[:2]]
 
     def q(self, t: float) -> FloatArray:
-        """Where the joints were [rad] (d,)."""
+        """Return the joint positions [rad] (d,)."""
         q = self._guided(t)
         q[HEAD] = [way * servo.angle(t) for way, servo in zip(DIRECTIONS, self.head, strict=False)]
         return q
 
     def seen(self, t: float) -> np.ndarray:
-        """What the cameras see, side by side."""
+        """Return the cameras' images side by side."""
         return np.hstack(drawn(self.config, self.q(t)))
 
     @property
     def torque(self) -> tuple[int, ...]:
-        """Of each servo."""
+        """Torque register of each servo."""
         return tuple(self._bench.arm.servo(joint)["torque"] for joint in self.config.robot.joints)
 
     def watch(self, sampler: SamplerProcess, seconds: float, pairs: int = 0) -> Watched:
@@ -167,7 +167,7 @@ class Stage:
 
 
 def write_robot(folder: Path, free_endpoint: Callable[[], str], device: Path) -> Config:
-    """The demonstration's upper body, of servos, with gaze and a camera."""
+    """Write the demonstration's upper body, with servos, gaze and a camera."""
     shutil.copytree(demonstration_model().parent, folder, dirs_exist_ok=True)
     toml = folder / "robot.toml"
     servos = [

@@ -25,7 +25,7 @@ LATEST_PAIR, LATEST_CHECKPOINT, LATEST_S = 40, 3, 1.0
 
 @dataclass(frozen=True)
 class Kill:
-    """How one life of a process ends.
+    """End of one life of a process.
 
     Attributes:
         point: a named point, at whose nth time the process dies; or NOWHERE.
@@ -49,7 +49,7 @@ def plan(rng: np.random.Generator, points: list[str], kills: int, latest: int) -
 
 
 def doomed(config: Config, process: str, kill: Kill) -> contextlib.AbstractContextManager[subprocess.Popen[bytes]]:
-    """A process of ours that has a `kill` before it."""
+    """Run a process that is to die by `kill`."""
     return running(config, process, fate=(kill.point, str(kill.nth)))
 
 
@@ -88,7 +88,7 @@ class Lives:
             self._enough.wait()
 
     def _death(self, child: subprocess.Popen[bytes], kill: Kill) -> str:
-        """The point where the process died; or what came instead."""
+        """Return the point where the process died, or the event that came instead."""
         if kill.point == NOWHERE:
             return self._death_from_outside(child, kill)
         try:
@@ -108,7 +108,7 @@ class Lives:
 
 @dataclass(frozen=True)
 class Aftermath:
-    """What is left when all kills are over and the learner had the time to catch up.
+    """State after all kills, once the learner had time to catch up.
 
     Attributes:
         planned, deaths: where processes were to die, and where they died.

@@ -27,7 +27,7 @@ CHECKPOINT = "learner.ckpt"
 
 @dataclass
 class Promised:
-    """What has to be there, whatever the disk lost.
+    """State that must survive whatever the disk lost.
 
     Attributes:
         accepted: number of the last pair that a sampler had accepted.
@@ -41,7 +41,7 @@ class Promised:
     previous: list[bytes | None] = field(default_factory=lambda: [None])
 
     def follow(self, done: Done, disk: Disk) -> None:
-        """What was done adds to it."""
+        """Record an operation."""
         if done.operation is Operation.RENAME and done.data.decode() == CHECKPOINT:
             self.previous += self.possible
             self.possible.append(bytes(disk.names[CHECKPOINT].present))

@@ -32,7 +32,7 @@ _INSTANTS = 9
 
 @dataclass(frozen=True)
 class Look:
-    """How a scene is lit and taken; levels are fractions of white.
+    """Lighting and exposure of a scene; levels are fractions of white.
 
     Attributes:
         ball_rgb: reflectance of the ball.
@@ -65,12 +65,12 @@ class Look:
 
 
 def backdrop(rng: np.random.Generator, size_px: tuple[int, int], wall: float | None) -> FloatArray:
-    """A picture (height, width, 3) RGB of 0..1: an even wall, or clutter when `wall` is None."""
+    """Return a picture (height, width, 3) RGB of 0..1: an even wall, or clutter when `wall` is None."""
     return clutter(rng, size_px) if wall is None else np.full((size_px[1], size_px[0], 3), wall)
 
 
 def clutter(rng: np.random.Generator, size_px: tuple[int, int]) -> FloatArray:
-    """A picture (height, width, 3) RGB of 0..1: smooth wall, boxes, some of them brown and brick red, and lines."""
+    """Return a picture (height, width, 3) RGB of 0..1: smooth wall, boxes (some brown or brick red) and lines."""
     width, height = size_px
     coarse = rng.uniform(0.25, 0.7, (6, 8, 1)) * np.array([1.0, 0.98, 0.94])
     picture = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
@@ -106,7 +106,7 @@ def render_pair(
 
 
 def in_eyes(x: FloatArray, calibration: StereoCalibration) -> tuple[FloatArray, FloatArray]:
-    """A point (3,) [m] of the left optical frame, in the left and in the right one."""
+    """Return a point (3,) [m] of the left optical frame in the left frame and in the right one."""
     return x, x - np.array([calibration.baseline_m, 0.0, 0.0])
 
 
@@ -159,7 +159,7 @@ def paint_ball(
 
 
 def _reach_px(x_eye: FloatArray, moved: FloatArray, look: Look, calibration: StereoCalibration) -> float:
-    """How far from its undistorted, resting image the ball may show [px]."""
+    """Return the largest distance at which the ball may show from its undistorted, resting image [px]."""
     return float(np.abs(moved).max() * calibration.focal_px / x_eye[2]) + abs(look.distortion) * max(
         calibration.image_size_px
     )
@@ -178,7 +178,7 @@ def _neighbourhood(
 
 
 def take(picture: FloatArray, look: Look, rng: np.random.Generator) -> ImageArray:
-    """What the camera makes of a picture: lens blur, exposure, noise of light and sensor, eight bits, JPEG; BGR."""
+    """Expose a picture: lens blur, exposure, shot and sensor noise, eight bits, JPEG; BGR."""
     grey_levels = 255.0 * look.exposure * picture[..., ::-1]
     if look.blur_px > 0:
         grey_levels = cv2.GaussianBlur(grey_levels, (0, 0), look.blur_px)

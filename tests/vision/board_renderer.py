@@ -60,7 +60,7 @@ class TrueLens:
         return at
 
     def _angle(self, bent: FloatArray) -> FloatArray:
-        """The angle off the axis whose image is at this distance from the centre, in focal lengths."""
+        """Return the angle off the axis that is imaged at this distance from the centre, in focal lengths."""
         k = np.array(self.distortion)
         t = bent
         for _ in range(12):
@@ -145,7 +145,7 @@ class Printed:
 
 @dataclass(frozen=True)
 class Taken:
-    """How an image is taken; levels are those of an 8-bit image."""
+    """Exposure of an image; levels are those of an 8-bit image."""
 
     blur_px: float = 0.7
     motion_px: float = 0.0
@@ -174,11 +174,11 @@ class Photographer:
         return StereoFrame(time, left, right)
 
     def left(self, R: FloatArray, t_m: FloatArray) -> ImageArray:
-        """The left eye's image alone."""
+        """Return the left image alone."""
         return self._image(0, self.rig.left, R, t_m)
 
     def corners(self, R: FloatArray, t_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Where the board's inner corners are in both eyes' images, in exact arithmetic, shape (n, 2) each [px]."""
+        """Return the exact image positions of the board's inner corners in both cameras, shape (n, 2) each [px]."""
         c, r = np.meshgrid(np.arange(1, self.board.columns), np.arange(1, self.board.rows))
         x = self.board.square_m * np.column_stack([c.ravel(), r.ravel(), np.zeros(c.size)]) @ R.T + t_m
         return self.rig.left.image(x), self.rig.right.image(x @ self.rig.R.T + self.rig.t_m)
@@ -199,7 +199,7 @@ class Photographer:
         return self._photograph(picture)
 
     def _met(self, rays: FloatArray, M: FloatArray) -> FloatArray:
-        """What rays (n, 2) meet."""
+        """Return the grey levels where rays (n, 2) meet the board."""
         x, y, w = (rays[:, 0] * M[k, 0] + rays[:, 1] * M[k, 1] + M[k, 2] for k in range(3))
         with np.errstate(divide="ignore", invalid="ignore"):
             return self._levels(x / w, y / w, w > 0)

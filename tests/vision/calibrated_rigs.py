@@ -75,7 +75,7 @@ def figures(truth: TrueRig, found: Calibrated) -> Figures:
 
 
 def calibrated_rig(seed: int, *, fisheye: bool, model: ModelChoice = "auto") -> Figures | str:
-    """The figures of a rig drawn at random, or why its calibration was refused."""
+    """Return the figures of a random rig, or the reason why its calibration was refused."""
     rng = np.random.default_rng(seed)
     truth = webcams(rng, fisheye=fisheye)
     photographer = Photographer(truth, Printed(), Taken(), rng)

@@ -65,7 +65,7 @@ def reason(answer: MarkerFix | MarkerMiss | None) -> Reason | None:
 
 
 def sigmas_off(answer: MarkerFix | MarkerMiss, ball: Ball) -> float:
-    """How far a fix is from the ball in the metric of its own covariance; infinite for a miss."""
+    """Return the distance of a fix from the ball in the metric of its own covariance; infinite for a miss."""
     if isinstance(answer, MarkerMiss):
         return np.inf
     error = answer.x - np.array(ball.x)
@@ -100,7 +100,7 @@ class Errors:
 
 
 def place(calibration: StereoCalibration, radius_px: float, rng: np.random.Generator) -> FloatArray:
-    """A random point (3,) [m] where a ball of RADIUS_M has about this radius and is well inside both images."""
+    """Return a random point (3,) [m] where a ball of RADIUS_M has about this radius and is well inside both images."""
     z = calibration.focal_px * RADIUS_M / radius_px
     disparity = calibration.focal_px * calibration.baseline_m / z
     width, height = calibration.image_size_px
@@ -126,7 +126,7 @@ def measure_errors(
 
 
 def compare(answers: Sequence[tuple[FloatArray, MarkerFix | MarkerMiss]], calibration: StereoCalibration) -> Errors:
-    """True places (3,) [m] and what the tracker said to each."""
+    """Return the errors of the tracker's answers against true positions (3,) [m]."""
     fixes = [(x, answer) for x, answer in answers if isinstance(answer, MarkerFix)]
     true = np.array([x for x, _ in fixes])
     return Errors(

@@ -20,7 +20,7 @@ BLACK, WHITE = 0.07, 0.85
 
 
 def pattern(id: int, dictionary: int = cv2.aruco.DICT_APRILTAG_36h11) -> np.ndarray:
-    """A tag's 8 by 8 squares (rows from the top), True where it is black."""
+    """Return a tag's 8 by 8 squares (rows from the top), True where it is black."""
     found = cv2.aruco.getPredefinedDictionary(dictionary)
     return cv2.aruco.generateImageMarker(found, id, 8, borderBits=1) < 128
 

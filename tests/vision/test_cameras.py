@@ -1,4 +1,4 @@
-"""What cameras are configured as, how their images are dated and paired, files in their place."""
+"""Configuration of cameras, time stamps and pairing of their images, and files used as cameras."""
 
 from __future__ import annotations
 

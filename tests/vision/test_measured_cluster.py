@@ -1,4 +1,4 @@
-"""Where tags are on a cluster, measured from images that show several at once."""
+"""Positions of tags on a cluster, measured from images that show several at once."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Places = dict[int, tuple[FloatArray, FloatArray]]
 
 
 def built(rng: np.random.Generator) -> Places:
-    """A cube of tags that were glued on by hand: each turned and shifted by a little, the first one too."""
+    """Return a cube of tags glued on by hand: each turned and shifted slightly, including the first."""
     faces = [np.eye(3), *(Rotation.from_euler("xyz", turn, degrees=True).as_matrix() for turn in TURNS)]
     turned = [face @ Rotation.from_rotvec(rng.normal(0.0, 0.03, 3)).as_matrix() for face in faces]
     places = [0.03 * face[:, 2] + rng.normal(0, 1e-3, 3) for face in faces]
@@ -47,7 +47,7 @@ TURNS = ([0, 90, 0], [0, -90, 0], [90, 0, 0], [-90, 0, 0])
 
 
 def poses(rng: np.random.Generator, count: int) -> list[tuple[FloatArray, FloatArray]]:
-    """The cluster turned by 35° to 65° to all sides in turn, about 0.5 m ahead."""
+    """Return poses of the cluster turned by 35° to 65° to all sides in turn, about 0.5 m ahead."""
     ways = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False) + 0.4
     turns = [rng.uniform(0.6, 1.1) * np.array([np.cos(way), np.sin(way), 0.0]) for way in ways]
     facing = np.diag([1.0, -1.0, -1.0])
@@ -78,7 +78,7 @@ def looked(
 
 
 def errors(found: MeasuredCluster, places: Places) -> tuple[FloatArray, FloatArray]:
-    """Of place [m] and turn [rad] of each tag but the first, in the first one's frame, (n, 3) each."""
+    """Return errors of position [m] and turn [rad] of all tags but the first, in the first one's frame, (n, 3) each."""
     first = min(places)
     R, x = places[first]
     off, turns = [], []

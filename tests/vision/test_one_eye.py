@@ -78,7 +78,7 @@ def test_depth_is_claimed_to_be_several_times_less_sure_than_what_is_across() ->
 
 
 def film_of_a_small_tag_that_turns_to_the_camera() -> tuple[FloatArray, list[StereoFrame]]:
-    """How it is turned in the end, and the frames."""
+    """Return the final orientation of a small tag that turns to the camera, and the frames."""
     turns = [tilted(float(degrees)) for degrees in np.linspace(25.0, 7.0, 10)]
     frames = [seen(at(turn, [0.0, 0.0, 0.65]), t=0.03 * k, noise=10.0, seed=k) for k, turn in enumerate(turns)]
     return turns[-1], frames

@@ -29,13 +29,13 @@ def answer(*things, config=None, **staging):
 
 
 def at_pixel(u: float, v: float, z: float = 0.8) -> Ball:
-    """A ball whose centre the left eye sees at (u, v) [px]."""
+    """Return a ball whose centre the left camera sees at (u, v) [px]."""
     cx, cy = SMALL.principal_point_px
     return Ball(((u - cx) * z / SMALL.focal_px, (v - cy) * z / SMALL.focal_px, z))
 
 
 def seen_discs(ball: Ball, level: float) -> list[Disc]:
-    """The discs of a ball in the left and in the right eye."""
+    """Return the discs of a ball in the left and in the right image."""
     eye = Pinhole(SMALL.focal_px, SMALL.principal_point_px)
     outlines = [eye.outline(x_eye, ball.radius_m) for x_eye in in_eyes(np.array(ball.x), SMALL)]
     return [Disc(one.centre_px, one.radius_px, 1e-4 * np.eye(2), 0.01, level) for one in outlines if one is not None]

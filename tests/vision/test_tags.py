@@ -55,7 +55,7 @@ def seen(*things: Sheet | Card, seed: int = 0, t: float = 0.0, look: Look = WALL
 
 
 def cube_at(rotation: FloatArray, x: FloatArray) -> list[Sheet]:
-    """The two tags of the cube where it is."""
+    """Return the two tags of the cube at this pose."""
     return [
         sheet(tag.id, rotation @ Rotation.from_euler("xyz", tag.rpy).as_matrix(), x + rotation @ np.array(tag.xyz))
         for tag in PLACED

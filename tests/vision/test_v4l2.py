@@ -37,7 +37,7 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def camera(tmp_path):
-    """A function that plugs a camera in."""
+    """Yield a function that plugs a camera in."""
     with ExitStack() as stack:
 
         def plug(name: str, images=GREY, **settings: Any) -> ShimCamera:

@@ -42,7 +42,7 @@ CONTROLS: dict[str, tuple[int, int, int, int]] = {
 
 
 def compiled(folder: Path) -> Path | None:
-    """The shim, compiled into `folder`; None where there is no compiler, or none with V4L2's headers."""
+    """Compile the shim into `folder`; return None if there is no compiler or no V4L2 header."""
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None or not Path("/usr/include/linux/videodev2.h").exists():
         return None
@@ -53,7 +53,7 @@ def compiled(folder: Path) -> Path | None:
 
 
 def preloaded(library: Path) -> dict[str, str]:
-    """The environment of a process that shall see the cameras."""
+    """Return the environment of a process that sees the cameras."""
     return {**os.environ, "LD_PRELOAD": str(library)}
 
 
@@ -115,15 +115,15 @@ class ShimCamera:
 
     @property
     def served(self) -> int:
-        """How many frames were taken."""
+        """Number of frames taken."""
         return HEADER.unpack_from(self._memory)[FIELDS.index("served")]
 
     def control(self, name: str) -> int:
-        """The value of a control."""
+        """Return the value of a control."""
         return CONTROL.unpack_from(self._memory, self._place(name))[4]
 
     def make_deaf(self, name: str) -> None:
-        """The control keeps its value whatever it is told."""
+        """Make the control keep its value whatever is written to it."""
         id, _, *rest = CONTROL.unpack_from(self._memory, self._place(name))
         CONTROL.pack_into(self._memory, self._place(name), id, 1, *rest)
 
