@@ -262,7 +262,7 @@ def head(rng: np.random.Generator) -> Arm:
 
 
 def drawn(rng: np.random.Generator) -> Arm:
-    """Six joints with drawn lengths, twists and masses; neighbouring axes are never parallel along the link."""
+    """Six joints with random lengths, twists and masses; neighbouring axes are never parallel along the link."""
     rows, letters = [("j1", "revolute", (0.0, 0.0, 0.25), (0.0, 0.0, 0.0), "z", -110.0, 110.0)], "yyxyx"
     for index, letter in enumerate(letters, 2):
         length = rng.uniform(0.18, 0.34) * (0.5 if index > 4 else 1.0)

@@ -130,7 +130,7 @@ def hide(
     rendered: bool = False,
     scatter: tuple[float, float] | None = None,
 ) -> HiddenCase:
-    """Write a case into `folder`; everything is drawn from `seed`.
+    """Write a case into `folder`; all random choices derive from `seed`.
 
     Args:
         effects: how many effects of the table to draw, or which ("backlash", "backlash@elbow",
@@ -138,18 +138,18 @@ def hide(
         arm: a name of `ARMS`; any when None.
         pairs, fresh_pairs: of measured.csv and of fresh.csv (as many when None).
         size: of each effect in units of the noise, one for all or one for each; "random" draws 0.2..15 each.
-        outliers: fraction of false fixes, beside any effect.
+        outliers: fraction of false fixes, in addition to any effect.
         hold: torque_free, zero_force or held; any in which the effects show when None.
-        reach: part of each joint's range that both recordings go through, around a posture that is drawn.
+        reach: part of each joint's range that both recordings cover, around a random posture.
         still: joints that never move.
         marker_known, pose_known: False writes a rough marker or camera pose into robot.toml and says so there.
         rendered: paint every image and look for the marker in it with the tracker (some tenths of a second a pair);
             a pair whose marker is not found is left out.
-        scatter: between what the encoders scatter before they round, 1-sigma [ticks], drawn; joints that do not lead
-            then stand still. None for encoders that only round.
+        scatter: range of the random encoder noise before rounding, 1-sigma [ticks]; joints that do not lead then
+            stand still. None for encoders that only round.
 
     Raises:
-        ValueError: an effect cannot sit there, or does not show in this motion.
+        ValueError: an effect is not possible there, or does not show in this motion.
     """
     streams = [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(7)]
     choosing, building, moving, freshly, noising, rough, scattering = streams
@@ -250,7 +250,7 @@ def _one(
 
 
 def _finished(hidden: Hidden, site: Site, sizer: Sizer) -> Hidden:
-    """Lost ticks are whole ones; a lag is told with the rest that it was given."""
+    """Round lost ticks to whole ones; add the time constant to a lag."""
     p = hidden.parameters
     if hidden.effect == "encoder_jump":
         name, tick = f"jump_{site.unit}", site.arm.quantum(str(site.where))

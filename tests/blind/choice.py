@@ -20,7 +20,7 @@ EVERY = {**KINDS, **OUTSIDE}
 
 @dataclass(frozen=True)
 class Wish:
-    """An effect that is to be hidden; a joint that is None is drawn."""
+    """An effect to hide; a joint that is None is chosen at random."""
 
     effect: str
     where: str | None = None
@@ -50,7 +50,7 @@ def wishes(
 ) -> list[Wish]:
     """Return the effects to hide: those named, "outside" for one outside the table, or a number of random ones.
 
-    Those in `rough` are no findings in this case and not drawn.
+    Effects in `rough` are not findings in this case and are not chosen.
     """
     if isinstance(effects, str):
         effects = [effects]

@@ -29,17 +29,17 @@ class DenseJudgement(msgspec.Struct, frozen=True):
     """One case.
 
     Attributes:
-        outcome: right: every hidden cause is named and no false one of weight. honest: what is not named is told as an
-            alternative, or its joint as one on which what is unexplained depends. wrong: something false is named for
-            sure, and nothing that is true is told beside it. vague: the rest.
-        named: causes with their probabilities; false, missed: those of weight that are not there, and those not named.
-        inside: of hidden zeros and plays that were named, how many of their intervals hold the truth, and how many
-            there are.
-        placed_mm, extended_mm: RMS error on other poses of the nominal model with what is not known fitted, and of
-            extended.toml.
+        outcome: right: every hidden cause is named and no significant false one. honest: each cause not named is
+            listed as an alternative, or its joint as one on which the unexplained error depends. wrong: a false cause
+            is named as certain, without a true alternative. vague: the rest.
+        named: causes with their probabilities; false, missed: significant ones not there, and those not named.
+        inside: number of named hidden joint offsets and backlashes whose intervals contain the truth, and number of
+            them.
+        placed_mm, extended_mm: RMS error on other poses of the nominal model with the unknown parameters fitted, and
+            of extended.toml.
         floor_ratio: stated noise floor over the RMS of the true noise.
-        tolerances, stated_tolerances: 1 sigma, as they are and as they are stated.
-        refused: message of the command where it needed --force.
+        tolerances, stated_tolerances: 1 sigma, true and stated.
+        refused: message of the command that needed --force.
     """
 
     seed: int

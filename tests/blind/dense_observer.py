@@ -41,10 +41,10 @@ class Observer:
         spans: columns of each cause.
         G: information (p, p) about all amounts, in units of their usual sizes, beside tolerances and noise.
         Q: covariance (p, p) of the noise in the same.
-        told: what the tolerances as they are add to the causes' data (p,).
-        free: information (p, p) with tolerances of zero, beside what is not known of instrument and marker.
+        told: contribution of the true tolerances to the causes' data (p,).
+        free: information (p, p) with tolerances of zero, with the unknown parameters of camera and marker.
         amounts: of every cause as if it were there, in usual sizes, shape (p,).
-        costs: what a set pays for each of its causes (K,) [nats].
+        costs: cost of each cause (K,) [nats].
     """
 
     spans: tuple[slice, ...]
@@ -68,9 +68,9 @@ class Observer:
         """Return an observer of whitened columns, rows of noise 1.
 
         Args:
-            flat: of what is not known at all (r, f).
-            background: of tolerances, each column times its 1 sigma (r, b).
-            drawn: the tolerances as they are, in sigmas (b,).
+            flat: columns of entirely unknown parameters (r, f).
+            background: columns of tolerances, each times its 1 sigma (r, b).
+            drawn: the true tolerances, in sigmas (b,).
             causes: columns of each cause times their usual sizes, (r, m) each.
             amounts: of each cause in usual sizes (m,).
             costs: of each cause [nats].

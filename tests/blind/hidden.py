@@ -24,14 +24,14 @@ class Hidden:
         where: the joint it sits at, or None.
         source: the other joint of a coupling, or None.
         parameters: physical quantities; the unit is the end of each name, SI without one.
-        sign: what positive parameters mean.
-        outside: whether it is in no table: to be called unexplained.
+        sign: meaning of positive parameters.
+        outside: True if it is in no table and should be called unexplained.
         drivers: with `outside`, the joints on which the hidden error itself depends.
         size: RMS of the noise-free residual of the nominal chain under this effect alone, whitened: 1 is as large as
             the noise along each axis, that of pixels and of ticks.
         rms_m: the same residual in metres.
-        shows_on: with `outside`, for each joint the share (0..1) of that residual's variance that goes when the other
-            joints stay and this one is drawn anew.
+        shows_on: with `outside`, for each joint the share (0..1) of that residual's variance that is lost when only
+            this joint is resampled.
     """
 
     effect: str

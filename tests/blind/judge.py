@@ -375,9 +375,9 @@ def joints_right(hidden: Hidden, depends_on: Sequence[str]) -> bool:
 
 
 def smooth_ratio(truth: Truth, diagnosis: Diagnosis) -> float | None:
-    """Error on data not fitted after the smooth model of what is unexplained, over the noise; None where there is none.
+    """Return the held-out error after the smooth model of the unexplained part, over the noise; None without a model.
 
-    Against positions free of noise nothing needs to be held out: what was fitted to the noise counts as an error.
+    Positions free of noise need no held-out data: a fit to the noise counts as an error.
     """
     if not truth.strange or diagnosis.left.model is None:
         return None

@@ -54,13 +54,13 @@ class CauseJudged(msgspec.Struct, frozen=True):
     """One named cause.
 
     Attributes:
-        is_right: whether it is a hidden effect, or the simplest name of one.
-        open: whether its rivals hold a hidden effect and it is not said to be sure.
-        listed: how many others it is said not to be told from.
-        needless: those from which this motion tells it.
-        wrong_reach: those of which it is wrongly said that no motion tells them, or that another one would.
-        numbers: of a right cause in a right diagnosis.
-        left_out: numbers that were not judged, and why.
+        is_right: True if it is a hidden effect, or the simplest name of one.
+        open: True if its alternatives contain a hidden effect and it is not stated as certain.
+        listed: number of effects reported as indistinguishable from it.
+        needless: those of them that this motion does distinguish.
+        wrong_reach: those of them with a wrong statement on whether another motion would distinguish them.
+        numbers: parameters of a right cause in a right diagnosis.
+        left_out: numbers that were not judged, with the reasons.
     """
 
     effect: str

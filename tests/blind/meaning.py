@@ -23,7 +23,7 @@ class Meant:
 
     Attributes:
         effect: with its numbers, to first order in the hidden ones.
-        told: names of the numbers that it has by its mechanism; the others are only near.
+        told: names of the numbers that follow from its mechanism; the others are approximate.
     """
 
     effect: Effect

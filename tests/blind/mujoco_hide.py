@@ -372,9 +372,9 @@ def hide(
     """Draw an arm by its seed, hide causes in it, and record it.
 
     Args:
-        rows: of the recording; drawn by default.
-        kind: which causes; `seed` modulo the number of kinds by default.
-        dense: scale of the tolerances; drawn by default.
+        rows: of the recording; random by default.
+        kind: kind of causes; `seed` modulo the number of kinds by default.
+        dense: scale of the tolerances; random by default.
     """
     rng = np.random.default_rng([seed, 7])
     model = MODELS[int(rng.integers(len(MODELS)))]

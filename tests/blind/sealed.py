@@ -121,7 +121,7 @@ def judged(cases: Iterable[Case], processes: int = 1) -> Iterator[Record]:
 
 
 def run(case: Case) -> Record | None:
-    """One case; None where the effects that were drawn show nowhere on the arm that was drawn."""
+    """Run one case; return None if the random effects show nowhere on the random arm."""
     scenario, seed = SCENARIOS[case.scenario], case.seed
     with tempfile.TemporaryDirectory() as folder:
         try:

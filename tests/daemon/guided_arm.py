@@ -84,7 +84,7 @@ def new_learning(nominal: NominalModel | None = None, settings: LearnerConfig | 
 
 
 def teach(learning: Learning, pairs: Iterable[Pair], *, background: bool = True, every: int = 5) -> None:
-    """Learn pairs, with all background work done after `every` so many and at the end."""
+    """Learn pairs, with all background work done after each `every` pairs and at the end."""
     for number, pair in enumerate(pairs, 1):
         learning.learn(pair, pair.t)
         while background and number % every == 0 and learning.work():

@@ -498,7 +498,7 @@ def flip_each(bits: Iterable[int], archive: Path, robot: Path) -> Counter[str]:
 
 @pytest.fixture
 def at_rest(monkeypatch) -> None:
-    """No process is asked for: there is none."""
+    """Skip the check for running processes: there are none."""
     monkeypatch.setattr("bodyschema.daemon.restoring.is_alive", lambda *_: False)
 
 

@@ -44,7 +44,7 @@ SIGMA_M = 0.0005
 
 @dataclass(frozen=True, eq=False)
 class Planted:
-    """A desk arm that is not as drawn: its pairs, and the truth about it."""
+    """A desk arm that deviates from nominal: its pairs and the ground truth."""
 
     robot: RobotDescription
     parameters: ChainParameters

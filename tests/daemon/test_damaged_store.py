@@ -414,7 +414,7 @@ def test_a_wrong_type_costs_its_own_pair(file, column, value) -> None:
 
 
 def test_sealed_nonsense_costs_its_own_pairs(file) -> None:
-    """Their checksums are right: whoever made them knew how."""
+    """Check rows whose checksums are valid."""
     rng = np.random.default_rng(0)
     with contextlib.closing(store_schema.connect(file)) as connection:
         for seq in range(1, PAIRS):

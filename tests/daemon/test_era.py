@@ -1,4 +1,4 @@
-"""The map beside a model that is none: whoever wants a file gets the best one."""
+"""The map exported while the current model is not a map: the best map is used."""
 
 from __future__ import annotations
 

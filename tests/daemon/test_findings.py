@@ -52,7 +52,7 @@ class Slow(Ticking):
 
 @dataclass
 class Planted:
-    """A desk arm that is not as drawn, and a learner that has pairs of it."""
+    """A desk arm that deviates from nominal, and a learner that has pairs of it."""
 
     robot: RobotDescription
     parameters: ChainParameters

@@ -22,7 +22,7 @@ POSE = np.array([0.1, 0.4, 0.6, 0.0])
 
 
 def wiggle(seed: int, latency_s: float, noise_mm: float = 0.5, joints: int = 4, harmonics: int = 6) -> Wiggle:
-    """5 s of uneven motion of an arm that is not quite the drawn one: zeros 3° off, another tool."""
+    """Return 5 s of uneven motion of an arm that deviates from nominal: joint offsets of 3°, another tool."""
     rng = np.random.default_rng(seed)
     pace = 2 * np.pi * rng.uniform(0.3, 1.2, (joints, harmonics))
     width = 0.2 * rng.normal(size=(joints, harmonics)) * np.sqrt(2 / harmonics) / pace * 3.8
@@ -43,7 +43,7 @@ def wiggle(seed: int, latency_s: float, noise_mm: float = 0.5, joints: int = 4, 
 def latency_by_speed(wiggle: Wiggle, chain: RigidChain) -> float:
     """Return the latency [s] from speeds alone: the shift that best correlates the speeds of chain and marker.
 
-    For comparison: the drawn arm's speed is not the real one's, and noise is differentiated.
+    For comparison: the nominal arm's speed is not the real one's, and noise is differentiated.
     """
     t = wiggle.t_marker[(wiggle.t_marker - LATEST_S >= wiggle.t_joints[0])]
     x = wiggle.x[-len(t) :]

@@ -1,4 +1,4 @@
-"""One robot's learner on a bus that is none: what it says of itself and of how far it is behind."""
+"""One robot's learner on a fake bus: its status and its backlog."""
 
 from __future__ import annotations
 

@@ -241,7 +241,7 @@ def test_a_lost_process_leaves_no_order_behind(shared: SharedSolver, process: Sc
 
 
 class Scripted:
-    """Has so many pieces of work; ends everything after the last."""
+    """A learner with a given number of work items, which stops the host after the last."""
 
     def __init__(self, name: str, pieces: int, done: list[str], end: Callable[[], None]) -> None:
         self._name, self._left, self._done, self._end = name, pieces, done, end

@@ -101,7 +101,7 @@ MISREAD = {
 }
 
 
-# Of two columns misread alike, and of more than two, `make soak` knows more.
+# `make soak` tests two columns misread alike, and more than two.
 RARELY = (
     "q2 and q5 count the other way",
     "the columns q1, q2 and q3 are in the order q2, q3, q1",

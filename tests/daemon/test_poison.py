@@ -1,4 +1,4 @@
-"""Pairs that no sensor can mean: the learner refuses or doubts them, says so, and answers numbers all the same."""
+"""Implausible pairs: the learner rejects them or marks them as outliers, reports it, and still answers numbers."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ CASES = ["as drawn", "frame to be found", "other tool", "amid doubts"]
 
 @pytest.fixture(scope="module", params=CASES)
 def case(request: pytest.FixtureRequest) -> tuple[Saved, list[Pair], FloatArray]:
-    """Taught once for both claims; the first compares before the second goes on."""
+    """Train once for both tests; the first compares before the second continues."""
     return scene_with(request.param)
 
 

@@ -22,7 +22,7 @@ OVER = ("done", "failed", "stopped")
 
 
 class Stored:
-    """A sampler's history with so many pairs; it waits for `go` before its first page."""
+    """A sampler's history of stored pairs; it waits for `go` before its first page."""
 
     def __init__(self, config: Config, pairs: int) -> None:
         rng = np.random.default_rng(7)

@@ -23,7 +23,7 @@ ADDRESSES = ["/", "/api/state", "/api/events", "/report", "/static/style.css", "
 
 @dataclass
 class Processes:
-    """Stands for both processes and the diagnoses; remembers what it was told."""
+    """Stub of both processes and the diagnoses that records its commands."""
 
     told: list[tuple[str, ...]] = field(default_factory=list)
     error: Exception | None = None

@@ -1,4 +1,4 @@
-"""Eyes that are turned against each other are told from a wrong scale where the data tell, and left open where not."""
+"""A vergence error is distinguished from a wrong scale if the data allow it, and left open otherwise."""
 
 from __future__ import annotations
 

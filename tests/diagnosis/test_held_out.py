@@ -32,7 +32,7 @@ from bodyschema.interfaces.robot import RobotDescription
 
 CHANCE = 1e-4
 SEEDS, MANY_SEEDS = range(100), range(300)
-# Of so many poses each is read so many times, in coarse ticks.
+# Number of poses, and of readings of each, in coarse ticks.
 POSES, ALIKE, TICK_RAD = 120, 5, 2.0 * np.pi / 512
 
 

@@ -1,4 +1,4 @@
-"""Arms of Dynamixel servos on the bench in virtual time, and what they were told."""
+"""Arms of emulated Dynamixel servos in virtual time, and the instructions that they received."""
 
 from __future__ import annotations
 

@@ -128,7 +128,7 @@ class Babble:
         self._clock, self.received = clock, 0
 
     def write(self, data: bytes) -> None:
-        """Nobody listens."""
+        """Ignore the data."""
 
     def receive(self, until: float) -> bytes:
         self._clock.wait_until(self._clock.now() + 1e-4)

@@ -1,4 +1,4 @@
-"""Checks of ports and servos: what is found, and the command that mends it."""
+"""Checks of ports and servos: findings and the commands that fix them."""
 
 from __future__ import annotations
 

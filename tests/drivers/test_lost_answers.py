@@ -45,7 +45,7 @@ BUSES = {
 
 
 class LosesAnswersTo:
-    """The wire of a chain whose answers to one instruction are lost so many times."""
+    """The wire of a chain that loses a given number of answers to one instruction."""
 
     def __init__(self, arm, code: int, times: float) -> None:
         self._arm, self._code, self.left = arm, code, times
@@ -141,7 +141,7 @@ def test_a_late_answer_does_not_hold_the_next_question_up(model) -> None:
 
 
 class RepeatsItself:
-    """The wire of a chain on which some answers carry what the servo told several answers of their length before."""
+    """The wire of a chain on which some answers repeat the data of an earlier answer of the same length."""
 
     def __init__(self, before: int, share: float) -> None:
         self._told: dict[tuple[int, int], deque[bytes]] = {}

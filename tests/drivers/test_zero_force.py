@@ -324,7 +324,7 @@ def test_a_servo_that_takes_no_goals_ends_it() -> None:
     with (arm := FloatingArm()).joints:
         arm.float()
         servo = arm.chain.servo(1)
-        servo["current_limit"] = 100  # what is more it refuses, and nobody is told of that
+        servo["current_limit"] = 100  # larger values are refused without an error
         arm.pendulums[0].pushed = 0.05
         assert "does not take its goal" in dropped(arm)
 
@@ -399,7 +399,7 @@ def test_after_a_kill_the_watchdogs_stop_the_servos_and_the_next_program_frees_t
     with arm.joints:
         arm.float()
         sent = [i.code for i in arm.port.heard]
-        arm.clock.wait_until(arm.clock.now() + 0.13)  # heartbeat of 100 ms; nobody says anything any more
+        arm.clock.wait_until(arm.clock.now() + 0.13)  # heartbeat of 100 ms; all is silent
         assert sent.count(Code.SYNC_WRITE) > 100
         assert not any(arm.currents())
         assert [servo["watchdog"] for servo in arm.chain.servos] == [-1, -1]

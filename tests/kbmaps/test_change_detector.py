@@ -28,12 +28,12 @@ KINDS = {"tool": None, "camera": None, "joint": 2}
 
 
 def isotropic(sigma_m: float, pairs: int) -> np.ndarray:
-    """Covariances of so many errors (pairs, 3, 3) [m²]."""
+    """Return isotropic covariances (pairs, 3, 3) [m²]."""
     return np.broadcast_to(sigma_m**2 * np.eye(3), (pairs, 3, 3))
 
 
 class Arm:
-    """An arm that is as drawn within its tolerances, along a smooth path that it goes on with after a change."""
+    """An arm that is nominal within its tolerances, on a smooth path that continues after a change."""
 
     def __init__(self, seed: int, pairs: int = BEFORE + AFTER, speed: float = 1.0) -> None:
         self.rng = np.random.default_rng(seed)

@@ -41,7 +41,7 @@ BASES = bases_for(KINDS)
 PREFIX = struct.Struct("<8sII")
 # What a number, a text or an object is replaced by: nothing of its type.
 WRONG = ([], "1e400", "1" + "0" * 400, "-Infinity", [[1.0]])
-# NaN says something here: not told, not predicted.
+# NaN has a meaning here: not given, not predicted.
 WITH_NAN = ("sigma", "errors")
 
 

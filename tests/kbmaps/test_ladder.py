@@ -26,7 +26,7 @@ LIMIT = np.full(3, np.radians(90.0))
 
 
 class Scripted:
-    """A model that says what it is told to."""
+    """A model with scripted answers."""
 
     joints = 3
 

@@ -67,7 +67,7 @@ LONG = {
 
 
 def bent_pairs(arm: Arm, rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of the arm with eccentric encoders, and errors of which nobody knows the cause."""
+    """Return pairs of the arm with eccentric encoders, and errors without a modelled cause."""
     q = arm.pairs(rng, n)[0]
     x = arm.real.positions(q + 0.03 * np.sin(q + 1.0)) + 0.02 * np.sin(2.0 * q)
     return q, x + 0.001 * rng.normal(size=(n, 3))

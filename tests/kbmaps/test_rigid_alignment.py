@@ -106,7 +106,7 @@ def test_points_seen_in_a_mirror_are_not_fitted_by_a_mirror():
 
 
 def test_a_marker_shift_that_the_pose_can_make_up_for_stays_small():
-    """All joints turn about z, so height of instrument and height of marker cannot be told apart."""
+    """All joints turn about z, so the heights of instrument and marker are not separately identifiable."""
     rng = np.random.default_rng(5)
     fixed = np.tile(np.eye(4), (3, 1, 1))
     fixed[1:, 0, 3] = 0.4

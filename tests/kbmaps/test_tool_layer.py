@@ -211,7 +211,7 @@ def test_what_the_arm_itself_is_unsure_of_is_claimed_too():
     batch.learn(*arm.pairs(rng, 100, 0.005, reach_deg=15.0))
 
     class Oriented:
-        """The learner's claims with its chain's orientations."""
+        """The learner's predictions with its chain's orientations."""
 
         joints = 4
         predict, jacobian, estimate = batch.predict, batch.jacobian, batch.estimate

@@ -26,9 +26,9 @@ NOISE_M = 5e-4
 
 
 class So101:
-    """An arm whose middle was found by eye, so that it stands `offsets_deg` from where its readings say.
+    """An arm whose middle was set by eye, so that its true angles differ by `offsets_deg` from its readings.
 
-    Its links are made to 0.1° and 0.3 mm, its camera stands anywhere, its marker is 20 mm off the drawn place.
+    Its links are built to 0.1° and 0.3 mm, its camera stands anywhere, its marker is 20 mm off nominal.
     """
 
     def __init__(self, robot: RobotDescription, motors: Calibrations, offsets_deg: Sequence[float], seed: int) -> None:

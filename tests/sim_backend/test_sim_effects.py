@@ -22,7 +22,7 @@ from bodyschema.vision.tracker import StereoTracker
 
 CLOSE_M = 1e-6
 FRAME_STEPS = 8
-# After so many frames, nothing is remembered of what was before the first.
+# After this many frames, nothing depends on the state before the first.
 FORGOTTEN = 25
 # Readings as fine as numbers are, at every step of the physics.
 EXACT = EncoderConfig(ticks_per_turn=2**44, ticks_per_metre=2**44, noise_ticks=0.0, rate_hz=240)
@@ -155,7 +155,7 @@ def test_on_a_smooth_path_a_late_stamp_is_what_the_simulation_says(latency_s: fl
     motion = Motion(np.array(read), t, np.zeros(len(t), dtype=np.int64))
     well_inside = slice(20, -20)  # where the lag leads to no moment before the first or after the last row
     said = motion.earlier(simulation.latency_s).q
-    assert np.abs(np.array(seen) - said)[well_inside].max() < 1e-5  # a path between readings is not told exactly
+    assert np.abs(np.array(seen) - said)[well_inside].max() < 1e-5  # the path between readings is not known exactly
 
 
 class NoRenderer:

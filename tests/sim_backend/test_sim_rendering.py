@@ -39,7 +39,7 @@ def painted(bullet, x, config=PLAIN, seed=0, T_world_camera=None, turn=UNTURNED)
 
 
 def ellipse_centre(x):
-    """Centre of the outline (u, v) of a ball at `x` in an eye: the projected centre, drawn outward by z²/(z²-r²)."""
+    """Return the outline's centre (u, v) of a ball at `x`: the projected centre, shifted outward by z²/(z²-r²)."""
     stretch = x[2] ** 2 / (x[2] ** 2 - RADIUS**2)
     return np.array([319.5, 239.5]) + CALIBRATION.focal_px * stretch * x[:2] / x[2]
 

@@ -36,7 +36,7 @@ def stored(config: Config, pairs: int) -> int:
 
 
 def lose_the_link(config: Config, pairs: int) -> None:
-    """No packet passes until the store has so many more pairs and every session is over."""
+    """Block all packets until the store has this many more pairs and every session is over."""
     begun, done = time.monotonic(), stored(config, 1)
     ip("link", "set", "lo", "down")
     stored(config, done + pairs)

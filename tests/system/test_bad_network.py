@@ -61,7 +61,7 @@ def predicts(config: Config) -> None:
 
 
 def lose_each_other(config: Config, link: BadLink, pairs: int) -> None:
-    """Part them until the learner has noticed and the sampler has so many more pairs; then let them meet."""
+    """Block the link until the learner has noticed and the sampler has this many more pairs; then restore it."""
     link.part()
     noticed = status_when(config, "learner", LearnerStatus, lambda status: not status.sampler_alive)
     sampler_with(config, noticed.last_seq + pairs)

@@ -29,7 +29,7 @@ PACE = np.array([0.0, 0.0, 0.65, 0.5, 0.75, 0.5, 0.5])  # so slow that a busy ma
 AT_FIRST_S, FOUND_S, WATCHED_S = 2.0, 1.0, 8.4  # the head has found the hand; once to and fro
 EVERY_S = 0.05
 SPEED_DEG_S, YAW_DEG = 60.0, (-30.0, 40.0)
-FPS, LATENCY_S = 10.0, 0.25  # the images of a busy machine are drawn late
+FPS, LATENCY_S = 10.0, 0.25  # a busy machine renders images late
 PAIRS = 25  # a busy machine makes fewer in a second
 GREY = np.full((480, 1280, 3), 128, np.uint8)
 OVERLOAD = 0x20
@@ -88,7 +88,7 @@ def looking_at_the_hand(robot: RobotDescription) -> FloatArray:
 
 
 class Guided:
-    """A hand that guides the arm, once it begins; the head is nobody's."""
+    """A hand that guides the arm, once it begins; the head is left alone."""
 
     def __init__(self, start: FloatArray) -> None:
         self.start, self.begin_s = start, math.inf
@@ -154,7 +154,7 @@ class Stage:
         return tuple(self._bench.arm.servo(joint)["torque"] for joint in self.config.robot.joints)
 
     def watch(self, sampler: SamplerProcess, seconds: float, pairs: int = 0) -> Watched:
-        """Look on for so long, and until so many pairs were made."""
+        """Observe for at least this time and this many pairs."""
         begin, first, torque, seen = time.monotonic(), len(pairs_of(self.config)), set(), []
         while time.monotonic() < begin + seconds or len(pairs_of(self.config)) < first + pairs:
             assert time.monotonic() < begin + LIMIT_S

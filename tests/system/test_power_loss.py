@@ -53,7 +53,7 @@ class Promised:
 
 
 def work(config: Config, disk_shim: Path, pairs: int) -> Path:
-    """Let both processes do so many pairs, end them, and give the log of what they did to the disk."""
+    """Let both processes handle this many pairs, end them, and return the log of their disk operations."""
     disk = FailingDisk(config.state_dir, disk_shim)
     with ExitStack() as stack:
         children = [
@@ -69,7 +69,7 @@ def work(config: Config, disk_shim: Path, pairs: int) -> Path:
 
 
 class Losses:
-    """Loses the power again and again while what was done is done anew, and holds what is left to the promise."""
+    """Repeated power losses during a replay of the disk operations, each checked against the promise."""
 
     def __init__(self, config: Config, folder: Path) -> None:
         self._config, self._folder = config, folder

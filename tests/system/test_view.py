@@ -51,7 +51,7 @@ class PageServer:
         assert self._process.stdout.readline() == f"look at {self.address}\n"
 
     def end(self) -> None:
-        """By SIGTERM, in order, whoever looks."""
+        """End the process by SIGTERM, in order, even with open pages."""
         self._process.terminate()
         assert self._process.wait() == 0
         self._process.communicate()

@@ -111,7 +111,7 @@ def in_eyes(x: FloatArray, calibration: StereoCalibration) -> tuple[FloatArray, 
 
 
 class Room:
-    """Two pictures, photographed once; only a ball's neighbourhood is rendered and taken anew for each frame."""
+    """Two backgrounds, rendered once; only a ball's neighbourhood is rendered again for each frame."""
 
     def __init__(self, calibration: StereoCalibration, look: Look, rng: np.random.Generator) -> None:
         """Draw the pictures and an exposure; `look` says how they are taken."""

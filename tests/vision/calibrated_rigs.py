@@ -1,4 +1,4 @@
-"""Rigs drawn at random, calibrated from rendered images, beside what they are."""
+"""Random rigs, calibrated from rendered images and compared with the ground truth."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ class Errors:
 
     Attributes:
         x: errors (n, 3) [m].
-        sigma: claimed 1-sigma (n, 3) [m].
+        sigma: stated 1-sigma (n, 3) [m].
         centres_px: errors of (ul, vl, ur, vr), shape (n, 4) [px].
         misses: reasons of the frames without a fix.
     """
@@ -95,7 +95,7 @@ class Errors:
     misses: tuple[Reason, ...]
 
     def covered(self, sigmas: float = 1.0) -> FloatArray:
-        """Share of errors within so many claimed sigmas, per axis (3,)."""
+        """Return the share of errors within this multiple of the stated sigma, per axis (3,)."""
         return np.mean(np.abs(self.x) < sigmas * self.sigma, axis=0)
 
 
@@ -113,7 +113,7 @@ def place(calibration: StereoCalibration, radius_px: float, rng: np.random.Gener
 def measure_errors(
     calibration: StereoCalibration, look: Look, frames: int, seed: int, radii_px: tuple[float, float] = (5.0, 30.0)
 ) -> Errors:
-    """Track `frames` unrelated frames: every place, size and light is drawn anew, rooms and exposures change."""
+    """Track `frames` unrelated frames: position, size and light are random in each, rooms and exposures change."""
     rng = np.random.default_rng(seed)
     rooms = [Room(calibration, look, rng) for _ in range(min(frames, max(16, frames // 8)))]
     tracker = StereoTracker(calibration)

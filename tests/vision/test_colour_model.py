@@ -115,5 +115,5 @@ def test_a_bright_ball_is_found_by_its_brightness_over_exposed_or_not(exposure):
     frame = stage(white, Slab((-1, -1), (1, 1), 0.8, rgb=(0.2, 0.2, 0.2)), white, look=look)
     fix = StereoTracker(SMALL, VisionConfig(marker="bright_ball")).track(frame)
     assert isinstance(fix, MarkerFix)
-    # Where pixels are over-exposed the claim does not cover what is cut off: a sixth of a pixel here.
+    # In over-exposed pixels the stated uncertainty does not cover the clipping: a sixth of a pixel here.
     assert np.abs(fix.x - np.array(white.x))[:2].max() < 4e-4

@@ -144,7 +144,7 @@ def test_no_ball_is_none() -> None:
 
 @pytest.fixture(scope="module")
 def calibrated() -> tuple[TrueRig, Calibrated]:
-    """One camera of a pair drawn at random, and its calibration of 20 views."""
+    """Return one camera of a random pair, and its calibration from 20 views."""
     rng = np.random.default_rng(31)
     rig = webcams(rng)
     views = [replace(view, right=None) for view in corner_views(rig, rng)]

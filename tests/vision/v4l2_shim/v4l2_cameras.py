@@ -132,12 +132,12 @@ class ShimCamera:
 
 
 class LiveCamera(ShimCamera):
-    """A camera whose images are drawn while it runs, each `latency_s` before its time stamp.
+    """A camera whose images are rendered while it runs, each `latency_s` before its time stamp.
 
-    What is not drawn in time is shown as it was in the beginning, without anything in it.
+    An image that is not rendered in time is shown empty, as at the beginning.
 
     Attributes:
-        drawn: how many images were in time.
+        drawn: number of images that were in time.
     """
 
     SLOTS = 8
@@ -155,9 +155,9 @@ class LiveCamera(ShimCamera):
         """Write the file.
 
         Args:
-            draw: the image of a time of CLOCK_MONOTONIC.
+            draw: returns the image at a time of CLOCK_MONOTONIC.
             latency_s: shorter than SLOTS / 2 frames.
-            settled_s: so long after its time an image is drawn, when all is known that belongs to that time.
+            settled_s: delay from an image's time to its rendering, by which all data of that time are known.
         """
         super().__init__(file, [blank] * self.SLOTS, fps=fps, fourcc="YUYV")
         self._blank, self._draw, self._fps = _encoded(blank, "YUYV"), draw, fps
