@@ -36,12 +36,12 @@ def pytest_make_collect_report(collector: pytest.Collector) -> Generator[None, R
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Three for two processors: half of the tests wait for processes, clocks or disks."""
+    """Return three workers for two processors: half of the tests wait for processes, clocks or disks."""
     return (3 * len(os.sched_getaffinity(0)) + 1) // 2
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files of many quick tests come last, so that no worker sits alone over a long one in the end."""
+    """Move files of many quick tests to the end, so that no worker is left with a long one."""
     items.sort(key=lambda item: item.nodeid.startswith(QUICK))
 
 

@@ -28,7 +28,7 @@ def two_joints() -> RigidChain:
 
 
 def simple_problem(pairs: int = 80) -> Problem:
-    """Two joints, a tenth of a millimetre of noise, a drawing whose tool is off by 50 mm."""
+    """Return a problem of two joints, 0.1 mm of noise and a nominal model whose tool is off by 50 mm."""
     chain, rng = two_joints(), np.random.default_rng(5)
     q = rng.uniform(-REACH, REACH, (pairs, 2))
     return Problem(

@@ -89,7 +89,7 @@ class Arm:
         return next(joint for joint in self.joints if joint.name == name)
 
     def mass(self, link: str) -> Mass:
-        """Mass of a link; of next to nothing where none is given."""
+        """Return the mass of a link; negligible if none is given."""
         return self.masses.get(link, Mass(1e-3))
 
     @property
@@ -98,7 +98,7 @@ class Arm:
         return np.array([(self.joint(name).lower, self.joint(name).upper) for name in self.read])
 
     def quantum(self, name: str) -> float:
-        """One encoder tick [rad or m]."""
+        """Return one encoder tick [rad or m]."""
         whole = 1.0 if self.joint(name).kind == "prismatic" else 2.0 * math.pi
         return whole / self.ticks[name]
 
@@ -108,7 +108,7 @@ class Arm:
 
 
 def look_at(eye: FloatArray, target: FloatArray, roll_rad: float = 0.0) -> Vector:
-    """rpy [rad] of an optical frame (x right, y down, z forward) at `eye` that looks at `target`."""
+    """Return rpy [rad] of an optical frame (x right, y down, z forward) at `eye` that looks at `target`."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
@@ -117,7 +117,7 @@ def look_at(eye: FloatArray, target: FloatArray, roll_rad: float = 0.0) -> Vecto
 
 
 def _chain(start: str, *rows: tuple[str, str, Vector, Vector, str, float, float]) -> tuple[Joint, ...]:
-    """Joints one behind the other: name, kind, xyz, rpy, letter of the axis, range in degrees (m if prismatic)."""
+    """Return serial joints from name, kind, xyz, rpy, letter of the axis, range in degrees (m if prismatic)."""
     joints, parent = [], start
     for name, kind, xyz, rpy, axis, lower, upper in rows:
         unit = 1.0 if kind == "prismatic" else math.pi / 180.0
@@ -128,7 +128,7 @@ def _chain(start: str, *rows: tuple[str, str, Vector, Vector, str, float, float]
 
 
 def _masses(joints: tuple[Joint, ...], kilograms: list[float], rng: np.random.Generator) -> dict[str, Mass]:
-    """Masses with centres about half way to the next joint and some centimetres off the axes."""
+    """Return masses with centres about half way to the next joint and some centimetres off the axes."""
     ends = {joint.parent: np.array(joint.xyz) for joint in joints}
     masses = {}
     for joint, kg in zip(joints, kilograms, strict=True):
@@ -182,7 +182,7 @@ def _ticks(read: tuple[str, ...], rng: np.random.Generator) -> dict[str, int]:
 
 
 def industrial(rng: np.random.Generator) -> Arm:
-    """Six joints, shoulder and elbow offset to the side, a wrist with its axes 0.1 m apart."""
+    """Return an arm of six joints, shoulder and elbow offset to the side, a wrist with its axes 0.1 m apart."""
     chain = _chain(
         BASE,
         ("waist", "revolute", (0, 0, 0.32), (0, 0, 0), "z", -120, 120),
@@ -196,7 +196,7 @@ def industrial(rng: np.random.Generator) -> Arm:
 
 
 def humanoid(rng: np.random.Generator) -> Arm:
-    """Seven joints of a humanoid's left arm, its shoulder mounted sideways on a torso."""
+    """Return a humanoid's left arm of seven joints, its shoulder mounted sideways on a torso."""
     chain = _chain(
         BASE,
         ("shoulder_pitch", "revolute", (0, 0.17, 0.02), (0.2, 0, 0), "y", -130, 60),
@@ -214,7 +214,7 @@ def humanoid(rng: np.random.Generator) -> Arm:
 
 
 def gantry(rng: np.random.Generator) -> Arm:
-    """Six joints, the second a lift: waist, lift, reach, elbow and a wrist of two."""
+    """Return a gantry of six joints, the second a lift: waist, lift, reach, elbow and a wrist of two."""
     chain = _chain(
         BASE,
         ("waist", "revolute", (0, 0, 0.20), (0, 0, 0), "z", -110, 110),
@@ -228,7 +228,7 @@ def gantry(rng: np.random.Generator) -> Arm:
 
 
 def head(rng: np.random.Generator) -> Arm:
-    """Two head joints that carry the cameras, and an arm of five: the way from camera to marker leads down the neck."""
+    """Return two head joints that carry the cameras, and an arm of five: the chain leads down the neck to the arm."""
     neck = _chain(
         BASE,
         ("head_pan", "revolute", (0.02, 0, 0.22), (0, 0, 0), "z", -20, 60),
@@ -262,7 +262,7 @@ def head(rng: np.random.Generator) -> Arm:
 
 
 def drawn(rng: np.random.Generator) -> Arm:
-    """Six joints with random lengths, twists and masses; neighbouring axes are never parallel along the link."""
+    """Return six joints with random lengths, twists and masses; neighbouring axes are never parallel along the link."""
     rows, letters = [("j1", "revolute", (0.0, 0.0, 0.25), (0.0, 0.0, 0.0), "z", -110.0, 110.0)], "yyxyx"
     for index, letter in enumerate(letters, 2):
         length = rng.uniform(0.18, 0.34) * (0.5 if index > 4 else 1.0)

@@ -42,7 +42,7 @@ class Body:
         self._T_link_camera = (np.array(arm.camera_xyz), Rotation.from_euler("xyz", arm.camera_rpy).as_matrix())
 
     def marker_link_poses(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pose of the marker's link in the camera's frame: positions (n, 3), rotations (n, 3, 3).
+        """Return the pose of the marker's link in the camera's frame: positions (n, 3), rotations (n, 3, 3).
 
         Args:
             q: positions of `moving` [rad or m], shape (n, number of moving joints).
@@ -89,7 +89,7 @@ class Body:
         pybullet.removeBody(self._body, physicsClientId=self._client)
 
     def _mass_states(self, q: list[float], links: list[int]) -> list[list[float]]:
-        """Positions and orientations (quaternions x, y, z, w) of the links' centres of mass."""
+        """Return positions and orientations (quaternions x, y, z, w) of the links' centres of mass."""
         pybullet.resetJointStatesMultiDof(
             self._body, self._indices, [[value] for value in q], physicsClientId=self._client
         )

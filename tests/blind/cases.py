@@ -233,7 +233,7 @@ def _one(
     truth: Sequence[Hidden],
     rng: np.random.Generator,
 ) -> Hidden:
-    """One effect of that size, where it shows."""
+    """Return one effect of that size, at a place where it shows."""
     taken = [(hidden.effect, hidden.where) for hidden in truth]
     for left in reversed(range(TRIES)):
         there = placed(wish, arm, taken, rng)

@@ -33,7 +33,7 @@ class Wish:
 
     @classmethod
     def parsed(cls, text: str) -> Wish:
-        """From `effect`, `effect@joint` or `effect@joint:source`.
+        """Parse `effect`, `effect@joint` or `effect@joint:source`.
 
         Raises:
             ValueError: there is no such effect.
@@ -63,7 +63,7 @@ def wishes(
 
 
 def _shown(kinds: dict[str, Kind], hold: str | None) -> list[str]:
-    """Effects that show while the arm's weight is borne as `hold` says."""
+    """Return the effects that show while the arm's weight is supported as `hold` says."""
     return [
         name
         for name, kind in kinds.items()
@@ -117,7 +117,7 @@ def placed(wish: Wish, arm: Arm, taken: Sequence[tuple[str, str | None]], rng: n
 
 
 def _possible(effect: str, arm: Arm) -> tuple[str, ...]:
-    """Joints where the effect is what it is called."""
+    """Return the joints at which the effect is possible."""
     if effect == "link_bend":
         return bending_joints(arm)
     if effect == "growing_link" and arm.camera_link == FLOOR:

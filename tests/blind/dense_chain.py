@@ -33,7 +33,7 @@ class Built:
     soft: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def balanced(self, positions: FloatArray) -> FloatArray:
-        """Positions (n, d) of the joints under the arm's own weight."""
+        """Return positions (n, d) of the joints under the arm's own weight."""
         if not self.soft.any():
             return positions
         loaded = positions
@@ -84,12 +84,12 @@ class Posture:
         return cls(built, R, x, before)
 
     def eye(self) -> tuple[FloatArray, FloatArray]:
-        """Orientation (n, 3, 3) and place (n, 3) of the measurement frame in the world."""
+        """Return orientation (n, 3, 3) and position (n, 3) of the measurement frame in the world."""
         link = self.built.arm.camera_link
         return self.R[link] @ self.built.eye_R, self.x[link] + self.R[link] @ self.built.eye_x
 
     def marker(self) -> FloatArray:
-        """In the world (n, 3) [m]."""
+        """Return the marker in the world (n, 3) [m]."""
         link = self.built.arm.marker_link
         on_link = np.broadcast_to(self.built.marker, self.x[link].shape)
         return self.x[link] + np.einsum("nij,nj->ni", self.R[link], on_link)
@@ -135,7 +135,7 @@ class Posture:
         return np.einsum("nji,njd->nid", self.eye()[0], np.stack(columns, axis=2))
 
     def torques(self) -> FloatArray:
-        """Torque [N·m] or force [N] of gravity along each read joint's axis (n, d), counted the way it moves."""
+        """Return gravity's torque [N·m] or force [N] along each read joint's axis (n, d), positive in its direction."""
         arm = self.built.arm
         out = []
         for name in arm.read:
@@ -164,7 +164,7 @@ class Posture:
         return self.x[joint.child] - begun
 
     def _toward(self, name: str) -> float:
-        """+1 for a joint that carries the marker, -1 for one that carries the instrument."""
+        """Return +1 for a joint that carries the marker, -1 for one that carries the instrument."""
         return 1.0 if self.built.arm.marker_link in _beyond(self.built.arm, self.built.arm.joint(name).child) else -1.0
 
 

@@ -80,7 +80,7 @@ class Noise:
         return self.sigma_m * math.sqrt((STUDENT - 2.0) / STUDENT * (STUDENT + 3.0) / (STUDENT + 1.0))
 
     def of(self, begins: BoolArray, rng: np.random.Generator) -> tuple[FloatArray, BoolArray]:
-        """Noise (n, 3) [m] of rows, the first of each run given; and which fixes are false."""
+        """Return noise (n, 3) [m] of rows, given the first row of each run, and a mask of the outliers."""
         n = len(begins)
         noise = rng.normal(0.0, self.sigma_m, (n, 3))
         if self.kind == "student":
@@ -229,7 +229,7 @@ def hide_dense(
 
 
 def written(cause: Cause) -> str:
-    """`effect@where:source`."""
+    """Return the cause as `effect@where:source`."""
     effect, where, source = cause.key
     return effect + (f"@{where}" if where else "") + (f":{source}" if source else "")
 
@@ -377,7 +377,7 @@ def _loaded(way: Way) -> list[str]:
 
 
 def _clock(motion: Motion, timed: bool) -> FloatArray:
-    """Seconds, or numbers of rows where no times are written."""
+    """Return times in seconds, or row numbers if no times are written."""
     return motion.stamps if timed else np.arange(len(motion.stamps), dtype=float)
 
 
@@ -476,7 +476,7 @@ def _taken(robot: _Robot, motion: Motion, timed: bool, noise: Noise, rng: np.ran
 
 
 def _begins(motion: Motion) -> BoolArray:
-    """First rows of runs; static poses follow each other."""
+    """Return a mask of the first rows of runs; static poses are one sequence."""
     if motion.style == "held":
         return np.arange(len(motion.stamps)) == 0
     return np.append(True, np.diff(motion.segment) > 0)

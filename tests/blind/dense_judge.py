@@ -73,7 +73,7 @@ class DenseJudgement(msgspec.Struct, frozen=True):
 
 
 def name(entry: Json) -> str:
-    """`effect@where:source` of an entry of diagnosis.json."""
+    """Return an entry of diagnosis.json as `effect@where:source`."""
     where, source = entry.get("where"), entry.get("source")
     return entry["effect"] + (f"@{where}" if where else "") + (f":{source}" if source else "")
 
@@ -203,7 +203,7 @@ def line(record: DenseJudgement) -> str:
 
 
 def table(records: Sequence[DenseJudgement]) -> str:
-    """All figures as Markdown."""
+    """Return all figures as Markdown."""
     groups = {
         **{f"{count} causes": [r for r in records if r.decidable and len(r.truth) == count] for count in range(9)},
         "several zeros": [r for r in records if r.decidable and _zeros(r) > 1],
@@ -235,7 +235,7 @@ def _figures(records: Sequence[DenseJudgement]) -> list[str]:
 
 
 def _spread(values: Iterable[float]) -> str:
-    """Median and range."""
+    """Return median and range."""
     found = sorted(values)
     return f"median {np.median(found):.2f} ({found[0]:.2f} to {found[-1]:.2f})" if found else "–"
 

@@ -158,7 +158,7 @@ class Observer:
         return self.told + self.G[:, columns] @ self.amounts[columns]
 
     def _log_evidence(self, chosen: Sequence[int], data: FloatArray) -> float:
-        """Mean log evidence of a set over the noise, less what its causes cost [nats], from that of none."""
+        """Return the mean log evidence of a set minus the cost of its causes [nats], relative to the empty set."""
         if not chosen:
             return 0.0
         columns = self._columns(chosen)
@@ -168,7 +168,7 @@ class Observer:
         return float(0.5 * fits - np.log(np.diag(factor[0])).sum() - self.costs[list(chosen)].sum())
 
     def _left(self, cause: int, signal: FloatArray, beside: Sequence[int]) -> float:
-        """Square of a cause's signal that free amounts of others leave."""
+        """Return the squared norm of a cause's signal that free amounts of the others cannot explain."""
         own = np.arange(self.spans[cause].start, self.spans[cause].stop)
         whole = float(signal @ self.free[np.ix_(own, own)] @ signal)
         if not beside:
@@ -188,7 +188,7 @@ class Observer:
 
 
 def whitened(columns: FloatArray, sigma: float, correlation: float, begins: BoolArray) -> FloatArray:
-    """Columns (n, 3, m) with noise of 1, as (3 n, m).
+    """Scale columns (n, 3, m) to noise of 1 and flatten them to (3 n, m).
 
     Args:
         correlation: of neighbouring rows of a run.

@@ -36,7 +36,7 @@ class TrueEyes:
         return cls(eyes, eyes.focal_px, eyes.baseline_m)
 
     def project(self, x: FloatArray) -> FloatArray:
-        """Pixel centres ul, vl, ur, vr [px] of points in the left optical frame [m], shape (n, 4)."""
+        """Return pixel centres ul, vl, ur, vr [px] of points in the left optical frame [m], shape (n, 4)."""
         right = (x - np.array([self.baseline_m, 0.0, 0.0])) @ Rotation.from_euler("y", self.vergence_rad).as_matrix()
         return np.hstack([self._pixels(x), self._pixels(right)])
 
@@ -47,7 +47,7 @@ class TrueEyes:
 
 
 def triangulate(eyes: Eyes, pixels: FloatArray) -> FloatArray:
-    """Positions in the left optical frame [m] of pixel centres (n, 4), by the pair's description, shape (n, 3)."""
+    """Return positions (n, 3) [m] in the left optical frame of pixel centres (n, 4), by the pair's description."""
     ul, vl, ur, vr = pixels.T
     cu, cv = eyes.principal_point_px
     per_pixel = eyes.baseline_m / (ul - ur)
@@ -57,7 +57,7 @@ def triangulate(eyes: Eyes, pixels: FloatArray) -> FloatArray:
 
 
 def covariance(eyes: Eyes, pixels: FloatArray) -> FloatArray:
-    """Covariance [m²] of the triangulated positions for the noise of pixel centres (n, 4), shape (n, 3, 3)."""
+    """Return the covariance [m²] of triangulated positions for the noise of pixel centres (n, 4), shape (n, 3, 3)."""
     ul, _, ur, _ = pixels.T
     x = triangulate(eyes, pixels)
     disparity, per_pixel = ul - ur, eyes.baseline_m / (ul - ur)

@@ -42,7 +42,7 @@ class Rate:
 
 
 def markdown(records: Sequence[Judgement | Crash]) -> str:
-    """All tables."""
+    """Return all tables."""
     crashes = [record for record in records if isinstance(record, Crash)]
     cases = [record for record in records if isinstance(record, Judgement)]
     parts = [goals(cases), confusion(cases), calibration(cases), coverage(cases), failures(cases, crashes)]
@@ -50,7 +50,7 @@ def markdown(records: Sequence[Judgement | Crash]) -> str:
 
 
 def goals(cases: Sequence[Judgement]) -> str:
-    """Each figure beside its goal."""
+    """Return each figure with its goal."""
     rows = []
     for scenario in dict.fromkeys(case.scenario for case in cases):
         chosen = [case for case in cases if case.scenario == scenario]
@@ -146,7 +146,7 @@ def is_wrong(case: Judgement) -> bool:
 
 
 def share_of_gain(case: Judgement) -> float:
-    """Gain on fresh data over that of the truth."""
+    """Return the gain on fresh data over that of the ground truth."""
     assert case.gain is not None
     assert case.gain_of_truth is not None
     return case.gain / case.gain_of_truth
@@ -158,7 +158,7 @@ def gains_enough(case: Judgement) -> bool:
 
 
 def confusion(cases: Sequence[Judgement]) -> str:
-    """Hidden effects, and what was named when each alone was hidden; only those that an oracle tells."""
+    """Return a confusion table of single hidden effects that an oracle can distinguish."""
     alone = [(case.truth[0], case) for case in cases if len(case.truth) == 1 and case.told_chi2 >= TOLD]
     rows = []
     for effect in sorted({truth.effect for truth, _ in alone}):

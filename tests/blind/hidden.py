@@ -114,7 +114,7 @@ def moment(site: Site, rng: np.random.Generator) -> float:
 
 
 def sign(rng: np.random.Generator) -> float:
-    """±1."""
+    """Return +1 or -1 at random."""
     return float(rng.choice([-1.0, 1.0]))
 
 

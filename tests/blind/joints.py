@@ -13,20 +13,20 @@ from .motion import FINE
 
 
 def off_centre_ring(shaft_rad: FloatArray, ex: float, ey: float) -> FloatArray:
-    """Angle [rad] that a sensor reads from a magnet ring displaced by (ex, ey), in parts of the ring's radius."""
+    """Return the angle [rad] read from a magnet ring displaced by (ex, ey), in parts of the ring's radius."""
     field = np.arctan2(np.sin(shaft_rad) + ey, np.cos(shaft_rad) + ex)
     return shaft_rad + _wrapped(field - shaft_rad)
 
 
 def biased_poles(shaft_rad: FloatArray, poles: float, bias_sine: float, bias_cosine: float) -> FloatArray:
-    """Angle [rad] read from `poles` pole pairs a turn whose sine and cosine signals have a bias (of amplitude 1)."""
+    """Return the angle [rad] read from `poles` pole pairs per turn with a bias of the sine and cosine signals."""
     electrical = poles * shaft_rad
     read = np.arctan2(np.sin(electrical) + bias_sine, np.cos(electrical) + bias_cosine)
     return shaft_rad + _wrapped(read - electrical) / poles
 
 
 def play(shaft: FloatArray, width: float) -> FloatArray:
-    """Output of a gear with `width` of play along a path (f,): it stays until a flank takes it along."""
+    """Return the output of a gear with backlash `width` along a path (f,): it stays until a flank moves it."""
     half, place = 0.5 * width, float(shaft[0])
     output = np.empty_like(shaft)
     for index, pushed in enumerate(shaft.tolist()):
@@ -54,7 +54,7 @@ def lagging(t: FloatArray, shaft: FloatArray, tau_s: float) -> FloatArray:
 
 
 def left_of_move(tau_s: float, move_s: float, rest_s: float) -> float:
-    """Part of a smooth move of `move_s` that a lagging output still lacks `rest_s` after its end.
+    """Return the part of a smooth move of `move_s` that a lagging output still lacks `rest_s` after its end.
 
     The move is as a `Motion` has it: straight between `FINE` instants.
     """
@@ -64,7 +64,7 @@ def left_of_move(tau_s: float, move_s: float, rest_s: float) -> float:
 
 
 def lag_that_leaves(left: float, move_s: float, rest_s: float) -> float:
-    """Time constant [s] of a lag that leaves this part of a move."""
+    """Return the time constant [s] of a lag that leaves this part of a move."""
 
     def excess(log_tau: float) -> float:
         return left_of_move(float(np.exp(log_tau)), move_s, rest_s) - left

@@ -56,7 +56,7 @@ class Truth:
 
     @classmethod
     def of(cls, case: HiddenCase, robot: RobotDescription, motion: Motion) -> Truth:
-        """From a case and the motion that was recorded."""
+        """Build the ground truth from a case and the recorded motion."""
         scene = Scene.of(robot, motion, case.measured.covariance, case.scatter)
         usual_s = float(np.median(np.diff(motion.clock)[motion.segment[1:] == motion.segment[:-1]]))
         nuisances = tuple(m.effect for h in case.nuisances if (m := meant(h, robot, usual_s)) is not None)
@@ -82,7 +82,7 @@ class Truth:
         return self.case.measured.x_noise_free if self.strange else self.scene.positions(self.fitted.effects)
 
     def beside(self, index: int) -> tuple[Effect, ...]:
-        """All that is true but one of the effects."""
+        """Return all true effects but one."""
         return (*self.nuisances, *(e for k, e in enumerate(self.effects) if k != index))
 
     def same_anywhere(self, index: int, other: Effect) -> bool:
@@ -93,7 +93,7 @@ class Truth:
         return self.wide.replaced(target, others, self.effects[index], other).chi2 < SAME_SHARE * max(signal, 1e-9)
 
     def behind(self, index: int, other: Effect) -> float:
-        """Chi-square by which another effect in the place of a true one stays behind on the measured motion."""
+        """Return the rise of chi-square if another effect replaces a true one on the measured motion."""
         others = self.beside(index)
         return self.scene.replaced(self.target, others, self.effects[index], other).chi2
 
@@ -144,7 +144,7 @@ class Named:
 
     @classmethod
     def of(cls, cause: Cause, robot: RobotDescription) -> Named | None:
-        """None for outliers, which are no effect of the simulation."""
+        """Return the named cause; None for outliers, which are not an effect of the simulation."""
         if cause.effect == "outliers":
             return None
         effect = Effect.at(robot, cause.effect, cause.where, cause.source)
@@ -237,7 +237,7 @@ def _is_camera_pose(truth: Truth, index: int) -> bool:
 
 
 def cause_judged(truth: Truth, named: Named, index: int | None, whole: bool) -> CauseJudged:
-    """One cause; `index` of the true effect that it names."""
+    """Return the judgement of one cause; `index` is that of the true effect that it names."""
     cause = named.cause
     true_keys = {effect.key for effect in truth.effects}
     rivals = {(r.effect, r.where, r.source) for r in (*cause.rivals, *cause.indistinguishable_from)}

@@ -128,7 +128,7 @@ class Judgement(msgspec.Struct, frozen=True, tag="judged"):
 
 
 def written(key: Key) -> str:
-    """`effect@where:source`."""
+    """Return the key as `effect@where:source`."""
     effect, where, source = key
     return effect + (f"@{where}" if where else "") + (f":{source}" if source else "")
 

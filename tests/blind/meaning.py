@@ -49,7 +49,7 @@ def meant(hidden: Hidden, robot: RobotDescription, usual_s: float) -> Meant | No
 
 
 def _named(hidden: Hidden, usual_s: float) -> tuple[str, Parameters]:
-    """Name and numbers; NaN for a number that the mechanism does not have."""
+    """Return name and numbers; NaN for a number that the mechanism does not have."""
     p, name = hidden.parameters, hidden.effect
     unit = "m" if any(key in p for key in ("turn_m", "offset_m", "jump_m", "play_m")) else "rad"
     match name:

@@ -161,7 +161,7 @@ class _Walk:
         return np.clip(way, self._ranges[:, 0], self._ranges[:, 1])
 
     def _add(self, q: FloatArray, *, seen: bool, jump: bool) -> int:
-        """Append a knot; 1 when it gives a pair."""
+        """Append a knot; return 1 if it gives a pair."""
         step = SEGMENT_RAD.mean() if self._last is None else float(np.linalg.norm(q - self._last))
         paired = seen and step >= SEGMENT_RAD[0]
         if paired:
@@ -175,7 +175,7 @@ class _Walk:
     def _timed(
         self, style: Style, q: FloatArray, paired: BoolArray, jump: BoolArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Instants and positions of the path's knots, and the stamps of the pairs."""
+        """Return times and positions of the path's knots, and the stamps of the pairs."""
         step = np.linalg.norm(np.diff(q, axis=0, prepend=q[:1]), axis=1)
         speed = np.clip(np.exp(np.log(9.0) + _slow_noise(self._rng, len(q), 0.3)), 5.0, 15.0)
         lasts = np.maximum(step / STEP_RAD.mean(), 0.5) / speed
@@ -213,7 +213,7 @@ def _held(rng: np.random.Generator, ranges: FloatArray, pairs: int, visible: Vis
 
 
 def _slow_noise(rng: np.random.Generator, count: int, sigma: float) -> FloatArray:
-    """Noise that changes over some twenty knots."""
+    """Return noise that changes over about twenty knots."""
     white, out, value = rng.normal(0.0, sigma * 0.3, count), np.empty(count), 0.0
     for index in range(count):
         value = 0.95 * value + white[index]
@@ -229,6 +229,6 @@ def _sorted_unique(t: FloatArray) -> tuple[FloatArray, IntArray]:
 
 
 def _refined(t: FloatArray) -> FloatArray:
-    """FINE instants in each interval, the knots among them."""
+    """Return FINE times in each interval, the knots among them."""
     inner = t[:-1, None] + np.arange(FINE) / FINE * np.diff(t)[:, None]
     return np.append(inner.ravel(), t[-1])

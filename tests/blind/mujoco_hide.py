@@ -450,7 +450,7 @@ def hide(
 
 
 def _range(urdf: Urdf) -> tuple[FloatArray, FloatArray]:
-    """Middle and half of the range over which each joint is moved [rad] (d,)."""
+    """Return middle and half width of the range over which each joint is moved [rad] (d,)."""
     lower, upper = urdf.limits().T
     half = np.minimum(0.4 * (upper - lower), FARTHEST)
     return 0.5 * (lower + upper), half

@@ -97,7 +97,7 @@ class Urdf:
         return ET.tostring(root, encoding="unicode")
 
     def limits(self) -> FloatArray:
-        """Lower and upper limits [rad] of the joints that are read (d, 2)."""
+        """Return lower and upper limits [rad] of the joints that are read (d, 2)."""
         found = [self._joint(name).find("limit") for name in self.model.joints]
         return np.array(
             [[float(limit.get(end, "0")) for end in ("lower", "upper")] for limit in found if limit is not None]

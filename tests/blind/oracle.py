@@ -67,7 +67,7 @@ class Scene:
         return self.simulation.with_effects(effects).positions(self.motion)
 
     def whitened(self, x: FloatArray) -> FloatArray:
-        """(n, 3) or (n, 3, p) [m] in units of the noise, flat: (3 n,) or (3 n, p)."""
+        """Scale (n, 3) or (n, 3, p) [m] to units of the noise and flatten: (3 n,) or (3 n, p)."""
         columns = x[:, :, None] if x.ndim == 2 else x
         flat = (self.whitening @ columns).reshape(3 * len(x), columns.shape[2])
         return flat[:, 0] if x.ndim == 2 else flat
@@ -119,7 +119,7 @@ class Scene:
     def _nearest(
         self, target: FloatArray, others: Sequence[Effect], wanted: Sequence[Effect]
     ) -> list[tuple[float, Effect]]:
-        """To first order: what each leaves of the target, and with which numbers."""
+        """Rank effects to first order by the part of the target that they leave, with their numbers."""
         run = self.simulation.with_effects(others).run(self.motion)
         basis = orthonormal(self.columns(others))
         left = self.whitened(target - run.measured)
@@ -158,7 +158,7 @@ class Scene:
                 return [effect]
 
     def _ripples(self, effect: Effect, left: FloatArray, basis: FloatArray) -> list[Effect]:
-        """With the few numbers of cycles that explain most, found on the joint's own column alone."""
+        """Return ripples with the few numbers of cycles that explain most, found on the joint's own column alone."""
         place = self.simulation.place(effect)
         q = self.motion.q[:, place.joint]
         span = max(float(np.ptp(q)), 1e-6)
@@ -175,7 +175,7 @@ class Scene:
 
 
 def hypotheses(simulation: Simulation) -> list[Effect]:
-    """One of each effect at each place of a robot, at rest."""
+    """Return one of each effect at each place of a robot, with amounts of zero."""
     robot = simulation.robot
     prismatic = dict(zip(robot.joints, robot.chain.prismatic, strict=True))
     found = []
@@ -216,7 +216,7 @@ def wide(scene: Scene) -> Scene:
 
 
 def solved(columns: FloatArray, target: FloatArray) -> FloatArray:
-    """Least squares, with columns of any scale."""
+    """Solve least squares, with columns of any scale."""
     scales = np.linalg.norm(columns, axis=0)
     scales = np.where(scales > 0.0, scales, 1.0)
     return np.linalg.lstsq(columns / scales, target, rcond=1e-8)[0] / scales

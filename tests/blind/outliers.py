@@ -32,7 +32,7 @@ def false_fixes(world: World, sight: Sight, fraction: float, rng: np.random.Gene
 
 
 def _runs(count: int, wanted: int, rng: np.random.Generator) -> BoolArray:
-    """`wanted` of `count` places, in short runs."""
+    """Return a mask of `wanted` of `count` places, in short runs."""
     chosen = np.zeros(count, dtype=bool)
     while chosen.sum() < wanted:
         start, length = int(rng.integers(count)), int(rng.integers(1, LONGEST_RUN + 1))
@@ -53,7 +53,7 @@ def _reflected(x: FloatArray, mirror: tuple[FloatArray, FloatArray]) -> FloatArr
 
 
 def _elsewhere(world: World, x: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Points in view, far apart from each other."""
+    """Return points in view, far apart from each other."""
     spread = 1.5 * x.std(axis=0) + NEAREST_M
     points = x.mean(axis=0) + rng.normal(size=(TRIES * 20, 3)) * spread
     return points[in_view(world.arm.eyes, points, INSIDE_PX)][:TRIES]

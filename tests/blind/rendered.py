@@ -42,7 +42,7 @@ class Studio:
         self._empty = [[_grey_levels(room + noise) for noise in self._noise] for room in self._rooms]
 
     def frame(self, t: float, x: FloatArray) -> StereoFrame:
-        """Both images of a ball at `x` (3,) [m] in the true left optical frame."""
+        """Return both images of a ball at `x` (3,) [m] in the true left optical frame."""
         turn = Rotation.from_euler("y", self._eyes.vergence_rad).as_matrix()
         in_right = (x - np.array([self._eyes.baseline_m, 0.0, 0.0])) @ turn
         return StereoFrame(t, self._image(0, x), self._image(1, in_right))
@@ -85,7 +85,7 @@ class Studio:
         return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
     def _window(self, centre: FloatArray) -> tuple[int, int, int, int]:
-        """Left, top, right, bottom [px] of what surely holds the ball, inside the image."""
+        """Return left, top, right, bottom [px] of a window inside the image that contains the ball."""
         straight = TrueEyes(self._eyes.described, self._eyes.focal_px, 0.0, self._eyes.k1, self._eyes.k2)
         at = straight.project(centre[None])[0, :2]
         reach = 1.6 * self._eyes.focal_px * BALL_RADIUS_M / (centre[2] - BALL_RADIUS_M) + AROUND_PX

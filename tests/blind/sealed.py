@@ -109,7 +109,7 @@ def main() -> None:
 
 
 def judged(cases: Iterable[Case], processes: int = 1) -> Iterator[Record]:
-    """Each case as soon as it is judged; what cannot be hidden is left out."""
+    """Yield each case as soon as it is judged; cases that cannot be hidden are left out."""
     if processes == 1:
         results = map(run, cases)
         yield from (record for record in results if record is not None)

@@ -64,7 +64,7 @@ class Sizer:
         )
 
     def shows_on(self, hidden: Hidden, rng: np.random.Generator) -> dict[str, float]:
-        """For each joint the share of the residual's variance that it alone holds, the others given.
+        """Return for each joint the share of the residual's variance that it alone holds, the others given.
 
         Half the mean square change when this joint alone is taken from another posture, over the variance (the total
         effect of a variance-based sensitivity analysis).
@@ -88,7 +88,7 @@ class Sizer:
 
 
 def _next(tried: list[tuple[float, float]]) -> float:
-    """Logarithm of the amplitude to try next: between the nearest from below and above, else in proportion."""
+    """Return the logarithm of the next amplitude: between the nearest from below and above, else in proportion."""
     below = max((point for point in tried if point[1] < 0.0), default=None)
     above = min((point for point in tried if point[1] > 0.0), default=None)
     if below is None or above is None:

@@ -100,7 +100,7 @@ def test_tolerances_keep_to_their_two_decades() -> None:
 
 
 def _observer(amounts: list[float]) -> Observer:
-    """One column of tolerances, and causes of one number whose columns stand at right angles."""
+    """Return an observer with one column of tolerances, and causes of one number with orthogonal columns."""
     rows = 50
     basis = np.linalg.qr(np.random.default_rng(0).normal(size=(rows, len(amounts) + 1)))[0]
     blocks = [100.0 * basis[:, [k]] for k in range(len(amounts))]

@@ -74,7 +74,7 @@ def _failed(record: Record) -> bool:
 
 
 def _allowed(rate: float, cases: int) -> int:
-    """Failures that are exceeded with a probability of at most BY_CHANCE, shared among the tests here."""
+    """Return the number of failures exceeded with a probability of at most BY_CHANCE, shared among the tests here."""
     return int(binom.isf(BY_CHANCE / len(SEALED), cases, rate))
 
 

@@ -29,7 +29,7 @@ GENERATOR = sorted(file for file in HERE.glob("*.py") if not file.name.startswit
 
 
 def imported(file: Path) -> Iterator[str]:
-    """Full names of the modules that a file imports, those of its own folder left out."""
+    """Return full names of the modules that a file imports, without those of its own folder."""
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)

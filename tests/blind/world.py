@@ -156,12 +156,12 @@ def time_constant(p: Parameters) -> float:
 
 
 def residuals(nominal: World, sight: Sight) -> FloatArray:
-    """Seen positions minus those that the nominal robot has at the readings [m], shape (n, 3)."""
+    """Return seen positions minus those that the nominal robot has at the readings [m], shape (n, 3)."""
     return sight.x - nominal.marker(sight.readings, np.zeros(len(sight.readings)))
 
 
 def noise(nominal: World, q: FloatArray, pixels: FloatArray, scatter: float) -> FloatArray:
-    """Covariance [m²] of residuals at readings (n, d), pixels (n, 4) and encoders adding to it, shape (n, 3, 3).
+    """Return the covariance [m²] of residuals at readings (n, d), pixels (n, 4), encoder noise included, (n, 3, 3).
 
     Args:
         scatter: 1-sigma of what encoders scatter before they round [ticks].
@@ -178,6 +178,6 @@ def noise(nominal: World, q: FloatArray, pixels: FloatArray, scatter: float) -> 
 
 
 def whitened(covariances: FloatArray, x: FloatArray) -> FloatArray:
-    """Vectors (n, 3) in units of their noise with covariances (n, 3, 3)."""
+    """Return vectors (n, 3) in units of their noise with covariances (n, 3, 3)."""
     lower = np.linalg.cholesky(covariances)
     return np.asarray(np.linalg.solve(lower, x[:, :, None])[:, :, 0], dtype=np.float64)

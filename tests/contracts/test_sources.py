@@ -215,7 +215,7 @@ def tracked_camera() -> Iterator[Rig]:
 
 @contextmanager
 def eyes(tables: dict[str, Any], open_capture: OpenCapture = lambda _: FakeCapture()) -> Iterator[Rig]:
-    """Cameras as [vision.cameras] asks for them, with what they read in a folder of its own."""
+    """Return cameras as [vision.cameras] asks for them, with their input in a folder of its own."""
     with TemporaryDirectory() as name:
         folder = Path(name)
         write_pictures(folder)
@@ -320,7 +320,7 @@ ARM = Path(__file__).parents[2] / "examples" / "desk_arm"
 
 @contextmanager
 def through_a_bench(file: str, tables: str = "") -> Iterator[Rig]:
-    """Joints of another source, read from a bench by the driver that a robot.toml configures."""
+    """Return joints of another source, read from an emulator by the driver that a robot.toml configures."""
     with TemporaryDirectory() as folder:
         arm = shutil.copytree(ARM, Path(folder) / "arm")
         with (arm / file).open("a", encoding="utf-8") as toml:

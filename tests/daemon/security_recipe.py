@@ -20,7 +20,7 @@ def blocks(language: str) -> list[str]:
 
 
 def carried_out(folder: Path) -> Path:
-    """`folder` with the certificates that the page's lines make there."""
+    """Run the page's commands in `folder` and return it with the certificates."""
     script = "set -eu\n" + "\n".join(blocks("bash"))
     command = ["bash", "-c", script]
     try:

@@ -150,7 +150,7 @@ def test_a_restored_store_is_another_one_so_that_no_learner_mixes_it_with_the_fi
 
 
 def contents(folder: Path) -> dict[str, bytes | None]:
-    """Everything in a folder; None for what is not a file."""
+    """Return everything in a folder; None for what is not a file."""
     return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
 
 

@@ -79,7 +79,7 @@ def refused(*arguments: object, cwd: Path, stdin: str = "") -> str:
 
 @pytest.fixture
 def robot(tmp_path: Path, free_endpoint: Callable[[], str]) -> Path:
-    """robot.toml of an arm whose encoders and camera are the recording walk.csv; the working directory of `run`."""
+    """Return robot.toml of an arm that replays walk.csv as encoders and camera; the working directory of `run`."""
     (tmp_path / "walk.csv").write_text(RECORDING)
     tables = f'[zenoh]\nsampler = "{free_endpoint()}"\nlearner = "{free_endpoint()}"\n[daemon]\nstate_dir = "state"\n'
     return write_small_arm(tmp_path, tables + '[drivers]\nrecording = "walk.csv"\nspeed = 0\n')

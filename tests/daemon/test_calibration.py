@@ -95,7 +95,7 @@ def test_the_learnt_arm_is_the_true_one_within_the_noise() -> None:
 
 
 def covered(seeds: range) -> float:
-    """Share of the figures whose true values lie inside their intervals."""
+    """Return the share of the figures whose true values lie inside their intervals."""
     inside: list[bool] = []
     for seed in seeds:
         arm = planted(seed)
@@ -395,7 +395,7 @@ def test_rows_that_are_not_there_are_told(pairs_file) -> None:
 
 @pytest.fixture
 def robot_with_store(tmp_path) -> Path:
-    """robot.toml of an arm whose store has 20 pairs with one tool and 30 with another, as its learner knows."""
+    """Return robot.toml of an arm whose store has 20 pairs with one tool and 30 with another, known to its learner."""
     shutil.copytree(DESK_ARM.parent, tmp_path / "arm")
     robot = tmp_path / "arm" / "robot.toml"
     robot.write_text(robot.read_text() + '\n[daemon]\nstate_dir = "state"\n')

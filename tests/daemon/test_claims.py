@@ -28,7 +28,7 @@ def new_claims(belief: ChainBelief = DRAWN) -> Claims:
 
 
 def learnt(claims: Claims, q: FloatArray, prior_error_m: float, error_m: float = 0.0) -> None:
-    """Pairs at q: there the prior is wrong by the first, the instant learner by the second error on each axis."""
+    """Learn pairs at q, where the prior errs by the first, the instant learner by the second error on each axis."""
     for row in q:
         x = MODEL.predict(row[None]) + prior_error_m
         claims.predicted(Where(row[None]), x, {PRIOR: x - prior_error_m, INSTANT: x - error_m}, NOISE[None])

@@ -46,10 +46,10 @@ class Joints:
         return self
 
     def __exit__(self, *_) -> None:
-        """Nothing was opened."""
+        """Do nothing: nothing was opened."""
 
     def read(self, timeout_s: float) -> None:
-        """Never anything."""
+        """Return None."""
 
 
 @pytest.fixture

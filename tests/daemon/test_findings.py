@@ -73,7 +73,7 @@ class Planted:
         return arm
 
     def teach(self, rng: np.random.Generator, pairs: int) -> None:
-        """Pairs all over the joints' ranges; then everything that the background has to do but replay."""
+        """Learn pairs all over the joints' ranges; then do all background work but the replay."""
         first = self.learning.counters.last_seq + 1
         q = rng.uniform(self.robot.lower, self.robot.upper, (pairs, 4))
         x = self.parameters.positions(self.change, q) + SIGMA_M * rng.normal(size=(pairs, 3))
@@ -204,7 +204,7 @@ def guided(seed: int, pairs: int) -> tuple[Learning, Scene]:
 
 @pytest.fixture(scope="module")
 def after_60() -> list[tuple[Learning, Scene, Outlook]]:
-    """Learners that know the first 60 pairs of a path of 160, and their outlook then."""
+    """Return learners that know the first 60 pairs of a path of 160, and their outlook then."""
     found = []
     for seed in range(4):
         scene, learning = Scene.draw(seed, 160), new_learning()
@@ -214,7 +214,7 @@ def after_60() -> list[tuple[Learning, Scene, Outlook]]:
 
 
 def true_error_m(learning: Learning, scene: Scene, pairs: int) -> float:
-    """Near the first `pairs` of the path."""
+    """Return the true error near the first `pairs` of the path."""
     q = near(np.random.default_rng(0), scene.q[:pairs])
     return float(np.linalg.norm(learning.snapshot.predict(q).x - scene.chain.positions(q), axis=1).mean())
 

@@ -69,7 +69,7 @@ def positions(q: FloatArray, waist: float) -> FloatArray:
 
 @contextmanager
 def robots(endpoint: str, waists: dict[str, float], *, learners: bool = True) -> Iterator[None]:
-    """Robots that listen at one place, each with its waist off by so much."""
+    """Serve robots at one endpoint, each with its own waist offset."""
     with Bus(listen=endpoint) as bus:
 
         def stand(name: str, waist: float) -> None:

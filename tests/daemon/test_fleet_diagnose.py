@@ -25,7 +25,7 @@ pytest.importorskip("distributed")
 
 
 def fleet(*words: object) -> tuple[object, str, str]:
-    """Exit code, standard output and standard error of `bodyschema fleet`."""
+    """Return exit code, standard output and standard error of `bodyschema fleet`."""
     out, err = io.StringIO(), io.StringIO()
     with (
         mock.patch.object(sys, "argv", ["bodyschema", "fleet", *map(str, words)]),

@@ -345,7 +345,7 @@ def test_a_small_parquet_file_of_billions_of_rows_is_refused_unread(tmp_path: Pa
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory) -> tuple[dict[str, Any], bytes]:
-    """Header and arrays of a taught learner's checkpoint."""
+    """Return header and arrays of a trained learner's checkpoint."""
     file, learning = tmp_path_factory.mktemp("state") / "learner.ckpt", new_learning()
     teach(learning, Scene.draw(0, 40).pairs, background=False)
     checkpoint.write_checkpoint(file, learning.state(), robot="arm", utc="")

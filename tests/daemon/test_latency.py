@@ -74,7 +74,7 @@ def test_the_claimed_uncertainty_covers() -> None:
 
 
 def guided(seed: int) -> Wiggle:
-    """12 s as a hand guides the arm: from pose to pose at one pace, its zeros 2.5°, axes 0.6° and links 5 mm off."""
+    """Return 12 s of hand guiding from pose to pose at one pace: joint offsets 2.5°, axes 0.6° and links 5 mm off."""
     rng = np.random.default_rng(seed)
     parameters = ChainParameters(ARM.chain)
     made = ChainTolerances(axes=0.01, points=0.005, zeros=0.045, tool=0.01)
@@ -107,7 +107,7 @@ def test_the_95_percent_intervals_of_slowly_guided_arms_cover_95_percent() -> No
 
 
 def in_step(seed: int, latency_s: float) -> Wiggle:
-    """Slow motion, every fourth of the readings at the very time of an image, and readings with noise."""
+    """Return slow motion with noisy readings, every fourth of them exactly at the time of an image."""
     rng = np.random.default_rng(seed)
     pace = 2 * np.pi * rng.uniform(0.3, 1.2, (4, 6))
     width, phase = 0.18 * rng.normal(size=(4, 6)) / pace, rng.uniform(0, 2 * np.pi, (4, 6))

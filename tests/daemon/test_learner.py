@@ -60,7 +60,7 @@ class Wire:
         self.handlers[key] = changed
 
     def token(self, key: str) -> None:
-        """Nothing watches it."""
+        """Do nothing: no client watches the token."""
 
     def ask_one(self, key: str, **_: object) -> bytes:
         begin = int(key.partition("from=")[2])

@@ -36,7 +36,7 @@ HALF = 150
 
 
 def fingerprint(learning: Learning) -> tuple[object, ...]:
-    """Everything that a refused pair must not change."""
+    """Return everything that a refused pair must not change."""
     state = learning.state()
     return (state.header, {name: array.tobytes() for name, array in state.arrays.items()})
 
@@ -113,7 +113,7 @@ class Taught:
         return Scene(self.scene.chain, self.scene.q[:count], self.scene.pairs[:count])
 
     def copy(self) -> Learning:
-        """Another learner that knows the same, its solver too."""
+        """Return another learner with the same data and solver state."""
         copy = new_learning()
         copy.restore(self.learning.state())
         while copy.work():

@@ -57,7 +57,7 @@ def robot_of(arm: str, file: Path, port: object = "/dev/ttyACM0") -> Config:
 
 
 def servos_of(motors: dict[str, MotorCalibration]) -> list[Servo]:
-    """Servos with LeRobot's offsets in their EEPROM, on an arm that stands in POSE_RAD."""
+    """Return servos with LeRobot's offsets in their EEPROM, on an arm that stands in POSE_RAD."""
     servos: list[Servo] = []
     for name, motor in motors.items():
         encoder = motor.homing_offset + motor.middle + POSE_RAD[name] * 4096 / (2 * math.pi)

@@ -72,7 +72,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def held(views: list[View], places: Iterable[int] | None = None) -> tuple[LiveViews, list[StereoFrame]]:
-    """Each view held for two frames."""
+    """Return each view held for two frames."""
     shown = [k for k in (range(len(views)) if places is None else places) for _ in range(2)]
     return LiveViews(BOARD, KnownCorners(views)), [shot(k, 0.1 * n) for n, k in enumerate(shown)]
 

@@ -54,7 +54,7 @@ def sampling(config: Config, sources: Sources, *, exit_at_end: bool = False) -> 
 
 
 def sample(config: Config, sources: Sources) -> tuple[list[Pair], SamplerStatus]:
-    """Sample to the end of the sources: the pairs in the store, and the last status."""
+    """Sample to the end of the sources; return the pairs in the store and the last status."""
     with sampling(config, sources, exit_at_end=True) as sampler:
         sampler.run()
         return sampler._store.read(), sampler.status()
@@ -176,7 +176,7 @@ def test_encoders_of_other_joints_are_refused(config) -> None:
 
 @pytest.fixture
 def impatient(monkeypatch) -> None:
-    """Lost sources are opened again at once."""
+    """Reopen lost sources at once."""
     monkeypatch.setattr("bodyschema.daemon.reopen.FIRST_WAIT_S", 0.0)
 
 

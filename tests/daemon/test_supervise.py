@@ -132,7 +132,7 @@ def test_the_command_run_with_a_port_in_use_ends_with_its_message(tmp_path, free
 
 @contextmanager
 def running(robot: Path, log: Path) -> Iterator[warm.Child]:
-    """`bodyschema run`, with both processes at work."""
+    """Run `bodyschema run`, with both processes at work."""
     with log.open("wb") as stream:
         run = warm.Child("-m", "bodyschema", "run", "--robot", robot, stderr=stream)
     try:

@@ -60,7 +60,7 @@ def document(hub: Hub, topic: str) -> Any:
 def process(
     endpoint: str, name: str, status: object, answers: dict[str, Callable[..., bytes]], router: str = ""
 ) -> Iterator[None]:
-    """One of the two processes, as zenoh shows it; it says its state all the while."""
+    """Run one of the two processes as zenoh shows it; it publishes its state continuously."""
     with Bus(listen=endpoint, connect=router or None, settings={"mode": "router"} if router else None) as bus:
         for key, answer in answers.items():
             bus.answer(key, answer)

@@ -103,7 +103,7 @@ def test_the_page_shows_the_example_as_it_is() -> None:
 
 @pytest.fixture(scope="module")
 def learner(tmp_path_factory, free_endpoint) -> Iterator[Config]:
-    """robot.toml of a learner that answers, without a sampler."""
+    """Yield robot.toml of a learner that answers, without a sampler."""
     folder = tmp_path_factory.mktemp("robot")
     zenoh = f'[zenoh]\nsampler = "{free_endpoint()}"\nlearner = "{free_endpoint()}"\n'
     robot = write_small_arm(folder, zenoh + '[daemon]\nstate_dir = "state"\n')

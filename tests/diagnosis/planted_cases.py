@@ -49,7 +49,7 @@ def walk(robot: RobotDescription, seed: int, rows: int = 300) -> Motion:
 
 
 def scattered(robot: RobotDescription, seed: int, rows: int = 300) -> Motion:
-    """Poses that have nothing to do with each other, over most of the joints' range."""
+    """Return unrelated poses over most of the joints' range."""
     shares = np.random.default_rng([seed, 2]).uniform(0.1, 0.9, size=(rows, len(robot.joints)))
     return motion_of(robot.lower + shares * (robot.upper - robot.lower))
 
@@ -62,13 +62,13 @@ def seen(robot: RobotDescription, motion: Motion, effects: tuple[Effect, ...], s
 
 
 def measured(robot: RobotDescription, motion: Motion, x: FloatArray) -> Recording:
-    """Positions x (n, 3) [m], their noise stated as `SIGMA_M`."""
+    """Return a recording of positions x (n, 3) [m], their noise stated as `SIGMA_M`."""
     cov = np.broadcast_to(SIGMA_M**2 * np.eye(3), (len(motion), 3, 3))
     return Recording(joints=robot.joints, q=motion.q, x=x, t=motion.t, cov=cov, segment=motion.segment)
 
 
 def observed(robot: RobotDescription, motion: Motion, effects: tuple[Effect, ...], seed: int) -> Observations:
-    """`seen`, as the diagnosis takes it."""
+    """Return `seen` as observations of the diagnosis."""
     return Observations.of(seen(robot, motion, effects, seed), Simulation(robot))
 
 

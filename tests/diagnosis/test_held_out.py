@@ -50,7 +50,7 @@ def converged(fit: Fit) -> Fit:
 
 @pytest.fixture(scope="module")
 def small(robot) -> Fit:
-    """Sixty poses, each a run of its own: what is left of them is measured as before."""
+    """Return sixty poses, each a run of its own."""
     motion = walk(robot, 1, 60)
     alone = Motion(motion.q, motion.t, np.arange(60))
     truth = (
@@ -115,7 +115,7 @@ def test_a_gain_of_nothing_is_none() -> None:
 
 
 def chances(robot: RobotDescription, starts: list[Fit], name: str, where: str | None) -> FloatArray:
-    """p-values of an effect that is not there."""
+    """Return p-values of an effect that is not there."""
     effect = Effect.at(robot, name, where)
     return np.array(
         [

@@ -53,7 +53,7 @@ PLANTED = (("joint_scale", 0.03), ("joint_offset", 0.03))
 
 
 def narrow(robot: RobotDescription) -> Motion:
-    """All joints but one move widely: that stays near one place."""
+    """Return a motion in which one joint stays near one position and all others move widely."""
     q = walk(robot, 2, ROWS).q.copy()
     q[:, 1] = 1.0 + 0.002 * np.sin(np.arange(len(q)))
     return motion_of(q)

@@ -32,14 +32,14 @@ def robot() -> RobotDescription:
 
 
 def slow_way(robot: RobotDescription, rng: np.random.Generator) -> Motion:
-    """From pair to pair the joints move by about as much as their readings scatter, to and fro."""
+    """Return a motion to and fro whose steps are about as large as the readings' noise."""
     speeds, phases = rng.uniform(0.01, 0.02, len(robot.joints)), rng.uniform(0.0, 6.0, len(robot.joints))
     shares = 0.5 + 0.03 * np.sin(speeds * np.arange(ROWS)[:, None] + phases)
     return motion_of(robot.lower + shares * (robot.upper - robot.lower))
 
 
 def way_with_rests(robot: RobotDescription, rng: np.random.Generator) -> Motion:
-    """From posture to posture by a degree a row or so; of each joint every other move is a rest."""
+    """Return a motion between postures by about a degree per row; every other move of each joint is a rest."""
     shares = 0.5 + 0.3 * rng.uniform(-1.0, 1.0, (ROWS // 40 + 2, len(robot.joints)))
     rests = rng.random(shares.shape) < 0.5
     for row in range(1, len(shares)):
@@ -50,7 +50,7 @@ def way_with_rests(robot: RobotDescription, rng: np.random.Generator) -> Motion:
 
 
 def poses(robot: RobotDescription, rng: np.random.Generator) -> Motion:
-    """Poses that have nothing to do with each other."""
+    """Return unrelated poses."""
     return motion_of(robot.lower + rng.uniform(0.2, 0.8, (ROWS, len(robot.joints))) * (robot.upper - robot.lower))
 
 

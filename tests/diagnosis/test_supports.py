@@ -41,7 +41,7 @@ def moments_about_the_floor(robot: RobotDescription, q: np.ndarray) -> np.ndarra
 
 
 def on_a_soft_mount(robot: RobotDescription, times_the_noise: float, seed: int) -> Recording:
-    """Seen when the floor turns about its origin, alike about all axes, in proportion to the moment on it."""
+    """Return the positions on a mount that turns about the floor's origin, in proportion to the moment on it."""
     motion, camera = walk(robot, seed), robot.camera.pose
     x = Simulation(robot).positions(motion)
     floor = x @ camera[:3, :3].T + camera[:3, 3]
@@ -56,7 +56,7 @@ def found(recording: Recording, robot: RobotDescription) -> DiagnosisFile:
 
 
 def with_a_link_that_bends(robot: RobotDescription, times_the_noise: float, seed: int) -> Recording:
-    """Seen when the upper arm turns about its middle, across it alone, in proportion to the moment on it there."""
+    """Return the positions with an upper arm that bends across its middle, in proportion to the moment there."""
     motion, k = walk(robot, seed), robot.joints.index(ELBOW)
     run, (T, *_) = Simulation(robot).run(motion), Simulation(robot).gravity.in_supports(robot.joints.index(ELBOW))
     moments, forces = (load[:, k] for load in Simulation(robot).gravity.loads(motion.q))

@@ -28,7 +28,7 @@ class HeardPort(VirtualPort):
         super().write(data)
 
     def writes(self) -> list[tuple[int, bytes]]:
-        """Address and data of all that was written to servos."""
+        """Return address and data of all writes to servos."""
         wide = {1: 1, 2: 2}
         told = [i for i in self.heard if i.code in (Code.WRITE, Code.REG_WRITE, Code.SYNC_WRITE, Code.BULK_WRITE)]
         return [(int.from_bytes(i.params[: wide[i.protocol]], "little"), i.params[wide[i.protocol] :]) for i in told]

@@ -28,7 +28,7 @@ class HeardPort(VirtualPort):
         super().write(data)
 
     def writes(self) -> list[tuple[int, bytes]]:
-        """Address and data of all that was written to servos."""
+        """Return address and data of all writes to servos."""
         told = [i for i in self.heard if i.code in (Code.WRITE, Code.REG_WRITE, Code.SYNC_WRITE, Code.RESET)]
         return [(i.params[0], i.params[1:]) for i in told]
 

@@ -148,7 +148,7 @@ class FloatingArm:
             pendulum.held_until = self.clock.now()
 
     def float(self) -> None:
-        """On, ramped in while a hand holds the arm, and then let go."""
+        """Switch on, ramp in while a hand holds the arm, and then let go."""
         self.switch_on()
         self.run(self.table.ramp_s + 0.1)
         self.let_go()

@@ -34,7 +34,7 @@ LOOK_S = 0.04
 
 
 def nobody(payload: bytes) -> bytes:
-    """No learner answers."""
+    """Return None: no learner answers."""
     raise BusError("nobody answers")
 
 

@@ -47,7 +47,7 @@ class Robot:
         )
 
     def read(self, seconds: float) -> list[JointReading]:
-        """All readings of so long."""
+        """Return all readings of this time span."""
         end, readings = self.clock.now() + seconds, []
         while (left := end - self.clock.now()) > 1e-9:
             reading = self.joints.read(left)
@@ -56,6 +56,6 @@ class Robot:
         return readings
 
     def error(self, reading: JointReading) -> float:
-        """Largest error of the reading's positions against the truth at its time [rad]."""
+        """Return the largest error of the reading's positions against the truth at its time [rad]."""
         names = self.joints.joints
         return max(abs(q - self.paths[name](reading.t)) for q, name in zip(reading.q, names, strict=True))

@@ -67,7 +67,7 @@ class ServoArm:
         self.joints = driver(config, self.names, self.clock, open_port=lambda *_: opened, **settings)
 
     def error(self, reading) -> float:
-        """Largest error of the reading's angles against the truth at its time [rad]."""
+        """Return the largest error of the reading's angles against the truth at its time [rad]."""
         return max(abs(q - path(reading.t)) for q, path in zip(reading.q, self.paths, strict=True))
 
     def sampled(self) -> float:

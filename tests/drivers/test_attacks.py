@@ -137,10 +137,10 @@ class Babble:
         return b"\x55"
 
     def flush(self) -> None:
-        """More comes."""
+        """Do nothing: more data come."""
 
     def close(self) -> None:
-        """More comes."""
+        """Do nothing: more data come."""
 
 
 @pytest.mark.parametrize("model", WEAK)

@@ -77,7 +77,7 @@ class Bench:
 
 
 def scanned(scan: Callable[[], dict[int, int]], there: dict[int, int]) -> bool:
-    """Scan until all that are there have answered in time; nothing else may answer."""
+    """Scan until all servos present have answered in time; fail if any other answers."""
     for _ in range(SCANS):
         found = scan()
         assert found.items() <= there.items()

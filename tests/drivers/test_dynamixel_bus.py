@@ -41,10 +41,10 @@ class TalkingPort:
         return self._pieces.pop(0) if next_s <= until and self._pieces else b""
 
     def flush(self) -> None:
-        """Nothing waits."""
+        """Do nothing: nothing waits."""
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Do nothing: there is nothing to close."""
 
 
 def fitted(model: str) -> FittedServo:

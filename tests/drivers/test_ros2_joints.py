@@ -238,7 +238,7 @@ def test_messages_that_do_not_tell_where_a_joint_is_are_refused(names, positions
 
 
 def feed(robot: Robot, messages: list[JointState]):
-    """Instead of a link's `receive`: these messages, and then nothing."""
+    """Replace a link's `receive` by these messages, and then nothing."""
 
     def receive(until: float) -> Sample | None:
         robot.clock.wait_until(min(until, robot.clock.now() + 0.01) if messages else until)

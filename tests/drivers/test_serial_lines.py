@@ -91,7 +91,7 @@ class BoardArm:
         )
 
     def error(self, reading) -> float:
-        """Largest error of the reading's angles against the truth at its time [rad]."""
+        """Return the largest error of the reading's angles against the truth at its time [rad]."""
         return max(abs(q - path(reading.t)) for q, path in zip(reading.q, self.paths, strict=True))
 
     def read(self, count: int = 1) -> list[JointReading]:
@@ -191,7 +191,7 @@ def test_times_are_those_of_the_measurements_to_half_a_millisecond() -> None:
 
 
 def time_error(reading: JointReading) -> float:
-    """By how much the time is wrong [s] of a reading of `STEEP`, modulo a turn of it."""
+    """Return the time error [s] of a reading of `STEEP`, modulo a turn of it."""
     turn_s = 2 * math.pi / 8.0
     return (reading.t - reading.q[0] / 8.0 - 100.0 + turn_s / 2) % turn_s - turn_s / 2
 

@@ -116,7 +116,7 @@ class Floating:
         raise AssertionError(self.errors())
 
     def ended(self) -> int:
-        """Its exit code."""
+        """Return its exit code."""
         for _ in self._said:
             pass
         return self.process.wait()

@@ -87,7 +87,7 @@ def walk(seed: int = 0, rows: int = 120) -> Motion:
 
 
 def everywhere(robot: RobotDescription) -> list[tuple[str, str | None, str | None]]:
-    """Every effect at every joint that it can sit at; a coupling from one other joint each."""
+    """Return every effect at every possible joint; a coupling from one other joint each."""
     found: list[tuple[str, str | None, str | None]] = []
     for kind in KINDS.values():
         for k, joint in enumerate(robot.joints if kind.at_joint else (None,)):

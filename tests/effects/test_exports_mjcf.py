@@ -40,7 +40,7 @@ MOVE_S, REST_S, STIFF = 1.0, 1.0, [0.9999, 0.9999, 0.001, 0.5, 2.0]
 
 @pytest.fixture(autouse=True)
 def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """MuJoCo writes what it warns of into a file in the current folder."""
+    """Change to a temporary folder: MuJoCo writes its warnings to a file in the current one."""
     monkeypatch.chdir(tmp_path)
 
 

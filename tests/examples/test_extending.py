@@ -97,7 +97,7 @@ def test_a_driver_that_nobody_installed_is_named_with_its_line(installed, robot_
 
 
 def dotted(*eyes: tuple[float, float] | None) -> StereoFrame:
-    """Both eyes' images of a green dot at these places (column, row)."""
+    """Return both cameras' images of a green dot at these places (column, row)."""
     v, u = np.mgrid[0:480, 0:640]
     images = []
     for place in eyes:

@@ -80,7 +80,7 @@ def test_pybullet_reads_the_learnt_positions(seed, head, arm) -> None:
 
 
 def without_visuals(urdf: Path) -> Path:
-    """pybullet loads no URDF whose meshes are missing."""
+    """Return a URDF without visuals: pybullet loads no URDF whose meshes are missing."""
     tree = ElementTree.parse(urdf)
     for link in tree.iterfind("link"):
         for visual in link.findall("visual"):

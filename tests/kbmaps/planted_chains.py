@@ -24,7 +24,7 @@ def random_chain(rng: np.random.Generator, kinds: str) -> RigidChain:
 
 
 def half_ranges(kinds: str, revolute_deg: float) -> np.ndarray:
-    """Half ranges (d,): revolute_deg for a revolute joint [rad], 0.3 m for a prismatic one."""
+    """Return half ranges (d,): revolute_deg for a revolute joint [rad], 0.3 m for a prismatic one."""
     return np.array([np.radians(revolute_deg) if kind == "R" else 0.3 for kind in kinds])
 
 

@@ -45,7 +45,7 @@ class Arm:
         self.x = self.parameters.positions(self.truth, self.q) + SIGMA * self.rng.normal(size=(pairs, 3))
 
     def change(self, kind: str, size_m: float) -> None:
-        """From the pair `BEFORE` on, by about so much at the marker."""
+        """Change the positions from the pair `BEFORE` on, by about this size at the marker."""
         chosen = next(
             each for each in change_kinds(self.parameters, 0.5) if (each.name, each.joint) == (kind, KINDS[kind])
         )
@@ -61,7 +61,7 @@ class Arm:
         self.x += size_m * np.sin(waves @ self.q.T + self.rng.uniform(0.0, 6.0, (3, 1))).T
 
     def err(self, size_m: float) -> None:
-        """Each encoder sits beside its axis: it errs as a wave of its joint's turn, by about so much at the marker."""
+        """Make each encoder eccentric: its error is a wave of the joint's turn, of about this size at the marker."""
         phases = self.rng.uniform(0.0, 6.0, self.q.shape[1])
         read_wrongly = self.q + size_m / self.parameters.reach * np.sin(self.q + phases)
         self.x += self.parameters.positions(self.truth, read_wrongly) - self.parameters.positions(self.truth, self.q)

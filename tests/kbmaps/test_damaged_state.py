@@ -47,7 +47,7 @@ WITH_NAN = ("sigma", "errors")
 
 @functools.cache
 def stored() -> dict[str, tuple[Any, bytes]]:
-    """By name, the class that reads them and the bytes of taught models."""
+    """Return, by name, the reading class and the bytes of trained models."""
     rng = np.random.default_rng(1)
     arm = rough_arm(rng, KINDS)
     q, x = arm.pairs(rng, 40, 0.01)

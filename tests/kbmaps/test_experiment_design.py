@@ -43,7 +43,7 @@ class Waves:
         return self.features(q) @ self.root
 
     def covariances_after(self, q, region):
-        """By the textbook: (Σ⁻¹ + BᵀB/σ²)⁻¹ in the weights themselves."""
+        """Return the textbook covariance (Σ⁻¹ + BᵀB/σ²)⁻¹ of the weights themselves."""
         seen = self.features(q).reshape(-1, 12)
         covariance = np.linalg.inv(np.linalg.inv(self.root @ self.root.T) + seen.T @ seen / self.noise**2)
         shown = self.features(region)

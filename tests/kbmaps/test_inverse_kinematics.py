@@ -261,7 +261,7 @@ def test_targets_of_the_wrong_shape_are_refused():
 
 
 def humanoid() -> RigidChain:
-    """Twenty joints, links of 60 mm, axes in turn about z, y and x."""
+    """Return a chain of twenty joints, links of 60 mm, axes in turn about z, y and x."""
     fixed = np.tile(np.eye(4), (21, 1, 1))
     fixed[1:, :3, 3] = [0.05, 0.02, 0.03]
     return RigidChain(fixed, np.eye(3)[[2 - k % 3 for k in range(20)]], np.zeros(20, dtype=bool))

@@ -79,7 +79,7 @@ def test_the_model_that_predicts_best_answers(arm):
 
 
 def bent(arm: Arm, q: np.ndarray) -> np.ndarray:
-    """Positions of an arm that no rigid chain follows."""
+    """Return positions of an arm that no rigid chain fits."""
     return arm.real.positions(q) + 0.05 * np.sin(2.0 * q)
 
 

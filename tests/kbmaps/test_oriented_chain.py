@@ -26,7 +26,7 @@ TOLERANCES = ChainTolerances(
 
 
 def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angles between rotations (n, 3, 3) [rad], shape (n,)."""
+    """Return the angles between rotations (n, 3, 3) [rad], shape (n,)."""
     return np.linalg.norm(rotation_vectors(a @ b.swapaxes(-1, -2)), axis=1)
 
 

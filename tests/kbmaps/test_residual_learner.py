@@ -63,7 +63,7 @@ def arm(rng: np.random.Generator) -> Arm:
 
 @pytest.fixture
 def bent(arm: Arm, rng: np.random.Generator) -> ResidualLearner:
-    """Taught an arm with eccentric encoders."""
+    """Return a learner trained on an arm with eccentric encoders."""
     q = random_q(rng, arm.kinds, 200, 80.0)
     return taught(arm, q, arm.real.positions(eccentric(q)) + SIGMA * rng.normal(size=(200, 3)))
 
@@ -77,7 +77,7 @@ def test_a_rigid_arm_without_noise_is_learnt_as_a_rigid_chain_to_the_last_bit(ar
 
 @functools.cache
 def of_rigid_arms() -> list[tuple[ResidualLearner, float]]:
-    """Learners of rigid arms with noise, and how far they are from their rigid chain, over its sigma (RMS)."""
+    """Return learners of rigid arms with noise, and their RMS deviation from the rigid chain over its sigma."""
     learners = []
     for seed in range(12):
         rng = np.random.default_rng(seed)

@@ -188,7 +188,7 @@ NAMED = ("base_rotation", "base_translation", "tool_shift", "zeros")
 
 
 def over_half_widths(arms: int, pairs: int = 200, sigma: float = 0.001) -> dict[str, np.ndarray]:
-    """Errors in half widths (arms, k) of each kind of number in the report."""
+    """Return errors in half widths (arms, k) of each kind of number in the report."""
     off: dict[str, list[np.ndarray]] = {name: [] for name in NAMED}
     for seed in range(arms):
         rng = np.random.default_rng(seed)

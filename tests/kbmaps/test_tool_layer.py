@@ -30,7 +30,7 @@ SHIFT = np.array([0.1, -0.2, 0.12])
 def seen(
     chain: RigidChain, rng: np.random.Generator, joint_kinds: str, n: int, sigma: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of the chain with a tool of `SHIFT`."""
+    """Return pairs of the chain with a tool of `SHIFT`."""
     q = random_q(rng, joint_kinds, n, 80)
     return q, chain.with_tool(SHIFT).positions(q) + sigma * rng.normal(size=(n, 3))
 

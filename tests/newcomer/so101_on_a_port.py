@@ -54,7 +54,7 @@ class So101:
         return self
 
     def record(self, robot: Config, rows: int) -> Recording:
-        """Guide the arm for `rows` readings; joints as its driver reads them, positions as a camera does."""
+        """Guide the arm for `rows` readings; return joints as its driver reads them and positions as a camera does."""
         config, clock = robot.tables.drivers.feetech, VirtualClock()
         assert config is not None
         port = VirtualPort(Chain(self.servos), clock)

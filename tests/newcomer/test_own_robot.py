@@ -34,7 +34,7 @@ def output_of(command: str) -> str:
 
 
 def table(heading: str) -> list[list[str]]:
-    """Rows of the table whose first column has this heading."""
+    """Return the rows of the table whose first column has this heading."""
     body = re.search(rf"^\| {re.escape(heading)} \|.*\n\| ---.*\n((?:\|.*\n)+)", PAGE, re.MULTILINE)[1]
     return [[cell.strip() for cell in line.split(" | ")] for line in re.findall(r"^\| (.*) \|$", body, re.MULTILINE)]
 
@@ -122,7 +122,7 @@ def test_the_page_has_every_key_of_the_description(section, heading: str) -> Non
 
 
 def guided_recording(robot: RobotDescription, rows: int) -> str:
-    """CSV of a guided path of an arm that is not quite as `robot` describes it, seen with 0.5 mm noise."""
+    """Return the CSV of a guided path of an arm that deviates from `robot`, with 0.5 mm of noise."""
     rng = np.random.default_rng(0)
     fixed = robot.chain.fixed.copy()
     for transform in fixed:

@@ -38,7 +38,7 @@ class TypedPage:
         return found[1]
 
     def type(self, command: str) -> str:
-        """Type a command of the page, and return what it prints, in lines as long as they are."""
+        """Type a command of the page, and return its output with unwrapped lines."""
         assert command in self.commands, command
         words = shlex.split(command)[1:]
         self.printed.readouterr()

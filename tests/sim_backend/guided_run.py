@@ -64,7 +64,7 @@ def guide(
     tool: tuple[float, float, float] | None = None,
     settle: float = 0.0,
 ) -> Run:
-    """Guide the robot and record it, after a tool change and some time to settle where that is asked for."""
+    """Guide the robot and record it, optionally after a tool change and some time to settle."""
     assert robot.calibration is not None
     truth = TrueRobot.draw(robot, config)
     readings, fixes, visible = [], [], []
@@ -88,10 +88,10 @@ def guide(
 
 @cache
 def shipped_run(seed: int) -> Run:
-    """Twenty seconds of the shipped robot."""
+    """Return twenty seconds of the shipped robot."""
     return guide(shipped(), SimConfig(seed=seed), 20.0)
 
 
 def step_degrees(run: Run) -> FloatArray:
-    """Joint-space distance between neighbouring frames [deg]."""
+    """Return the joint-space distance between neighbouring frames [deg]."""
     return np.degrees(np.linalg.norm(np.diff(run.q, axis=0), axis=1))

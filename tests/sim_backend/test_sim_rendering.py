@@ -30,7 +30,7 @@ def bullet():
 
 
 def painted(bullet, x, config=PLAIN, seed=0, T_world_camera=None, turn=UNTURNED):
-    """Left and right image of a marker at `x` in the left eye."""
+    """Return left and right image of a marker at `x` in the left optical frame."""
     T = np.eye(4) if T_world_camera is None else T_world_camera
     images = tuple(np.zeros((480, 640, 3), dtype=np.uint8) for _ in range(2))
     eyes = StereoEyes(Raster(*bullet, CALIBRATION, TO_LIGHT), CALIBRATION, config, seed)
@@ -50,7 +50,7 @@ def weighted_centre(weight):
 
 
 def ball_centre(image):
-    """Centroid of the ball in an image with a plain light wall behind: clipped green contrast, free of shading."""
+    """Return the ball's centroid in an image with a plain light wall: clipped green contrast, free of shading."""
     contrast = 1.0 - image[..., 1] / 120.0
     return weighted_centre(np.clip(contrast, 0.0, 0.5))
 

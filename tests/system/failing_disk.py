@@ -94,7 +94,7 @@ class Done:
 
 
 def read_log(log: Path) -> Iterator[Done]:
-    """All that was done, in its order."""
+    """Return all operations in order."""
     notes, at = log.read_bytes(), 0
     while at < len(notes):
         operation, name_size, inode, offset, data_size = RECORD.unpack_from(notes, at)

@@ -60,7 +60,7 @@ def at_the_commit(kill: Countdown) -> None:
 
 
 def at_the_publication(kill: Countdown, *, before: bool) -> None:
-    """Die before or after a pair, which is in the store, is handed to zenoh."""
+    """Die before or after a stored pair is handed to zenoh."""
     declare = Bus.publisher
 
     def publisher(bus: Bus, key: str, *, cache: int = 0) -> Callable[[bytes], None]:
@@ -90,7 +90,7 @@ def in_the_middle_of_a_checkpoint(kill: Countdown) -> None:
 
 
 def at_the_rename(kill: Countdown, *, before: bool) -> None:
-    """Die before or after a whole checkpoint takes the place of the old one."""
+    """Die before or after a complete checkpoint replaces the old one."""
     replace = os.replace
 
     def doomed(source: Path, target: Path) -> None:

@@ -41,7 +41,7 @@ class File:
             _cut(self.present, done.offset)
 
     def sync(self) -> None:
-        """All that was done is on the disk."""
+        """Mark all operations as being on the disk."""
         self._safe = bytearray(self.present) if self._pending else self._safe
         self._pending.clear()
 

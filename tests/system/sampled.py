@@ -86,7 +86,7 @@ class SamplerProcess:
         return decode(reply, CommandReply).message
 
     def said(self) -> str:
-        """On its terminal, so far."""
+        """Return its terminal output so far."""
         return self._log.read_text()
 
     def _answer(self, ask: Callable[[], bytes]) -> bytes:
@@ -121,7 +121,7 @@ def sampling(config: Config, environment: dict[str, str] | None = None) -> Itera
 
 
 def until(sampler: SamplerProcess, holds: Callable[[SamplerStatus], bool]) -> SamplerStatus:
-    """Its status, when that holds."""
+    """Return the sampler's status once the condition holds."""
     limit = time.monotonic() + LIMIT_S
     while not holds(said := sampler.status()):
         assert time.monotonic() < limit, (said.rejected, said)

@@ -45,7 +45,7 @@ def over(link: BadLink, config: Config) -> Config:
 
 @contextlib.contextmanager
 def apart(folder: Path, free_endpoint) -> Iterator[tuple[Config, BadLink]]:
-    """Both processes with a link between them, and some pairs learnt."""
+    """Run both processes with a link between them until some pairs are learned."""
     config = write_robot(folder, free_endpoint)
     with (
         BadLink(config.tables.zenoh.sampler) as link,

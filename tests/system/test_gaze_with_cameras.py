@@ -208,7 +208,7 @@ def episode(library, tmp_path_factory, free_endpoint) -> Episode:
 
 
 def in_view(robot: RobotDescription, q: FloatArray) -> np.ndarray:
-    """At which of q (n, d) both eyes have the marker's centre in their images (n,)."""
+    """Return a mask (n,) of the rows of q (n, d) at which both cameras have the marker's centre in view."""
     calibration = robot.calibration
     assert calibration is not None
     x, eyes = robot.chain.positions(q), [[0.0, 0.0], [calibration.baseline_m, 0.0]]
@@ -217,7 +217,7 @@ def in_view(robot: RobotDescription, q: FloatArray) -> np.ndarray:
 
 
 def with_the_head_still(episode: Episode, q: FloatArray) -> FloatArray:
-    """q (n, d), the head where it stood before the gaze began."""
+    """Return q (n, d) with the head at its position before the gaze began."""
     q = q.copy()
     q[:, HEAD] = episode.without.q[0, HEAD]
     return q

@@ -40,7 +40,7 @@ class Kill:
 
 
 def plan(rng: np.random.Generator, points: list[str], kills: int, latest: int) -> list[Kill]:
-    """So many kills in random order: every third at a random moment, the others at the points in turn."""
+    """Return kills in random order: every third at a random moment, the others at the points in turn."""
     named = [points[k % len(points)] for k in range(kills - kills // 3)]
     order = rng.permutation([*named, *[NOWHERE] * (kills // 3)]).tolist()
     return [

@@ -115,7 +115,7 @@ class Losses:
 def lose_power(
     folder: Path, endpoint: Callable[[], str], disk_shim: Path, pairs: int, losses: int, seed: int
 ) -> Losses:
-    """At random moments, half of them around what was done to the checkpoint and to the folder."""
+    """Lose power at random moments, half of them around operations on the checkpoint and the folder."""
     config = write_robot(folder, endpoint, pairs_per_s=400.0)
     log = list(read_log(work(config, disk_shim, pairs)))
     rng = np.random.default_rng(seed)

@@ -92,7 +92,7 @@ def started(
 
 @contextlib.contextmanager
 def running(systemd: Systemd, log_file: Path, *arguments: object) -> Iterator[warm.Child]:
-    """Python with these arguments under `systemd`."""
+    """Run Python with these arguments under `systemd`."""
     environment = os.environ | {"NOTIFY_SOCKET": str(systemd.file), "WATCHDOG_USEC": str(round(1e6 * WATCHDOG_S))}
     with log_file.open("ab") as log:
         child = warm.Child(*arguments, stderr=log, env=environment)

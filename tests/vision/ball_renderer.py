@@ -97,7 +97,7 @@ def render_pair(
     calibration: StereoCalibration,
     t: float = 0.0,
 ) -> StereoFrame:
-    """Both eyes' view of a ball around `x` (3,) [m] in the left optical frame, before the two pictures."""
+    """Render both images of a ball around `x` (3,) [m] in the left optical frame, on the two backgrounds."""
     left, right = (
         take(paint_ball(picture, x_eye, radius_m, look, calibration), look, rng)
         for picture, x_eye in zip(pictures, in_eyes(x, calibration), strict=True)
@@ -121,7 +121,7 @@ class Room:
         self._images = [take(picture, self._look, rng) for picture in self._pictures]
 
     def photograph(self, x: FloatArray, radius_m: float, t: float) -> StereoFrame:
-        """Both eyes' view of a ball around `x` (3,) [m] in the left optical frame, in a random light."""
+        """Photograph a ball around `x` (3,) [m] in the left optical frame with both cameras, in a random light."""
         look = random_light(self._rng, self._look)
         eyes = zip(self._pictures, self._images, in_eyes(x, self._calibration), strict=True)
         return StereoFrame(t, *(self._eye(*eye, radius_m, look) for eye in eyes))
@@ -140,7 +140,7 @@ class Room:
 def paint_ball(
     picture: FloatArray, x_eye: FloatArray, radius_m: float, look: Look, calibration: StereoCalibration
 ) -> FloatArray:
-    """`picture` with the ball before it; both RGB of 0..1, shape (height, width, 3)."""
+    """Return `picture` with the ball in front; both RGB of 0..1, shape (height, width, 3)."""
     moved = np.array(look.moved_m)
     instants = np.linspace(-0.5, 0.5, _INSTANTS) if moved.any() else np.zeros(1)
     rows, columns = _neighbourhood(x_eye, radius_m, calibration, 2.0 + _reach_px(x_eye, moved, look, calibration))
@@ -168,7 +168,7 @@ def _reach_px(x_eye: FloatArray, moved: FloatArray, look: Look, calibration: Ste
 def _neighbourhood(
     x_eye: FloatArray, radius_m: float, calibration: StereoCalibration, margin_px: float
 ) -> tuple[slice, slice]:
-    """Rows and columns of the image that hold the ball and a margin."""
+    """Return rows and columns of the image that contain the ball and a margin."""
     size = np.array(calibration.image_size_px)
     centre = calibration.project(x_eye)[:2]
     reach = 1.3 * calibration.focal_px * radius_m / x_eye[2] + margin_px
@@ -197,7 +197,7 @@ def take(picture: FloatArray, look: Look, rng: np.random.Generator) -> ImageArra
 
 
 def random_light(rng: np.random.Generator, look: Look) -> Look:
-    """`look` with a light and gloss of its own."""
+    """Return `look` with a random light and gloss."""
     light = (float(rng.uniform(-1.5, 1.5)), float(rng.uniform(-1.5, 0.3)), -1.0)
     return replace(
         look,

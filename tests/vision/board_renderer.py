@@ -33,13 +33,13 @@ class TrueLens:
     fisheye: bool = False
 
     def image(self, x: FloatArray) -> FloatArray:
-        """Image coordinates (n, 2) of points (n, 3) in the eye's frame."""
+        """Return image coordinates (n, 2) of points (n, 3) in the camera's frame."""
         a, b = x[:, 0] / x[:, 2], x[:, 1] / x[:, 2]
         distorted = self._equidistant(a, b) if self.fisheye else self._radial_tangential(a, b)
         return np.column_stack(distorted) * self.focal_px + self.principal_point_px
 
     def rays(self, px: FloatArray) -> FloatArray:
-        """Directions (n, 2) with z = 1, by Newton's method: on the angle of a fisheye lens, else on `image`."""
+        """Return directions (n, 2) with z = 1, by Newton's method: on the angle of a fisheye lens, else on `image`."""
         goal = px
         at = (px - self.principal_point_px) / np.array(self.focal_px)
         if self.fisheye:
@@ -168,7 +168,7 @@ class Photographer:
     _rays: dict[int, FloatArray] = field(default_factory=dict)
 
     def pair(self, R: FloatArray, t_m: FloatArray, time: float = 0.0) -> StereoFrame:
-        """Both eyes' images of the board at a pose in the left eye's frame (R board -> eye, t its origin)."""
+        """Return both images of the board at a pose in the left camera's frame (R board -> camera, t its origin)."""
         left = self.left(R, t_m)
         right = self._image(1, self.rig.right, self.rig.R @ R, self.rig.R @ t_m + self.rig.t_m)
         return StereoFrame(time, left, right)
@@ -243,7 +243,7 @@ class Photographer:
 
 
 def _difference(field: FloatArray, v: FloatArray, u: FloatArray, axis: int) -> FloatArray:
-    """By how much the rays at rows v and columns u change from one place to the next along an axis, shape (n, 2)."""
+    """Return the change of the rays at rows v and columns u from one place to the next along an axis, shape (n, 2)."""
     at = (v, u)[axis]
     low, high = np.maximum(at - 1, 0), np.minimum(at + 1, field.shape[axis] - 1)
     ends = [field[each, u] if axis == 0 else field[v, each] for each in (low, high)]
@@ -251,7 +251,7 @@ def _difference(field: FloatArray, v: FloatArray, u: FloatArray, axis: int) -> F
 
 
 def ray_field(lens: TrueLens, u: FloatArray, v: FloatArray) -> FloatArray:
-    """Directions of the rays through all columns u and rows v, shape (len(v), len(u), 2)."""
+    """Return directions of the rays through all columns u and rows v, shape (len(v), len(u), 2)."""
     nodes_u, nodes_v = (np.arange(axis[0] - 8, axis[-1] + 9, 4.0) for axis in (u, v))
     grid = np.stack(np.meshgrid(nodes_u, nodes_v), axis=-1)
     known = lens.rays(grid.reshape(-1, 2)).reshape(grid.shape)
@@ -260,7 +260,7 @@ def ray_field(lens: TrueLens, u: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def webcams(rng: np.random.Generator, *, fisheye: bool = False, size_px: tuple[int, int] = (640, 480)) -> TrueRig:
-    """Two webcams on a bar, mounted by hand: toed in or out, a little rolled."""
+    """Return two webcams on a bar, mounted by hand: toed in or out, a little rolled."""
     width, height = size_px
 
     def lens() -> TrueLens:
@@ -282,7 +282,7 @@ def webcams(rng: np.random.Generator, *, fisheye: bool = False, size_px: tuple[i
 def poses(
     rng: np.random.Generator, rig: TrueRig, board: Printed, count: int = 20
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Poses as a careful person shows the board: all over both images, tilted each way, near and far."""
+    """Return poses of a board shown with care: all over both images, tilted each way, near and far."""
     found: list[tuple[FloatArray, FloatArray]] = []
     width, height = rig.size_px
     middle = 0.5 * board.square_m * np.array([board.columns, board.rows, 0.0])
@@ -313,7 +313,7 @@ def poses(
 
 
 def _seen(rig: TrueRig, board: Printed, R: FloatArray, t_m: FloatArray) -> float:
-    """Share of the board's corners in the image that shows fewer of them."""
+    """Return the share of the board's corners in the image that shows fewer of them."""
     c, r = np.meshgrid(np.arange(1, board.columns), np.arange(1, board.rows))
     x = board.square_m * np.column_stack([c.ravel(), r.ravel(), np.zeros(c.size)]) @ R.T + t_m
     eyes = rig.left.image(x), rig.right.image(x @ rig.R.T + rig.t_m)

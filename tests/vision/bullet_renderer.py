@@ -48,7 +48,7 @@ class BulletScene:
     def render(
         self, x: FloatArray, light: FloatArray, noise_sd: float, rng: np.random.Generator, t: float = 0.0
     ) -> StereoFrame:
-        """Both eyes' view with the ball at `x` (3,) [m], lit from the direction `light` (3,)."""
+        """Render both images with the ball at `x` (3,) [m], lit from the direction `light` (3,)."""
         self._place(self._ball, x)
         left, right = (self._eye(shift, light) for shift in (0.0, self.calibration.baseline_m))
         return StereoFrame(t, *(_noisy(image, noise_sd, rng) for image in (left, right)))
@@ -87,7 +87,7 @@ class BulletScene:
         return rgb[..., ::-1].astype(np.uint8)
 
     def _projection(self) -> list[float]:
-        """Frustum in which pixel centres have integer image coordinates.
+        """Return a frustum in which pixel centres have integer image coordinates.
 
         TinyRenderer samples column i at its left edge and row j at its lower edge, so the frustum is shifted by half
         a (sub)pixel to either side.

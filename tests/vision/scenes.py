@@ -42,7 +42,7 @@ def stage(
     t: float = 0.0,
     seed: int = 0,
 ) -> StereoFrame:
-    """Both eyes' view of `things`, the farthest first, before a grey wall."""
+    """Render both images of `things`, the farthest first, on a grey wall."""
     rng = np.random.default_rng(seed)
     width, height = calibration.image_size_px
     images = []
@@ -60,7 +60,7 @@ def stage(
 
 
 def reason(answer: MarkerFix | MarkerMiss | None) -> Reason | None:
-    """Why there is no fix; None when there is one."""
+    """Return the reason of a missing fix; None if there is a fix."""
     return answer.reason if isinstance(answer, MarkerMiss) else None
 
 

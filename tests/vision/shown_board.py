@@ -74,7 +74,7 @@ def photographed(
 
 
 def shot(number: int, t: float | None = None) -> StereoFrame:
-    """Images that show nothing but which one they are: `KnownCorners` tells what would be seen in them."""
+    """Return images that show only their own number: `KnownCorners` knows the corners in them."""
     marked = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
     marked[0, 0, :2] = divmod(number, 256)
     right = marked.copy()

@@ -58,7 +58,7 @@ def poses(rng: np.random.Generator, count: int) -> list[tuple[FloatArray, FloatA
 def looked(
     places: Places, rng: np.random.Generator, count: int = 20, sides_m: Mapping[int, float] | None = None
 ) -> list[ClusterView]:
-    """Exact corners and noise, of the tags that face an eye by 70° or less; some may have sides of their own [m]."""
+    """Return noisy corners of the tags that face a camera by 70° or less; some may have sides of their own [m]."""
     views = []
     for k, (turn, x) in enumerate(poses(rng, count)):
         eyes = []
@@ -161,7 +161,7 @@ def test_a_number_that_is_there_twice_is_no_rigid_body_and_named(seed: int) -> N
 
 
 def renumbered(view: ClusterView, numbers: Mapping[int, int]) -> ClusterView:
-    """With other numbers of some tags; where both are seen, neither is."""
+    """Return the cluster with other numbers of some tags; if both are seen, neither is."""
 
     def eye(tags: Mapping[int, TagImage]) -> dict[int, TagImage]:
         both = {new for old, new in numbers.items() if old in tags and new in tags}

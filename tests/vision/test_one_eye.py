@@ -52,7 +52,7 @@ def at(rotation: FloatArray, x: ArrayLike, id: int = 0) -> Sheet:
 
 
 def turned_off(fix: MarkerFix, rotation: FloatArray) -> FloatArray:
-    """By how much the fix is turned from the truth (3,) [rad]."""
+    """Return the rotation error of the fix (3,) [rad]."""
     assert fix.R is not None
     return (Rotation.from_quat(fix.R) * Rotation.from_matrix(rotation).inv()).as_rotvec()
 

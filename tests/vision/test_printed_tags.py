@@ -124,7 +124,7 @@ def test_single_tags_are_of_the_size_that_was_asked_for_and_have_their_numbers(w
 
 
 def edge(shape: Shape, cell: tuple[int, int], other: tuple[int, int]) -> FloatArray:
-    """Both ends of the edge between two neighbouring cells, on the folded body, as the face in `cell` has it."""
+    """Return both ends of the edge between two neighbouring cells on the folded body, in the frame of `cell`'s face."""
     face = next(face for face in shape.faces if face.cell == cell)
     step = np.array([other[0] - cell[0], cell[1] - other[1]]) * 0.5
     across = np.abs(step[::-1])

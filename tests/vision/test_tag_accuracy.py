@@ -32,7 +32,7 @@ pytestmark = pytest.mark.soak
 
 
 def pose(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Rotation (3, 3) and place (3,) [m] of a tag that both eyes see whole."""
+    """Return rotation (3, 3) and position (3,) [m] of a tag that both cameras see whole."""
     z = rng.uniform(0.3, 0.8)
     disparity = VGA.focal_px * VGA.baseline_m / z
     u, v = rng.uniform((disparity + 80, 80), (560, 400))

@@ -51,4 +51,4 @@ class FakeCapture:
         return True, self._image.copy()
 
     def release(self) -> None:
-        """Nothing is held."""
+        """Do nothing: nothing is held."""
