@@ -59,7 +59,7 @@ def endpoint(free_endpoint: Callable[[], str]) -> str:
 
 @pytest.fixture
 def mount_small_disk(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
-    """Return a function that mounts an empty tmpfs with the options given; needs root."""
+    """Yield a function that mounts an empty tmpfs with the options given; needs root."""
     if os.geteuid() != 0:
         pytest.skip("no small disk can be mounted; to run it: be root")
     folder = tmp_path / "disk"

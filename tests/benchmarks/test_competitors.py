@@ -1,4 +1,4 @@
-"""Every competitor learns; those that are our own versions of published ones do what was published."""
+"""Every competitor learns; our versions of published algorithms reproduce published results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Evidence for the hidden causes, as a linear Gaussian observer of the true generator has it.
+"""Evidence for the hidden causes, computed by a linear Gaussian observer of the true generator.
 
 It knows the scale of the tolerances, the noise, and how each cause looks; it does not know the tolerances themselves,
 the amounts, or which causes there are. What it says is averaged over the noise, with the tolerances as they are.

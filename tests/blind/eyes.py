@@ -1,4 +1,4 @@
-"""A stereo pair as it truly is, and what one who believes in its description measures with it."""
+"""The true stereo pair, and positions measured with its description."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PIXELS_PER_FIX = 4
 
 @dataclass(frozen=True)
 class TrueEyes:
-    """The pair as it is.
+    """The true camera pair.
 
     Attributes:
         focal_px, baseline_m: as they are.

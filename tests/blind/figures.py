@@ -1,4 +1,4 @@
-"""Rates over many judged cases, beside their goals, as Markdown."""
+"""Rates over many judged cases, with their goals, as Markdown."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`python -m tests.blind.hide --seed 7 --effect backlash --out DIR`: write a case to look at and say what is in it."""
+"""`python -m tests.blind.hide --seed 7 --effect backlash --out DIR`: write a case and print its hidden effects."""
 
 from __future__ import annotations
 

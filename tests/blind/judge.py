@@ -1,4 +1,4 @@
-"""Judges a diagnosis of a hidden case: whether it names what is there, how sure, with which numbers, for which gain."""
+"""Judge a diagnosis of a hidden case: its causes, their certainty, their numbers and their gain."""
 
 from __future__ import annotations
 

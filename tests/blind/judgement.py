@@ -11,7 +11,7 @@ Key = tuple[str, str | None, str | None]
 
 
 class Number(msgspec.Struct, frozen=True):
-    """A number that was found beside the true one."""
+    """A number that was found, with the true one."""
 
     name: str
     truth: float
@@ -134,7 +134,7 @@ def written(key: Key) -> str:
 
 
 class Crash(msgspec.Struct, frozen=True, tag="crashed"):
-    """A case in which the diagnosis broke."""
+    """A case in which the diagnosis crashed."""
 
     scenario: str
     seed: int

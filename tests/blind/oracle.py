@@ -30,7 +30,7 @@ IN_FRONT_M = 0.15
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """Effects with the numbers with which they come nearest to a target, and how near: chi-square."""
+    """Effects with the numbers that fit a target best, and chi-square of the fit."""
 
     effects: tuple[Effect, ...]
     chi2: float

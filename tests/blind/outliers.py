@@ -1,4 +1,4 @@
-"""Fixes that are not the marker: its image in something shiny, or a lamp somewhere else."""
+"""False fixes: the marker's reflection, or a lamp somewhere else."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Effects outside the table, which no name fits."""
+"""Effects outside the table, which no named effect fits."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ APART_S = 10.0  # between frames for the tracker: pairs are looked at singly, wi
 
 
 class Studio:
-    """Paints what the true eyes see."""
+    """Renderer of the true cameras' images."""
 
     def __init__(self, eyes: TrueEyes, rng: np.random.Generator) -> None:
         self._eyes, self._rng = eyes, rng

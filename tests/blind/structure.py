@@ -20,7 +20,7 @@ SHORTEST_BENDING_LINK_M = 0.08
 
 @dataclass
 class Structure:
-    """An arm as it is.
+    """The true structure of an arm.
 
     Attributes:
         arm: with every joint it truly has; those added are not among `arm.read`.

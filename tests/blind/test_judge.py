@@ -1,4 +1,4 @@
-"""The judge itself: what it calls right and wrong, fed with diagnoses that were made up."""
+"""Judgements of made-up diagnoses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each effect moves readings and positions in the way of its mechanism."""
+"""Each effect changes readings and positions according to its mechanism."""
 
 from __future__ import annotations
 

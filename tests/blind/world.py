@@ -1,4 +1,4 @@
-"""The hidden world: what a robot with hidden effects reads and what its cameras see, free of noise."""
+"""The hidden world: readings and images of a robot with hidden effects, free of noise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The laws of `bodyschema.interfaces.protocols`, held to every source that the sampler may read."""
+"""The laws of `bodyschema.interfaces.protocols`, checked for every source that the sampler may read."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ TIMES = np.cumsum(np.random.default_rng(1).uniform(0.01, 0.1, ROWS))
 
 @dataclass
 class Rig:
-    """A source under test, and what else has to be read for time to go on.
+    """A source under test, and the other sources that must be read for time to pass.
 
     Attributes:
         end: makes the source end; without it the source ends by itself.
@@ -215,7 +215,7 @@ def tracked_camera() -> Iterator[Rig]:
 
 @contextmanager
 def eyes(tables: dict[str, Any], open_capture: OpenCapture = lambda _: FakeCapture()) -> Iterator[Rig]:
-    """Return cameras as [vision.cameras] asks for them, with their input in a folder of its own."""
+    """Yield cameras as [vision.cameras] asks for them, with their input in a folder of its own."""
     with TemporaryDirectory() as name:
         folder = Path(name)
         write_pictures(folder)
@@ -320,7 +320,7 @@ ARM = Path(__file__).parents[2] / "examples" / "desk_arm"
 
 @contextmanager
 def through_a_bench(file: str, tables: str = "") -> Iterator[Rig]:
-    """Return joints of another source, read from an emulator by the driver that a robot.toml configures."""
+    """Yield joints of another source, read from an emulator by the driver that a robot.toml configures."""
     with TemporaryDirectory() as folder:
         arm = shutil.copytree(ARM, Path(folder) / "arm")
         with (arm / file).open("a", encoding="utf-8") as toml:

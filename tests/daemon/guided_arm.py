@@ -1,4 +1,4 @@
-"""A small arm as described and as built, guided along a path: pairs with a truth that the learner does not know."""
+"""A small arm as described and as built, guided along a path: pairs with a ground truth hidden from the learner."""
 
 from __future__ import annotations
 

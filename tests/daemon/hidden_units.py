@@ -1,4 +1,4 @@
-"""Recordings of units of one type of arm, each with a fault that is hidden in its kinematics by hand."""
+"""Recordings of units of one type of arm, each with a fault planted in its kinematics."""
 
 from __future__ import annotations
 

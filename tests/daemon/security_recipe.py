@@ -1,4 +1,4 @@
-"""docs/security.md carried out: its openssl lines, its tables, and the files of deploy/."""
+"""Run the instructions of docs/security.md: its openssl commands, its tables, and the files of deploy/."""
 
 from __future__ import annotations
 

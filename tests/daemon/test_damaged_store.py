@@ -1,4 +1,4 @@
-"""A disk that gives back something else than was written: each true pair is kept, and no other is believed."""
+"""Data corruption on disk: every intact pair is kept, and no damaged one is accepted."""
 
 from __future__ import annotations
 
@@ -263,7 +263,7 @@ def test_a_rebuild_without_room_leaves_the_damaged_file(mount_small_disk, long) 
 
 
 class Flips:
-    """A store of which one bit after the other is flipped, and what came of it."""
+    """A store whose bits are flipped one after the other, and the results."""
 
     def __init__(self, file: Path, folder: Path) -> None:
         with PairReader(file) as reader:

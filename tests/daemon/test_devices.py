@@ -35,7 +35,7 @@ ELBOW = {
 
 
 class Joints:
-    """Encoders of which only the record is looked at."""
+    """Encoders of which only the device record is used."""
 
     joints = ("elbow",)
 

@@ -1,4 +1,4 @@
-"""`bodyschema diagnose` at the command line: what it prints, what it writes, what it refuses."""
+"""`bodyschema diagnose` at the command line: output, files and errors."""
 
 from __future__ import annotations
 
@@ -227,7 +227,7 @@ def test_effects_that_are_excluded_are_not_looked_for(file) -> None:
 
 
 class Sampler:
-    """Answers for its pairs."""
+    """A fake sampler that serves its pairs."""
 
     def __init__(self, bus: Bus, name: str, recording: Recording) -> None:
         assert recording.t is not None

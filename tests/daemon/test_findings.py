@@ -1,4 +1,4 @@
-"""Camera, tool and zeros that the learner tells while it runs, and its outlook, against planted arms."""
+"""The learner's reports of camera, tool and joint offsets, and its forecast, against planted arms."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NAMES = ("a", "b", "c", "d")
 
 
 class Ticking:
-    """A clock that stands until it is moved."""
+    """A clock that stands still until it is moved."""
 
     def __init__(self) -> None:
         self.time = 0.0

@@ -1,4 +1,4 @@
-"""Many robots at one place: who is there, and which unit's model is off."""
+"""Many robots at one endpoint: discovery, and finding the unit whose model is off."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Many recordings diagnosed on Dask: which unit is off, what fails alone, what ends cleanly."""
+"""Many recordings diagnosed on Dask: the faulty unit, isolated failures and a clean end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Workers of Dask that are started in a folder whose files are called like the modules that they import."""
+"""Dask workers started in a folder whose files have the names of modules that they import."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`bodyschema calibrate latency`: what is collected, and as it is typed."""
+"""`bodyschema calibrate latency`: data collection and command line."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ class Still:
 
 
 class Wire:
-    """Stands for a session: keeps the handlers, and the sampler's history until that is gone."""
+    """Fake session: keeps the handlers, and serves the sampler's history until that is gone."""
 
     def __init__(self, stored: list[Pair]) -> None:
         self.handlers: dict[str, Callable[..., Any]] = {}

@@ -91,7 +91,7 @@ def test_a_bad_pair_is_refused_and_changes_nothing(pair: Pair, said: str) -> Non
 
 @dataclass(frozen=True)
 class Taught:
-    """An arm with a path of 300 pairs, and a learner that has had the first 150; tests go on with copies."""
+    """An arm with a path of 300 pairs, and a learner trained on the first 150; tests continue with copies."""
 
     scene: Scene
     learning: Learning
@@ -368,7 +368,7 @@ def test_predictions_are_finite_whatever_is_measured(seed: int, wild: dict[int, 
 
 
 class SlowSolver(DirectSolver):
-    """Answers only when the test lets it."""
+    """A solver that answers only when the test allows it."""
 
     waiting = True
 

@@ -34,7 +34,7 @@ RIGHT = ("A1", "B2")
 
 
 class PluggedEyes:
-    """Eyes that follow a script of frames and losses; `serials` are those of each opening, the last one stays."""
+    """Cameras that follow a script of frames and losses; `serials` are those of each opening, the last one stays."""
 
     def __init__(self, script: Iterable[StereoFrame | SourceLost], serials: Iterable[tuple[str, str]] = (RIGHT,)):
         self._script, self._plugged = list(script), list(serials)

@@ -1,4 +1,4 @@
-"""Queries that wait for their turn."""
+"""Queries that wait in the queue."""
 
 from __future__ import annotations
 

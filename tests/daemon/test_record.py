@@ -31,7 +31,7 @@ def pair(seq: int, store: str = "one") -> Pair:
 
 
 class FakeSampler:
-    """Answers for `pairs` as a sampler does, a page at a time."""
+    """A fake sampler that serves `pairs`, a page at a time."""
 
     def __init__(self, bus: Bus) -> None:
         self.pairs: list[Pair] = []

@@ -141,7 +141,7 @@ def test_what_only_a_new_process_may_open_ends_this_one() -> None:
 
 
 class Exchanged:
-    """Eyes that are lost after one frame; what is plugged in then, at each opening: serials and image size."""
+    """Cameras lost after one frame; serials and image size of the replacement are given for each opening."""
 
     def __init__(self, plugged: list[tuple[tuple[str, str], tuple[int, int]]]) -> None:
         self._plugged, self._frames = iter(plugged), 0

@@ -1,4 +1,4 @@
-"""A learner that goes on from a state learns and answers as the one that was saved."""
+"""A learner restored from a saved state learns and answers like the one that was saved."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TAUGHT, LATER = 100, 40
 
 
 class OnlyUntilSaved(DirectSolver):
-    """Answers no more when the learner has been saved."""
+    """A solver that stops answering once the learner has been saved."""
 
     saved = False
 
@@ -32,7 +32,7 @@ def same(a: Prediction, b: Prediction) -> None:
 
 
 class Saved:
-    """A learner that was taught and saved, and one that goes on from there; neither has solutions any more."""
+    """A learner that was trained and saved, and one restored from it; neither receives solutions any more."""
 
     def __init__(self, pairs: list[Pair], *, tool_changed_at: int | None = None, unknown: bool = False) -> None:
         solver, known = OnlyUntilSaved(), not unknown

@@ -169,7 +169,7 @@ def test_while_zero_force_bears_the_arm_pairs_are_taken(borne) -> None:
 
 
 class Cameras:
-    """Eyes with a complaint."""
+    """Cameras with a health warning."""
 
     health = ("the left camera's image is black: is the lens cap on?",)
 

@@ -1,4 +1,4 @@
-"""`bodyschema scan`: what was found, held against robot.toml."""
+"""`bodyschema scan`: findings compared with robot.toml."""
 
 from __future__ import annotations
 

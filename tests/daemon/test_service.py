@@ -27,7 +27,7 @@ class HandClock(SystemClock):
 
 
 class Heard:
-    """A socket that hears what systemd would."""
+    """A socket that receives systemd's notifications."""
 
     def __init__(self, address: str) -> None:
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)

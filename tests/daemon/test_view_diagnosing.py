@@ -1,4 +1,4 @@
-"""Diagnoses that the page asks for, as the processes that they are."""
+"""Diagnoses started from the page, as real processes."""
 
 from __future__ import annotations
 

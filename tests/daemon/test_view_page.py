@@ -1,4 +1,4 @@
-"""The page's addresses, without a browser: what they answer, and whom they refuse."""
+"""The page's addresses, without a browser: answers and refusals."""
 
 from __future__ import annotations
 

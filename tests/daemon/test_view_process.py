@@ -1,4 +1,4 @@
-"""The page as a process beside those that work."""
+"""The page as a process beside the working ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`bodyschema watch cameras`, and what the other commands say of cameras."""
+"""`bodyschema watch cameras`, and the other commands' messages about cameras."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""docs/zenoh.md and the clients in examples/ are held to the code, and to a running sampler and learner."""
+"""docs/zenoh.md and the clients in examples/ agree with the code and with a running sampler and learner."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Small recordings of the desk arm of which it is known what was hidden in them."""
+"""Small recordings of the desk arm with known hidden effects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ripples at regular angles look like other ripples, and the report says so."""
+"""Ripples at regular angles are aliased to other ripples, and the report says so."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from bodyschema.effects import Effect, Simulation
 
 
 class Believing:
-    """Takes what has no name to predict whatever it is asked about, and looking for causes to cost nothing."""
+    """Stub: the unnamed alternative predicts everything, and the search costs nothing."""
 
     def predicts(self, *_: object) -> bool:
         return True

@@ -1,4 +1,4 @@
-"""Amounts are recovered within what is stated of them, and fixes that are not the marker do not matter."""
+"""Amounts are recovered within their stated uncertainty, and outliers do not matter."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Errors on rows that were not fitted, and p-values that mean what they say."""
+"""Held-out errors and calibrated p-values."""
 
 from __future__ import annotations
 

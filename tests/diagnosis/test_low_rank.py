@@ -1,4 +1,4 @@
-"""Numbers of moves that follow a few functions together are found as such."""
+"""A group of errors that follow a few common functions is found."""
 
 from __future__ import annotations
 

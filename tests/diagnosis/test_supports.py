@@ -1,4 +1,4 @@
-"""A mount that gives under the arm's weight is not taken for a joint that does, nor the other way round."""
+"""A mount's compliance is not mistaken for a joint's, nor the other way round."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Readings in whole ticks are seen as such, and how much of the noise is theirs."""
+"""Readings in whole ticks are recognised, with their share of the noise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An arm that is a little off everywhere: what is larger than its tolerances is named, and nothing else."""
+"""An arm with tolerances everywhere: only errors larger than its tolerances are named."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from bodyschema.drivers.dynamixel.models import BY_NAME
 
 
 class HeardPort(VirtualPort):
-    """Keeps what is sent."""
+    """A port that records what is sent."""
 
     def __init__(self, *args, **kwargs) -> None:
         super().__init__(*args, **kwargs)
@@ -35,7 +35,7 @@ class HeardPort(VirtualPort):
 
 
 class Arm(ServoArm):
-    """A driver of Dynamixel servos with a bench behind it."""
+    """A driver of Dynamixel servos on an emulator."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Arms of Feetech servos on the bench in virtual time."""
+"""Arms of emulated Feetech servos in virtual time."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bodyschema.drivers.feetech.models import BY_NAME
 
 
 class HeardPort(VirtualPort):
-    """Keeps what is sent."""
+    """A port that records what is sent."""
 
     def __init__(self, *args, **kwargs) -> None:
         super().__init__(*args, **kwargs)
@@ -34,7 +34,7 @@ class HeardPort(VirtualPort):
 
 
 class FeetechArm(ServoArm):
-    """A driver of Feetech servos with a bench behind it."""
+    """A driver of Feetech servos on an emulator."""
 
     def __init__(
         self,

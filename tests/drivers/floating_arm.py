@@ -1,4 +1,4 @@
-"""Arms on the bench that servos move: pendulums, driven by the currents that the driver commands."""
+"""Emulated arms moved by servos: pendulums driven by the currents that the driver commands."""
 
 from __future__ import annotations
 

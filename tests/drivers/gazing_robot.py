@@ -1,4 +1,4 @@
-"""The demonstration's upper body on the bench: its arm moves along a path, its head as its servos turn it."""
+"""The demonstration's upper body on the emulator: its arm moves along a path, its head follows its servos."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def nobody(payload: bytes) -> bytes:
 
 
 class GazingRobot:
-    """A driver with gaze over the bench, in virtual time; `truth` is the arm as it really is."""
+    """A driver with gaze on the emulator, in virtual time; `truth` is the true arm."""
 
     def __init__(self, predict=nobody, truth: RigidChain | None = None, **settings) -> None:
         self.clock = VirtualClock()

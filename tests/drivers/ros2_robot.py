@@ -1,4 +1,4 @@
-"""A ROS 2 robot on the bench in virtual time, and who listens to it."""
+"""An emulated ROS 2 robot in virtual time, and its reader."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PATHS: dict[str, Callable[[float], float]] = {
 
 
 class Robot:
-    """A driver with nodes behind it: by default one that publishes three joints at 100 Hz."""
+    """A driver connected to nodes: by default one that publishes three joints at 100 Hz."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Arms of servos on a bench in virtual time, whatever their make."""
+"""Arms of emulated servos of any vendor in virtual time."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def swing(phase: float) -> Path:
 
 
 class ServoArm:
-    """A driver with a bench behind it.
+    """A driver connected to an emulator.
 
     Args:
         servo: makes one of a model's name, an ID and its path.

@@ -1,4 +1,4 @@
-"""Buses that do more than to lose answers: adapters that echo, answers that come twice, bytes without end."""
+"""Buses with faults beyond lost answers: adapters that echo, duplicate answers, endless bytes."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ WEAK = {
 
 
 class Wire(OnlyAnswers):
-    """A device whose answers are changed on their way."""
+    """A device whose answers are changed on the wire."""
 
     def __init__(self, device: Device, change: Change) -> None:
         self._device, self._change = device, change

@@ -1,4 +1,4 @@
-"""The servos of a configuration on a bench, and the faults that are asked for."""
+"""The servos of a configuration on an emulator, and the requested faults."""
 
 from __future__ import annotations
 
@@ -282,7 +282,7 @@ def test_a_swing_stays_within_the_limits() -> None:
 
 
 class Scripted:
-    """Gives prepared readings."""
+    """A source of prepared readings."""
 
     joints = JOINTS
 

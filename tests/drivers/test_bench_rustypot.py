@@ -1,4 +1,4 @@
-"""The benches on a pseudo-terminal, spoken to by rustypot as it is: a client that shares no code with ours."""
+"""The emulators on a pseudo-terminal with the unmodified rustypot: a client that shares no code with the project."""
 
 from __future__ import annotations
 

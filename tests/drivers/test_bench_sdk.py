@@ -1,4 +1,4 @@
-"""The bench, spoken to by dynamixel-sdk as it is, in virtual time; unplugging on a pseudo-terminal."""
+"""The emulator with the unmodified dynamixel-sdk, in virtual time; unplugging on a pseudo-terminal."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def chain() -> Chain:
 
 
 class VirtualHandler(sdk.PortHandler):
-    """The SDK's port with the bench behind it. Time passes while the SDK looks for bytes, which it does in a loop."""
+    """The SDK's port connected to the emulator. Time passes while the SDK polls for bytes, which it does in a loop."""
 
     def __init__(self, chain: Chain) -> None:
         super().__init__("virtual")

@@ -48,7 +48,7 @@ EACH = pytest.mark.parametrize("make", MAKES)
 
 
 class Machine:
-    """A file system with what the checks look at."""
+    """A fake file system with the entries that the checks read."""
 
     def __init__(self, root: Path) -> None:
         self.root = root

@@ -1,4 +1,4 @@
-"""examples/correction/ros2_node.py publishes corrected joint states beside the raw ones."""
+"""examples/correction/ros2_node.py publishes corrected joint states in addition to the raw ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Question and answer at a port that says anything."""
+"""Requests and answers at a port that sends arbitrary bytes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PIECES = st.lists(
 
 
 class TalkingPort:
-    """Says its pieces, a millisecond apart, whatever it is asked."""
+    """A port that sends its pieces, a millisecond apart, whatever the request."""
 
     baud = 1_000_000
 

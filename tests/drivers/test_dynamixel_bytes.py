@@ -1,4 +1,4 @@
-"""Parsers of bytes from outside, fuzzed, and held against dynamixel-sdk's own arithmetic and data."""
+"""Parsers of bytes from outside, fuzzed, and compared with dynamixel-sdk's own arithmetic and data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The driver over the bench, in virtual time."""
+"""The driver on the emulator, in virtual time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The driver over the bench on a pseudo-terminal: real time, a real port."""
+"""The driver with the emulator on a pseudo-terminal: real time, a real port."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Feetech's bytes: parsers fuzzed, and the bench's rules."""
+"""Feetech's bytes: fuzzed parsers, and the emulator's rules."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The Feetech driver over its bench, in virtual time."""
+"""The Feetech driver on its emulator, in virtual time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gaze of the demonstration's upper body on the bench, in virtual time."""
+"""Gaze of the demonstration's upper body on the emulator, in virtual time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scanning ports: who is there, at whatever rate, in whatever protocol."""
+"""Port scans: servos found at any baud rate, in any protocol."""
 
 from __future__ import annotations
 

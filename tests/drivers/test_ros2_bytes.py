@@ -1,4 +1,4 @@
-"""Messages at the bytes, against bytes that other programs made."""
+"""Messages as bytes, compared with bytes that other programs wrote."""
 
 from __future__ import annotations
 

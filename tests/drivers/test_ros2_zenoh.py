@@ -1,4 +1,4 @@
-"""The same over zenoh on the loopback interface: router, reader and publisher in one process."""
+"""ROS 2 over zenoh on the loopback interface: router, reader and publisher in one process."""
 
 from __future__ import annotations
 

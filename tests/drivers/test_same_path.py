@@ -1,5 +1,4 @@
-"""One hand-guided path of the simulated arm through every driver: the same model is learnt, to within the encoders'
-resolution."""
+"""One hand-guided path of the simulated arm through every driver gives the same model, to within encoder resolution."""
 
 from __future__ import annotations
 
@@ -43,7 +42,7 @@ LATENCY_S = 1e-3
 
 @dataclass(frozen=True)
 class Guided:
-    """An arm, and where the virtual hand guided it."""
+    """An arm, and the path along which the virtual hand guided it."""
 
     robot: RobotDescription
     path: FloatArray  # (n, d) [rad]
@@ -76,7 +75,7 @@ def guided() -> Guided:
 
 
 class PacedLink:
-    """A robot's messages over zenoh, each sent when virtual time has come to it: no wait but zenoh's own."""
+    """A robot's messages over zenoh, each sent at its virtual time: no wait but zenoh's own."""
 
     def __init__(self, inner: Link, robot: ZenohRobot, node: Node, clock: VirtualClock) -> None:
         self._inner, self._robot, self._node, self._clock = inner, robot, node, clock

@@ -55,7 +55,7 @@ PIECES = st.lists(
 
 
 class BoardArm:
-    """A driver with a bench behind it."""
+    """A driver connected to an emulator."""
 
     def __init__(
         self,

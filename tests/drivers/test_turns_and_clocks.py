@@ -1,4 +1,4 @@
-"""Turns, speeds and device clocks, whatever the device."""
+"""Turns, speeds and device clocks of any device."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ ARMS = [("XM430-W350", "XM430-W350"), ("MX-28", "MX-28"), ("STS3215", "STS3215")
 
 
 class Arm:
-    """Two servos, IDs 1 and 2, and a workbench."""
+    """Two servos, IDs 1 and 2, and an EEPROM editor."""
 
     def __init__(self, models: tuple[str, ...] = ("XM430-W350", "XM430-W350"), angle: float = 0.3) -> None:
         self.clock = VirtualClock()

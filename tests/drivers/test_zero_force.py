@@ -1,4 +1,4 @@
-"""Zero-force over pendulums on the bench, in virtual time."""
+"""Zero-force of emulated pendulums, in virtual time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Zero-force with the weight that the URDF states, on an arm that an independent simulator lets fall."""
+"""Zero-force with the weight stated in the URDF, on an arm that falls in an independent simulator."""
 
 from __future__ import annotations
 

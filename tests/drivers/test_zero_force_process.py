@@ -1,4 +1,4 @@
-"""Zero-force of a real process, with dynamixel-sdk and a pseudo-terminal, and how it ends."""
+"""Zero-force of a real process, with dynamixel-sdk and a pseudo-terminal, and its end."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def bench(tmp_path: Path) -> Iterator[DryRun]:
 
 
 class Floating:
-    """`bodyschema joints --zero-force`, begun."""
+    """A running `bodyschema joints --zero-force`."""
 
     def __init__(self, folder: Path) -> None:
         words = ["joints", "--json", "--zero-force", "--robot", "robot.toml"]

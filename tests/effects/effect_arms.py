@@ -1,4 +1,4 @@
-"""An arm with all that an effect can meet: a head that carries the camera, a slide, masses, a joint held still."""
+"""An arm with all that effects act on: a head that carries the camera, a prismatic joint, masses, a held joint."""
 
 from __future__ import annotations
 

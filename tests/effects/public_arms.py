@@ -1,4 +1,4 @@
-"""Arms of public URDFs, with masses and meshes, as robots that are measured."""
+"""Arms of public URDFs, with masses and meshes, as measured robots."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A corrected URDF says by itself what a URDF can say of the effects."""
+"""A corrected URDF contains all effects that a URDF can express."""
 
 from __future__ import annotations
 

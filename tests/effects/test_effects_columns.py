@@ -1,4 +1,4 @@
-"""The derivatives that the fit takes are those of what the simulation measures."""
+"""The Jacobians of the fit are the derivatives of the simulated measurement."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Effects that depend on the order of the readings: plays, and the first stage reading by reading."""
+"""Effects that depend on the order of the readings: backlash, and the first stage reading by reading."""
 
 from __future__ import annotations
 

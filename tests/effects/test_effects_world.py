@@ -1,4 +1,4 @@
-"""The simulated world shows what the simulation says at every joint: a head's, a slide, behind one held still."""
+"""The simulated world agrees with the simulation at every joint: a head's, a prismatic one, one behind a held joint."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NO_ERRORS = ErrorConfig(
 
 
 class NoRenderer:
-    """In the renderer's place: nothing is painted."""
+    """Replacement of the renderer that paints nothing."""
 
     def __init__(self, *arguments) -> None: ...
 

@@ -1,4 +1,4 @@
-"""MuJoCo puts the marker of an exported model where the simulation has it."""
+"""MuJoCo puts the marker of an exported model at the simulation's position."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plays that hang on one flank, payloads that springs show, friction that lags."""
+"""Backlash that rests on one flank, payloads that springs reveal, friction that lags."""
 
 from __future__ import annotations
 

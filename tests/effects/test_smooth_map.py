@@ -1,4 +1,4 @@
-"""A smooth function of the readings becomes a KB-Map: exactly where it is a sum of harmonics, else nearly."""
+"""A smooth function of the readings becomes a KB-Map: exactly for a sum of harmonics, otherwise approximately."""
 
 from __future__ import annotations
 

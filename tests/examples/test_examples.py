@@ -1,4 +1,4 @@
-"""The numbered scripts in examples/ do what their texts say."""
+"""The numbered scripts in examples/ do as their texts say."""
 
 from __future__ import annotations
 

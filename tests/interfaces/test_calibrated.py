@@ -1,4 +1,4 @@
-"""A learnt chain written as URDF and robot.toml gives the same positions to everybody who reads them."""
+"""A calibrated chain written as URDF and robot.toml gives the same positions in every reader."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Arms that differ from their drawing as their tolerances say, for the tests of the rigid learners."""
+"""Arms that deviate from nominal within their tolerances, for the tests of the rigid learners."""
 
 from __future__ import annotations
 

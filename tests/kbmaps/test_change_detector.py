@@ -1,4 +1,4 @@
-"""A change is noticed, dated and named from the errors of a model; no change is not."""
+"""A change is detected, dated and named from a model's errors; without a change there is no alarm."""
 
 from __future__ import annotations
 

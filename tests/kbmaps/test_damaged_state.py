@@ -1,4 +1,4 @@
-"""Stored models whose checksum is right and whose parts do not fit each other."""
+"""Stored models with a valid checksum and inconsistent parts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The search for the scale of the greatest evidence."""
+"""The search for the scale of maximum evidence."""
 
 from __future__ import annotations
 

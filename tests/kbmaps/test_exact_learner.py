@@ -177,8 +177,7 @@ def test_the_chosen_ridge_has_the_greatest_evidence_of_a_grid(pairs):
 
 
 def held_out_ratio(seed: int) -> float:
-    """Return the held-out error with the evidence's ridge over the best of a grid: noisy pairs, a wrong nominal chain.
-    """
+    """Return the held-out error of the evidence's ridge over the best of a grid, with noisy pairs and a wrong prior."""
     rng = np.random.default_rng(seed)
     chain = random_chain(rng, "RRRR")
     fixed = chain.fixed.copy()

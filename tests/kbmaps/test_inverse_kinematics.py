@@ -28,7 +28,7 @@ RANGE_DEG = 100.0
 
 
 class PositionsOnly:
-    """A chain as a model that has nothing but positions and their derivative."""
+    """A chain as a model with positions and their derivative only."""
 
     def __init__(self, chain: RigidChain) -> None:
         self.joints, self.predict, self.jacobian = chain.joints, chain.positions, chain.jacobian

@@ -1,4 +1,4 @@
-"""docs/model_file.md and examples/read_model.js are held to what `KBMap.to_bytes` writes."""
+"""docs/model_file.md and examples/read_model.js agree with the output of `KBMap.to_bytes`."""
 
 from __future__ import annotations
 

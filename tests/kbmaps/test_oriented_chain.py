@@ -31,7 +31,7 @@ def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 class Arm:
-    """A built arm with a tag on its hand, and the drawing of it."""
+    """A built arm with a tag on its hand, and its nominal model."""
 
     def __init__(self, seed: int, kinds: str = KINDS) -> None:
         self.rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""The rigid chain with residual: as good as the chain where the arm is rigid, better where it is not, and honest."""
+"""The rigid chain with residual: as good as the chain on a rigid arm, better on others, with a valid uncertainty."""
 
 from __future__ import annotations
 

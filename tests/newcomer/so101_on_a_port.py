@@ -1,4 +1,4 @@
-"""An SO-101 in virtual time, read by its driver at the bytes, and a camera that sees a marker on its hand."""
+"""An SO-101 in virtual time, read by its driver byte by byte, and a camera that sees a marker on its hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Wheel and sdist hold the same files, no links, and live beside a package that brings its own `daemon`."""
+"""Wheel and sdist hold the same files, no links, and coexist with a package that brings its own `daemon`."""
 
 from __future__ import annotations
 

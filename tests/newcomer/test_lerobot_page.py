@@ -1,4 +1,4 @@
-"""The way of docs/lerobot.md, typed as it stands there, on an SO-101 emulated at the bytes."""
+"""The commands of docs/lerobot.md, typed as printed, on an SO-101 emulated at the byte level."""
 
 from __future__ import annotations
 

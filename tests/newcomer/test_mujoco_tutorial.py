@@ -1,4 +1,4 @@
-"""The way of docs/mujoco_tutorial.md, typed as it stands there."""
+"""The commands of docs/mujoco_tutorial.md, typed as printed."""
 
 from __future__ import annotations
 

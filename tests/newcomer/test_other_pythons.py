@@ -1,4 +1,4 @@
-"""Installed without extras on every Python of this machine that it is for: no pybullet, and both processes learn."""
+"""Installation without extras on every supported Python of this machine: no pybullet, and both processes learn."""
 
 from __future__ import annotations
 

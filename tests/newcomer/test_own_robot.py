@@ -1,4 +1,4 @@
-"""The way of docs/own_robot.md, typed as it stands there."""
+"""The commands of docs/own_robot.md, typed as printed."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 @dataclass(frozen=True)
 class TypedPage:
-    """A page whose commands are typed in the present folder.
+    """A page whose commands are typed in the working directory.
 
     Attributes:
         text: of the page.

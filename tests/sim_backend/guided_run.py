@@ -1,4 +1,4 @@
-"""A stretch of hand guiding without cameras, recorded, for tests to judge."""
+"""A recorded stretch of hand guiding without cameras, for tests to check."""
 
 from __future__ import annotations
 

@@ -159,7 +159,7 @@ def test_on_a_smooth_path_a_late_stamp_is_what_the_simulation_says(latency_s: fl
 
 
 class NoRenderer:
-    """In the renderer's place: nothing is painted."""
+    """Replacement of the renderer that paints nothing."""
 
     def __init__(self, *arguments) -> None: ...
 

@@ -1,4 +1,4 @@
-"""A TCP connection that is slow, silent or cut, between two processes that do not know of it."""
+"""A TCP connection that is slow, silent or cut, between two processes unaware of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""At a desk somewhere on the network: waits until the learner has all pairs, then asks as a viewer and as an operator.
+"""A desk somewhere on the network: wait until the learner has all pairs, then ask as a viewer and as an operator.
 
 It looks on as the page does, too.
 

@@ -1,4 +1,4 @@
-"""A folder whose disk fails on demand, below any process that `disk_shim/shim.c` is preloaded into."""
+"""A folder whose disk fails on demand, through the preloaded library `disk_shim/shim.c`."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class Done:
 
 
 def read_log(log: Path) -> Iterator[Done]:
-    """Return all operations in order."""
+    """Yield all operations in order."""
     notes, at = log.read_bytes(), 0
     while at < len(notes):
         operation, name_size, inode, offset, data_size = RECORD.unpack_from(notes, at)

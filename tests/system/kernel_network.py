@@ -1,4 +1,4 @@
-"""Runs both processes in a network namespace of their own and makes its network bad, as the kernel can.
+"""Run both processes in a network namespace of their own and degrade its network by kernel means.
 
 unshare --net python kernel_network.py down|slow FOLDER PAIRS
 """

@@ -1,4 +1,4 @@
-"""Runs `bodyschema` and kills it, as by SIGKILL from outside, at a named point of its work.
+"""Run `bodyschema` and kill it, as by SIGKILL from outside, at a named point of its work.
 
 python killed_at.py POINT NTH JOURNAL sampler --robot robot.toml
 
@@ -24,7 +24,7 @@ NOWHERE = "at a random moment"  # from outside
 
 
 class Countdown:
-    """Kills the process when it is called for the nth time."""
+    """Counter that kills the process at its nth call."""
 
     def __init__(self, nth: int) -> None:
         self._left = nth

@@ -26,7 +26,7 @@ def _cut(content: bytearray, size: int) -> None:
 
 
 class File:
-    """A file: as it is read now, as it is on the disk, and what lies between."""
+    """A file: its contents as read now, its contents on the disk, and the pending operations."""
 
     def __init__(self) -> None:
         self.present, self._safe = bytearray(), bytearray()
@@ -66,7 +66,7 @@ Names = dict[str, File]
 
 
 class Disk:
-    """A folder on a disk whose power may go.
+    """A folder on a disk whose power may fail.
 
     Attributes:
         names: the files as they are read now.

@@ -1,4 +1,4 @@
-"""A sampler process over servos of the bench, what its cameras see, and what it says."""
+"""A sampler process with emulated servos, its cameras' images, and its output."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def on_the_bench(config: Config, folder: Path, angle: Callable[[float], FloatArr
 
 
 class SamplerProcess:
-    """`bodyschema sampler`, begun."""
+    """A running `bodyschema sampler`."""
 
     def __init__(self, config: Config, bus: Bus, process: subprocess.Popen[bytes] | warm.Child, log: Path) -> None:
         self.process, self._bus, self._log = process, bus, log

@@ -1,4 +1,4 @@
-"""Runs `bodyschema` and lets a loop hang, as a device or a disk would, as long as a file of its name is in a folder.
+"""Run `bodyschema` and let a loop hang, as a device or a disk would, while a file of its name is in a folder.
 
 python stalled_at.py FOLDER sampler --robot robot.toml
 """

@@ -1,4 +1,4 @@
-"""Sampler and learner with a bad network between them, and with others who burden them: no pair is lost or doubled."""
+"""Sampler and learner with a bad network between them, and with clients that load them: no pair is lost or doubled."""
 
 from __future__ import annotations
 
@@ -160,7 +160,7 @@ def test_a_subscriber_that_takes_nothing_delays_nobody_else(tmp_path, free_endpo
 
 
 class Flood:
-    """Clients that ask for as large a batch as they may, each as soon as it was answered."""
+    """Clients that each ask for the largest batch allowed as soon as the last one was answered."""
 
     def __init__(self, config: Config, clients: int) -> None:
         self._config, self._end = config, threading.Event()

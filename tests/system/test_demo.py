@@ -1,4 +1,4 @@
-"""The demo as a newcomer runs it, only shorter."""
+"""The demo as a newcomer runs it, but shorter."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`bodyschema sampler` with gaze: a head of two servos on the bench, which carries cameras below OpenCV."""
+"""`bodyschema sampler` with gaze: an emulated head of two servos, which carries cameras below OpenCV."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class Watched:
 
 @dataclass(frozen=True)
 class Episode:
-    """A sampler from its start to its end: first without gaze, then with it, then a servo of the head failed.
+    """A sampler from start to end: first without gaze, then with it, then with a failed servo of the head.
 
     Attributes:
         torque_again: after it was asked for once more. torque_at_exit: after SIGTERM.
@@ -132,7 +132,7 @@ class Episode:
 
 
 class Stage:
-    """An arm with a head on the bench, and the cameras that the head carries."""
+    """An arm with an emulated head, and the cameras that the head carries."""
 
     def __init__(self, config: Config, bench: DryRun, guided: Guided) -> None:
         self.config, self._bench, self._guided = config, bench, guided

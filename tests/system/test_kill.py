@@ -54,7 +54,7 @@ def doomed(config: Config, process: str, kill: Kill) -> contextlib.AbstractConte
 
 
 class Lives:
-    """The lives of one process, each ended by its kill, and then a last one that goes on until `__exit__`."""
+    """The lives of one process, each ended by its kill, and a last one that continues until `__exit__`."""
 
     def __init__(self, config: Config, process: str, kills: list[Kill]) -> None:
         self.deaths: list[str] = []

@@ -1,4 +1,4 @@
-"""Files that older versions wrote, kept in tests/daemon/older_versions: what a robot has after an upgrade."""
+"""Files of older versions, kept in tests/daemon/older_versions: the state of a robot after an upgrade."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pairs that are none, on the wire and in the store, before a real learner."""
+"""Invalid pairs, on the wire and in the store, with a real learner."""
 
 from __future__ import annotations
 

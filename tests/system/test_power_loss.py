@@ -1,4 +1,4 @@
-"""The power goes at any moment of two working processes: what was accepted is there, the checkpoint is one that was."""
+"""A power loss at any moment of two working processes: accepted pairs survive, and the checkpoint is a valid one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A real sampler and a real learner under something that listens as systemd does."""
+"""A real sampler and a real learner under a stand-in for systemd."""
 
 from __future__ import annotations
 

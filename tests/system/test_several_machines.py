@@ -25,7 +25,7 @@ DESK = Path(__file__).with_name("desk.py")
 
 @dataclass
 class Network:
-    """Hosts on one bridge, which is a namespace too; all are gone with `close`."""
+    """Hosts on one bridge, which is a namespace too; `close` removes all."""
 
     prefix: str
     made: list[str] = field(default_factory=list)

@@ -37,7 +37,7 @@ SIZES = {"desktop": {"width": 1280, "height": 900}, "phone": {"width": 360, "hei
 
 
 class PageServer:
-    """`bodyschema view` on a port of its own, which can be ended and started again."""
+    """`bodyschema view` on a port of its own, which can be stopped and restarted."""
 
     def __init__(self, robot: Path, port: str) -> None:
         self._command = [sys.executable, "-m", "bodyschema", "view", "--robot", str(robot), "--port", port]

@@ -1,4 +1,4 @@
-"""The base installation has no extras: all that needs neither simulator nor cameras works without them."""
+"""The base installation has no extras: all functions that need neither simulator nor cameras work without them."""
 
 from __future__ import annotations
 

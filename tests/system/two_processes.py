@@ -1,4 +1,4 @@
-"""A small robot whose sampler plays a recording, its two processes, and what they say."""
+"""A small robot whose sampler plays a recording, its two processes, and their answers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A small ray tracer for one ball before a picture: rays against a sphere, nothing about ellipses.
+"""A small ray tracer for one ball in front of a picture: rays against a sphere, without the geometry of ellipses.
 
 Every sub-pixel sends a ray from the eye through the image plane; where it meets the sphere, the surface is lit
 (ambient, diffuse, specular); elsewhere the picture behind shows. Blur, exposure and noise come after.

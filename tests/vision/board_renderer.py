@@ -1,4 +1,4 @@
-"""A ray caster for a board seen by two distorting eyes. It shares no code with what it tests.
+"""A ray caster for a board seen by two distorting cameras, which shares no code with the product.
 
 The ray through each pixel's middle is found by inverting the lens with Newton steps, at every fourth pixel, and by a
 cubic spline between (good to 1e-8); where it meets the board's plane, the square or the marker's cell is looked up.
@@ -87,7 +87,7 @@ class TrueLens:
 
 @dataclass(frozen=True)
 class TrueRig:
-    """Two eyes; a point of the left eye's frame is at R x + t in the right one's."""
+    """Two cameras; a point x of the left camera's frame is at R x + t in the right one's."""
 
     left: TrueLens
     right: TrueLens
@@ -102,7 +102,7 @@ class TrueRig:
 
 @dataclass(frozen=True)
 class Printed:
-    """A board as it lies on the table.
+    """A printed board on the table.
 
     Attributes:
         columns, rows: squares.
@@ -159,7 +159,7 @@ class Taken:
 
 @dataclass
 class Photographer:
-    """Takes stereo images of a board; remembers the rays of each eye."""
+    """Photographer of stereo images of a board, which caches the rays of each camera."""
 
     rig: TrueRig
     board: Printed

@@ -1,4 +1,4 @@
-"""Pages as their files have them, read back from the files' own numbers."""
+"""Printed pages, read back from the numbers in their files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Balls at random places in random light, and what a tracker makes of them."""
+"""Balls at random places in random light, and the errors of a tracker."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Ball:
 
 @dataclass(frozen=True)
 class Slab:
-    """A grey board that faces the eyes: corners (x, y) and depth z [m] in the left optical frame."""
+    """A grey board that faces the cameras: corners (x, y) and depth z [m] in the left optical frame."""
 
     low: tuple[float, float]
     high: tuple[float, float]

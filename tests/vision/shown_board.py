@@ -1,4 +1,4 @@
-"""Views of a board with exact truth: rendered, or its corners alone, which is quick."""
+"""Views of a board with ground truth: rendered images, or the corners alone, which is quick."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def shot(number: int, t: float | None = None) -> StereoFrame:
 
 
 class KnownCorners:
-    """A detector of what views have, by the numbers of `shot`."""
+    """A detector that returns known corners, by the numbers of `shot`."""
 
     def __init__(self, views: Sequence[View]) -> None:
         self._views = views
@@ -95,7 +95,7 @@ class KnownCorners:
 
 
 class Eyes:
-    """Cameras that give the frames they were made with."""
+    """Cameras that return given frames."""
 
     def __init__(self, frames: list[StereoFrame], serials: tuple[str, str] = ("A1", "B2")) -> None:
         self.frames, self.serials = iter(frames), serials

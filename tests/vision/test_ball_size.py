@@ -1,4 +1,4 @@
-"""The ball's size, learnt while it is followed."""
+"""The ball's size, learned during tracking."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The board's page, and finding a board in images."""
+"""The board's printed page, and board detection in images."""
 
 from __future__ import annotations
 

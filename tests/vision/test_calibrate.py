@@ -1,4 +1,4 @@
-"""Two cameras' calibration against planted ones, and what it refuses."""
+"""Stereo calibration against planted cameras, and its refusals."""
 
 from __future__ import annotations
 

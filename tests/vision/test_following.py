@@ -163,7 +163,7 @@ def test_a_followed_ball_stays_the_marker_though_another_one_was_in_view_beside_
 
 
 class Camera:
-    """Gives the frames it was given, one a read."""
+    """A camera that returns given frames, one per read."""
 
     calibration = SMALL
 

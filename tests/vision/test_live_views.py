@@ -1,4 +1,4 @@
-"""Views taken by themselves from cameras that send images now."""
+"""Views taken automatically from live cameras."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One camera alone: the marker's pose from one image, and what that leaves open."""
+"""One camera alone: the marker's pose from one image, and its ambiguity."""
 
 from __future__ import annotations
 

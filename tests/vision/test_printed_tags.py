@@ -1,4 +1,4 @@
-"""Tags as they are printed, cut out and folded are what the tracker looks for."""
+"""Tags as printed, cut out and folded agree with those that the tracker looks for."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""cameras.toml: written whole, read strictly."""
+"""cameras.toml: complete when written, strict when read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cameras as OpenCV's V4L2 backend reads them, emulated below it, with everything that goes wrong with webcams."""
+"""Cameras under OpenCV's V4L2 backend, emulated below it, with the usual faults of webcams."""
 
 from __future__ import annotations
 

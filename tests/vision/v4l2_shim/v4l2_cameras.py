@@ -1,4 +1,4 @@
-"""Cameras for `shim.c`: files that OpenCV opens like devices where the shim is preloaded."""
+"""Cameras for `shim.c`: files that OpenCV opens like devices if the shim is preloaded."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def preloaded(library: Path) -> dict[str, str]:
 
 
 class ShimCamera:
-    """One camera: its file, and what is wrong with it, which may change while it is read.
+    """One camera: its file and its faults, which may change while it is read.
 
     What it shows at a time of CLOCK_MONOTONIC: image floor(t·fps − phase) modulo their number.
     """
