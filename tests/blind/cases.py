@@ -63,10 +63,10 @@ class Taken:
         segment: run of pairs, shape (n,).
         q: encoder readings, quantised [rad or m], shape (n, d).
         x: measured marker positions [m], shape (n, 3).
-        x_noise_free: what the described cameras would report without pixel noise and without false fixes, shape (n, 3).
-        covariance: of x for the pixel noise [m²], which the recording may tell, shape (n, 3, 3).
-        noise: that and what the encoders add to a residual at the readings [m²], shape (n, 3, 3).
-        outlier: which fixes are not the marker, shape (n,).
+        x_noise_free: positions of the described cameras without pixel noise and false fixes [m], shape (n, 3).
+        covariance: of x for the pixel noise [m²], optional in the recording, shape (n, 3, 3).
+        noise: covariance of a residual at the readings, encoder noise included [m²], shape (n, 3, 3).
+        outlier: mask of the fixes that are not the marker, shape (n,).
     """
 
     t: FloatArray
@@ -81,17 +81,17 @@ class Taken:
 
 @dataclass(frozen=True)
 class HiddenCase:
-    """Recordings with something hidden in them, and what it is.
+    """Recordings with hidden effects, and the ground truth.
 
     Attributes:
         folder: with robot.toml, arm.urdf, measured.csv and fresh.csv; the truth is not in it.
         arm: as robot.toml describes it.
         truth: the hidden effects; none when nothing is hidden.
-        nuisances: what is wrong but not a finding, since robot.toml calls it not known.
-        measured, fresh: the recording, and another one of the same arm on another way. Moments (t0) count from the
+        nuisances: errors that are not findings, since robot.toml marks the parameters as unknown.
+        measured, fresh: the recording, and another one of the same arm on another path. Moments (t0) count from the
             start of either.
-        sigma_m: RMS length of the noise of a residual, that of encoders included.
-        scatter: 1-sigma of what the encoders scatter before they round [ticks].
+        sigma_m: RMS length of the noise of a residual, encoder noise included.
+        scatter: 1-sigma of the encoder noise before rounding [ticks].
     """
 
     folder: Path

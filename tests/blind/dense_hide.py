@@ -121,10 +121,10 @@ class DenseCase:
         truth: the hidden causes.
         nats: of each, by how much an observer who knows the scale of tolerances and noise prefers the truth to the
             best set without it.
-        rivals: keys of what stands in its place in that set.
-        same: keys of what can be all that it is, in any motion, with as few numbers.
-        spare_nats: by how much the truth beats the best set with one cause more.
-        rounding_m: what whole ticks of the encoders do to a position, along each axis.
+        rivals: keys of the causes that replace it in that set.
+        same: keys of causes equivalent to it in any motion, with as few numbers.
+        spare_nats: margin of the truth over the best set with one cause more.
+        rounding_m: effect of the encoders' rounding on a position, along each axis.
         nominal: the arm as described, with its instrument and marker as robot.toml puts them.
     """
 

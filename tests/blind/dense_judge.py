@@ -124,7 +124,7 @@ def _is_false_fixes(sealed: Json, cause: Json) -> bool:
 
 
 def inside(sealed: Json, told: Json) -> tuple[int, int]:
-    """Count the intervals of zeros and plays that contain the truth, and all of them."""
+    """Count the intervals of joint offsets and backlashes that contain the truth, and all of them."""
     hits = []
     for entry in sealed["truth"]:
         effect = entry["cause"].partition("@")[0]

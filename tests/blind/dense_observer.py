@@ -1,7 +1,7 @@
 """Evidence for the hidden causes, computed by a linear Gaussian observer of the true generator.
 
-It knows the scale of the tolerances, the noise, and how each cause looks; it does not know the tolerances themselves,
-the amounts, or which causes there are. What it says is averaged over the noise, with the tolerances as they are.
+It knows the scale of the tolerances, the noise and the signature of each cause; it does not know the tolerances
+themselves, the amounts, or which causes there are. Its evidence is averaged over the noise, with the true tolerances.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ def whitened(columns: FloatArray, sigma: float, correlation: float, begins: Bool
 
     Args:
         correlation: of neighbouring rows of a run.
-        begins: which rows are the first of their run (n,).
+        begins: mask of the first rows of runs (n,).
     """
     out = columns / sigma
     if correlation:

@@ -18,7 +18,7 @@ class TrueEyes:
     """The true camera pair.
 
     Attributes:
-        focal_px, baseline_m: as they are.
+        focal_px, baseline_m: true values.
         k1, k2: Brown's radial distortion of either lens, in units of the normalised image.
         vergence_rad: the right eye turned about its y axis.
     """

@@ -80,11 +80,11 @@ class Kind:
         amplitudes: the parameters that are scaled to reach a size; the others are its shape.
         draw: parameters of unit amplitude.
         most: largest value of any amplitude.
-        sign: what positive parameters mean.
-        bears: only where the joints bear the arm's weight.
+        sign: meaning of positive parameters.
+        bears: possible only if the joints carry the arm's weight.
         styles: the kinds of motion that show it.
-        outside, drivers: whether it is in no table, and then on which joints the error depends.
-        beside_only: only where the cameras stand beside the arm.
+        outside, drivers: True if it is in no table, and the joints on which its error then depends.
+        beside_only: possible only if the cameras stand beside the arm.
     """
 
     at: str

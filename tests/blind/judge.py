@@ -39,10 +39,10 @@ class Truth:
 
     Attributes:
         scene: the measured motion.
-        wide: a way through all postures, in the place of any motion.
-        nuisances: what robot.toml does not know, with its true numbers.
-        hidden, meanings: the effects that a row of the table describes, in the same order.
-        strange: those that none does.
+        wide: a path through all postures, which stands for any motion.
+        nuisances: parameters unknown in robot.toml, with their true numbers.
+        hidden, meanings: the effects described by a row of the table, in the same order.
+        strange: the effects outside the table.
     """
 
     case: HiddenCase

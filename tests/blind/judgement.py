@@ -30,12 +30,12 @@ class TruthJudged(msgspec.Struct, frozen=True):
     Attributes:
         effect, where, source: in the table's words.
         size: in units of the noise.
-        outside: whether no row of the table describes it.
-        seen_chi2: what leaving it out costs an oracle.
-        told_chi2: what putting its best rival in its place costs an oracle.
-        rival: that rival.
-        found_as: the cause that names it; None when none does.
-        among_rivals: whether a wrong cause names it as what it may be as well.
+        outside: True if no row of the table describes it.
+        seen_chi2: rise of an oracle's chi-square without it.
+        told_chi2: rise of an oracle's chi-square with its best alternative in its place.
+        rival: that alternative.
+        found_as: the cause that names it, or None.
+        among_rivals: True if a wrong cause lists it as an alternative.
     """
 
     effect: str
@@ -80,17 +80,17 @@ class Judgement(msgspec.Struct, frozen=True, tag="judged"):
     """One case.
 
     Attributes:
-        outcome: right: all causes and no other. honest: what is not right is left open. missed: a cause is not
-            named though an oracle sees it. wrong: something is named that is not there, or left unexplained.
-        gain: by how much the extended simulation's error falls on a fresh recording, counted from the aligned one,
-            against positions free of noise (0..1); None where nothing is hidden.
+        outcome: right: all causes and no other. honest: causes that are not right are left open. missed: a cause is
+            not named though an oracle sees it. wrong: a false cause is named, or an explained case left unexplained.
+        gain: reduction (0..1) of the extended simulation's error on a fresh recording, relative to the aligned
+            nominal model, against positions free of noise; None if nothing is hidden.
         gain_of_truth: the same with the true effects.
-        depends_on, shows_on: with an effect outside the table, what was said and what is so.
-        joints_right: whether that agrees.
+        depends_on, shows_on: reported and true joints of an effect outside the table.
+        joints_right: True if these agree.
         smooth_ratio: held-out error after the smooth model over the noise floor.
-        seconds, cpu_seconds: that the diagnosis took, by the clock and of the processor.
-        command: to look at it again.
-        false_fixes: how many fixes truly are not the marker.
+        seconds, cpu_seconds: wall time and CPU time of the diagnosis.
+        command: command that repeats the case.
+        false_fixes: number of fixes that are not the marker.
     """
 
     scenario: str

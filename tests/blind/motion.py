@@ -31,8 +31,8 @@ class Motion:
         shaft: positions at those instants, after the gears and free of any error [rad or m], shape (f, d).
         stamps: when pairs are read [s], shape (n,).
         segment: number of the run of pairs each belongs to, shape (n,).
-        move_s, rest_s: how long every move lasts, and the time between its end and the reading; None in a walk that
-            never rests.
+        move_s, rest_s: duration of every move, and time between its end and the reading; None in a walk without
+            rests.
     """
 
     style: Style
@@ -66,7 +66,7 @@ def move(
 
     Args:
         ranges: lower and upper end of each joint's range [rad or m], shape (d, 2).
-        visible: whether the cameras see the marker at shaft positions (n, d).
+        visible: returns a mask of the shaft positions (n, d) at which the cameras see the marker.
         rests: of a walk, whether joints that do not lead stand still.
     """
     if style == "held":

@@ -63,8 +63,8 @@ class Urdf:
     """A URDF that can be changed.
 
     Args:
-        model: which public arm.
-        mount_rpy: how its base is bolted to the floor [rad].
+        model: the public arm.
+        mount_rpy: orientation of its base on the floor [rad].
     """
 
     def __init__(self, model: Model, mount_rpy: tuple[float, float, float]) -> None:

@@ -1,7 +1,7 @@
 """Distinguishability of effects for an observer who knows the truth, in units of the noise.
 
-All is done on positions free of noise. How far a rival stays behind the truth is the rise of chi-square when, in the
-place of the true effect, the rival is fitted along with all that is free.
+All computations use positions free of noise. The distance of an alternative from the truth is the rise of chi-square
+when the alternative is fitted in place of the true effect, with all free parameters.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ class Scenario:
         effects: as `hide` takes them.
         pairs: of the recording.
         outliers: share of false fixes.
-        gross: whether effects are all of gross size.
+        gross: True if all effects are of gross size.
         scatter: between what the encoders scatter before they round, 1-sigma [ticks]; None for nothing.
     """
 

@@ -1,11 +1,11 @@
 """`diagnose` on hidden causes: a few cases of known seeds in every run, new cases of each commit in the soak run.
 
-The seeds of the soak run come from the commit, else from the date. How many failures it allows follows from how often
-each scenario failed in a sealed run with as many pairs, `python -m tests.blind.sealed --pairs ... --scenario ...`,
-whose counts stand in `SEALED`. The true rate of failures is taken to be the upper end p of the 95 % interval (Clopper
-and Pearson) around such a count, which leaves a margin. Of n cases more than k fail with the probability P(X > k), X
-binomial with n and p: allowed is the smallest k for which all tests here together fail an unchanged program in at most
-1 of 1,000 runs. The more cases a sealed run had, the sharper.
+The seeds of the soak run come from the commit, else from the date. The number of failures allowed follows from the
+failures of each scenario in a sealed run with as many pairs, `python -m tests.blind.sealed --pairs ... --scenario ...`,
+recorded in `SEALED`. The true failure rate is taken as the upper end p of the 95 % Clopper-Pearson interval of that
+count, which leaves a margin. More than k of n cases fail with probability P(X > k), X binomial with n and p. The limit
+is the smallest k for which all tests here together fail an unchanged program in at most 1 of 1,000 runs. A sealed run
+with more cases gives a sharper limit.
 """
 
 from __future__ import annotations

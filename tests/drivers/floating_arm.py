@@ -125,7 +125,7 @@ class FloatingArm:
         )
 
     def run(self, seconds: float) -> int:
-        """Read for so long; how many readings came."""
+        """Read for this time and return the number of readings."""
         end, readings = self.clock.now() + seconds, 0
         while self.clock.now() < end:
             readings += self.joints.read(0.02) is not None

@@ -88,7 +88,7 @@ class GazingRobot:
         return answer.result()
 
     def run(self, seconds: float, *, looking: bool = True) -> np.ndarray:
-        """Read for so long; where the hand was in the left image at each reading [px] (n, 2)."""
+        """Read for this time and return the hand's position in the left image at each reading [px] (n, 2)."""
         end, next_look, seen = self.clock.now() + seconds, 0.0, []
         while self.clock.now() < end:
             reading = self.joints.read(0.02)

@@ -28,7 +28,7 @@ class ServoArm:
     Args:
         servo: makes one of a model's name, an ID and its path.
         port: a class of ports, which may keep what is sent.
-        held_s: questions are held up by up to so long.
+        held_s: largest delay of a request.
     """
 
     joints: ServoJoints

@@ -56,7 +56,7 @@ def largest_error(learner, chain: RigidChain, kinds: str, revolute_deg: float = 
 
 @functools.cache
 def noisy_fit():
-    """Return a fit of a rough prior to 200 pairs of four joints, with 10 mm of noise and 10 % outliers of about 0.3 m."""
+    """Return a fit of a rough prior to 200 pairs of four joints: 10 mm of noise, 10 % outliers of about 0.3 m."""
     chain, prior, q, x = case("RRRR", 200, 5, SIGMA_M)
     x[::10] += 0.3 * np.random.default_rng(1).choice([-1.0, 1.0], size=(20, 3))
     learner = TensorLearner.around(prior, bases_for("RRRR"))

@@ -20,7 +20,7 @@ class TypedPage:
 
     Attributes:
         text: of the page.
-        printed: what went to the terminal.
+        printed: terminal output.
     """
 
     text: str

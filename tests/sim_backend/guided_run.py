@@ -24,7 +24,7 @@ class Run:
     Attributes:
         q: readings (n, d).
         x: true ball in the true left eye (n, 3) [m].
-        visible: whether both eyes see the ball, in view and not hidden (n,).
+        visible: mask of the frames in which both cameras see the ball, in view and not hidden (n,).
     """
 
     robot: RobotDescription

@@ -32,8 +32,8 @@ class FailingDisk:
     """Faults of the disk of a folder, and of the wall clock of the processes that use it.
 
     Attributes:
-        environment: of a process for which it is so.
-        log: where all is noted that is done to the folder.
+        environment: environment of a process that uses this disk.
+        log: file with all operations on the folder.
     """
 
     def __init__(self, folder: Path, library: Path) -> None:

@@ -2,7 +2,7 @@
 
 python killed_at.py POINT NTH JOURNAL sampler --robot robot.toml
 
-Whatever the point, the sequence number of each pair that was accepted stands in JOURNAL, a line each.
+The sequence number of each accepted pair is written to JOURNAL, one per line.
 """
 
 from __future__ import annotations

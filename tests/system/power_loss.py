@@ -1,7 +1,7 @@
 """Contents of a disk after a power loss: all that was synced, and a random part of the rest.
 
-Of writes that were not synced, each sector is there or not, whatever the others are. Of names (made, renamed, removed)
-that were not synced, the first few are there, as many as by chance: file systems write these down in their order.
+Each sector of a write that was not synced is there or not, independently of the others. Of name changes (create,
+rename, remove) that were not synced, a random number of the first is there: file systems write them in order.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Disk:
     """A folder on a disk whose power may fail.
 
     Attributes:
-        names: the files as they are read now.
+        names: the files by their present names.
     """
 
     def __init__(self) -> None:

@@ -102,10 +102,10 @@ class Watched:
     """Observations over a while.
 
     Attributes:
-        t, q: where the joints were, and when [s], shapes (n,) and (n, d) [rad].
-        torque: of each servo; all that it was.
-        pairs: that were made meanwhile.
-        health: what the sampler said in the end.
+        t, q: times [s] and positions of the joints [rad], shapes (n,) and (n, d).
+        torque: all observed torque registers of the servos.
+        pairs: pairs made meanwhile.
+        health: the sampler's last health messages.
     """
 
     t: FloatArray

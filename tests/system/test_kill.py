@@ -30,7 +30,7 @@ class Kill:
     Attributes:
         point: a named point, at whose nth time the process dies; or NOWHERE.
         after_s: with NOWHERE, the time from its first sign of life, or from its start, to its death from outside.
-        alive: whether to wait for the sign of life; otherwise it may die while it starts.
+        alive: True to wait for the sign of life; otherwise it may die while it starts.
     """
 
     point: str
@@ -111,7 +111,7 @@ class Aftermath:
     """State after all kills, once the learner had time to catch up.
 
     Attributes:
-        planned, deaths: where processes were to die, and where they died.
+        planned, deaths: planned and actual points of death.
         accepted: numbers of the pairs that a sampler had accepted before it died.
         published: the pairs that were heard on zenoh.
         unusable: checkpoints that a learner could not go on from.

@@ -31,9 +31,9 @@ class Promised:
 
     Attributes:
         accepted: number of the last pair that a sampler had accepted.
-        possible: checkpoints, the last that was safe and those after it; None stands for none at all.
-        previous: those that the one before may be. It may always be none: it gives its name away before the present
-            one takes it.
+        possible: possible checkpoints: the last safe one and those after it; None for no checkpoint.
+        previous: possible previous checkpoints. It may always be absent: it loses its name before the present one
+            takes it.
     """
 
     accepted: int = 0

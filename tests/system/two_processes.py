@@ -91,9 +91,9 @@ def running(
 
     Args:
         fate: at which point of `killed_at`, and at whose which time, it dies.
-        journal: where the numbers of accepted pairs are written; else beside robot.toml.
+        journal: file for the numbers of accepted pairs; beside robot.toml if None.
         environment: variables beside those of this process.
-        prefix: what the command begins with.
+        prefix: words before the command.
     """
     wrapper, notes = Path(__file__).with_name("killed_at.py"), journal or config.file.with_name("journal")
     words = [wrapper, *fate, notes, process, "--robot", config.file]

@@ -42,7 +42,7 @@ class Look:
         noise_sd: 1-sigma of each channel [grey levels] in the dark ...
         shot: ... and the variance that each grey level of light adds [grey levels].
         jpeg: quality of the compression that the camera applies, 4:2:0 as most do; None for none.
-        moved_m: how far the ball goes while the shutter is open, (x, y, z) [m]; it is at its place half-way.
+        moved_m: motion of the ball while the shutter is open, (x, y, z) [m]; it is at its place half-way.
         distortion: lens distortion that rectification left over: radial, relative at the image's corner.
         wall: an even grey behind the ball instead of clutter.
     """

@@ -2,9 +2,9 @@
 
 The ray through each pixel's middle is found by inverting the lens with Newton steps, at every fourth pixel, and by a
 cubic spline between (good to 1e-8); where it meets the board's plane, the square or the marker's cell is looked up.
-A pixel that sees something else than its neighbours sends 34 rays from all over it, in an order without rows: rows
-see an edge that lies along them jump by as much as they are apart. No picture is warped or interpolated: edges are
-smooth because a pixel has many rays. Uneven light, lens blur, exposure, noise and JPEG come after.
+A pixel that differs from its neighbours sends 34 rays from all over it, not arranged in rows: rows would make an edge
+along them jump by their spacing. No picture is warped or interpolated: edges are smooth because a pixel has many rays.
+Uneven light, lens blur, exposure, noise and JPEG are added afterwards.
 """
 
 from __future__ import annotations

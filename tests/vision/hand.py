@@ -20,7 +20,7 @@ def paint_fingers(
     """Paint three fingers on `picture` (RGB of 0..1) that come from the direction `turn` [rad].
 
     Args:
-        reach: where their tips end, in radii from the ball's centre: above 1 they stay clear of it.
+        reach: distance of their tips from the ball's centre, in radii: above 1 they stay clear of it.
     """
     painted = picture.astype(np.float64, copy=True)
     centre = calibration.project(x_eye)[:2]

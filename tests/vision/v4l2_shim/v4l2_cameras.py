@@ -60,7 +60,7 @@ def preloaded(library: Path) -> dict[str, str]:
 class ShimCamera:
     """One camera: its file and its faults, which may change while it is read.
 
-    What it shows at a time of CLOCK_MONOTONIC: image floor(t·fps − phase) modulo their number.
+    At a time t of CLOCK_MONOTONIC it shows image floor(t·fps − phase) modulo their number.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class ShimCamera:
         """Write the file.
 
         Args:
-            told_fps: what it says of its rate. without: controls that it does not have.
+            told_fps: frame rate that it reports. without: controls that it does not have.
         """
         self.file = file
         height, width = images[0].shape[:2]
