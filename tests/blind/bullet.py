@@ -74,7 +74,7 @@ class Body:
                 bearing = pybullet.calculateInverseDynamics(
                     self._body, bent.tolist(), still, still, physicsClientId=self._client
                 )
-                new = unloaded - compliance * bearing  # the load is what the torque that bears it is against
+                new = unloaded - compliance * bearing  # the external load is opposite to the torque that holds it
                 settled = np.abs(new - bent).max() < AT_REST
                 bent = new
                 if settled:

@@ -116,7 +116,7 @@ class Posture:
         for name in arm.read:
             joint = arm.joint(name)
             along = self.before[name]
-            # A slide's frame turns about where it stands before it slides.
+            # A prismatic joint's frame turns about its position before the motion.
             place = self.x[joint.child] - self._slid(name)
             turns = np.cross(np.swapaxes(along, 1, 2), (self.marker() - place)[:, None])
             columns.append(self._toward(name) * np.concatenate([along, np.swapaxes(turns, 1, 2)], axis=2))

@@ -27,7 +27,7 @@ from .motion import Motion, move
 DECIDABLE = 7.5  # nats
 A_CAUSE = 3.0  # nats that a cause of the usual weight costs
 TRIES = 80
-HARD_SHARE, HARD = 0.12, 1.0  # share of cases whose causes may be as small as this [nats], but no gauge
+HARD_SHARE, HARD = 0.12, 1.0  # share of cases that need only this evidence [nats], which excludes gauges
 COUNTS, SHARES = (0, 1, 2, 3, 5), (0.2, 0.25, 0.2, 0.2, 0.15)
 ZEROS = 0.5  # share of the cases with several causes that have several zeros
 WEIGHTS = {
@@ -45,7 +45,7 @@ WEIGHTS = {
     "camera_pose": 0.5,
     "tool_offset": 1.5,
 }
-LOADED = 0.1  # of the largest load: a joint that bears less is not said to give
+LOADED = 0.1  # share of the largest load: a joint with less is not given a compliance
 STUDENT = 4.0  # degrees of freedom
 
 
@@ -484,7 +484,7 @@ def _begins(motion: Motion) -> BoolArray:
 
 def _told(arm: Arm, rng: np.random.Generator, *, marker_known: bool, pose_known: bool) -> Arm:
     """Return the arm with instrument and marker as robot.toml describes them."""
-    if not pose_known and rng.random() < 0.5:  # the instrument stands anywhere
+    if not pose_known and rng.random() < 0.5:  # arbitrary pose of the instrument
         arm = replace(arm, camera_xyz=(0.0, 0.0, 0.0), camera_rpy=(0.0, 0.0, 0.0))
     elif not pose_known:
         xyz = np.array(arm.camera_xyz) + 0.03 * direction(rng)

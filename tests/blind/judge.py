@@ -24,13 +24,13 @@ from .judgement import CauseJudged, Judgement, Key, Number, Outcome, TruthJudged
 from .meaning import Meant, meant
 from .oracle import Fitted, Scene, wide
 
-TOLD = 25.0  # chi-square by which an oracle tells two effects apart
-SAME_SHARE = 1e-4  # what is left of a signal, of its chi-square, by an effect that is the same in every motion
+TOLD = 25.0  # chi-square by which an oracle distinguishes two effects
+SAME_SHARE = 1e-4  # share of a signal's chi-square left by an effect that is the same in every motion
 SURE = 0.9
 FEWEST_FALSE_FIXES = 3
 SHOWS, HIDDEN_FROM = 0.25, 0.02  # share of the variance from which a joint has to be named, and below which it must not
 FIRST_ORDER = ("joint_ripple",)  # poles of unequal strength, read by atan2
-TELLS_LITTLE = 10.0  # usual sizes: a wider interval says that the motion does not tell the number
+TELLS_LITTLE = 10.0  # usual sizes: with a wider interval the number is not identifiable from this motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +244,7 @@ def cause_judged(truth: Truth, named: Named, index: int | None, whole: bool) -> 
     needless: list[str] = []
     wrong_reach: list[str] = []
     if index is not None:
-        # What has no name is no effect that an oracle could put in the place of a true one.
+        # An oracle has no effect to put in place of one outside the table.
         for member in (member for member in cause.indistinguishable_from if not member.what):
             needless += _needless(truth, index, member)
             wrong_reach += _wrong_reach(truth, index, member)

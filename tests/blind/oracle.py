@@ -18,7 +18,7 @@ from .arrays import FloatArray
 
 ROUNDS = 8
 CONVERGED = 1e-4
-MOMENTS = 40  # not at the ends, where what begins at a moment becomes what was there all the time
+MOMENTS = 40  # not at the ends, where a sudden effect is equivalent to a constant one
 CYCLES = np.arange(2.0, 101.0)
 WIDTHS = np.geomspace(2e-4, 0.1, 8)
 SETTLED = (0.03, 0.1, 0.3, 1.0, 3.0)

@@ -23,7 +23,7 @@ TO_LIGHT = np.array([-0.3, -0.8, -0.5]) / np.linalg.norm([-0.3, -0.8, -0.5])
 AMBIENT = 0.6
 SUPERSAMPLING = 4
 NOISE_GREY, NOISE_FIELDS = 5.0, 2
-PIXEL_SIGMA = 0.02  # about what the tracker reaches on these images
+PIXEL_SIGMA = 0.02  # about the tracker's accuracy on these images
 AROUND_PX = 6
 APART_S = 10.0  # between frames for the tracker: pairs are looked at singly, without its memory
 

@@ -36,7 +36,7 @@ class Sizer:
         Raises:
             NoEffect: no amplitude shows.
         """
-        tried: list[tuple[float, float]] = []  # logarithms of amplitude and of what it came to, over the size wanted
+        tried: list[tuple[float, float]] = []  # logarithms of amplitude and relative size
         amplitude, best = 1.0, hidden
         for _ in range(MOST_ROUNDS):
             parameters, stopped = kind.scaled(hidden.parameters, amplitude)

@@ -23,7 +23,7 @@ from .judge import TOLD
 from .judgement import Crash, told
 from .sealed import Case, Record, judged, run
 
-# Each is far from undecided: the hidden effects stand out from what resembles them, chi-square of 10 and more.
+# All are clear: chi-square between the hidden effects and their alternatives is 10 or more.
 KNOWN = [
     Case("one", 2, 300),
     Case("two", 3, 300),
@@ -41,9 +41,9 @@ MORE = [
 CASES = {"one": 8, "two": 4, "three": 3, "outliers": 3, "none": 4, "outside": 6}
 PAIRS = {name: 1600 if name == "outside" else 600 for name in CASES}
 NAMED, NOTHING, OUTSIDE = ("one", "two", "three", "outliers"), ("none",), ("outside",)
-# In units of the noise; what is smaller may be taken for what the arm's makers tolerate.
+# In units of the noise; smaller effects may be taken for manufacturing tolerances.
 SMALL = 1.5
-# Failures and cases in the sealed run; what no oracle tells from the table's effects is no failure outside of it.
+# Failures and cases in the sealed run; an outside effect that an oracle cannot distinguish does not count.
 SEALED: dict[tuple[str, ...], tuple[int, int]] = {NAMED: (5, 160), NOTHING: (0, 40), OUTSIDE: (8, 100)}
 BY_CHANCE = 1e-3
 
@@ -97,7 +97,7 @@ def _check(names: tuple[str, ...]) -> None:
     ids=lambda case: f"{case.scenario}-{case.seed}",
 )
 def test_a_case_of_a_known_seed_is_right_or_below_the_noise(case: Case) -> None:
-    # A camera that stands 0.3 mm and 0.02° off, or a slow drift of 0.8 mm below 4 mm of noise, is tolerated.
+    # A camera 0.3 mm and 0.02° off, or a slow drift of 0.8 mm below 4 mm of noise, is tolerated.
     record = run(case)
     assert not isinstance(record, Crash), record
     assert record is not None

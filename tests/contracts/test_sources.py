@@ -120,7 +120,7 @@ class Rig:
             self.read(1)
 
 
-# --- who has to obey
+# --- implementations under test
 
 
 def recording() -> Recording:
@@ -459,7 +459,7 @@ def test_an_error_in_the_block_passes_through_the_closing(rig: Rig) -> None:
 def test_where_nothing_comes_in_time_none_is_returned(make: Make, shared: Shared) -> None:
     rig = shared(make)
     with rig.opened():
-        while rig.source.read(0.01) is not None:  # time stands still until the other side is read too
+        while rig.source.read(0.01) is not None:  # time stands still until the other source is read too
             continue
         assert rig.source.read(0.0) is None
 

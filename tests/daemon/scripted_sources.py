@@ -18,7 +18,7 @@ from kbmaps import RigidChain
 FRAME_S = 1 / 30
 COV = frozen_array(np.eye(3) * 1e-6)
 
-# What a script may hold: something to give, an error to raise, or an event to wait for.
+# Content of a script: an item to return, an error to raise, or an event to wait for.
 Step = JointReading | MarkerFix | MarkerMiss | Exception | threading.Event
 
 

@@ -37,7 +37,7 @@ WITHOUT_ROOTS_RIGHTS = """import ctypes, os, sys
 PR_CAPBSET_DROP, CAP_DAC_OVERRIDE = 24, 1
 ctypes.CDLL(None).prctl(PR_CAPBSET_DROP, CAP_DAC_OVERRIDE, 0, 0, 0)
 os.execv(sys.executable, [sys.executable, "-m", "bodyschema", *sys.argv[1:]])"""
-# SQLite says of a file that may not grow what it says of a disk that is full.
+# SQLite reports a file size limit in the same words as a full disk.
 
 
 def run(*arguments: object, cwd: Path, by: tuple[str, ...] = DAEMON) -> subprocess.CompletedProcess[str]:

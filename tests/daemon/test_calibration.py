@@ -64,14 +64,14 @@ def planted(seed: int, *, pairs: int = 100, sigma: float = SIGMA_M, outliers: in
     made = ChainTolerances(0.003, 0.001, ZEROS_RAD, tool=0.03, base_rotation=0.5, base_translation=0.5)
     change = parameters.standard_deviations(made) * rng.normal(size=parameters.size)
     zeros = change[parameters.zeros]
-    zeros[[0, -1]] = 0.0  # no motion tells them from a turn of camera and marker
+    zeros[[0, -1]] = 0.0  # equivalent to a rotation of camera and marker in any motion
     q = rng.uniform(robot.lower, robot.upper, (pairs, 4))
     x = parameters.positions(change, q) + sigma * rng.normal(size=(pairs, 3))
     x[:outliers] += 0.1
     return Planted(robot, parameters, change, Recording(joints=robot.joints, q=q, x=x))
 
 
-# --- what is found
+# --- results
 
 
 @functools.cache
@@ -141,7 +141,7 @@ def test_a_marker_that_never_moved_is_told() -> None:
         Calibration.of(arm.robot, still, sigma_m=None, zeros_rad=ZEROS_RAD)
 
 
-# --- what is said
+# --- messages
 
 
 def said(arm: Planted, **changed) -> str:

@@ -114,7 +114,7 @@ def found(recording) -> DiagnosisFile:
     return run(Config.load(DESK_ARM), source, Asked(("joint_scale", "backlash"), (), 0), lambda _: None).file
 
 
-# --- what it prints
+# --- output
 
 
 def test_a_cause_is_told_in_a_sentence_with_its_joint_and_number(told, robot) -> None:
@@ -193,7 +193,7 @@ def test_what_fits_no_effect_is_told_with_its_joints(found) -> None:
     assert "elbow, time. Link 2 bends." in text
 
 
-# --- what it writes
+# --- files
 
 
 def test_without_out_nothing_is_written(file, tmp_path, monkeypatch) -> None:
@@ -268,7 +268,7 @@ def test_a_sampler_that_does_not_run_is_said_not_to(live_robot) -> None:
     assert "nobody listens on" in refused("--live", "--robot", live_robot)
 
 
-# --- what it refuses
+# --- refusals
 
 
 def written(recording: Recording, folder: Path, **changes) -> Path:

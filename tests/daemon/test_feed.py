@@ -217,7 +217,7 @@ def test_pairs_that_a_disk_changed_are_passed_over(lost) -> None:
     assert fed.feed.problem is None
 
 
-# --- what cannot be taken
+# --- invalid pairs
 
 
 def wrong(pair: Pair) -> list[bytes]:

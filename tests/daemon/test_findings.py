@@ -67,7 +67,7 @@ class Planted:
         made = ChainTolerances(0.003, 0.001, 0.05, tool=0.03, base_rotation=0.5, base_translation=0.5)
         change = parameters.standard_deviations(made) * rng.normal(size=parameters.size)
         zeros = change[parameters.zeros]
-        zeros[[0, -1]] = 0.0  # no motion tells them from a turn of camera and marker
+        zeros[[0, -1]] = 0.0  # equivalent to a rotation of camera and marker in any motion
         arm = cls(robot, parameters, change, Learning(NominalModel.of(robot), LearnerConfig(), DirectSolver()))
         arm.teach(rng, pairs)
         return arm

@@ -44,11 +44,11 @@ quick = settings(
     max_examples=40,
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
-    phases=[Phase.explicit, Phase.reuse, Phase.generate],  # the bytes found say enough; shrinking them takes minutes
+    phases=[Phase.explicit, Phase.reuse, Phase.generate],  # the bytes found are enough; shrinking them takes minutes
 )
 long = settings(quick, max_examples=5000)
 
-# What is put in the middle of a text that was right.
+# Pieces inserted into the middle of a valid text.
 NASTY = (
     b"nan", b"1e999", b"-inf", b"9" * 5000, b"0x" + b"f" * 50, b"\x00", b"\xff\xfe", b'"', b"'", b"[" * 2000,
     b"{" * 2000, b"a." * 2000, b"<x>" * 300, b"&a;", b"<!DOCTYPE a>", b"../../", b"file:///etc/passwd", b"true",
@@ -387,7 +387,7 @@ def test_a_forged_checkpoint_is_restored_or_refused(tmp_path: Path, stored, plac
     try:
         assert state is not None
         learning.restore(state)
-    except (StateError, KBMapsError, *DOES_NOT_FIT):  # what the learner sets the file aside for
+    except (StateError, KBMapsError, *DOES_NOT_FIT):  # errors for which the learner sets the file aside
         return
     assert np.isfinite(learning.snapshot.predict(np.zeros((1, len(Scene.draw(0, 1).pairs[0].q)))).x).all()
 

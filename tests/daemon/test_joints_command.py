@@ -78,7 +78,7 @@ def test_noise_is_no_movement(config) -> None:
     assert signs(config, (YAW, 0.02)) == ""
 
 
-# --- over the bench
+# --- on the emulator
 
 
 def test_the_watch_has_angles_speeds_temperatures_and_ranges(config, tmp_path) -> None:

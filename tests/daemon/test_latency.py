@@ -123,7 +123,7 @@ def in_step(seed: int, latency_s: float) -> Wiggle:
 
 @pytest.mark.parametrize("latency_s", [0.0, 0.04])
 def test_readings_in_step_with_the_images_do_not_draw_the_latency_between_two_readings(latency_s) -> None:
-    """A straight line between two readings has half their noise in the middle: there it would seem to fit best."""
+    """Check midpoints: a straight line between two readings has half their noise there and seems to fit best."""
     found = [latency_of(in_step(seed, latency_s), ARM.chain) for seed in range(12)]
     off = np.array([each.latency_s - latency_s for each in found])
     assert np.sqrt(np.mean(off**2)) < 1e-3
@@ -215,7 +215,7 @@ def test_a_recording_that_is_too_short_is_named_with_its_length() -> None:
 
 @pytest.mark.parametrize("share", [0.0, 0.01])
 def test_joints_that_hardly_moved_are_named(share: float) -> None:
-    """To the tick, or not at all."""
+    """Check joints that moved by less than a tick."""
     moved = wiggle(0, 0.05)
     with pytest.raises(LatencyError, match="the joints hardly moved"):
         latency_of(Wiggle(moved.t_joints, POSE + share * (moved.q - POSE), moved.t_marker, moved.x), ARM.chain)
@@ -230,7 +230,7 @@ def test_joints_that_do_not_move_the_marker_are_named() -> None:
 
 
 def test_a_marker_that_moves_by_itself_is_named() -> None:
-    """Somebody else's motion, or the joints in another order."""
+    """Check another motion, as when the marker is moved by hand or the joints are in another order."""
     ours, others = wiggle(0, 0.05), wiggle(1, 0.05)
     with pytest.raises(LatencyError, match="does not follow the joints"):
         latency_of(Wiggle(ours.t_joints, ours.q, ours.t_marker, others.x), ARM.chain)

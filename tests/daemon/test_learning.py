@@ -181,7 +181,7 @@ def test_a_gross_outlier_is_counted_as_doubted_and_as_learnt() -> None:
 
 
 def test_no_listed_model_beats_the_one_that_answers() -> None:
-    """By more than a fifth, on the pairs that are shown, while another tool is learnt."""
+    """Require less than a fifth, on the pairs shown, while another tool is learned."""
     scene, learning = Taught.draw(1).half, Taught.draw(1).copy()
     rng = np.random.default_rng(1)
     q = scene.q[-1] + path(rng, 40)

@@ -169,7 +169,7 @@ def test_the_solver_in_its_own_process_finds_the_same_orientations() -> None:
 
 
 def test_where_the_hand_bends_the_maps_of_the_axes_answer() -> None:
-    """An arm that gives way under its load, so that no rigid chain has its orientations."""
+    """Check an arm with compliance, whose orientations no rigid chain has."""
     rng = np.random.default_rng(9)
     chain, q = built_chain(rng), rng.uniform(-1.0, 1.0, (500, 4))
     pairs = turned(measured(chain, q, rng), chain, sigma_rad=0.002)

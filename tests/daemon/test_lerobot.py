@@ -139,7 +139,7 @@ def test_written_offsets_correct_the_readings(arm, tmp_path) -> None:
 
 @pytest.mark.parametrize("inverted", [0, 1])
 def test_dynamixel_offsets_correct_the_readings(inverted, tmp_path) -> None:
-    """An elbow of a Koch leader, which LeRobot sets to count the other way in the servo itself."""
+    """Check an elbow of a Koch leader, which LeRobot sets to count the other way in the servo itself."""
     before = MotorCalibration(3, inverted, -512, 900, 3100)
     servo = JointServo("elbow_flex", "dynamixel", 1, before.middle)
     (change,) = corrections({"elbow_flex": before}, [servo], {"elbow_flex": math.radians(3.0)})

@@ -166,7 +166,7 @@ def test_the_images_of_every_view_are_kept(views, tmp_path) -> None:
     assert len(pair_files(tmp_path / "kept", None, None, side_by_side=False)) == 9
 
 
-# --- what is shown
+# --- pictures
 
 
 def shown_of(views: list[View], frames: int) -> Shown:

@@ -92,7 +92,7 @@ def command(bus: Bus, name: str) -> str:
     return json.loads(bus.ask_one(KEYS.command("sampler"), encode(CommandRequest(name))))["message"]
 
 
-# --- the way of a pair
+# --- the path of a pair
 
 
 def test_each_frame_of_a_walk_becomes_a_pair_with_the_angles_of_its_time(config) -> None:
@@ -262,7 +262,7 @@ def test_a_position_that_is_no_number_makes_no_pair(config) -> None:
     assert (len(pairs), status.rejected) == (9, {"not_finite": 1})
 
 
-# --- what others see
+# --- published data
 
 
 def test_pairs_are_published_in_order(config) -> None:

@@ -27,7 +27,7 @@ from bodyschema.daemon.router import RouterConfig
 from bodyschema.interfaces.errors import BusError, ConfigError, RequestError
 
 LIMIT_S = 500.0
-SILENCE_S = 0.3  # in which what was dropped would have arrived
+SILENCE_S = 0.3  # time in which a dropped message would have arrived
 KEYS = Keys("arm")
 QUESTIONS = {name: getattr(KEYS, name) for name in ("predict", "jacobian", "ik", "model", "pairs")}
 STATES = {f"status/{process}": KEYS.status(process) for process in ("sampler", "learner")}
@@ -175,7 +175,7 @@ def test_pairs_that_the_sampler_did_not_publish_teach_the_learner_nothing(site: 
     with client(site.as_somebody(name)) as bus:
         bus.publisher(KEYS.pair)(b"poison")
         bus.ask(KEYS.predict)
-        site.publish(b"a pair")  # what was published before would have come before
+        site.publish(b"a pair")  # earlier messages would have arrived before it
         assert drained(site.heard) == [b"a pair"]
 
 
@@ -330,7 +330,7 @@ def test_name_and_password_open_the_router_and_nothing_else_does(pki: Path, endp
                 pass
 
 
-# --- what robot.toml and router.toml may say
+# --- valid settings of robot.toml and router.toml
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from bodyschema.daemon.view.documents import DiagnosisDocument
 from bodyschema.interfaces.errors import BusError, RequestError
 from bodyschema.interfaces.records import Pair, frozen_array
 
-# The limit only ends what would never end.
+# only ends a diagnosis that would never end
 LIMIT_S = 500.0
 OVER = ("done", "failed", "stopped")
 

@@ -119,7 +119,7 @@ def test_a_learner_that_goes_is_missed_and_one_that_comes_back_is_seen(config, h
     with learner(config):
         until(answers)
     until(lambda: not answers())
-    assert document(hub, "learner")["status"]["pairs"] == LEARNER.pairs  # what it knew last is still to be seen
+    assert document(hub, "learner")["status"]["pairs"] == LEARNER.pairs  # the last known state is still shown
     with learner(config):
         until(answers)
 

@@ -69,7 +69,7 @@ def test_pictures_are_written_with_what_was_seen_in_them(tmp_path, capsys) -> No
     assert [picture.name for picture in pictures] == [f"{number:06}.jpg" for number in (1, 2, 3, 4)]
     picture = cv2.imread(str(pictures[0]))
     assert picture is not None
-    row = picture[120, :60].astype(int)  # of the other eye, through the ball: yellow on grey
+    row = picture[120, :60].astype(int)  # the other camera's ray, through the ball: yellow on grey
     assert (row[:, 2] - row[:, 0]).min() > 60
 
 

@@ -247,7 +247,7 @@ def test_the_example_follows_stored_and_new_pairs_in_order(tmp_path, endpoint) -
         subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=os.sep) as follower,
     ):
         try:
-            lines = [follower.stdout.readline() for _ in range(10)]  # it has begun with what is stored
+            lines = [follower.stdout.readline() for _ in range(10)]  # it has started with the stored pairs
             go_on.set()
             lines += follower.stdout.readlines()
         finally:

@@ -119,7 +119,7 @@ def _server() -> socket.socket:
             stdin=subprocess.DEVNULL,
             env=environment,
             pass_fds=[its.fileno()],
-        ).returncode = 0  # nobody waits for it
+        ).returncode = 0  # never waited for
     atexit.register(ours.close)
     return ours
 

@@ -91,7 +91,7 @@ def test_a_play_of_several_times_the_scatter_is_clearly_seen_beside_it(robot, se
 
 @pytest.mark.parametrize("name", ["backlash", "settling"])
 def test_of_memories_that_no_joint_has_one_in_a_hundred_is_as_improbable_as_one_in_a_hundred(robot, name) -> None:
-    """However much the readings scatter, and though joints rest. More than 4 of 80 are so in 1 of 700 such tests."""
+    """More than 4 of 80 p-values below 0.01 occur by chance in 1 of 700 such tests."""
     chances = []
     for seed in range(20):
         fit = fit_of(robot, seed, way=way_with_rests, scatter_rad=(0.2, 1.0, 3.0)[seed % 3] * SCATTER_RAD)

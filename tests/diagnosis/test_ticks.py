@@ -16,7 +16,7 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.interfaces.robot import RobotDescription
 
 TICK_RAD = 2.0 * np.pi / 4096
-# A coarser encoder: what its readings add to the noise is about as large as the instrument's own.
+# A coarser encoder: its readings add about as much noise as the instrument has.
 COARSE_RAD = 2.0 * np.pi / 512
 
 

@@ -67,7 +67,7 @@ LINES_CONFIG = SerialLinesConfig(
         EncoderConfig("elbow", zero_ticks=1000, ticks_per_turn=16384),
     ),
 )
-# Of each make: its bench, the configured arm, the kinds of faults, and the driver.
+# For each vendor: its emulator, the configured arm, the kinds of faults, and the driver.
 MAKES: dict[str, tuple[Any, Any, FaultKinds, Any]] = {
     "Dynamixel": (DynamixelArm, CONFIG, KINDS, DynamixelJoints),
     "Feetech": (FeetechArm, FEETECH_CONFIG, FEETECH_KINDS, FeetechJoints),
@@ -223,7 +223,7 @@ def test_a_turned_shaft_knows_where_it_was() -> None:
     assert waist.angle(2.5) == pytest.approx(0.2)
 
 
-# --- what is asked for
+# --- requested faults
 
 
 @pytest.mark.parametrize(("make", "kind"), [(make, kind) for make in MAKES for kind in MAKES[make][2].names])

@@ -299,7 +299,7 @@ def test_a_fault_shows_at_the_sdk_and_passes(port, chain, fault, result) -> None
 
 
 def test_a_program_that_has_it_open_notices_the_unplugging(chain, tmp_path, monkeypatch) -> None:
-    # The SDK spins while it waits, in this process: the bench may get its turn late.
+    # The SDK spins while it waits, in this process: the emulator may be scheduled late.
     monkeypatch.setattr(sdk.port_handler, "LATENCY_TIMER", 1000)
     with PtyShell(chain, tmp_path / "bus") as shell:
         port = sdk.PortHandler(str(shell.link))

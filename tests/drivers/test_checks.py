@@ -139,7 +139,7 @@ def test_a_port_of_another_group_is_told_with_the_command(machine, monkeypatch) 
     assert check.mend.startswith("sudo usermod -aG ")
 
 
-# --- servos on a bench
+# --- emulated servos
 
 
 class Told:

@@ -22,8 +22,8 @@ from bodyschema.drivers.dynamixel.powered_config import FloatingJoint, ZeroForce
 from bodyschema.drivers.dynamixel.zero_force import ZeroForce
 from bodyschema.interfaces.errors import RequestError, SourceError, SourceLost
 
-DRIFT_RAD = math.radians(0.5)  # what the arm may drift in ten seconds after it is let go
-LATE_S = 0.015  # from too fast to torque off: the servo's measuring, a cycle, and the way
+DRIFT_RAD = math.radians(0.5)  # allowed drift of the arm in ten seconds after its release
+LATE_S = 0.015  # from overspeed to torque off: the servo's measurement, a cycle, and the motion meanwhile
 TORQUE, GOAL_CURRENT, WATCHDOG = 64, 102, 98
 
 

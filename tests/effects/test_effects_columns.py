@@ -101,7 +101,7 @@ def test_with_nominal_amounts_nothing_changes(robot, kind) -> None:
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_half_the_usual_size_moves_positions(robot, kind) -> None:
     for place in everywhere(robot):
-        if place[0] == kind and place != ("joint_compliance", "neck_yaw", None):  # whose axis stands upright
+        if place[0] == kind and place != ("joint_compliance", "neck_yaw", None):  # whose axis is vertical
             beside = sprung(robot, kind)
             nominal = Simulation(robot, beside).positions(MOTION)
             moved = Simulation(robot, (*beside, sized(robot, place, 0.5))).positions(MOTION) - nominal

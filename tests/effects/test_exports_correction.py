@@ -77,7 +77,7 @@ def test_python_agrees_effect_by_effect(name, robot, tmp_path) -> None:
         reader = Correction((tmp_path / "c.json").read_text())
         found = [reader.read(row.tolist()) for row in motion.q]
         run = simulation.run(motion)
-        # On which side a play begins is known when the joint has moved.
+        # The side on which a backlash starts is known once the joint has moved.
         np.testing.assert_allclose([angles for angles, _ in found][1:], run.q[1:], rtol=0, atol=1e-12)
         np.testing.assert_allclose([pose[3::4] for _, pose in found][1:], run.measured[1:], rtol=0, atol=1e-9)
 

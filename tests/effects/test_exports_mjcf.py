@@ -64,7 +64,7 @@ def stepped(file: Path, joints: tuple[str, ...], motion: Motion) -> FloatArray:
     held = [model.equality(f"held {name}").id for name in joints]
     read = [model.joint(name).qposadr[0] for name in joints]
     zero, found = model.qpos0[read], []
-    # A play begins on the side to which the first move leads: it is reached from there.
+    # A backlash starts on the side of the first move: it is approached from there.
     last = motion.q[0] - 0.05 * np.sign(motion.q[1] - motion.q[0])
     data.qpos[read] = last
     for row in motion.q:

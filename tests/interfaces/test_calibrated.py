@@ -136,7 +136,7 @@ def test_a_second_calibration_replaces_the_frames_of_the_first(tmp_path) -> None
     assert again.tree.links.count(CAMERA_LINK) == 1
 
 
-# --- what else is in the files
+# --- other contents of the files
 
 
 @pytest.fixture

@@ -37,7 +37,7 @@ def load(folder: Path, robot: str = ROBOT, urdf: str | None = URDF) -> RobotDesc
     return RobotDescription.load(folder / "robot.toml")
 
 
-# --- what is understood
+# --- valid files
 
 
 def test_the_chain_leads_from_the_camera_to_the_marker(tmp_path) -> None:

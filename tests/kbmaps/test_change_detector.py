@@ -223,7 +223,7 @@ def test_a_change_of_an_arm_that_bends_is_noticed_and_dated(seed: int) -> None:
 
 
 def test_errors_that_the_axes_share_count_once() -> None:
-    """A camera is thrice as bad along one direction: a pair that is off along it by two sigmas is nothing strange."""
+    """A camera is three times as bad along one direction: an error of two sigmas along it is not unusual."""
     arm, along = Arm(0), np.array([2.0, -1.0, 2.0]) / 3.0
     covariances = isotropic(SIGMA, len(arm.q)) + 8.0 * SIGMA**2 * np.outer(along, along)
     turned, plain = arm.detector(), arm.detector()

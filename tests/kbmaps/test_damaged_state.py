@@ -39,7 +39,7 @@ from kbmaps.packed import MAGIC, VERSION, pack
 KINDS = "RPR"
 BASES = bases_for(KINDS)
 PREFIX = struct.Struct("<8sII")
-# What a number, a text or an object is replaced by: nothing of its type.
+# Replacements of a number, a text or an object: values of another type.
 WRONG = ([], "1e400", "1" + "0" * 400, "-Infinity", [[1.0]])
 # NaN has a meaning here: not given, not predicted.
 WITH_NAN = ("sigma", "errors")

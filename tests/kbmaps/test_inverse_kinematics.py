@@ -173,7 +173,7 @@ def test_a_start_near_the_target_gives_an_answer_near_the_start():
 
 @pytest.mark.parametrize("pose", [False, True])
 def test_the_posture_is_followed_as_far_as_the_target_leaves_a_choice(pose):
-    """The objective is that of an independent solver that begins at our answer."""
+    """Compare the objective with that of an independent solver started at our answer."""
     for seed in range(4):
         rng = np.random.default_rng(seed)
         kbmap, half = planted(rng, "RRRRRRR")
@@ -212,7 +212,7 @@ def test_a_model_of_positions_alone_is_enough_for_positions():
 
 
 def test_the_reaching_error_of_the_true_arm_is_that_of_the_model():
-    """A map that is wrong by some millimetres leads the true arm astray by as much, and no more."""
+    """A map that is wrong by some millimetres misplaces the true arm by as much, and no more."""
     rng = np.random.default_rng(6)
     chain, half = random_chain(rng, "RRRRRRR"), half_ranges("RRRRRRR", RANGE_DEG)
     exact = chain.to_kbmap(bases_for("RRRRRRR", RANGE_DEG))

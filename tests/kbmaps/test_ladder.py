@@ -128,7 +128,7 @@ def test_a_model_that_comes_back_with_nonsense_stays_out(arm):
 
 
 def test_a_model_that_came_back_is_compared_by_what_it_predicts_since(arm):
-    """It was right before, and is wrong ever since."""
+    """The model was right before, and is wrong since."""
     other = Scripted(lambda q: bent(arm, q) if other.pairs < 60 else np.zeros((len(q), 3)), breaks_at=40, mends_at=60)
     held, failed = ladder(arm, other), False
     for q in arm.pairs(np.random.default_rng(13), 120)[0]:

@@ -53,10 +53,10 @@ MODELS: dict[str, Callable[[Arm], Model]] = {
     "tensor": lambda arm: TensorLearner.around(arm.nominal, bases_for(KINDS)),
     "tensor, from nothing": lambda arm: TensorLearner(bases_for(KINDS)),
 }
-# Those that say what is in support by the law of `Estimate`, and of these those of which not all is shown by any pair.
+# Models that report support by the law of `Estimate`, and those of them that no pair shows entirely.
 LAWFUL = [name for name in MODELS if not name.startswith("kernel")]
 LOCAL = [name for name in LAWFUL if not name.startswith("tool layer")]
-# Those whose state takes more pairs than a lesson of 12 to be there whole.
+# Models whose state needs more pairs than a lesson of 12 to be complete.
 LONG = {
     "recursive rigid, with a folded window": 40,
     "residual": 150,

@@ -96,7 +96,7 @@ def test_where_noise_speaks_for_no_deviation_the_answer_is_the_rigid_chain_s_to_
 
 
 def test_deviations_are_those_that_the_pairs_speak_for():
-    """Not those that are in the average with a small weight."""
+    """Deviations with a small weight in the average do not count."""
     averaged = [learner for learner, share in of_rigid_arms() if share > 0.0]
     assert any(set(learner.model.weights) > set(learner.deviations) for learner in averaged)
 

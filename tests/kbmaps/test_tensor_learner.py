@@ -295,7 +295,7 @@ def test_a_window_keeps_no_more_than_its_pairs():
 
 
 def test_the_gauge_of_the_prior_does_not_show_in_what_is_learnt():
-    """Turning the frame between two links, mean and covariance alike, is no other prior."""
+    """Turning the frame between two links, mean and covariance alike, gives the same prior."""
     _, prior, q, x = case("RR", 60, 1, SIGMA_M)
     bases = bases_for("RR")
     turn = random_small_turn(np.random.default_rng(0), 2.0)

@@ -60,7 +60,7 @@ EFFECTS = [
 ]  # fmt: skip
 
 
-# What happens to images on their way to the tracker.
+# Effects on images on their way to the tracker.
 SEEN = (("camera_scale", "camera_focal", "lens_distortion"), ("camera_moved", "thermal_drift"))
 # Those without a memory of their own go through the same lines of the guided world.
 TOGETHER = (
@@ -74,7 +74,7 @@ def groups() -> list[list]:
     """Return the groups of effects that the guided world tries together, then each other effect alone."""
     grouped = [[case for case in EFFECTS if case[0] in names] for names in TOGETHER]
     alone = [case for case in EFFECTS if not any(case[0] in names for names in TOGETHER)]
-    return grouped + [[case] for case in alone if case[0] != "camera_latency"]  # whose formula is of smooth paths
+    return grouped + [[case] for case in alone if case[0] != "camera_latency"]  # whose formula holds for smooth paths
 
 
 def named(case) -> str:

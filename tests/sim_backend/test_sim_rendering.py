@@ -116,7 +116,7 @@ def test_an_edge_half_across_the_ball_hides_half_of_it(bullet):
     shape = module.createVisualShape(
         module.GEOM_BOX, halfExtents=[0.1, 0.2, 0.001], rgbaColor=[0.5, 0.5, 0.5, 1], physicsClientId=client
     )
-    module.createMultiBody(0, -1, shape, [0.1, 0, 0.5], physicsClientId=client)  # its edge is the left eye's axis
+    module.createMultiBody(0, -1, shape, [0.1, 0, 0.5], physicsClientId=client)  # its edge is the left camera's axis
     x = np.array([0.0, 0.0, 0.6])
     whole_area = np.pi * (CALIBRATION.focal_px * RADIUS) ** 2 / (0.6**2 - RADIUS**2)
     assert red_pixels(painted(bullet, x)[0]) == pytest.approx(whole_area / 2, rel=0.1)
@@ -158,7 +158,7 @@ def test_the_background_avoids_the_balls_hue(hue_deg, gap_deg):
     hue, saturation, _ = np.moveaxis(cv2.cvtColor(room, cv2.COLOR_BGR2HSV).astype(float), -1, 0)
     apart_deg = np.abs((2.0 * hue - hue_deg + 180.0) % 360.0 - 180.0)[saturation > 100]
     assert len(apart_deg) > 1000
-    assert (apart_deg < gap_deg - 8.0).mean() < 0.01  # what lies between two things in a blurred edge
+    assert (apart_deg < gap_deg - 8.0).mean() < 0.01  # a blurred edge mixes two things
 
 
 def test_a_lamp_is_brighter_than_all_else(bullet):

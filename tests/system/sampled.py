@@ -105,7 +105,7 @@ def sampling(config: Config, environment: dict[str, str] | None = None) -> Itera
     words = ["-m", "bodyschema", "sampler", "--robot", config.file]
     log = config.file.with_suffix(".log")
     with log.open("w") as errors:
-        if environment:  # it works on what starts
+        if environment:  # the environment applies to new processes
             process = subprocess.Popen([sys.executable, *words], env=environment, stderr=errors)
         else:
             process = warm.Child(*words, stderr=errors)

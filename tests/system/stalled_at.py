@@ -14,7 +14,7 @@ from typing import Any
 
 from bodyschema.daemon.cli import main
 
-# What each loop does in its round.
+# The work of each loop in one round.
 WORK = {
     "encoders": ("bodyschema.daemon.reopen", "Reopening", "read", "the encoders"),
     "frames": ("bodyschema.daemon.reopen", "Reopening", "read", "the cameras"),

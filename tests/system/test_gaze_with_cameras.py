@@ -159,7 +159,7 @@ class Stage:
         while time.monotonic() < begin + seconds or len(pairs_of(self.config)) < first + pairs:
             assert time.monotonic() < begin + LIMIT_S
             torque.add(self.torque)
-            t = time.monotonic() - EVERY_S  # the bench was asked since
+            t = time.monotonic() - EVERY_S  # the emulator was asked since
             seen.append((t, self.q(t)))
             time.sleep(EVERY_S)
         t, q = zip(*seen, strict=True)
@@ -199,7 +199,7 @@ def episode(library, tmp_path_factory, free_endpoint) -> Episode:
             gazing = stage.watch(sampler, WATCHED_S, PAIRS)
             stage.head[1].fail(OVERLOAD)
             until(sampler, lambda said: any("gaze ended" in text for text in said.health))
-            time.sleep(EVERY_S)  # what is looked at next was after the end
+            time.sleep(EVERY_S)  # later observations are after the end
             failed = stage.watch(sampler, 0.5)
             stage.head[1].reboot(time.monotonic())
             sampler.command("gaze_on")

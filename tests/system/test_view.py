@@ -45,7 +45,7 @@ class PageServer:
         self.start()
 
     def start(self) -> None:
-        """Return when a browser may ask."""
+        """Start the page's process and wait until a browser may connect."""
         self._process = subprocess.Popen(self._command, stdout=subprocess.PIPE, text=True)
         assert self._process.stdout is not None
         assert self._process.stdout.readline() == f"look at {self.address}\n"
@@ -233,7 +233,7 @@ def test_nothing_is_wider_than_the_screen_and_all_text_can_be_read(browser, addr
         assert page.evaluate(CONTRASTS) == []
 
 
-# What has less contrast than WCAG 2.2 asks of text, 4.5 to 1: its relative luminance, of what is written on what.
+# Texts with less contrast than the 4.5 to 1 of WCAG 2.2: relative luminance of text and background.
 CONTRASTS = """() => {
   const numbers = (color) => color.match(/[\\d.]+/g).map(Number);
   const light = (color) => {

@@ -21,7 +21,7 @@ VGA = StereoCalibration(
     image_size_px=(640, 480),
     pixel_sigma=1e-6,
 )
-# The same eyes with a smaller picture: quicker to render.
+# The same cameras with a smaller image: quicker to render.
 SMALL = StereoCalibration(
     focal_px=600.0, principal_point_px=(159.5, 119.5), baseline_m=0.06, image_size_px=(320, 240), pixel_sigma=1e-6
 )

@@ -294,7 +294,7 @@ def poses(
             "z", rng.normal(0, 0.3)
         )
         share = rng.uniform(0.35, 0.75)
-        nearest = 2.0 * rig.baseline_m  # below that the eyes hardly share a view
+        nearest = 2.0 * rig.baseline_m  # below that the cameras hardly share a view
         z = max(rig.left.focal_px[0] * board.square_m * board.columns / (share * width), nearest)
         cell = np.array([wanted % 3, wanted // 3 % 3])
         at = (cell + rng.uniform(0.1, 0.9, 2)) / 3 * (0.5 + 0.5 * (1 - share)) + 0.25 * share

@@ -13,7 +13,7 @@ from bodyschema.interfaces.records import FloatArray, ImageArray, StereoFrame
 NEAR_M, FAR_M = 0.05, 5.0
 BROWN, BRICK = (0.45, 0.28, 0.18, 1.0), (0.55, 0.22, 0.16, 1.0)
 GREY, BLUE, DARK = (0.75, 0.75, 0.78, 1.0), (0.2, 0.3, 0.6, 1.0), (0.12, 0.12, 0.13, 1.0)
-# Optical frame (x right, y down, z forward) to the renderer's eye frame (x right, y up, z backward), column-major.
+# Optical frame (x right, y down, z forward) to the renderer's frame (x right, y up, z backward), column-major.
 VIEW = (1, 0, 0, 0, 0, -1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1)
 
 

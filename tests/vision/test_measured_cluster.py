@@ -152,7 +152,7 @@ def test_a_tag_that_moved_in_one_view_is_left_out_and_named() -> None:
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 2))])
 def test_a_number_that_is_there_twice_is_no_rigid_body_and_named(seed: int) -> None:
-    """On opposite faces, so that no image shows both."""
+    """Check duplicate numbers on opposite faces, so that no image shows both."""
     rng = np.random.default_rng(seed)
     places = built(rng)
     views = [renumbered(view, {4: 7}) for view in looked({id: places[id] for id in (3, 4, 7, 8)}, rng)]
