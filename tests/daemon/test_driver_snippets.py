@@ -1,4 +1,4 @@
-"""Driver settings report the findings in the drivers' own units."""
+"""Driver settings express the findings in the drivers' own units."""
 
 from __future__ import annotations
 

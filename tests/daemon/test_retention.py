@@ -1,4 +1,4 @@
-"""Deletion of old pairs from a store, and its notifications."""
+"""Deletion of old pairs from a store, and its consequences for readers."""
 
 from __future__ import annotations
 

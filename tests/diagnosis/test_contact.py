@@ -1,4 +1,4 @@
-"""Rows after the start of a run do not depend on the unknown initial state."""
+"""The unknown state at the start of a run is not assumed for the rows that depend on it."""
 
 from __future__ import annotations
 

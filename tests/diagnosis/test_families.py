@@ -1,4 +1,4 @@
-"""Effect of the unnamed error families on the positions, and its size."""
+"""Unnamed error families: their columns and numbers agree with the motions they describe."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A group of errors that follow a few common functions is found."""
+"""Families of numbers that follow a few common functions are found at low rank."""
 
 from __future__ import annotations
 
