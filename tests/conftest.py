@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, settings
 from skip_remedies import Report, with_remedy
 
 # No time limits: a busy machine is no failure. The same examples in every run, so that a red test is red again;
-# `make soak` draws others, and more (its profile), and keeps what failed in .hypothesis.
+# `make soak` generates other and more examples (its profile), and keeps failures in .hypothesis.
 TIMELESS = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("suite", TIMELESS, derandomize=True, max_examples=40)
 settings.register_profile("soak", TIMELESS, print_blob=True, max_examples=300)
@@ -36,30 +36,30 @@ def pytest_make_collect_report(collector: pytest.Collector) -> Generator[None, R
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Three for two processors: half of the tests wait for processes, clocks or disks."""
+    """Return three workers for two processors: half of the tests wait for processes, clocks or disks."""
     return (3 * len(os.sched_getaffinity(0)) + 1) // 2
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files of many quick tests come last, so that no worker sits alone over a long one in the end."""
+    """Move files of many quick tests to the end, so that no worker is left with a long one."""
     items.sort(key=lambda item: item.nodeid.startswith(QUICK))
 
 
 @pytest.fixture(scope="session")
 def free_endpoint() -> Callable[[], str]:
-    """A function that gives zenoh endpoints on this machine that nobody listens on."""
+    """Return a function that returns unused zenoh endpoints on this machine."""
     return free_ports.free_endpoint
 
 
 @pytest.fixture
 def endpoint(free_endpoint: Callable[[], str]) -> str:
-    """A zenoh endpoint on this machine that nobody listens on."""
+    """Return an unused zenoh endpoint on this machine."""
     return free_endpoint()
 
 
 @pytest.fixture
 def mount_small_disk(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
-    """A function that mounts an empty tmpfs with the options given; needs root."""
+    """Yield a function that mounts an empty tmpfs with the options given; needs root."""
     if os.geteuid() != 0:
         pytest.skip("no small disk can be mounted; to run it: be root")
     folder = tmp_path / "disk"

@@ -1,4 +1,4 @@
-"""Every competitor learns; those that are our own versions of published ones do what was published."""
+"""Every competitor learns; our versions of published algorithms reproduce published results."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def two_joints() -> RigidChain:
 
 
 def simple_problem(pairs: int = 80) -> Problem:
-    """Two joints, a tenth of a millimetre of noise, a drawing whose tool is off by 50 mm."""
+    """Return a problem of two joints, 0.1 mm of noise and a nominal model whose tool is off by 50 mm."""
     chain, rng = two_joints(), np.random.default_rng(5)
     q = rng.uniform(-REACH, REACH, (pairs, 2))
     return Problem(
@@ -164,7 +164,7 @@ def test_a_hands_pose_follows_from_three_markers():
 
 
 def cross(x: np.ndarray) -> np.ndarray:
-    """The test function of Schaal and Atkeson 1998, and of Vijayakumar, D'Souza and Schaal 2005."""
+    """Return the test function of Schaal and Atkeson 1998, and of Vijayakumar, D'Souza and Schaal 2005."""
     ridges = np.stack([np.exp(-10.0 * x[:, 0] ** 2), np.exp(-50.0 * x[:, 1] ** 2)])
     return np.maximum(ridges.max(axis=0), 1.25 * np.exp(-5.0 * np.square(x).sum(axis=1)))
 

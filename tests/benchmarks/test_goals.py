@@ -1,4 +1,4 @@
-"""The table of figures to reach: how it is measured and judged, and that the page shows all of it."""
+"""The table of target figures: measurement, judgement, and its presence on the page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs go on where they stopped, and the page shows all that was run."""
+"""Benchmark runs resume where they stopped, and the page shows all of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The arms that learners are measured against are what their names say."""
+"""The arms that learners are measured against match their names."""
 
 from __future__ import annotations
 

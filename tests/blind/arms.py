@@ -37,7 +37,7 @@ class Joint:
 
     @property
     def moves(self) -> bool:
-        """Whether it is no fixed joint."""
+        """True if the joint is not fixed."""
         return self.kind != "fixed"
 
 
@@ -85,11 +85,11 @@ class Arm:
     marker_xyz: Vector
 
     def joint(self, name: str) -> Joint:
-        """The joint called `name`."""
+        """Return the joint called `name`."""
         return next(joint for joint in self.joints if joint.name == name)
 
     def mass(self, link: str) -> Mass:
-        """Mass of a link; of next to nothing where none is given."""
+        """Return the mass of a link; negligible if none is given."""
         return self.masses.get(link, Mass(1e-3))
 
     @property
@@ -98,17 +98,17 @@ class Arm:
         return np.array([(self.joint(name).lower, self.joint(name).upper) for name in self.read])
 
     def quantum(self, name: str) -> float:
-        """One encoder tick [rad or m]."""
+        """Return one encoder tick [rad or m]."""
         whole = 1.0 if self.joint(name).kind == "prismatic" else 2.0 * math.pi
         return whole / self.ticks[name]
 
     def with_joint(self, joint: Joint) -> Arm:
-        """The same arm with the joint of that name replaced."""
+        """Return the same arm with the joint of that name replaced."""
         return replace(self, joints=tuple(joint if old.name == joint.name else old for old in self.joints))
 
 
 def look_at(eye: FloatArray, target: FloatArray, roll_rad: float = 0.0) -> Vector:
-    """rpy [rad] of an optical frame (x right, y down, z forward) at `eye` that looks at `target`."""
+    """Return rpy [rad] of an optical frame (x right, y down, z forward) at `eye` that looks at `target`."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
@@ -117,7 +117,7 @@ def look_at(eye: FloatArray, target: FloatArray, roll_rad: float = 0.0) -> Vecto
 
 
 def _chain(start: str, *rows: tuple[str, str, Vector, Vector, str, float, float]) -> tuple[Joint, ...]:
-    """Joints one behind the other: name, kind, xyz, rpy, letter of the axis, range in degrees (m if prismatic)."""
+    """Return serial joints from name, kind, xyz, rpy, letter of the axis, range in degrees (m if prismatic)."""
     joints, parent = [], start
     for name, kind, xyz, rpy, axis, lower, upper in rows:
         unit = 1.0 if kind == "prismatic" else math.pi / 180.0
@@ -128,7 +128,7 @@ def _chain(start: str, *rows: tuple[str, str, Vector, Vector, str, float, float]
 
 
 def _masses(joints: tuple[Joint, ...], kilograms: list[float], rng: np.random.Generator) -> dict[str, Mass]:
-    """Masses with centres about half way to the next joint and some centimetres off the axes."""
+    """Return masses with centres about half way to the next joint and some centimetres off the axes."""
     ends = {joint.parent: np.array(joint.xyz) for joint in joints}
     masses = {}
     for joint, kg in zip(joints, kilograms, strict=True):
@@ -138,7 +138,7 @@ def _masses(joints: tuple[Joint, ...], kilograms: list[float], rng: np.random.Ge
 
 
 def _standing_camera(rng: np.random.Generator, eye: Vector, target: Vector) -> tuple[Vector, Vector, Eyes]:
-    """A camera beside the arm: where it stands, how it looks, what it is."""
+    """Draw a camera beside the arm: return its position, its orientation and its optics."""
     at = np.array(eye) + rng.uniform(-0.15, 0.15, 3)
     rpy = look_at(at, np.array(target) + rng.uniform(-0.08, 0.08, 3), rng.uniform(-0.1, 0.1))
     eyes = Eyes(
@@ -159,7 +159,7 @@ def _beside(
     target: Vector,
     mount: Joint | None = None,
 ) -> Arm:
-    """An arm on its mount with a stereo camera standing beside it."""
+    """Return an arm on its mount with a stereo camera standing beside it."""
     xyz, rpy, eyes = _standing_camera(rng, eye, target)
     read = tuple(joint.name for joint in chain)
     return Arm(
@@ -182,7 +182,7 @@ def _ticks(read: tuple[str, ...], rng: np.random.Generator) -> dict[str, int]:
 
 
 def industrial(rng: np.random.Generator) -> Arm:
-    """Six joints, shoulder and elbow offset to the side, a wrist with its axes 0.1 m apart."""
+    """Return an arm of six joints, shoulder and elbow offset to the side, a wrist with its axes 0.1 m apart."""
     chain = _chain(
         BASE,
         ("waist", "revolute", (0, 0, 0.32), (0, 0, 0), "z", -120, 120),
@@ -196,7 +196,7 @@ def industrial(rng: np.random.Generator) -> Arm:
 
 
 def humanoid(rng: np.random.Generator) -> Arm:
-    """Seven joints of a humanoid's left arm, its shoulder mounted sideways on a torso."""
+    """Return a humanoid's left arm of seven joints, its shoulder mounted sideways on a torso."""
     chain = _chain(
         BASE,
         ("shoulder_pitch", "revolute", (0, 0.17, 0.02), (0.2, 0, 0), "y", -130, 60),
@@ -214,7 +214,7 @@ def humanoid(rng: np.random.Generator) -> Arm:
 
 
 def gantry(rng: np.random.Generator) -> Arm:
-    """Six joints, the second a lift: waist, lift, reach, elbow and a wrist of two."""
+    """Return a gantry of six joints, the second a lift: waist, lift, reach, elbow and a wrist of two."""
     chain = _chain(
         BASE,
         ("waist", "revolute", (0, 0, 0.20), (0, 0, 0), "z", -110, 110),
@@ -228,7 +228,7 @@ def gantry(rng: np.random.Generator) -> Arm:
 
 
 def head(rng: np.random.Generator) -> Arm:
-    """Two head joints that carry the cameras, and an arm of five: the way from camera to marker leads down the neck."""
+    """Return two head joints that carry the cameras, and an arm of five: the chain leads down the neck to the arm."""
     neck = _chain(
         BASE,
         ("head_pan", "revolute", (0.02, 0, 0.22), (0, 0, 0), "z", -20, 60),
@@ -262,7 +262,7 @@ def head(rng: np.random.Generator) -> Arm:
 
 
 def drawn(rng: np.random.Generator) -> Arm:
-    """Six joints with drawn lengths, twists and masses; neighbouring axes are never parallel along the link."""
+    """Return six joints with random lengths, twists and masses; neighbouring axes are never parallel along the link."""
     rows, letters = [("j1", "revolute", (0.0, 0.0, 0.25), (0.0, 0.0, 0.0), "z", -110.0, 110.0)], "yyxyx"
     for index, letter in enumerate(letters, 2):
         length = rng.uniform(0.18, 0.34) * (0.5 if index > 4 else 1.0)
@@ -282,7 +282,7 @@ ARMS: dict[str, Callable[[np.random.Generator], Arm]] = {
 
 
 def urdf(arm: Arm) -> str:
-    """The arm as a URDF, every number with all its digits."""
+    """Return the arm as a URDF, every number with all its digits."""
     links = [FLOOR, *(joint.child for joint in arm.joints)]
     lines = [f'<robot name="{arm.name}">', *(_link(name, arm.mass(name)) for name in links)]
     return "\n".join([*lines, *map(_joint, arm.joints), "</robot>", ""])

@@ -14,6 +14,6 @@ Vector = tuple[float, float, float]
 
 
 def vector(values: Iterable[float]) -> Vector:
-    """Three floats as a tuple."""
+    """Return three floats as a tuple."""
     x, y, z = (float(value) for value in values)
     return x, y, z

@@ -1,4 +1,4 @@
-"""Where pybullet says that the marker is, and which torques bear the arm's weight."""
+"""The marker's position and the joint torques under gravity, computed by pybullet."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Body:
         self._T_link_camera = (np.array(arm.camera_xyz), Rotation.from_euler("xyz", arm.camera_rpy).as_matrix())
 
     def marker_link_poses(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pose of the marker's link in the camera's frame: positions (n, 3), rotations (n, 3, 3).
+        """Return the pose of the marker's link in the camera's frame: positions (n, 3), rotations (n, 3, 3).
 
         Args:
             q: positions of `moving` [rad or m], shape (n, number of moving joints).
@@ -60,7 +60,7 @@ class Body:
         return np.einsum("nij,ni->nj", R_world_camera, x - eye), np.einsum("nij,nik->njk", R_world_camera, R)
 
     def balance(self, q: FloatArray, compliance: FloatArray) -> FloatArray:
-        """Where springs in the joints come to rest under the arm's weight, shape as q.
+        """Return the joint positions at which compliant joints come to rest under the arm's weight, shape as q.
 
         Args:
             q: positions with no load [rad or m], shape (n, number of moving joints).
@@ -74,7 +74,7 @@ class Body:
                 bearing = pybullet.calculateInverseDynamics(
                     self._body, bent.tolist(), still, still, physicsClientId=self._client
                 )
-                new = unloaded - compliance * bearing  # the load is what the torque that bears it is against
+                new = unloaded - compliance * bearing  # the external load is opposite to the torque that holds it
                 settled = np.abs(new - bent).max() < AT_REST
                 bent = new
                 if settled:
@@ -89,7 +89,7 @@ class Body:
         pybullet.removeBody(self._body, physicsClientId=self._client)
 
     def _mass_states(self, q: list[float], links: list[int]) -> list[list[float]]:
-        """Positions and orientations (quaternions x, y, z, w) of the links' centres of mass."""
+        """Return positions and orientations (quaternions x, y, z, w) of the links' centres of mass."""
         pybullet.resetJointStatesMultiDof(
             self._body, self._indices, [[value] for value in q], physicsClientId=self._client
         )
@@ -105,13 +105,13 @@ class Bullet:
         self._client, self._folder = client, folder
 
     def load(self, arm: Arm) -> Body:
-        """The arm as a body of this client."""
+        """Load the arm as a body of this client."""
         return Body(self._client, arm, self._folder / "arm.urdf")
 
 
 @contextmanager
 def bullet() -> Iterator[Bullet]:
-    """A client for as long as the context lasts."""
+    """Yield a pybullet client that is closed when the context ends."""
     client = pybullet.connect(pybullet.DIRECT)
     try:
         pybullet.setGravity(0.0, 0.0, -GRAVITY, physicsClientId=client)

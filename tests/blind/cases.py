@@ -31,7 +31,7 @@ Size = float | str | Sequence[float]
 
 @dataclass(frozen=True)
 class Encoders:
-    """What becomes of shaft positions.
+    """Encoders that turn shaft positions into readings.
 
     Attributes:
         ticks: of each joint [rad or m], shape (d,).
@@ -47,7 +47,7 @@ class Encoders:
         return cls(np.array([arm.quantum(name) for name in arm.read]), scatter, rng)
 
     def read(self, shaft: FloatArray) -> FloatArray:
-        """Readings (n, d) in whole ticks."""
+        """Return readings (n, d) in whole ticks."""
         exact = shaft / self.ticks
         if self.scatter:
             exact = exact + self.scatter * self.rng.normal(size=exact.shape)
@@ -63,10 +63,10 @@ class Taken:
         segment: run of pairs, shape (n,).
         q: encoder readings, quantised [rad or m], shape (n, d).
         x: measured marker positions [m], shape (n, 3).
-        x_noise_free: what the described cameras would report without pixel noise and without false fixes, shape (n, 3).
-        covariance: of x for the pixel noise [m²], which the recording may tell, shape (n, 3, 3).
-        noise: that and what the encoders add to a residual at the readings [m²], shape (n, 3, 3).
-        outlier: which fixes are not the marker, shape (n,).
+        x_noise_free: positions of the described cameras without pixel noise and false fixes [m], shape (n, 3).
+        covariance: of x for the pixel noise [m²], optional in the recording, shape (n, 3, 3).
+        noise: covariance of a residual at the readings, encoder noise included [m²], shape (n, 3, 3).
+        outlier: mask of the fixes that are not the marker, shape (n,).
     """
 
     t: FloatArray
@@ -81,17 +81,17 @@ class Taken:
 
 @dataclass(frozen=True)
 class HiddenCase:
-    """Recordings with something hidden in them, and what it is.
+    """Recordings with hidden effects, and the ground truth.
 
     Attributes:
         folder: with robot.toml, arm.urdf, measured.csv and fresh.csv; the truth is not in it.
         arm: as robot.toml describes it.
         truth: the hidden effects; none when nothing is hidden.
-        nuisances: what is wrong but not a finding, since robot.toml calls it not known.
-        measured, fresh: the recording, and another one of the same arm on another way. Moments (t0) count from the
+        nuisances: errors that are not findings, since robot.toml marks the parameters as unknown.
+        measured, fresh: the recording, and another one of the same arm on another path. Moments (t0) count from the
             start of either.
-        sigma_m: RMS length of the noise of a residual, that of encoders included.
-        scatter: 1-sigma of what the encoders scatter before they round [ticks].
+        sigma_m: RMS length of the noise of a residual, encoder noise included.
+        scatter: 1-sigma of the encoder noise before rounding [ticks].
     """
 
     folder: Path
@@ -130,7 +130,7 @@ def hide(
     rendered: bool = False,
     scatter: tuple[float, float] | None = None,
 ) -> HiddenCase:
-    """Write a case into `folder`; everything is drawn from `seed`.
+    """Write a case into `folder`; all random choices derive from `seed`.
 
     Args:
         effects: how many effects of the table to draw, or which ("backlash", "backlash@elbow",
@@ -138,18 +138,18 @@ def hide(
         arm: a name of `ARMS`; any when None.
         pairs, fresh_pairs: of measured.csv and of fresh.csv (as many when None).
         size: of each effect in units of the noise, one for all or one for each; "random" draws 0.2..15 each.
-        outliers: fraction of false fixes, beside any effect.
+        outliers: fraction of false fixes, in addition to any effect.
         hold: torque_free, zero_force or held; any in which the effects show when None.
-        reach: part of each joint's range that both recordings go through, around a posture that is drawn.
+        reach: part of each joint's range that both recordings cover, around a random posture.
         still: joints that never move.
         marker_known, pose_known: False writes a rough marker or camera pose into robot.toml and says so there.
         rendered: paint every image and look for the marker in it with the tracker (some tenths of a second a pair);
             a pair whose marker is not found is left out.
-        scatter: between what the encoders scatter before they round, 1-sigma [ticks], drawn; joints that do not lead
-            then stand still. None for encoders that only round.
+        scatter: range of the random encoder noise before rounding, 1-sigma [ticks]; joints that do not lead then
+            stand still. None for encoders that only round.
 
     Raises:
-        ValueError: an effect cannot sit there, or does not show in this motion.
+        ValueError: an effect is not possible there, or does not show in this motion.
     """
     streams = [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(7)]
     choosing, building, moving, freshly, noising, rough, scattering = streams
@@ -205,7 +205,7 @@ def _hidden(
     arm: Arm,
     rng: np.random.Generator,
 ) -> tuple[Hidden, ...]:
-    """The effects with their places and parameters."""
+    """Return the effects with their places and parameters."""
     truth: list[Hidden] = []
     for index, wish in enumerate(wished):
         if wish.effect == "outliers":
@@ -233,7 +233,7 @@ def _one(
     truth: Sequence[Hidden],
     rng: np.random.Generator,
 ) -> Hidden:
-    """One effect of that size, where it shows."""
+    """Return one effect of that size, at a place where it shows."""
     taken = [(hidden.effect, hidden.where) for hidden in truth]
     for left in reversed(range(TRIES)):
         there = placed(wish, arm, taken, rng)
@@ -250,7 +250,7 @@ def _one(
 
 
 def _finished(hidden: Hidden, site: Site, sizer: Sizer) -> Hidden:
-    """Lost ticks are whole ones; a lag is told with the rest that it was given."""
+    """Round lost ticks to whole ones; add the time constant to a lag."""
     p = hidden.parameters
     if hidden.effect == "encoder_jump":
         name, tick = f"jump_{site.unit}", site.arm.quantum(str(site.where))
@@ -262,7 +262,7 @@ def _finished(hidden: Hidden, site: Site, sizer: Sizer) -> Hidden:
 
 
 def _rough(rng: np.random.Generator, *, marker_known: bool, pose_known: bool) -> tuple[Hidden, ...]:
-    """What is wrong with a marker and a camera pose that are only roughly known."""
+    """Return the errors of a marker and a camera pose that are only roughly known."""
     nuisances = []
     if not marker_known:
         shift: Parameters = dict(zip(SHIFT, (0.015 * direction(rng)).tolist(), strict=True))
@@ -285,7 +285,7 @@ def _taken(
     *,
     rendered: bool,
 ) -> Taken:
-    """The first `pairs` pairs that the true cameras see, with noise, ticks and false fixes."""
+    """Return the first `pairs` pairs that the true cameras see, with noise, ticks and outliers."""
     arm, sight = world.arm, world.measure(motion)
     width, height = arm.eyes.image_size_px
     inside = (sight.pixels > 0.0).all(axis=1) & (sight.pixels < [width, height, width, height]).all(axis=1)
@@ -313,7 +313,7 @@ def _taken(
 
 
 def _fixed(world: World, points: FloatArray, rng: np.random.Generator) -> tuple[BoolArray, FloatArray, FloatArray]:
-    """Fixes from noisy pixel centres: all are found; positions and covariances."""
+    """Return fixes from noisy pixel centres: a mask that is all true, positions and covariances."""
     eyes = world.arm.eyes
     pixels = world.eyes.project(points)
     pixels = pixels + rng.normal(0.0, eyes.pixel_sigma, pixels.shape)

@@ -1,4 +1,4 @@
-"""Which effects are hidden, at which joints, in which kind of motion."""
+"""Choice of the hidden effects, of their joints and of the kind of motion."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EVERY = {**KINDS, **OUTSIDE}
 
 @dataclass(frozen=True)
 class Wish:
-    """An effect that is to be hidden; a joint that is None is drawn."""
+    """An effect to hide; a joint that is None is chosen at random."""
 
     effect: str
     where: str | None = None
@@ -28,12 +28,12 @@ class Wish:
 
     @property
     def kind(self) -> Kind:
-        """What is known of the effect."""
+        """Description of the effect."""
         return EVERY[self.effect]
 
     @classmethod
     def parsed(cls, text: str) -> Wish:
-        """From `effect`, `effect@joint` or `effect@joint:source`.
+        """Parse `effect`, `effect@joint` or `effect@joint:source`.
 
         Raises:
             ValueError: there is no such effect.
@@ -48,9 +48,9 @@ class Wish:
 def wishes(
     effects: int | str | Sequence[str], hold: str | None, rough: Sequence[str], rng: np.random.Generator
 ) -> list[Wish]:
-    """The effects to hide: those named, "outside" for one outside the table, or a number of different ones drawn.
+    """Return the effects to hide: those named, "outside" for one outside the table, or a number of random ones.
 
-    Those in `rough` are no findings in this case and not drawn.
+    Effects in `rough` are not findings in this case and are not chosen.
     """
     if isinstance(effects, str):
         effects = [effects]
@@ -63,7 +63,7 @@ def wishes(
 
 
 def _shown(kinds: dict[str, Kind], hold: str | None) -> list[str]:
-    """Effects that show while the arm's weight is borne as `hold` says."""
+    """Return the effects that show while the arm's weight is supported as `hold` says."""
     return [
         name
         for name, kind in kinds.items()
@@ -72,7 +72,7 @@ def _shown(kinds: dict[str, Kind], hold: str | None) -> list[str]:
 
 
 def chosen_arm(arm: str | None, wished: Sequence[Wish], rng: np.random.Generator) -> Arm:
-    """The arm of that name, or any that the effects can sit on."""
+    """Return the arm of that name, or a random one that the effects can act on."""
     beside = any(wish.kind.beside_only for wish in wished)
     if arm == "head" and beside:
         raise ValueError("with the cameras on the robot nobody sees its mount give way")
@@ -84,7 +84,7 @@ def chosen_arm(arm: str | None, wished: Sequence[Wish], rng: np.random.Generator
 
 
 def chosen_motion(hold: str | None, wished: Sequence[Wish], rng: np.random.Generator) -> tuple[str, Style]:
-    """Who bears the arm's weight, and the kind of motion, so that every effect shows.
+    """Return who supports the arm's weight and the kind of motion, chosen so that every effect shows.
 
     Raises:
         ValueError: no motion shows them all while the weight is borne as `hold` says.
@@ -102,7 +102,7 @@ def chosen_motion(hold: str | None, wished: Sequence[Wish], rng: np.random.Gener
 
 
 def placed(wish: Wish, arm: Arm, taken: Sequence[tuple[str, str | None]], rng: np.random.Generator) -> Wish:
-    """The wish with its joints drawn, at none where the same effect already sits."""
+    """Return the wish with random joints, none of which already has the same effect."""
     kind = wish.kind
     if kind.at == "robot":
         return wish
@@ -117,7 +117,7 @@ def placed(wish: Wish, arm: Arm, taken: Sequence[tuple[str, str | None]], rng: n
 
 
 def _possible(effect: str, arm: Arm) -> tuple[str, ...]:
-    """Joints where the effect is what it is called."""
+    """Return the joints at which the effect is possible."""
     if effect == "link_bend":
         return bending_joints(arm)
     if effect == "growing_link" and arm.camera_link == FLOOR:

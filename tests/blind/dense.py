@@ -92,7 +92,7 @@ class Checkout:
 
 
 def main() -> None:
-    """The command."""
+    """Run the command."""
     parser = argparse.ArgumentParser(prog="python -m tests.blind.dense", description=__doc__)
     parser.add_argument("--cases", type=int, default=20)
     parser.add_argument("--first-seed", type=int, default=0)

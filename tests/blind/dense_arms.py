@@ -42,7 +42,7 @@ class Made:
     harmonics: tuple[FloatArray, ...]
 
     def drive_error(self, joint: int, shaft: FloatArray) -> FloatArray:
-        """Output minus shaft position [rad or m] of a joint at the positions (n,)."""
+        """Return output minus shaft position [rad or m] of a joint at the positions (n,)."""
         rows = self.harmonics[joint]
         phase = np.multiply.outer(shaft, rows[:, 0])
         return np.sin(phase) @ rows[:, 1] + np.cos(phase) @ rows[:, 2]
@@ -67,7 +67,7 @@ def made(arm: Arm, rng: np.random.Generator) -> Made:
 
 
 def _scales(rng: np.random.Generator) -> tuple[float, float]:
-    """Scales of lengths and of angles."""
+    """Return the scales of lengths and of angles."""
     while True:
         shared, own = rng.normal(size=2)
         logs = np.array([shared, SHARED * shared + math.sqrt(1.0 - SHARED**2) * own])
@@ -151,7 +151,7 @@ def _range(index: int, slide: bool, reach: float, rng: np.random.Generator) -> t
 
 
 def _neck(reach: float) -> tuple[Joint, ...]:
-    """Two joints that carry the instrument."""
+    """Return two joints that carry the instrument."""
     up = round(0.5 * reach, 3)
     pan = Joint("head_pan", "revolute", BASE, "head_pan_link", (0.02, 0.0, up), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
     tilt = Joint("head_tilt", "revolute", "head_pan_link", "head_tilt_link", (0.02, 0.01, 0.08), axis=(0.0, 1.0, 0.0))
@@ -164,7 +164,7 @@ def _ranged(joint: Joint, low_deg: float, high_deg: float) -> Joint:
 
 
 def _masses(chain: tuple[Joint, ...], kilograms: FloatArray, reach: float, rng: np.random.Generator) -> dict[str, Mass]:
-    """Centres of mass about half way to the next joint."""
+    """Return centres of mass about half way to the next joint."""
     ends: dict[str, Vector] = {joint.parent: joint.xyz for joint in chain}
     return {
         joint.child: Mass(
@@ -176,7 +176,7 @@ def _masses(chain: tuple[Joint, ...], kilograms: FloatArray, reach: float, rng: 
 
 
 def _ticks(joint: Joint, rng: np.random.Generator) -> int:
-    """Ticks a turn, or a metre."""
+    """Return the ticks per turn, or per metre."""
     return int(rng.choice([100_000, 1_000_000]) if joint.kind == "prismatic" else 2 ** rng.integers(15, 21))
 
 

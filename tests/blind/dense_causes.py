@@ -63,7 +63,7 @@ class Way:
         return self.path[self.rows]
 
     def index(self, name: str | None) -> int:
-        """Column of a joint."""
+        """Return the column of a joint."""
         return self.arm.read.index(str(name))
 
 

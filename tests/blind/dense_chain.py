@@ -33,7 +33,7 @@ class Built:
     soft: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def balanced(self, positions: FloatArray) -> FloatArray:
-        """Positions (n, d) of the joints under the arm's own weight."""
+        """Return positions (n, d) of the joints under the arm's own weight."""
         if not self.soft.any():
             return positions
         loaded = positions
@@ -42,7 +42,7 @@ class Built:
         return loaded
 
     def measured(self, positions: FloatArray) -> FloatArray:
-        """The marker (n, 3) [m] in the measurement frame at true joint positions (n, d)."""
+        """Return the marker (n, 3) [m] in the measurement frame at true joint positions (n, d)."""
         return Posture.of(self, positions).seen()
 
 
@@ -62,7 +62,7 @@ class Posture:
 
     @classmethod
     def of(cls, built: Built, positions: FloatArray) -> Posture:
-        """The links at joint positions (n, d)."""
+        """Return the links at joint positions (n, d)."""
         arm, n = built.arm, len(positions)
         root = arm.joints[0].parent
         R, x, before = {root: np.tile(np.eye(3), (n, 1, 1))}, {root: np.zeros((n, 3))}, {}
@@ -84,39 +84,39 @@ class Posture:
         return cls(built, R, x, before)
 
     def eye(self) -> tuple[FloatArray, FloatArray]:
-        """Orientation (n, 3, 3) and place (n, 3) of the measurement frame in the world."""
+        """Return orientation (n, 3, 3) and position (n, 3) of the measurement frame in the world."""
         link = self.built.arm.camera_link
         return self.R[link] @ self.built.eye_R, self.x[link] + self.R[link] @ self.built.eye_x
 
     def marker(self) -> FloatArray:
-        """In the world (n, 3) [m]."""
+        """Return the marker in the world (n, 3) [m]."""
         link = self.built.arm.marker_link
         on_link = np.broadcast_to(self.built.marker, self.x[link].shape)
         return self.x[link] + np.einsum("nij,nj->ni", self.R[link], on_link)
 
     def seen(self) -> FloatArray:
-        """The marker in the measurement frame (n, 3) [m]."""
+        """Return the marker in the measurement frame (n, 3) [m]."""
         R, x = self.eye()
         return np.einsum("nji,nj->ni", R, self.marker() - x)
 
     def by_marker(self) -> FloatArray:
-        """Derivative (n, 3, 3) of what is seen by the marker's place in its link."""
+        """Return the derivative (n, 3, 3) of `seen` with respect to the marker's position in its link."""
         return np.swapaxes(self.eye()[0], 1, 2) @ self.R[self.built.arm.marker_link]
 
     def by_eye(self) -> FloatArray:
-        """Derivative (n, 3, 6) of what is seen by a motion of the measurement frame in itself."""
+        """Return the derivative (n, 3, 6) of `seen` with respect to a motion of the measurement frame in itself."""
         seen = self.seen()
         turns = np.stack([-np.cross(axis, seen) for axis in np.eye(3)], axis=2)
         return np.concatenate([np.tile(-np.eye(3), (len(seen), 1, 1)), turns], axis=2)
 
     def by_frames(self) -> FloatArray:
-        """Derivative (n, 3, d, 6) of what is seen by shift and turn of each read joint's frame in itself."""
+        """Return the derivative (n, 3, d, 6) of `seen` with respect to a local motion of each read joint's frame."""
         arm = self.built.arm
         columns = []
         for name in arm.read:
             joint = arm.joint(name)
             along = self.before[name]
-            # A slide's frame turns about where it stands before it slides.
+            # A prismatic joint's frame turns about its position before the motion.
             place = self.x[joint.child] - self._slid(name)
             turns = np.cross(np.swapaxes(along, 1, 2), (self.marker() - place)[:, None])
             columns.append(self._toward(name) * np.concatenate([along, np.swapaxes(turns, 1, 2)], axis=2))
@@ -124,7 +124,7 @@ class Posture:
         return np.einsum("nji,njdk->nidk", R, np.stack(columns, axis=2))
 
     def by_joints(self) -> FloatArray:
-        """Derivative (n, 3, d) of what is seen by the joints' true positions."""
+        """Return the derivative (n, 3, d) of `seen` with respect to the joints' true positions."""
         arm = self.built.arm
         columns = []
         for name in arm.read:
@@ -135,7 +135,7 @@ class Posture:
         return np.einsum("nji,njd->nid", self.eye()[0], np.stack(columns, axis=2))
 
     def torques(self) -> FloatArray:
-        """Torque [N·m] or force [N] of gravity along each read joint's axis (n, d), counted the way it moves."""
+        """Return gravity's torque [N·m] or force [N] along each read joint's axis (n, d), positive in its direction."""
         arm = self.built.arm
         out = []
         for name in arm.read:
@@ -164,12 +164,12 @@ class Posture:
         return self.x[joint.child] - begun
 
     def _toward(self, name: str) -> float:
-        """+1 for a joint that carries the marker, -1 for one that carries the instrument."""
+        """Return +1 for a joint that carries the marker, -1 for one that carries the instrument."""
         return 1.0 if self.built.arm.marker_link in _beyond(self.built.arm, self.built.arm.joint(name).child) else -1.0
 
 
 def _beyond(arm: Arm, link: str) -> list[str]:
-    """A link and all that hang on it."""
+    """Return a link and all its descendants."""
     links = [link]
     for joint in arm.joints:  # parents come before children
         if joint.parent in links:

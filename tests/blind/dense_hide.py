@@ -27,7 +27,7 @@ from .motion import Motion, move
 DECIDABLE = 7.5  # nats
 A_CAUSE = 3.0  # nats that a cause of the usual weight costs
 TRIES = 80
-HARD_SHARE, HARD = 0.12, 1.0  # share of cases whose causes may be as small as this [nats], but no gauge
+HARD_SHARE, HARD = 0.12, 1.0  # share of cases that need only this evidence [nats], which excludes gauges
 COUNTS, SHARES = (0, 1, 2, 3, 5), (0.2, 0.25, 0.2, 0.2, 0.15)
 ZEROS = 0.5  # share of the cases with several causes that have several zeros
 WEIGHTS = {
@@ -45,7 +45,7 @@ WEIGHTS = {
     "camera_pose": 0.5,
     "tool_offset": 1.5,
 }
-LOADED = 0.1  # of the largest load: a joint that bears less is not said to give
+LOADED = 0.1  # share of the largest load: a joint with less is not given a compliance
 STUDENT = 4.0  # degrees of freedom
 
 
@@ -80,7 +80,7 @@ class Noise:
         return self.sigma_m * math.sqrt((STUDENT - 2.0) / STUDENT * (STUDENT + 3.0) / (STUDENT + 1.0))
 
     def of(self, begins: BoolArray, rng: np.random.Generator) -> tuple[FloatArray, BoolArray]:
-        """Noise (n, 3) [m] of rows, the first of each run given; and which fixes are false."""
+        """Return noise (n, 3) [m] of rows, given the first row of each run, and a mask of the outliers."""
         n = len(begins)
         noise = rng.normal(0.0, self.sigma_m, (n, 3))
         if self.kind == "student":
@@ -121,10 +121,10 @@ class DenseCase:
         truth: the hidden causes.
         nats: of each, by how much an observer who knows the scale of tolerances and noise prefers the truth to the
             best set without it.
-        rivals: keys of what stands in its place in that set.
-        same: keys of what can be all that it is, in any motion, with as few numbers.
-        spare_nats: by how much the truth beats the best set with one cause more.
-        rounding_m: what whole ticks of the encoders do to a position, along each axis.
+        rivals: keys of the causes that replace it in that set.
+        same: keys of causes equivalent to it in any motion, with as few numbers.
+        spare_nats: margin of the truth over the best set with one cause more.
+        rounding_m: effect of the encoders' rounding on a position, along each axis.
         nominal: the arm as described, with its instrument and marker as robot.toml puts them.
     """
 
@@ -229,13 +229,13 @@ def hide_dense(
 
 
 def written(cause: Cause) -> str:
-    """`effect@where:source`."""
+    """Return the cause as `effect@where:source`."""
     effect, where, source = cause.key
     return effect + (f"@{where}" if where else "") + (f":{source}" if source else "")
 
 
 def sealed(case: DenseCase) -> dict[str, Any]:
-    """The truth, for a file."""
+    """Return the ground truth for a file."""
     return {
         "seed": case.seed,
         "joints": list(case.arm.read),
@@ -277,7 +277,7 @@ class _Robot:
     causes: Sequence[Cause]
 
     def readings(self, shaft: FloatArray, clock: FloatArray) -> FloatArray:
-        """Encoder readings (n, d), in whole ticks."""
+        """Return encoder readings (n, d), in whole ticks."""
         read = shaft.copy()
         for index, name in enumerate(self.arm.read):
             column = read[:, index]
@@ -288,7 +288,7 @@ class _Robot:
         return read
 
     def outputs(self, motion: Motion) -> FloatArray:
-        """True positions of the joints (n, d) when the rows are read, before their springs give."""
+        """Return the joints' true positions (n, d) when the rows are read, before their compliance."""
         rows = np.searchsorted(motion.t, motion.stamps)
         shaft = motion.shaft[rows]
         out = np.empty_like(shaft)
@@ -304,7 +304,7 @@ class _Robot:
         return out
 
     def positions(self, motion: Motion, clock: FloatArray) -> FloatArray:
-        """Of the marker in the measurement frame (n, 3) [m], free of noise."""
+        """Return positions of the marker in the measurement frame (n, 3) [m], free of noise."""
         frames, soft = self.made.frames.copy(), np.zeros(len(self.arm.read))
         marker = np.tile(self.plain.marker, (len(clock), 1))
         out = self.outputs(motion)
@@ -377,7 +377,7 @@ def _loaded(way: Way) -> list[str]:
 
 
 def _clock(motion: Motion, timed: bool) -> FloatArray:
-    """Seconds, or numbers of rows where no times are written."""
+    """Return times in seconds, or row numbers if no times are written."""
     return motion.stamps if timed else np.arange(len(motion.stamps), dtype=float)
 
 
@@ -476,7 +476,7 @@ def _taken(robot: _Robot, motion: Motion, timed: bool, noise: Noise, rng: np.ran
 
 
 def _begins(motion: Motion) -> BoolArray:
-    """First rows of runs; static poses follow each other."""
+    """Return a mask of the first rows of runs; static poses are one sequence."""
     if motion.style == "held":
         return np.arange(len(motion.stamps)) == 0
     return np.append(True, np.diff(motion.segment) > 0)
@@ -484,7 +484,7 @@ def _begins(motion: Motion) -> BoolArray:
 
 def _told(arm: Arm, rng: np.random.Generator, *, marker_known: bool, pose_known: bool) -> Arm:
     """Return the arm with instrument and marker as robot.toml describes them."""
-    if not pose_known and rng.random() < 0.5:  # the instrument stands anywhere
+    if not pose_known and rng.random() < 0.5:  # arbitrary pose of the instrument
         arm = replace(arm, camera_xyz=(0.0, 0.0, 0.0), camera_rpy=(0.0, 0.0, 0.0))
     elif not pose_known:
         xyz = np.array(arm.camera_xyz) + 0.03 * direction(rng)

@@ -29,17 +29,17 @@ class DenseJudgement(msgspec.Struct, frozen=True):
     """One case.
 
     Attributes:
-        outcome: right: every hidden cause is named and no false one of weight. honest: what is not named is told as an
-            alternative, or its joint as one on which what is unexplained depends. wrong: something false is named for
-            sure, and nothing that is true is told beside it. vague: the rest.
-        named: causes with their probabilities; false, missed: those of weight that are not there, and those not named.
-        inside: of hidden zeros and plays that were named, how many of their intervals hold the truth, and how many
-            there are.
-        placed_mm, extended_mm: RMS error on other poses of the nominal model with what is not known fitted, and of
-            extended.toml.
+        outcome: right: every hidden cause is named and no significant false one. honest: each cause not named is
+            listed as an alternative, or its joint as one on which the unexplained error depends. wrong: a false cause
+            is named as certain, without a true alternative. vague: the rest.
+        named: causes with their probabilities; false, missed: significant ones not there, and those not named.
+        inside: number of named hidden joint offsets and backlashes whose intervals contain the truth, and number of
+            them.
+        placed_mm, extended_mm: RMS error on other poses of the nominal model with the unknown parameters fitted, and
+            of extended.toml.
         floor_ratio: stated noise floor over the RMS of the true noise.
-        tolerances, stated_tolerances: 1 sigma, as they are and as they are stated.
-        refused: message of the command where it needed --force.
+        tolerances, stated_tolerances: 1 sigma, true and stated.
+        refused: message of the command that needed --force.
     """
 
     seed: int
@@ -73,7 +73,7 @@ class DenseJudgement(msgspec.Struct, frozen=True):
 
 
 def name(entry: Json) -> str:
-    """`effect@where:source` of an entry of diagnosis.json."""
+    """Return an entry of diagnosis.json as `effect@where:source`."""
     where, source = entry.get("where"), entry.get("source")
     return entry["effect"] + (f"@{where}" if where else "") + (f":{source}" if source else "")
 
@@ -114,7 +114,7 @@ def _alternatives(cause: Json) -> set[str]:
 
 
 def _place(hidden: str) -> str:
-    """The joint of a cause; `time` for one that has none."""
+    """Return the joint of a cause; `time` for one that has no joint."""
     return hidden.partition("@")[2].partition(":")[0] or "time"
 
 
@@ -124,7 +124,7 @@ def _is_false_fixes(sealed: Json, cause: Json) -> bool:
 
 
 def inside(sealed: Json, told: Json) -> tuple[int, int]:
-    """Count the intervals of zeros and plays that contain the truth, and all of them."""
+    """Count the intervals of joint offsets and backlashes that contain the truth, and all of them."""
     hits = []
     for entry in sealed["truth"]:
         effect = entry["cause"].partition("@")[0]
@@ -141,7 +141,7 @@ _NUMBERS: dict[str, tuple[str, float]] = {"joint_offset": ("offset_", -1.0), "ba
 
 
 def placed(nominal: Built, q: FloatArray, x: FloatArray, *, pose_known: bool, marker_known: bool) -> Built:
-    """The nominal arm with what is not known of instrument and marker fitted to x (n, 3) [m] at q (n, d)."""
+    """Return the nominal arm with the unknown parameters of camera and marker fitted to x (n, 3) [m] at q (n, d)."""
     built = nominal
     if not pose_known:
         built = _turned(built, q, x)
@@ -185,12 +185,12 @@ def _shifted(built: Built, step: FloatArray) -> Built:
 
 
 def rms_mm(off: FloatArray) -> float:
-    """Of distances (n, 3) [m]."""
+    """Return the RMS of distances (n, 3) [m] in millimetres."""
     return float(1e3 * np.sqrt(np.square(off).sum(axis=1).mean()))
 
 
 def line(record: DenseJudgement) -> str:
-    """A record in a line."""
+    """Return a record as one line of text."""
     there = ", ".join(f"{t} ({n:.0f})" for t, n in zip(record.truth, record.nats, strict=True)) or "nothing"
     named = ", ".join(record.named) or "nothing"
     hard = "" if record.decidable else " (not decidable)"
@@ -203,7 +203,7 @@ def line(record: DenseJudgement) -> str:
 
 
 def table(records: Sequence[DenseJudgement]) -> str:
-    """All figures as Markdown."""
+    """Return all figures as Markdown."""
     groups = {
         **{f"{count} causes": [r for r in records if r.decidable and len(r.truth) == count] for count in range(9)},
         "several zeros": [r for r in records if r.decidable and _zeros(r) > 1],
@@ -235,7 +235,7 @@ def _figures(records: Sequence[DenseJudgement]) -> list[str]:
 
 
 def _spread(values: Iterable[float]) -> str:
-    """Median and range."""
+    """Return median and range."""
     found = sorted(values)
     return f"median {np.median(found):.2f} ({found[0]:.2f} to {found[-1]:.2f})" if found else "–"
 

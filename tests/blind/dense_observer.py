@@ -1,7 +1,7 @@
-"""Evidence for the hidden causes, as a linear Gaussian observer of the true generator has it.
+"""Evidence for the hidden causes, computed by a linear Gaussian observer of the true generator.
 
-It knows the scale of the tolerances, the noise, and how each cause looks; it does not know the tolerances themselves,
-the amounts, or which causes there are. What it says is averaged over the noise, with the tolerances as they are.
+It knows the scale of the tolerances, the noise and the signature of each cause; it does not know the tolerances
+themselves, the amounts, or which causes there are. Its evidence is averaged over the noise, with the true tolerances.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ class Observer:
         spans: columns of each cause.
         G: information (p, p) about all amounts, in units of their usual sizes, beside tolerances and noise.
         Q: covariance (p, p) of the noise in the same.
-        told: what the tolerances as they are add to the causes' data (p,).
-        free: information (p, p) with tolerances of zero, beside what is not known of instrument and marker.
+        told: contribution of the true tolerances to the causes' data (p,).
+        free: information (p, p) with tolerances of zero, with the unknown parameters of camera and marker.
         amounts: of every cause as if it were there, in usual sizes, shape (p,).
-        costs: what a set pays for each of its causes (K,) [nats].
+        costs: cost of each cause (K,) [nats].
     """
 
     spans: tuple[slice, ...]
@@ -65,12 +65,12 @@ class Observer:
         amounts: Sequence[FloatArray],
         costs: FloatArray,
     ) -> Observer:
-        """An observer of whitened columns, rows of noise 1.
+        """Return an observer of whitened columns, rows of noise 1.
 
         Args:
-            flat: of what is not known at all (r, f).
-            background: of tolerances, each column times its 1 sigma (r, b).
-            drawn: the tolerances as they are, in sigmas (b,).
+            flat: columns of entirely unknown parameters (r, f).
+            background: columns of tolerances, each times its 1 sigma (r, b).
+            drawn: the true tolerances, in sigmas (b,).
             causes: columns of each cause times their usual sizes, (r, m) each.
             amounts: of each cause in usual sizes (m,).
             costs: of each cause [nats].
@@ -153,12 +153,12 @@ class Observer:
         return gains
 
     def _data(self, truth: Sequence[int]) -> FloatArray:
-        """Expected data (p,) in the presence of the true causes."""
+        """Return the expected data (p,) in the presence of the true causes."""
         columns = self._columns(truth)
         return self.told + self.G[:, columns] @ self.amounts[columns]
 
     def _log_evidence(self, chosen: Sequence[int], data: FloatArray) -> float:
-        """Mean log evidence of a set over the noise, less what its causes cost [nats], from that of none."""
+        """Return the mean log evidence of a set minus the cost of its causes [nats], relative to the empty set."""
         if not chosen:
             return 0.0
         columns = self._columns(chosen)
@@ -168,7 +168,7 @@ class Observer:
         return float(0.5 * fits - np.log(np.diag(factor[0])).sum() - self.costs[list(chosen)].sum())
 
     def _left(self, cause: int, signal: FloatArray, beside: Sequence[int]) -> float:
-        """Square of a cause's signal that free amounts of others leave."""
+        """Return the squared norm of a cause's signal that free amounts of the others cannot explain."""
         own = np.arange(self.spans[cause].start, self.spans[cause].stop)
         whole = float(signal @ self.free[np.ix_(own, own)] @ signal)
         if not beside:
@@ -188,11 +188,11 @@ class Observer:
 
 
 def whitened(columns: FloatArray, sigma: float, correlation: float, begins: BoolArray) -> FloatArray:
-    """Columns (n, 3, m) with noise of 1, as (3 n, m).
+    """Scale columns (n, 3, m) to noise of 1 and flatten them to (3 n, m).
 
     Args:
         correlation: of neighbouring rows of a run.
-        begins: which rows are the first of their run (n,).
+        begins: mask of the first rows of runs (n,).
     """
     out = columns / sigma
     if correlation:

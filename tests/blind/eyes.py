@@ -1,4 +1,4 @@
-"""A stereo pair as it truly is, and what one who believes in its description measures with it."""
+"""The true stereo pair, and positions measured with its description."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ PIXELS_PER_FIX = 4
 
 @dataclass(frozen=True)
 class TrueEyes:
-    """The pair as it is.
+    """The true camera pair.
 
     Attributes:
-        focal_px, baseline_m: as they are.
+        focal_px, baseline_m: true values.
         k1, k2: Brown's radial distortion of either lens, in units of the normalised image.
         vergence_rad: the right eye turned about its y axis.
     """
@@ -32,11 +32,11 @@ class TrueEyes:
 
     @classmethod
     def as_described(cls, eyes: Eyes) -> TrueEyes:
-        """A pair that is what it is described to be."""
+        """Return a camera pair that is exactly as described."""
         return cls(eyes, eyes.focal_px, eyes.baseline_m)
 
     def project(self, x: FloatArray) -> FloatArray:
-        """Pixel centres ul, vl, ur, vr [px] of points in the left optical frame [m], shape (n, 4)."""
+        """Return pixel centres ul, vl, ur, vr [px] of points in the left optical frame [m], shape (n, 4)."""
         right = (x - np.array([self.baseline_m, 0.0, 0.0])) @ Rotation.from_euler("y", self.vergence_rad).as_matrix()
         return np.hstack([self._pixels(x), self._pixels(right)])
 
@@ -47,7 +47,7 @@ class TrueEyes:
 
 
 def triangulate(eyes: Eyes, pixels: FloatArray) -> FloatArray:
-    """Positions in the left optical frame [m] of pixel centres (n, 4), by the pair's description, shape (n, 3)."""
+    """Return positions (n, 3) [m] in the left optical frame of pixel centres (n, 4), by the pair's description."""
     ul, vl, ur, vr = pixels.T
     cu, cv = eyes.principal_point_px
     per_pixel = eyes.baseline_m / (ul - ur)
@@ -57,7 +57,7 @@ def triangulate(eyes: Eyes, pixels: FloatArray) -> FloatArray:
 
 
 def covariance(eyes: Eyes, pixels: FloatArray) -> FloatArray:
-    """Covariance [m²] of the triangulated positions for the noise of pixel centres (n, 4), shape (n, 3, 3)."""
+    """Return the covariance [m²] of triangulated positions for the noise of pixel centres (n, 4), shape (n, 3, 3)."""
     ul, _, ur, _ = pixels.T
     x = triangulate(eyes, pixels)
     disparity, per_pixel = ul - ur, eyes.baseline_m / (ul - ur)
@@ -70,7 +70,7 @@ def covariance(eyes: Eyes, pixels: FloatArray) -> FloatArray:
 
 
 def in_view(eyes: Eyes, x: FloatArray, margin_px: float, nearest_m: float = 0.15) -> BoolArray:
-    """Whether both eyes see points in the left optical frame [m] this far inside their images, shape (n,)."""
+    """Return a mask (n,) of the points in the left optical frame [m] that both cameras see with this margin."""
     width, height = eyes.image_size_px
     front = x[:, 2] > nearest_m
     pixels = TrueEyes.as_described(eyes).project(np.where(front[:, None], x, [0.0, 0.0, 1.0]))

@@ -1,4 +1,4 @@
-"""Rates over many judged cases, beside their goals, as Markdown."""
+"""Rates over many judged cases, with their goals, as Markdown."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ Test = Callable[[Judgement], bool]
 
 @dataclass(frozen=True)
 class Rate:
-    """How often something was so, with the interval in which 95 % of such counts put the true rate."""
+    """Share of cases that pass a test, with its 95 % interval."""
 
     hits: int
     of: int
 
     @classmethod
     def over(cls, records: Iterable[Judgement], test: Test) -> Rate:
-        """How many of the records pass."""
+        """Count the records that pass."""
         passed = [test(record) for record in records]
         return cls(sum(passed), len(passed))
 
@@ -42,7 +42,7 @@ class Rate:
 
 
 def markdown(records: Sequence[Judgement | Crash]) -> str:
-    """All tables."""
+    """Return all tables."""
     crashes = [record for record in records if isinstance(record, Crash)]
     cases = [record for record in records if isinstance(record, Judgement)]
     parts = [goals(cases), confusion(cases), calibration(cases), coverage(cases), failures(cases, crashes)]
@@ -50,7 +50,7 @@ def markdown(records: Sequence[Judgement | Crash]) -> str:
 
 
 def goals(cases: Sequence[Judgement]) -> str:
-    """Each figure beside its goal."""
+    """Return each figure with its goal."""
     rows = []
     for scenario in dict.fromkeys(case.scenario for case in cases):
         chosen = [case for case in cases if case.scenario == scenario]
@@ -130,35 +130,35 @@ def _of_named(scenario: str, cases: Sequence[Judgement]) -> list[tuple[str, str,
 
 
 def all_named(case: Judgement) -> bool:
-    """Whether every hidden effect is named, whatever else is."""
+    """Return True if every hidden effect is named."""
     fixes = any(cause.effect == "outliers" for cause in case.causes)
     return all(t.found_as is not None for t in case.truth) and (fixes or case.false_fixes < FEWEST_FALSE_FIXES)
 
 
 def is_strange(case: Judgement) -> bool:
-    """Whether it is called unexplained."""
+    """Return True if the verdict is "unexplained"."""
     return case.verdict == "unexplained"
 
 
 def is_wrong(case: Judgement) -> bool:
-    """Whether something is named wrongly, or called unexplained that is not."""
+    """Return True if a cause is named wrongly, or an explained case is called unexplained."""
     return case.outcome == "wrong"
 
 
 def share_of_gain(case: Judgement) -> float:
-    """Gain on fresh data over that of the truth."""
+    """Return the gain on fresh data over that of the ground truth."""
     assert case.gain is not None
     assert case.gain_of_truth is not None
     return case.gain / case.gain_of_truth
 
 
 def gains_enough(case: Judgement) -> bool:
-    """Whether it has nearly all the gain that the truth gives."""
+    """Return True if the diagnosis has nearly all the gain that the true causes give."""
     return share_of_gain(case) >= GAIN_WANTED
 
 
 def confusion(cases: Sequence[Judgement]) -> str:
-    """Hidden effects, and what was named when each alone was hidden; only those that an oracle tells."""
+    """Return a confusion table of single hidden effects that an oracle can distinguish."""
     alone = [(case.truth[0], case) for case in cases if len(case.truth) == 1 and case.told_chi2 >= TOLD]
     rows = []
     for effect in sorted({truth.effect for truth, _ in alone}):
@@ -185,7 +185,7 @@ def _named(truth: TruthJudged, case: Judgement) -> str:
 
 
 def calibration(cases: Sequence[Judgement]) -> str:
-    """How often causes are right that are said to be so probable."""
+    """Return a table of stated probabilities of causes and the observed share of right ones."""
     rows = []
     for low, chosen in _bins(cases).items():
         stated = np.mean([cause.probability for cause in chosen])
@@ -200,7 +200,7 @@ def calibration(cases: Sequence[Judgement]) -> str:
 
 
 def error_of_probability(cases: Sequence[Judgement]) -> float | None:
-    """Expected calibration error over all named causes that are effects."""
+    """Return the expected calibration error over all named causes that are effects."""
     bins = _bins(cases).values()
     total = sum(len(chosen) for chosen in bins)
     if not total:
@@ -223,7 +223,7 @@ def _bins(cases: Sequence[Judgement]) -> dict[float, list[CauseJudged]]:
 
 
 def coverage(cases: Sequence[Judgement]) -> str:
-    """How often the intervals of each number hold the truth, and how far off it is in their half widths."""
+    """Return a table of the intervals' coverage of each number, with the errors in half widths of the interval."""
     inside: dict[tuple[str, str], list[bool]] = defaultdict(list)
     off: dict[tuple[str, str], list[float]] = defaultdict(list)
     for case in cases:
@@ -241,7 +241,7 @@ def coverage(cases: Sequence[Judgement]) -> str:
 
 
 def failures(cases: Sequence[Judgement], crashes: Sequence[Crash]) -> str:
-    """What went wrong, and the command to look at it again."""
+    """Return a table of the failed cases, with the command to repeat each."""
     rows = []
     for case in cases:
         strange = case.truth[0].outside if case.truth else False
@@ -262,6 +262,6 @@ def failures(cases: Sequence[Judgement], crashes: Sequence[Crash]) -> str:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown."""
+    """Return a table in Markdown."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)

@@ -34,7 +34,7 @@ UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def write_robot(folder: Path, arm: Arm, hold: str, *, marker_known: bool, pose_known: bool) -> Path:
-    """robot.toml and arm.urdf of the arm as it is described; the path of robot.toml."""
+    """Write robot.toml and arm.urdf of the arm as described; return the path of robot.toml."""
     text = CONFIG.format(
         name=arm.name,
         joints=", ".join(f'"{name}"' for name in arm.read),
@@ -65,7 +65,7 @@ def write_recording(
     x: FloatArray,
     covariance: FloatArray | None,
 ) -> None:
-    """A recording as CSV with all digits; columns whose values are None are left out."""
+    """Write a recording as CSV with all digits; columns whose values are None are left out."""
     names = [*joints, "x", "y", "z"]
     columns: list[list[float] | list[int]] = [*q.T.tolist(), *x.T.tolist()]
     if t is not None:

@@ -1,4 +1,4 @@
-"""What was hidden, and of which size it is drawn."""
+"""Hidden effects and the sizes that they are given."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ class Hidden:
         where: the joint it sits at, or None.
         source: the other joint of a coupling, or None.
         parameters: physical quantities; the unit is the end of each name, SI without one.
-        sign: what positive parameters mean.
-        outside: whether it is in no table: to be called unexplained.
+        sign: meaning of positive parameters.
+        outside: True if it is in no table and should be called unexplained.
         drivers: with `outside`, the joints on which the hidden error itself depends.
         size: RMS of the noise-free residual of the nominal chain under this effect alone, whitened: 1 is as large as
             the noise along each axis, that of pixels and of ticks.
         rms_m: the same residual in metres.
-        shows_on: with `outside`, for each joint the share (0..1) of that residual's variance that goes when the other
-            joints stay and this one is drawn anew.
+        shows_on: with `outside`, for each joint the share (0..1) of that residual's variance that is lost when only
+            this joint is resampled.
     """
 
     effect: str
@@ -48,7 +48,7 @@ class Hidden:
 
 @dataclass(frozen=True)
 class Site:
-    """Where and when an effect is drawn."""
+    """Joints and motion for which an effect is generated."""
 
     arm: Arm
     motion: Motion
@@ -57,7 +57,7 @@ class Site:
 
     @property
     def prismatic(self) -> bool:
-        """Whether the joint slides."""
+        """True if the joint is prismatic."""
         return self.where is not None and self.arm.joint(self.where).kind == "prismatic"
 
     @property
@@ -80,11 +80,11 @@ class Kind:
         amplitudes: the parameters that are scaled to reach a size; the others are its shape.
         draw: parameters of unit amplitude.
         most: largest value of any amplitude.
-        sign: what positive parameters mean.
-        bears: only where the joints bear the arm's weight.
+        sign: meaning of positive parameters.
+        bears: possible only if the joints carry the arm's weight.
         styles: the kinds of motion that show it.
-        outside, drivers: whether it is in no table, and then on which joints the error depends.
-        beside_only: only where the cameras stand beside the arm.
+        outside, drivers: True if it is in no table, and the joints on which its error then depends.
+        beside_only: possible only if the cameras stand beside the arm.
     """
 
     at: str
@@ -99,7 +99,7 @@ class Kind:
     beside_only: bool = False
 
     def scaled(self, parameters: Parameters, factor: float) -> tuple[Parameters, bool]:
-        """The parameters with amplitudes `factor` times as large, and whether the largest value stopped them."""
+        """Return the parameters with amplitudes scaled by `factor`, and True if the upper limit was reached."""
         largest = max(abs(parameters[name]) for name in self.amplitudes if name in parameters)
         allowed = min(factor, self.most / largest)
         scaled = {name: value * (allowed if name in self.amplitudes else 1.0) for name, value in parameters.items()}
@@ -107,18 +107,18 @@ class Kind:
 
 
 def moment(site: Site, rng: np.random.Generator) -> float:
-    """A moment in the middle three fifths of the recording, between two pairs [s]."""
+    """Return a random time in the middle three fifths of the recording, between two pairs [s]."""
     count = len(site.motion.stamps)
     index = int(rng.integers(max(1, count // 5), max(2, 4 * count // 5)))
     return float(site.motion.stamps[index - 1 : index + 1].mean())
 
 
 def sign(rng: np.random.Generator) -> float:
-    """±1."""
+    """Return +1 or -1 at random."""
     return float(rng.choice([-1.0, 1.0]))
 
 
 def direction(rng: np.random.Generator, size: int = 3) -> FloatArray:
-    """A unit vector of any direction."""
+    """Return a random unit vector."""
     v = rng.normal(size=size)
     return v / np.linalg.norm(v)

@@ -1,4 +1,4 @@
-"""`python -m tests.blind.hide --seed 7 --effect backlash --out DIR`: write a case to look at and say what is in it."""
+"""`python -m tests.blind.hide --seed 7 --effect backlash --out DIR`: write a case and print its hidden effects."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["HiddenCase", "hide"]
 
 
 def main() -> None:
-    """The command."""
+    """Run the command."""
     parser = argparse.ArgumentParser(prog="python -m tests.blind.hide", description="Hide effects in a recording.")
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument(
@@ -45,7 +45,7 @@ def main() -> None:
 
 
 def told(case: HiddenCase) -> str:
-    """What is in the case, as JSON."""
+    """Return a summary of the case as JSON."""
     return json.dumps(
         {
             "folder": str(case.folder),

@@ -1,4 +1,4 @@
-"""What lies between an encoder's reading and a joint's true position, each by its mechanism.
+"""Mechanisms between an encoder's reading and a joint's true position.
 
 The *shaft* is the joint's position as its motor drives it. The encoder reads the shaft; the output may lag behind it.
 """
@@ -13,20 +13,20 @@ from .motion import FINE
 
 
 def off_centre_ring(shaft_rad: FloatArray, ex: float, ey: float) -> FloatArray:
-    """Angle [rad] that a sensor reads from a magnet ring displaced by (ex, ey), in parts of the ring's radius."""
+    """Return the angle [rad] read from a magnet ring displaced by (ex, ey), in parts of the ring's radius."""
     field = np.arctan2(np.sin(shaft_rad) + ey, np.cos(shaft_rad) + ex)
     return shaft_rad + _wrapped(field - shaft_rad)
 
 
 def biased_poles(shaft_rad: FloatArray, poles: float, bias_sine: float, bias_cosine: float) -> FloatArray:
-    """Angle [rad] read from `poles` pole pairs a turn whose sine and cosine signals have a bias (of amplitude 1)."""
+    """Return the angle [rad] read from `poles` pole pairs per turn with a bias of the sine and cosine signals."""
     electrical = poles * shaft_rad
     read = np.arctan2(np.sin(electrical) + bias_sine, np.cos(electrical) + bias_cosine)
     return shaft_rad + _wrapped(read - electrical) / poles
 
 
 def play(shaft: FloatArray, width: float) -> FloatArray:
-    """Output of a gear with `width` of play along a path (f,): it stays until a flank takes it along."""
+    """Return the output of a gear with backlash `width` along a path (f,): it stays until a flank moves it."""
     half, place = 0.5 * width, float(shaft[0])
     output = np.empty_like(shaft)
     for index, pushed in enumerate(shaft.tolist()):
@@ -36,8 +36,10 @@ def play(shaft: FloatArray, width: float) -> FloatArray:
 
 
 def lagging(t: FloatArray, shaft: FloatArray, tau_s: float) -> FloatArray:
-    """Output of a first-order lag dy/dt = (shaft − y)/τ along a path (f,), exact for a shaft that runs straight
-    between the instants."""
+    """Return the output (f,) of a first-order lag dy/dt = (shaft − y)/τ along a path.
+
+    The result is exact for a shaft that moves linearly between the times.
+    """
     lasts = np.diff(t)
     keeps = np.exp(-lasts / tau_s)
     slope = np.diff(shaft) / lasts
@@ -52,7 +54,7 @@ def lagging(t: FloatArray, shaft: FloatArray, tau_s: float) -> FloatArray:
 
 
 def left_of_move(tau_s: float, move_s: float, rest_s: float) -> float:
-    """Part of a smooth move of `move_s` that a lagging output still lacks `rest_s` after its end.
+    """Return the part of a smooth move of `move_s` that a lagging output still lacks `rest_s` after its end.
 
     The move is as a `Motion` has it: straight between `FINE` instants.
     """
@@ -62,7 +64,7 @@ def left_of_move(tau_s: float, move_s: float, rest_s: float) -> float:
 
 
 def lag_that_leaves(left: float, move_s: float, rest_s: float) -> float:
-    """Time constant [s] of a lag that leaves this part of a move."""
+    """Return the time constant [s] of a lag that leaves this part of a move."""
 
     def excess(log_tau: float) -> float:
         return left_of_move(float(np.exp(log_tau)), move_s, rest_s) - left
@@ -72,7 +74,7 @@ def lag_that_leaves(left: float, move_s: float, rest_s: float) -> float:
 
 
 def wandering(t: FloatArray, normals: FloatArray, interval_s: float) -> FloatArray:
-    """A slow random walk with smooth turns: unit steps `normals` every `interval_s`, at the times `t`, RMS 1."""
+    """Return a slow random walk with smooth turns: unit steps `normals` every `interval_s`, at the times `t`, RMS 1."""
     corners = np.cumsum(normals)
     corners = (corners - corners.mean()) / corners.std()
     phase = np.clip(t / interval_s, 0.0, len(corners) - 1.001)

@@ -1,4 +1,4 @@
-"""Judges a diagnosis of a hidden case: whether it names what is there, how sure, with which numbers, for which gain."""
+"""Judge a diagnosis of a hidden case: its causes, their certainty, their numbers and their gain."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ from .judgement import CauseJudged, Judgement, Key, Number, Outcome, TruthJudged
 from .meaning import Meant, meant
 from .oracle import Fitted, Scene, wide
 
-TOLD = 25.0  # chi-square by which an oracle tells two effects apart
-SAME_SHARE = 1e-4  # what is left of a signal, of its chi-square, by an effect that is the same in every motion
+TOLD = 25.0  # chi-square by which an oracle distinguishes two effects
+SAME_SHARE = 1e-4  # share of a signal's chi-square left by an effect that is the same in every motion
 SURE = 0.9
 FEWEST_FALSE_FIXES = 3
 SHOWS, HIDDEN_FROM = 0.25, 0.02  # share of the variance from which a joint has to be named, and below which it must not
 FIRST_ORDER = ("joint_ripple",)  # poles of unequal strength, read by atan2
-TELLS_LITTLE = 10.0  # usual sizes: a wider interval says that the motion does not tell the number
+TELLS_LITTLE = 10.0  # usual sizes: with a wider interval the number is not identifiable from this motion
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What is hidden in a case, in the words of the table, and what an oracle knows of it.
+    """Ground truth of a case in the terms of the effects table, and what an oracle knows of it.
 
     Attributes:
         scene: the measured motion.
-        wide: a way through all postures, in the place of any motion.
-        nuisances: what robot.toml does not know, with its true numbers.
-        hidden, meanings: the effects that a row of the table describes, in the same order.
-        strange: those that none does.
+        wide: a path through all postures, which stands for any motion.
+        nuisances: parameters unknown in robot.toml, with their true numbers.
+        hidden, meanings: the effects described by a row of the table, in the same order.
+        strange: the effects outside the table.
     """
 
     case: HiddenCase
@@ -56,7 +56,7 @@ class Truth:
 
     @classmethod
     def of(cls, case: HiddenCase, robot: RobotDescription, motion: Motion) -> Truth:
-        """From a case and the motion that was recorded."""
+        """Build the ground truth from a case and the recorded motion."""
         scene = Scene.of(robot, motion, case.measured.covariance, case.scatter)
         usual_s = float(np.median(np.diff(motion.clock)[motion.segment[1:] == motion.segment[:-1]]))
         nuisances = tuple(m.effect for h in case.nuisances if (m := meant(h, robot, usual_s)) is not None)
@@ -73,7 +73,7 @@ class Truth:
 
     @cached_property
     def effects(self) -> tuple[Effect, ...]:
-        """Of `fitted`, without the nuisances."""
+        """Effects of `fitted`, without the nuisances."""
         return self.fitted.effects[len(self.nuisances) :]
 
     @cached_property
@@ -82,23 +82,23 @@ class Truth:
         return self.case.measured.x_noise_free if self.strange else self.scene.positions(self.fitted.effects)
 
     def beside(self, index: int) -> tuple[Effect, ...]:
-        """All that is true but one of the effects."""
+        """Return all true effects but one."""
         return (*self.nuisances, *(e for k, e in enumerate(self.effects) if k != index))
 
     def same_anywhere(self, index: int, other: Effect) -> bool:
-        """Whether no motion tells another effect from a true one, since it can be all that this is."""
+        """Return True if no motion can distinguish a true effect from another one."""
         others = self.beside(index)
         target = self.wide.positions([*others, self.effects[index]])
         signal = self.wide.fitted(target, others).chi2
         return self.wide.replaced(target, others, self.effects[index], other).chi2 < SAME_SHARE * max(signal, 1e-9)
 
     def behind(self, index: int, other: Effect) -> float:
-        """Chi-square by which another effect in the place of a true one stays behind on the measured motion."""
+        """Return the rise of chi-square if another effect replaces a true one on the measured motion."""
         others = self.beside(index)
         return self.scene.replaced(self.target, others, self.effects[index], other).chi2
 
     def judged(self, index: int, found_as: Key | None, among_rivals: bool) -> TruthJudged:
-        """How well an oracle sees one of the true effects, and tells it from its best rival."""
+        """Judge how well an oracle sees one of the true effects, and distinguishes it from its best alternative."""
         hidden, effect = self.hidden[index], self.effects[index]
         others = self.beside(index)
         rivals = self.scene.rivals(self.target, others, [effect])
@@ -118,7 +118,7 @@ class Truth:
         )
 
     def strange_judged(self, hidden: Hidden) -> TruthJudged:
-        """How far the best single effect of the table stays behind one that is outside of it."""
+        """Judge how far the best single effect of the table falls short of one outside the table."""
         others = self.beside(-1)
         target = self.case.measured.x_noise_free
         floor = self.fitted_strange_floor
@@ -144,7 +144,7 @@ class Named:
 
     @classmethod
     def of(cls, cause: Cause, robot: RobotDescription) -> Named | None:
-        """None for outliers, which are no effect of the simulation."""
+        """Return the named cause; None for outliers, which are not an effect of the simulation."""
         if cause.effect == "outliers":
             return None
         effect = Effect.at(robot, cause.effect, cause.where, cause.source)
@@ -192,7 +192,7 @@ def judge(case: HiddenCase, scenario: str = "", command: str = "") -> Judgement:
 
 
 def compared(truth: Truth, file: DiagnosisFile) -> tuple[tuple[TruthJudged, ...], tuple[CauseJudged, ...], Outcome]:
-    """The hidden effects, the named causes, and what comes of both."""
+    """Return the judged hidden effects, the judged causes and the outcome."""
     named = [n for cause in file.causes if (n := Named.of(cause, truth.robot)) is not None]
     found = matched(truth, named)
     rivals = {(r.effect, r.where, r.source) for n in named for r in (*n.cause.rivals, *n.cause.indistinguishable_from)}
@@ -212,7 +212,7 @@ def compared(truth: Truth, file: DiagnosisFile) -> tuple[tuple[TruthJudged, ...]
 
 
 def matched(truth: Truth, named: Sequence[Named]) -> dict[int, Named]:
-    """Which cause names which true effect: by the same name, or by one that is as simple and the same in any motion."""
+    """Match causes to true effects: by the same name, or by one that is as simple and the same in any motion."""
     found: dict[int, Named] = {}
     for k, effect in enumerate(truth.effects):
         same = [n for n in named if n.effect.key == effect.key]
@@ -227,24 +227,24 @@ def matched(truth: Truth, named: Sequence[Named]) -> dict[int, Named]:
 
 
 def _rank(effect: Effect) -> tuple[int, bool]:
-    """The simpler comes first: fewer numbers, then no joint."""
+    """Return a sort key that puts the simpler effect first: fewer numbers, then no joint."""
     return len(effect.parameters), effect.where is not None
 
 
 def _is_camera_pose(truth: Truth, index: int) -> bool:
-    """Whether a link's geometry is no more than the camera's pose, which is its simpler name."""
+    """Return True if a link's geometry is equivalent to the camera's pose, which is its simpler name."""
     return truth.robot.camera.pose_known and truth.same_anywhere(index, Effect.at(truth.robot, "camera_pose"))
 
 
 def cause_judged(truth: Truth, named: Named, index: int | None, whole: bool) -> CauseJudged:
-    """One cause; `index` of the true effect that it names."""
+    """Return the judgement of one cause; `index` is that of the true effect that it names."""
     cause = named.cause
     true_keys = {effect.key for effect in truth.effects}
     rivals = {(r.effect, r.where, r.source) for r in (*cause.rivals, *cause.indistinguishable_from)}
     needless: list[str] = []
     wrong_reach: list[str] = []
     if index is not None:
-        # What has no name is no effect that an oracle could put in the place of a true one.
+        # An oracle has no effect to put in place of one outside the table.
         for member in (member for member in cause.indistinguishable_from if not member.what):
             needless += _needless(truth, index, member)
             wrong_reach += _wrong_reach(truth, index, member)
@@ -263,7 +263,7 @@ def cause_judged(truth: Truth, named: Named, index: int | None, whole: bool) -> 
 
 
 def _may_be_strange(truth: Truth, cause: Cause) -> bool:
-    """Whether a cause is said to be perhaps something without a name, where there is such a thing."""
+    """Return True if something is hidden outside the table and the cause allows for an unnamed alternative."""
     return bool(truth.strange) and any(rival.what for rival in cause.rivals)
 
 
@@ -288,7 +288,7 @@ def _wrong_reach(truth: Truth, index: int, member: Indistinguishable) -> list[st
 
 
 def judged_numbers(truth: Truth, named: Named, index: int) -> tuple[tuple[Number, ...], dict[str, str]]:
-    """The numbers of a cause beside the true ones."""
+    """Return the numbers of a cause with the true ones, and reasons for those left out."""
     meaning = truth.meanings[index]
     # Of these the mechanism has the numbers to first order only: where they come nearest to it is the truth.
     near = truth.effects[index] if meaning.effect.name in FIRST_ORDER else meaning.effect
@@ -308,14 +308,14 @@ def judged_numbers(truth: Truth, named: Named, index: int) -> tuple[tuple[Number
 
 
 def _between_rows(motion: Motion, moment: Interval) -> tuple[float, float]:
-    """The interval of a moment from row to row: all moments between two rows are one."""
+    """Return the interval of a moment widened to whole rows: moments between two rows cannot be distinguished."""
     low, high = moment.ci95
     before, after = motion.clock[motion.clock <= low], motion.clock[motion.clock >= high]
     return float(before.max(initial=-np.inf)), float(after.min(initial=np.inf))
 
 
 def judged_false_fixes(case: HiddenCase, file: DiagnosisFile) -> CauseJudged | None:
-    """The cause that says that some fixes are not the marker; None where it is not named."""
+    """Judge the cause that reports outliers; return None if it is not named."""
     for cause in file.causes:
         if cause.effect == "outliers":
             count = int(case.measured.outlier.sum())
@@ -329,7 +329,7 @@ def judged_false_fixes(case: HiddenCase, file: DiagnosisFile) -> CauseJudged | N
 def outcome(
     file: DiagnosisFile, hidden: Sequence[TruthJudged], causes: Sequence[CauseJudged], missed_fixes: bool
 ) -> Outcome:
-    """What the diagnosis as a whole is."""
+    """Return the outcome of the diagnosis as a whole."""
     false = [cause for cause in causes if not cause.is_right]
     if any(truth.outside for truth in hidden):
         if file.verdict == "unexplained":
@@ -346,7 +346,7 @@ def outcome(
 
 
 def gains(truth: Truth, diagnosis: Diagnosis, fresh: Recording) -> tuple[float | None, float | None]:
-    """How much of the error on a fresh recording goes with the causes found, and with the true ones."""
+    """Return the shares of the error on a fresh recording that the found and the true causes remove."""
     if not truth.effects and not truth.strange:
         return None, None
     motion, there = Motion.of(fresh), truth.case.fresh.x_noise_free
@@ -361,7 +361,7 @@ def gains(truth: Truth, diagnosis: Diagnosis, fresh: Recording) -> tuple[float |
 
 
 def joints_right(hidden: Hidden, depends_on: Sequence[str]) -> bool:
-    """Whether the joint that errs is named, and those that drive it and on which it clearly shows, but no idle one.
+    """Return True if the named joints are the erring one and those on which it clearly depends, without an idle one.
 
     An error that changes with time alone has to be named by time.
     """
@@ -375,9 +375,9 @@ def joints_right(hidden: Hidden, depends_on: Sequence[str]) -> bool:
 
 
 def smooth_ratio(truth: Truth, diagnosis: Diagnosis) -> float | None:
-    """Error on data not fitted after the smooth model of what is unexplained, over the noise; None where there is none.
+    """Return the held-out error after the smooth model of the unexplained part, over the noise; None without a model.
 
-    Against positions free of noise nothing needs to be held out: what was fitted to the noise counts as an error.
+    Positions free of noise need no held-out data: a fit to the noise counts as an error.
     """
     if not truth.strange or diagnosis.left.model is None:
         return None

@@ -1,4 +1,4 @@
-"""What the judge says of one case, as it is kept."""
+"""Judgement of one case, in the form in which it is stored."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Key = tuple[str, str | None, str | None]
 
 
 class Number(msgspec.Struct, frozen=True):
-    """A number that was found beside the true one."""
+    """A number that was found, with the true one."""
 
     name: str
     truth: float
@@ -20,7 +20,7 @@ class Number(msgspec.Struct, frozen=True):
 
     @property
     def is_inside(self) -> bool:
-        """Whether its interval holds the truth."""
+        """True if the interval contains the true value."""
         return self.ci95[0] <= self.truth <= self.ci95[1]
 
 
@@ -30,12 +30,12 @@ class TruthJudged(msgspec.Struct, frozen=True):
     Attributes:
         effect, where, source: in the table's words.
         size: in units of the noise.
-        outside: whether no row of the table describes it.
-        seen_chi2: what leaving it out costs an oracle.
-        told_chi2: what putting its best rival in its place costs an oracle.
-        rival: that rival.
-        found_as: the cause that names it; None when none does.
-        among_rivals: whether a wrong cause names it as what it may be as well.
+        outside: True if no row of the table describes it.
+        seen_chi2: rise of an oracle's chi-square without it.
+        told_chi2: rise of an oracle's chi-square with its best alternative in its place.
+        rival: that alternative.
+        found_as: the cause that names it, or None.
+        among_rivals: True if a wrong cause lists it as an alternative.
     """
 
     effect: str
@@ -54,13 +54,13 @@ class CauseJudged(msgspec.Struct, frozen=True):
     """One named cause.
 
     Attributes:
-        is_right: whether it is a hidden effect, or the simplest name of one.
-        open: whether its rivals hold a hidden effect and it is not said to be sure.
-        listed: how many others it is said not to be told from.
-        needless: those from which this motion tells it.
-        wrong_reach: those of which it is wrongly said that no motion tells them, or that another one would.
-        numbers: of a right cause in a right diagnosis.
-        left_out: numbers that were not judged, and why.
+        is_right: True if it is a hidden effect, or the simplest name of one.
+        open: True if its alternatives contain a hidden effect and it is not stated as certain.
+        listed: number of effects reported as indistinguishable from it.
+        needless: those of them that this motion does distinguish.
+        wrong_reach: those of them with a wrong statement on whether another motion would distinguish them.
+        numbers: parameters of a right cause in a right diagnosis.
+        left_out: numbers that were not judged, with the reasons.
     """
 
     effect: str
@@ -80,17 +80,17 @@ class Judgement(msgspec.Struct, frozen=True, tag="judged"):
     """One case.
 
     Attributes:
-        outcome: right: all causes and no other. honest: what is not right is left open. missed: a cause is not
-            named though an oracle sees it. wrong: something is named that is not there, or left unexplained.
-        gain: by how much the extended simulation's error falls on a fresh recording, counted from the aligned one,
-            against positions free of noise (0..1); None where nothing is hidden.
+        outcome: right: all causes and no other. honest: causes that are not right are left open. missed: a cause is
+            not named though an oracle sees it. wrong: a false cause is named, or an explained case left unexplained.
+        gain: reduction (0..1) of the extended simulation's error on a fresh recording, relative to the aligned
+            nominal model, against positions free of noise; None if nothing is hidden.
         gain_of_truth: the same with the true effects.
-        depends_on, shows_on: with an effect outside the table, what was said and what is so.
-        joints_right: whether that agrees.
+        depends_on, shows_on: reported and true joints of an effect outside the table.
+        joints_right: True if these agree.
         smooth_ratio: held-out error after the smooth model over the noise floor.
-        seconds, cpu_seconds: that the diagnosis took, by the clock and of the processor.
-        command: to look at it again.
-        false_fixes: how many fixes truly are not the marker.
+        seconds, cpu_seconds: wall time and CPU time of the diagnosis.
+        command: command that repeats the case.
+        false_fixes: number of fixes that are not the marker.
     """
 
     scenario: str
@@ -118,23 +118,23 @@ class Judgement(msgspec.Struct, frozen=True, tag="judged"):
 
     @property
     def told_chi2(self) -> float:
-        """Of the hidden effect that is hardest to tell."""
+        """Smallest `told_chi2` of the hidden effects."""
         return min((truth.told_chi2 for truth in self.truth), default=float("inf"))
 
     @property
     def false_causes(self) -> list[CauseJudged]:
-        """What is named and not there."""
+        """Causes that are named and not there."""
         return [cause for cause in self.causes if not cause.is_right]
 
 
 def written(key: Key) -> str:
-    """`effect@where:source`."""
+    """Return the key as `effect@where:source`."""
     effect, where, source = key
     return effect + (f"@{where}" if where else "") + (f":{source}" if source else "")
 
 
 class Crash(msgspec.Struct, frozen=True, tag="crashed"):
-    """A case in which the diagnosis broke."""
+    """A case in which the diagnosis crashed."""
 
     scenario: str
     seed: int
@@ -144,7 +144,7 @@ class Crash(msgspec.Struct, frozen=True, tag="crashed"):
 
 
 def told(record: Judgement | Crash) -> str:
-    """A record in a line."""
+    """Return a record as one line of text."""
     if isinstance(record, Crash):
         return f"{record.scenario} {record.seed} crashed: {record.error.strip().splitlines()[-1]}"
     effects = [f"{written((t.effect, t.where, t.source))} ({t.size:.2g})" for t in record.truth]

@@ -1,4 +1,4 @@
-"""The effects of the table: where each sits, how its parameters are drawn, what their signs mean."""
+"""The effects of the table: place, random parameters and meaning of the signs of each."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from .hidden import Kind, Parameters, Site, direction, moment, sign
 
-START = 0.003  # amplitude that is drawn first and then scaled
+START = 0.003  # initial amplitude, scaled later
 
 
 def _offset(site: Site, rng: np.random.Generator) -> Parameters:

@@ -1,4 +1,4 @@
-"""What a hidden effect is called in the table of effects, and which numbers it should be found with.
+"""Name of a hidden effect in the table of effects, and the numbers with which it should be found.
 
 The hider speaks of its own mechanisms, with signs of its own; here they become those of `effects`.
 """
@@ -23,7 +23,7 @@ class Meant:
 
     Attributes:
         effect: with its numbers, to first order in the hidden ones.
-        told: names of the numbers that it has by its mechanism; the others are only near.
+        told: names of the numbers that follow from its mechanism; the others are approximate.
     """
 
     effect: Effect
@@ -31,12 +31,12 @@ class Meant:
 
     @property
     def key(self) -> Key:
-        """What it is, whatever its numbers."""
+        """Identity of the effect, independent of its numbers."""
         return self.effect.key
 
 
 def meant(hidden: Hidden, robot: RobotDescription, usual_s: float) -> Meant | None:
-    """The hidden effect in the words of the table; None for what no row of it describes.
+    """Return the hidden effect in the terms of the table; None if no row of the table describes it.
 
     Args:
         usual_s: median time between two pairs of a run [s].
@@ -49,7 +49,7 @@ def meant(hidden: Hidden, robot: RobotDescription, usual_s: float) -> Meant | No
 
 
 def _named(hidden: Hidden, usual_s: float) -> tuple[str, Parameters]:
-    """Name and numbers; NaN for a number that the mechanism does not have."""
+    """Return name and numbers; NaN for a number that the mechanism does not have."""
     p, name = hidden.parameters, hidden.effect
     unit = "m" if any(key in p for key in ("turn_m", "offset_m", "jump_m", "play_m")) else "rad"
     match name:
@@ -80,7 +80,7 @@ def _named(hidden: Hidden, usual_s: float) -> tuple[str, Parameters]:
 
 
 def _periodic(name: str, p: Parameters) -> tuple[str, Parameters]:
-    """A reading that is off by (b cos Nq - a sin Nq) / N has to be corrected by (a sin Nq - b cos Nq) / N."""
+    """Return the correction (a sin Nq - b cos Nq) / N of a reading that is off by (b cos Nq - a sin Nq) / N."""
     poles = p.get("poles", 1.0)
     a, b = (p["ex"], p["ey"]) if name == "joint_eccentricity" else (p["bias_cosine"], p["bias_sine"])
     if "turn_m" in p:  # on a slide, once per turn of the ring is a ripple over its length
@@ -91,7 +91,7 @@ def _periodic(name: str, p: Parameters) -> tuple[str, Parameters]:
 
 
 def _settling(p: Parameters, usual_s: float) -> Parameters:
-    """What is left of a move, and of that after the usual time; on a walk without rests there are no such numbers."""
+    """Return the fractions left after a move and after the usual time; NaN on a walk without rests."""
     if "left" not in p:
         return {"fraction": math.nan, "memory": math.nan}
     return {"fraction": p["left"], "memory": math.exp(-usual_s / p["tau_s"])}

@@ -1,4 +1,4 @@
-"""How the arm is moved: guided by hand in small steps through what the cameras see, or to poses far apart."""
+"""Motions of the arm: guided by hand in small steps through the cameras' view, or to poses far apart."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class Motion:
         shaft: positions at those instants, after the gears and free of any error [rad or m], shape (f, d).
         stamps: when pairs are read [s], shape (n,).
         segment: number of the run of pairs each belongs to, shape (n,).
-        move_s, rest_s: how long every move lasts, and the time between its end and the reading; None in a walk that
-            never rests.
+        move_s, rest_s: duration of every move, and time between its end and the reading; None in a walk without
+            rests.
     """
 
     style: Style
@@ -44,12 +44,12 @@ class Motion:
     rest_s: float | None
 
     def thinned(self, count: int) -> Motion:
-        """The same path, read at only `count` of the stamps, evenly chosen."""
+        """Return the same path, read at only `count` of the stamps, evenly chosen."""
         chosen = np.unique(np.linspace(0, len(self.stamps) - 1, count).astype(int))
         return replace(self, stamps=self.stamps[chosen], segment=self.segment[chosen])
 
     def at(self, values: FloatArray, t: FloatArray) -> FloatArray:
-        """What the columns of `values`, given along the whole path, are at the times `t`, shape (len(t), d)."""
+        """Interpolate the columns of `values`, given along the whole path, at the times `t`, shape (len(t), d)."""
         return np.column_stack([np.interp(t, self.t, column) for column in values.T])
 
 
@@ -62,11 +62,11 @@ def move(
     *,
     rests: bool = False,
 ) -> Motion:
-    """A motion with `pairs` pairs that are all visible.
+    """Return a motion with `pairs` pairs that are all visible.
 
     Args:
         ranges: lower and upper end of each joint's range [rad or m], shape (d, 2).
-        visible: whether the cameras see the marker at shaft positions (n, d).
+        visible: returns a mask of the shaft positions (n, d) at which the cameras see the marker.
         rests: of a walk, whether joints that do not lead stand still.
     """
     if style == "held":
@@ -77,7 +77,7 @@ def move(
 def narrowed(
     rng: np.random.Generator, ranges: FloatArray, visible: Visible, reach: float, still: Sequence[int]
 ) -> FloatArray:
-    """The ranges (d, 2) cut to the part `reach` of their widths around a visible posture, to nothing for `still`."""
+    """Return the ranges (d, 2) cut to `reach` of their widths around a visible posture, and to zero for `still`."""
     centre = _Postures(rng, ranges, visible).draw()
     width = reach * np.ptp(ranges, axis=1)
     lower = np.clip(centre - 0.5 * width, ranges[:, 0], ranges[:, 1] - width)
@@ -141,7 +141,7 @@ class _Walk:
         return found
 
     def _next_target(self, here: FloatArray) -> FloatArray:
-        """A visible posture with some of the joints elsewhere."""
+        """Return a visible posture with some of the joints elsewhere."""
         for _ in range(20):
             leads = self._rng.random(len(here)) < 0.6
             target = np.where(leads, self._postures.draw(), here)
@@ -150,7 +150,7 @@ class _Walk:
         return self._postures.draw()
 
     def _steps(self, here: FloatArray, target: FloatArray) -> FloatArray:
-        """A bent way from `here` to `target` in steps of the joint-space norm, without `here`."""
+        """Return a curved path from `here` to `target` in steps of the joint-space norm, without `here`."""
         distance = np.linalg.norm(target - here)
         reach = np.cumsum(self._rng.uniform(STEP_RAD[0], STEP_RAD[1], int(distance / STEP_RAD[0]) + 2))
         s = np.append(reach[reach < distance - STEP_RAD[0]], distance) / distance
@@ -161,7 +161,7 @@ class _Walk:
         return np.clip(way, self._ranges[:, 0], self._ranges[:, 1])
 
     def _add(self, q: FloatArray, *, seen: bool, jump: bool) -> int:
-        """Append a knot; 1 when it gives a pair."""
+        """Append a knot; return 1 if it gives a pair."""
         step = SEGMENT_RAD.mean() if self._last is None else float(np.linalg.norm(q - self._last))
         paired = seen and step >= SEGMENT_RAD[0]
         if paired:
@@ -175,7 +175,7 @@ class _Walk:
     def _timed(
         self, style: Style, q: FloatArray, paired: BoolArray, jump: BoolArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Instants and positions of the path's knots, and the stamps of the pairs."""
+        """Return times and positions of the path's knots, and the stamps of the pairs."""
         step = np.linalg.norm(np.diff(q, axis=0, prepend=q[:1]), axis=1)
         speed = np.clip(np.exp(np.log(9.0) + _slow_noise(self._rng, len(q), 0.3)), 5.0, 15.0)
         lasts = np.maximum(step / STEP_RAD.mean(), 0.5) / speed
@@ -199,7 +199,7 @@ class _Walk:
 
 
 def _held(rng: np.random.Generator, ranges: FloatArray, pairs: int, visible: Visible) -> Motion:
-    """Static poses far apart: a move of all joints together that always lasts as long, a rest, a reading, a wait."""
+    """Return static poses far apart: a move of all joints of constant duration, a rest, a reading, a wait."""
     postures = _Postures(rng, ranges, visible)
     q = np.array([postures.draw() for _ in range(pairs)])
     lasts, rest = float(rng.uniform(0.7, 1.6)), float(rng.uniform(0.3, 0.9))
@@ -213,7 +213,7 @@ def _held(rng: np.random.Generator, ranges: FloatArray, pairs: int, visible: Vis
 
 
 def _slow_noise(rng: np.random.Generator, count: int, sigma: float) -> FloatArray:
-    """Noise that changes over some twenty knots."""
+    """Return noise that changes over about twenty knots."""
     white, out, value = rng.normal(0.0, sigma * 0.3, count), np.empty(count), 0.0
     for index in range(count):
         value = 0.95 * value + white[index]
@@ -222,13 +222,13 @@ def _slow_noise(rng: np.random.Generator, count: int, sigma: float) -> FloatArra
 
 
 def _sorted_unique(t: FloatArray) -> tuple[FloatArray, IntArray]:
-    """The instants in order without doubles, and which ones they were."""
+    """Return the times in order without duplicates, and their indices."""
     order = np.argsort(t, kind="stable")
     kept = np.append(True, np.diff(t[order]) > 1e-9)
     return t[order][kept], order[kept]
 
 
 def _refined(t: FloatArray) -> FloatArray:
-    """FINE instants in each interval, the knots among them."""
+    """Return FINE times in each interval, the knots among them."""
     inner = t[:-1, None] + np.arange(FINE) / FINE * np.diff(t)[:, None]
     return np.append(inner.ravel(), t[-1])

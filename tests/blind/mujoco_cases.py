@@ -34,11 +34,11 @@ class Judgement(msgspec.Struct, frozen=True):
 
     Attributes:
         outcome: right, honest, vague, wrong or crashed.
-        truth: in words; names: as they are looked for.
-        named: causes with their probabilities and shares of the gain; false: those of weight that are not there.
+        truth: hidden causes in words; names: names that count as right.
+        named: causes with their probabilities and shares of the gain; false: significant ones that are not there.
         not_worth: causes whose gain on held-out blocks is not positive.
-        placed_mm, extended_mm: RMS error on a later recording of the nominal model with what is not known fitted, and
-            of extended.toml.
+        placed_mm, extended_mm: RMS error on a later recording of the nominal model with the unknown parameters
+            fitted, and of extended.toml.
         floor_ratio: stated noise floor over true noise.
     """
 
@@ -73,9 +73,9 @@ class Judgement(msgspec.Struct, frozen=True):
 def outcome(truth: Sequence[Truth], also: Sequence[str], told: dict[str, Any]) -> tuple[Outcome, list[str]]:
     """Return the outcome and the false causes with a large share.
 
-    right: every hidden cause is named, or unexplained on its joints where it has no name, and nothing false.
-    honest: what is not named is an alternative of what is, or unexplained on the right joints.
-    wrong: something false is named for sure and nothing that is true beside it. vague: the rest.
+    right: every hidden cause is named, or unexplained on its joints if it has no name, and no false one is named.
+    honest: a cause not named is an alternative of a named one, or unexplained on the right joints.
+    wrong: a false cause is named as certain, without a true one. vague: the rest.
     """
     causes = [cause for cause in told["causes"] if cause["effect"] not in OF_TOLERANCES]
     hidden = {other: one for one in truth for other in (one.name, *one.same) if other}

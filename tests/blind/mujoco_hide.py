@@ -372,9 +372,9 @@ def hide(
     """Draw an arm by its seed, hide causes in it, and record it.
 
     Args:
-        rows: of the recording; drawn by default.
-        kind: which causes; `seed` modulo the number of kinds by default.
-        dense: scale of the tolerances; drawn by default.
+        rows: of the recording; random by default.
+        kind: kind of causes; `seed` modulo the number of kinds by default.
+        dense: scale of the tolerances; random by default.
     """
     rng = np.random.default_rng([seed, 7])
     model = MODELS[int(rng.integers(len(MODELS)))]
@@ -450,14 +450,14 @@ def hide(
 
 
 def _range(urdf: Urdf) -> tuple[FloatArray, FloatArray]:
-    """Middle and half of the range over which each joint is moved [rad] (d,)."""
+    """Return middle and half width of the range over which each joint is moved [rad] (d,)."""
     lower, upper = urdf.limits().T
     half = np.minimum(0.4 * (upper - lower), FARTHEST)
     return 0.5 * (lower + upper), half
 
 
 def _levers(world: World, postures: FloatArray) -> FloatArray:
-    """How far the marker moves by each joint (d,) [m/rad], RMS over postures (n, d)."""
+    """Return the marker's RMS displacement per joint (d,) [m/rad] over postures (n, d)."""
 
     def marker(q: FloatArray) -> FloatArray:
         places, turns = world.poses(q)

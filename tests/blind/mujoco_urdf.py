@@ -63,8 +63,8 @@ class Urdf:
     """A URDF that can be changed.
 
     Args:
-        model: which public arm.
-        mount_rpy: how its base is bolted to the floor [rad].
+        model: the public arm.
+        mount_rpy: orientation of its base on the floor [rad].
     """
 
     def __init__(self, model: Model, mount_rpy: tuple[float, float, float]) -> None:
@@ -97,7 +97,7 @@ class Urdf:
         return ET.tostring(root, encoding="unicode")
 
     def limits(self) -> FloatArray:
-        """Lower and upper limits [rad] of the joints that are read (d, 2)."""
+        """Return lower and upper limits [rad] of the joints that are read (d, 2)."""
         found = [self._joint(name).find("limit") for name in self.model.joints]
         return np.array(
             [[float(limit.get(end, "0")) for end in ("lower", "upper")] for limit in found if limit is not None]

@@ -1,7 +1,7 @@
-"""What one who knows the truth could tell from a motion: how far apart effects are, in units of the noise.
+"""Distinguishability of effects for an observer who knows the truth, in units of the noise.
 
-All is done on positions free of noise. How far a rival stays behind the truth is the rise of chi-square when, in the
-place of the true effect, the rival is fitted along with all that is free.
+All computations use positions free of noise. The distance of an alternative from the truth is the rise of chi-square
+when the alternative is fitted in place of the true effect, with all free parameters.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from .arrays import FloatArray
 
 ROUNDS = 8
 CONVERGED = 1e-4
-MOMENTS = 40  # not at the ends, where what begins at a moment becomes what was there all the time
+MOMENTS = 40  # not at the ends, where a sudden effect is equivalent to a constant one
 CYCLES = np.arange(2.0, 101.0)
 WIDTHS = np.geomspace(2e-4, 0.1, 8)
 SETTLED = (0.03, 0.1, 0.3, 1.0, 3.0)
@@ -30,7 +30,7 @@ IN_FRONT_M = 0.15
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """Effects with the numbers with which they come nearest to a target, and how near: chi-square."""
+    """Effects with the numbers that fit a target best, and chi-square of the fit."""
 
     effects: tuple[Effect, ...]
     chi2: float
@@ -52,7 +52,7 @@ class Scene:
 
     @classmethod
     def of(cls, robot: RobotDescription, motion: Motion, covariance: FloatArray, scatter: float) -> Scene:
-        """A motion seen with noise of this covariance (n, 3, 3) [m²], and that of readings.
+        """Return a motion measured with this noise covariance (n, 3, 3) [m²] and this noise of the readings.
 
         Args:
             scatter: 1-sigma of readings before they are rounded to whole ticks [ticks].
@@ -63,21 +63,21 @@ class Scene:
         return cls(simulation, motion, np.linalg.inv(np.linalg.cholesky(covariance + rounding)), rounding)
 
     def positions(self, effects: Sequence[Effect]) -> FloatArray:
-        """What would be measured (n, 3) [m]."""
+        """Return the noise-free measured positions (n, 3) [m]."""
         return self.simulation.with_effects(effects).positions(self.motion)
 
     def whitened(self, x: FloatArray) -> FloatArray:
-        """(n, 3) or (n, 3, p) [m] in units of the noise, flat: (3 n,) or (3 n, p)."""
+        """Scale (n, 3) or (n, 3, p) [m] to units of the noise and flatten: (3 n,) or (3 n, p)."""
         columns = x[:, :, None] if x.ndim == 2 else x
         flat = (self.whitening @ columns).reshape(3 * len(x), columns.shape[2])
         return flat[:, 0] if x.ndim == 2 else flat
 
     def chi2(self, target: FloatArray, effects: Sequence[Effect]) -> float:
-        """How far effects as they are stay from the target (n, 3) [m]."""
+        """Return chi-square of the difference between the effects' positions and the target (n, 3) [m]."""
         return float(np.square(self.whitened(target - self.positions(effects))).sum())
 
     def fitted(self, target: FloatArray, effects: Sequence[Effect]) -> Fitted:
-        """The amounts with which the effects come nearest to the target, by Gauss-Newton steps."""
+        """Fit the amounts of the effects to the target by Gauss-Newton steps."""
         best = Fitted(tuple(effects), self.chi2(target, effects))
         for _ in range(ROUNDS):
             columns = self.columns(best.effects)
@@ -96,20 +96,20 @@ class Scene:
         return best
 
     def columns(self, effects: Sequence[Effect]) -> FloatArray:
-        """Derivatives (3 n, p) of what is measured by all amounts, whitened."""
+        """Return the whitened derivatives (3 n, p) of the measured positions with respect to all amounts."""
         run = self.simulation.with_effects(effects).run(self.motion)
         parts = [run.columns(effect)[:, :, effect.amounts] for effect in effects]
         return self.whitened(np.concatenate(parts, axis=2) if parts else np.empty((len(self.motion), 3, 0)))
 
     def replaced(self, target: FloatArray, others: Sequence[Effect], true: Effect, effect: Effect) -> Fitted:
-        """An effect in the place of a true one, with the moment, period, width or time constant that comes nearest."""
+        """Fit an effect in place of a true one, at the moment, period, width or time constant that fits best."""
         starts = [effect, self._nearest(target, others, [effect])[0][1]]
         if all(e.parameters[-1].name == "t0" for e in (true, effect)):
             starts.append(effect.with_values(np.append(effect.values[:-1], true.values[-1])))
         return min((self.fitted(target, [*others, start]) for start in starts), key=lambda fit: fit.chi2)
 
     def rivals(self, target: FloatArray, others: Sequence[Effect], but: Iterable[Effect]) -> list[Fitted]:
-        """The single effects that come nearest to the target beside others, fitted in full, the nearest first."""
+        """Return the single effects that fit the target best beside others, fully fitted, the best first."""
         excluded = {effect.key for effect in (*but, *others)}
         ranked = self._nearest(target, others, [e for e in hypotheses(self.simulation) if e.key not in excluded])
         tried = [self.fitted(target, [*others, effect]) for _, effect in ranked[:NEAREST]]
@@ -119,7 +119,7 @@ class Scene:
     def _nearest(
         self, target: FloatArray, others: Sequence[Effect], wanted: Sequence[Effect]
     ) -> list[tuple[float, Effect]]:
-        """To first order: what each leaves of the target, and with which numbers."""
+        """Rank effects to first order by the part of the target that they leave, with their numbers."""
         run = self.simulation.with_effects(others).run(self.motion)
         basis = orthonormal(self.columns(others))
         left = self.whitened(target - run.measured)
@@ -139,7 +139,7 @@ class Scene:
         return sorted(found, key=lambda pair: pair[0])
 
     def _shapes(self, effect: Effect, left: FloatArray, basis: FloatArray) -> list[Effect]:
-        """The effect with all moments, periods, widths or time constants that are worth a try."""
+        """Return the effect with each moment, period, width or time constant worth a try."""
         clock = self.motion.clock
         match effect.name:
             case "joint_ripple":
@@ -158,7 +158,7 @@ class Scene:
                 return [effect]
 
     def _ripples(self, effect: Effect, left: FloatArray, basis: FloatArray) -> list[Effect]:
-        """With the few numbers of cycles that explain most, found on the joint's own column alone."""
+        """Return ripples with the few numbers of cycles that explain most, found on the joint's own column alone."""
         place = self.simulation.place(effect)
         q = self.motion.q[:, place.joint]
         span = max(float(np.ptp(q)), 1e-6)
@@ -175,7 +175,7 @@ class Scene:
 
 
 def hypotheses(simulation: Simulation) -> list[Effect]:
-    """One of each effect at each place of a robot, at rest."""
+    """Return one of each effect at each place of a robot, with amounts of zero."""
     robot = simulation.robot
     prismatic = dict(zip(robot.joints, robot.chain.prismatic, strict=True))
     found = []
@@ -198,7 +198,7 @@ def hypotheses(simulation: Simulation) -> list[Effect]:
 
 
 def wide(scene: Scene) -> Scene:
-    """A way through the joints' whole range, which stands for any motion: with stops, turns and uneven times."""
+    """Return a path through the joints' whole range, standing for any motion: with stops, turns and uneven times."""
     robot, motion = scene.simulation.robot, scene.motion
     rng = np.random.default_rng(0)
     lower, upper = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
@@ -216,14 +216,14 @@ def wide(scene: Scene) -> Scene:
 
 
 def solved(columns: FloatArray, target: FloatArray) -> FloatArray:
-    """Least squares, with columns of any scale."""
+    """Solve least squares, with columns of any scale."""
     scales = np.linalg.norm(columns, axis=0)
     scales = np.where(scales > 0.0, scales, 1.0)
     return np.linalg.lstsq(columns / scales, target, rcond=1e-8)[0] / scales
 
 
 def orthonormal(columns: FloatArray) -> FloatArray:
-    """A basis of what columns (m, p) span."""
+    """Return an orthonormal basis of the span of columns (m, p)."""
     if not columns.shape[1]:
         return columns
     scales = np.linalg.norm(columns, axis=0)
@@ -232,7 +232,7 @@ def orthonormal(columns: FloatArray) -> FloatArray:
 
 
 def stepped(effects: Sequence[Effect], step: FloatArray) -> tuple[Effect, ...]:
-    """The effects with their amounts moved by one step (p,)."""
+    """Return the effects with their amounts changed by one step (p,)."""
     moved, first = [], 0
     for effect in effects:
         amounts = effect.amounts
@@ -248,6 +248,6 @@ def _with_amounts(effect: Effect, amounts: FloatArray) -> Effect:
 
 
 def _ticks(q: FloatArray) -> FloatArray:
-    """The smallest step (d,) between readings."""
+    """Return the smallest step (d,) between readings."""
     gaps = [np.diff(np.unique(np.round(column, 12))) for column in q.T]
     return np.array([gap[gap > 1e-9].min() if (gap > 1e-9).any() else 0.0 for gap in gaps])

@@ -1,4 +1,4 @@
-"""Fixes that are not the marker: its image in something shiny, or a lamp somewhere else."""
+"""False fixes: the marker's reflection, or a lamp somewhere else."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TRIES = 60
 
 
 def false_fixes(world: World, sight: Sight, fraction: float, rng: np.random.Generator) -> tuple[FloatArray, BoolArray]:
-    """What is seen [m], in the true left optical frame, a `fraction` of it somewhere else, and which ones those are."""
+    """Return seen points [m] in the true left optical frame, a `fraction` of them outliers, and the outlier mask."""
     count = len(sight.at)
     outlier = _runs(count, round(fraction * count), rng)
     points = sight.at.copy()
@@ -32,7 +32,7 @@ def false_fixes(world: World, sight: Sight, fraction: float, rng: np.random.Gene
 
 
 def _runs(count: int, wanted: int, rng: np.random.Generator) -> BoolArray:
-    """`wanted` of `count` places, in short runs."""
+    """Return a mask of `wanted` of `count` places, in short runs."""
     chosen = np.zeros(count, dtype=bool)
     while chosen.sum() < wanted:
         start, length = int(rng.integers(count)), int(rng.integers(1, LONGEST_RUN + 1))
@@ -41,7 +41,7 @@ def _runs(count: int, wanted: int, rng: np.random.Generator) -> BoolArray:
 
 
 def _mirror(x: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """A shiny plane beside the places where the marker was: a point and the normal, in the left optical frame."""
+    """Return a reflecting plane beside the marker's positions: a point and the normal, in the left optical frame."""
     normal = direction(rng)
     along = (x - x.mean(axis=0)) @ normal
     return x.mean(axis=0) + normal * (along.min() - NEAREST_M), normal
@@ -53,7 +53,7 @@ def _reflected(x: FloatArray, mirror: tuple[FloatArray, FloatArray]) -> FloatArr
 
 
 def _elsewhere(world: World, x: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Points in view, far apart from each other."""
+    """Return points in view, far apart from each other."""
     spread = 1.5 * x.std(axis=0) + NEAREST_M
     points = x.mean(axis=0) + rng.normal(size=(TRIES * 20, 3)) * spread
     return points[in_view(world.arm.eyes, points, INSIDE_PX)][:TRIES]

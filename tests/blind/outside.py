@@ -1,4 +1,4 @@
-"""Effects outside the table, which no name fits."""
+"""Effects outside the table, which no named effect fits."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def _growth(site: Site, rng: np.random.Generator) -> Parameters:
 
 
 def _bearing(site: Site) -> tuple[str, ...]:
-    """Joints that move the arm's weight: all on the way from the floor to the marker but a first upright one."""
+    """Return the joints that move the arm's weight: all from floor to marker but a first vertical one."""
     names = _on_arm(site)
     first = site.arm.joint(names[0])
     upright = site.arm.joint(MOUNT).rpy == (0.0, 0.0, 0.0) and first.axis == (0.0, 0.0, 1.0) and not any(first.rpy)
@@ -50,7 +50,7 @@ def _bearing(site: Site) -> tuple[str, ...]:
 
 
 def _on_arm(site: Site) -> tuple[str, ...]:
-    """Joints that are read between floor and marker, from the floor on."""
+    """Return the joints that are read between floor and marker, from the floor on."""
     parents = {joint.child: joint for joint in site.arm.joints}
     link, way = site.arm.marker_link, []
     while link != FLOOR:

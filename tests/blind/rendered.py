@@ -23,13 +23,13 @@ TO_LIGHT = np.array([-0.3, -0.8, -0.5]) / np.linalg.norm([-0.3, -0.8, -0.5])
 AMBIENT = 0.6
 SUPERSAMPLING = 4
 NOISE_GREY, NOISE_FIELDS = 5.0, 2
-PIXEL_SIGMA = 0.02  # about what the tracker reaches on these images
+PIXEL_SIGMA = 0.02  # about the tracker's accuracy on these images
 AROUND_PX = 6
 APART_S = 10.0  # between frames for the tracker: pairs are looked at singly, without its memory
 
 
 class Studio:
-    """Paints what the true eyes see."""
+    """Renderer of the true cameras' images."""
 
     def __init__(self, eyes: TrueEyes, rng: np.random.Generator) -> None:
         self._eyes, self._rng = eyes, rng
@@ -42,7 +42,7 @@ class Studio:
         self._empty = [[_grey_levels(room + noise) for noise in self._noise] for room in self._rooms]
 
     def frame(self, t: float, x: FloatArray) -> StereoFrame:
-        """Both images of a ball at `x` (3,) [m] in the true left optical frame."""
+        """Return both images of a ball at `x` (3,) [m] in the true left optical frame."""
         turn = Rotation.from_euler("y", self._eyes.vergence_rad).as_matrix()
         in_right = (x - np.array([self._eyes.baseline_m, 0.0, 0.0])) @ turn
         return StereoFrame(t, self._image(0, x), self._image(1, in_right))
@@ -59,7 +59,7 @@ class Studio:
         return image
 
     def _with_ball(self, room: FloatArray, left: int, top: int, centre: FloatArray) -> FloatArray:
-        """The part of the image at (left, top) with the ball in it, averaged over the samples of each pixel."""
+        """Return the part of the image at (left, top) with the ball in it, averaged over the samples of each pixel."""
         rows, columns = room.shape[:2]
         inside = (np.arange(SUPERSAMPLING) + 0.5) / SUPERSAMPLING - 0.5
         u = (left + np.arange(columns)[:, None] + inside).ravel()
@@ -75,7 +75,7 @@ class Studio:
         return samples.reshape(rows, SUPERSAMPLING, columns, SUPERSAMPLING, 3).mean(axis=(1, 3))
 
     def _rays(self, u: FloatArray, v: FloatArray) -> FloatArray:
-        """Unit directions that the true lens brings to image points [px]."""
+        """Return unit directions of the rays that the true lens images at points [px]."""
         bent = (np.stack([u, v], axis=-1) - self._eyes.described.principal_point_px) / self._eyes.focal_px
         ideal = bent
         for _ in range(12):
@@ -85,7 +85,7 @@ class Studio:
         return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
     def _window(self, centre: FloatArray) -> tuple[int, int, int, int]:
-        """Left, top, right, bottom [px] of what surely holds the ball, inside the image."""
+        """Return left, top, right, bottom [px] of a window inside the image that contains the ball."""
         straight = TrueEyes(self._eyes.described, self._eyes.focal_px, 0.0, self._eyes.k1, self._eyes.k2)
         at = straight.project(centre[None])[0, :2]
         reach = 1.6 * self._eyes.focal_px * BALL_RADIUS_M / (centre[2] - BALL_RADIUS_M) + AROUND_PX
@@ -99,7 +99,7 @@ def _grey_levels(image: FloatArray) -> NDArray[np.uint8]:
 
 
 def tracked(eyes: TrueEyes, at: FloatArray, rng: np.random.Generator) -> tuple[BoolArray, FloatArray, FloatArray]:
-    """What the tracker makes of images of balls at (n, 3) [m] in the true left optical frame.
+    """Track the ball in rendered images of balls at (n, 3) [m] in the true left optical frame.
 
     Returns:
         Which were found (n,), their positions (n, 3) [m] and covariances (n, 3, 3) [m²]; NaN where none was found.

@@ -41,7 +41,7 @@ class Scenario:
         effects: as `hide` takes them.
         pairs: of the recording.
         outliers: share of false fixes.
-        gross: whether effects are all of gross size.
+        gross: True if all effects are of gross size.
         scatter: between what the encoders scatter before they round, 1-sigma [ticks]; None for nothing.
     """
 
@@ -52,7 +52,7 @@ class Scenario:
     scatter: tuple[float, float] | None = None
 
     def size(self, seed: int) -> float | str:
-        """Of the effects, in units of the noise."""
+        """Return the size of the effects in units of the noise, or "random"."""
         if not self.gross:
             return "random"
         return float(np.exp(np.random.default_rng([seed, 1]).uniform(*np.log(GROSS))))
@@ -88,7 +88,7 @@ class Case:
 
 
 def main() -> None:
-    """The command."""
+    """Run the command."""
     given = _arguments()
     names = list(SCENARIOS) if "all" in given.scenario else given.scenario
     records = read(given.json) if given.json else []
@@ -109,7 +109,7 @@ def main() -> None:
 
 
 def judged(cases: Iterable[Case], processes: int = 1) -> Iterator[Record]:
-    """Each case as soon as it is judged; what cannot be hidden is left out."""
+    """Yield each case as soon as it is judged; cases that cannot be hidden are left out."""
     if processes == 1:
         results = map(run, cases)
         yield from (record for record in results if record is not None)
@@ -121,7 +121,7 @@ def judged(cases: Iterable[Case], processes: int = 1) -> Iterator[Record]:
 
 
 def run(case: Case) -> Record | None:
-    """One case; None where the effects that were drawn show nowhere on the arm that was drawn."""
+    """Run one case; return None if the random effects show nowhere on the random arm."""
     scenario, seed = SCENARIOS[case.scenario], case.seed
     with tempfile.TemporaryDirectory() as folder:
         try:
@@ -144,12 +144,12 @@ def run(case: Case) -> Record | None:
 
 
 def encoded(record: Record) -> bytes:
-    """A record as JSON; numpy's numbers as what they are."""
+    """Return a record as JSON; numpy scalars become Python numbers."""
     return msgspec.json.encode(record, enc_hook=lambda number: number.item())
 
 
 def read(file: Path) -> list[Record]:
-    """The records of earlier runs; none where there is no file."""
+    """Return the records of earlier runs; an empty list if the file does not exist."""
     if not file.exists():
         return []
     decoder = msgspec.json.Decoder(Record)

@@ -31,12 +31,12 @@ class Sizer:
         self._noise = noise(nominal, plain.readings, plain.pixels, scatter)
 
     def scaled(self, hidden: Hidden, kind: Kind, size: float) -> Hidden:
-        """The effect with parameters scaled so that the whitened RMS of its residual is about `size`.
+        """Return the effect with parameters scaled so that the whitened RMS of its residual is about `size`.
 
         Raises:
             NoEffect: no amplitude shows.
         """
-        tried: list[tuple[float, float]] = []  # logarithms of amplitude and of what it came to, over the size wanted
+        tried: list[tuple[float, float]] = []  # logarithms of amplitude and relative size
         amplitude, best = 1.0, hidden
         for _ in range(MOST_ROUNDS):
             parameters, stopped = kind.scaled(hidden.parameters, amplitude)
@@ -51,7 +51,7 @@ class Sizer:
         return best
 
     def sized(self, hidden: Hidden) -> Hidden:
-        """The effect with its size filled in."""
+        """Return the effect with its size filled in."""
         world = World(self._bullet, self._nominal.arm, [hidden])
         try:
             sight = world.measure(self._motion)
@@ -64,7 +64,7 @@ class Sizer:
         )
 
     def shows_on(self, hidden: Hidden, rng: np.random.Generator) -> dict[str, float]:
-        """For each joint the share of the residual's variance that it alone holds, the others given.
+        """Return for each joint the share of the residual's variance that it alone holds, the others given.
 
         Half the mean square change when this joint alone is taken from another posture, over the variance (the total
         effect of a variance-based sensitivity analysis).
@@ -88,7 +88,7 @@ class Sizer:
 
 
 def _next(tried: list[tuple[float, float]]) -> float:
-    """Logarithm of the amplitude to try next: between the nearest from below and above, else in proportion."""
+    """Return the logarithm of the next amplitude: between the nearest from below and above, else in proportion."""
     below = max((point for point in tried if point[1] < 0.0), default=None)
     above = min((point for point in tried if point[1] > 0.0), default=None)
     if below is None or above is None:
@@ -98,6 +98,6 @@ def _next(tried: list[tuple[float, float]]) -> float:
 
 
 def drawn(kind: Kind, effect: str, site: Site, rng: np.random.Generator) -> Hidden:
-    """The effect with parameters of a first amplitude."""
+    """Return the effect with parameters of an initial amplitude."""
     drivers = kind.drivers(site) if kind.drivers is not None else ()
     return Hidden(effect, site.where, site.source, kind.draw(site, rng), kind.sign, kind.outside, drivers)

@@ -20,7 +20,7 @@ SHORTEST_BENDING_LINK_M = 0.08
 
 @dataclass
 class Structure:
-    """An arm as it is.
+    """The true structure of an arm.
 
     Attributes:
         arm: with every joint it truly has; those added are not among `arm.read`.
@@ -35,7 +35,7 @@ class Structure:
 
 
 def true_structure(arm: Arm, effects: Iterable[Hidden]) -> Structure:
-    """What the effects make of the described arm and its cameras."""
+    """Return the described arm and cameras as the effects change them."""
     true = Structure(arm, TrueEyes.as_described(arm.eyes))
     for number, hidden in enumerate(effects):
         _apply(true, hidden, f"hidden{number}")
@@ -43,7 +43,7 @@ def true_structure(arm: Arm, effects: Iterable[Hidden]) -> Structure:
 
 
 def bending_joints(arm: Arm) -> tuple[str, ...]:
-    """Joints whose links are long enough to bend and bear another joint."""
+    """Return the joints whose links are long enough to bend and carry another joint."""
     return tuple(name for name in arm.read if _next_joint(arm, name) is not None)
 
 
@@ -82,25 +82,25 @@ def _apply(true: Structure, hidden: Hidden, prefix: str) -> None:
 
 
 def shift(p: Parameters) -> FloatArray:
-    """dx, dy, dz [m]."""
+    """Return dx, dy, dz [m]."""
     return np.array([p[name] for name in SHIFT])
 
 
 def pose(p: Parameters) -> tuple[FloatArray, FloatArray]:
-    """Shift [m] and turn (3, 3) of six parameters."""
+    """Return shift [m] and rotation (3, 3) of six parameters."""
     six = np.array([p[name] for name in SIX])
     return six[:3], Rotation.from_rotvec(six[3:]).as_matrix()
 
 
 def _moved(xyz: Vector, rpy: Vector, p: Parameters) -> tuple[Vector, Vector]:
-    """The pose of a frame that is moved within itself."""
+    """Return the pose of a frame after a motion in its own axes."""
     x, R = pose(p)
     was = Rotation.from_euler("xyz", rpy).as_matrix()
     return vector(np.array(xyz) + was @ x), vector(Rotation.from_matrix(was @ R).as_euler("xyz"))
 
 
 def _insert(true: Structure, before: Joint, between: list[Joint]) -> None:
-    """Joints between the parent of `before` and `before`, which goes on from the last of them."""
+    """Insert joints between the parent of `before` and `before`, which continues from the last of them."""
     joints = list(true.arm.joints)
     index = [joint.name for joint in joints].index(before.name)
     joints[index : index + 1] = [*between, replace(before, parent=between[-1].child)]
@@ -109,7 +109,7 @@ def _insert(true: Structure, before: Joint, between: list[Joint]) -> None:
 
 
 def _soften_mount(true: Structure, p: Parameters, prefix: str) -> None:
-    """Two hinges and a slide between the mount's place on the floor and the base."""
+    """Insert two hinges and a slide between the mount's place on the floor and the base."""
     mount = true.arm.joint(MOUNT)
     a, b, c = f"{prefix}_a", f"{prefix}_b", f"{prefix}_c"
     place = replace(mount, name=f"{prefix}_place", child=a)
@@ -124,7 +124,7 @@ def _soften_mount(true: Structure, p: Parameters, prefix: str) -> None:
 
 
 def _soften_link(true: Structure, where: str, bend: float, prefix: str) -> None:
-    """Two hinges across the link, half way to the next joint."""
+    """Insert two hinges across the link, half way to the next joint."""
     following = _next_joint(true.arm, where)
     if following is None:
         raise ValueError(f"the link of {where} is too short to bend")
@@ -137,7 +137,7 @@ def _soften_link(true: Structure, where: str, bend: float, prefix: str) -> None:
 
 
 def _grow(true: Structure, where: str, p: Parameters, prefix: str) -> None:
-    """A slide between the joint and its parent."""
+    """Insert a prismatic joint between the joint and its parent."""
     joint, along = true.arm.joint(where), shift(p)
     length = float(np.linalg.norm(along))
     slide = Joint(f"{prefix}_s", "prismatic", joint.parent, f"{prefix}_a", axis=vector(along / length))
@@ -146,7 +146,7 @@ def _grow(true: Structure, where: str, p: Parameters, prefix: str) -> None:
 
 
 def _next_joint(arm: Arm, name: str) -> Joint | None:
-    """The joint that the link of `name` bears, if the way to it is long enough."""
+    """Return the joint carried by the link of `name`, if the link is long enough to bend."""
     link = arm.joint(name).child
     borne = [joint for joint in arm.joints if joint.parent == link]
     far = [joint for joint in borne if np.linalg.norm(joint.xyz) >= SHORTEST_BENDING_LINK_M]

@@ -16,7 +16,7 @@ from .dense_hide import DenseCase, _eye_R, _Robot, _way, hide_dense, written
 from .dense_observer import Observer
 from .motion import Motion, move
 
-SMALL = 1e-4  # usual amounts: what is left beside the linear part is smaller than that by far
+SMALL = 1e-4  # usual amounts: the nonlinear remainder is much smaller
 EFFECTS = (
     "joint_offset",
     "joint_scale",
@@ -36,7 +36,7 @@ EFFECTS = (
 
 @pytest.fixture(scope="module")
 def scene() -> tuple[Built, Motion, Way, list[Cause]]:
-    """An arm with a sliding joint and its instrument on a head, a walk, and all causes."""
+    """Return an arm with a prismatic joint and its instrument on a head, a walk, and all causes."""
     rng = np.random.default_rng(3)
     arm = next(a for a in (described(rng, with_masses=True) for _ in range(99)) if "head_pan" in a.read)
     as_made = made(arm, rng)
@@ -100,7 +100,7 @@ def test_tolerances_keep_to_their_two_decades() -> None:
 
 
 def _observer(amounts: list[float]) -> Observer:
-    """One column of tolerances, and causes of one number whose columns stand at right angles."""
+    """Return an observer with one column of tolerances, and causes of one number with orthogonal columns."""
     rows = 50
     basis = np.linalg.qr(np.random.default_rng(0).normal(size=(rows, len(amounts) + 1)))[0]
     blocks = [100.0 * basis[:, [k]] for k in range(len(amounts))]
@@ -110,7 +110,7 @@ def _observer(amounts: list[float]) -> Observer:
 
 def test_the_observer_is_sure_of_a_large_cause() -> None:
     evidence, spare = _observer([1.0, 1.0, 1.0]).evidence([1])
-    # Half the square of what shows beside what is usual, the freedom that it takes, and the cost of a cause.
+    # Half the squared signal beyond the tolerances, the loss for its degree of freedom, and the cost of a cause.
     shown = 0.5 * 100.0**2 * 1e4 / (1e4 + 1.0) - 0.5 * np.log(1e4 + 1.0) + 0.5 - 3.0
     assert evidence[0].nats == pytest.approx(shown, rel=1e-3)
     assert spare > 0.0

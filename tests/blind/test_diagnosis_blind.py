@@ -1,11 +1,11 @@
 """`diagnose` on hidden causes: a few cases of known seeds in every run, new cases of each commit in the soak run.
 
-The seeds of the soak run come from the commit, else from the date. How many failures it allows follows from how often
-each scenario failed in a sealed run with as many pairs, `python -m tests.blind.sealed --pairs ... --scenario ...`,
-whose counts stand in `SEALED`. The true rate of failures is taken to be the upper end p of the 95 % interval (Clopper
-and Pearson) around such a count, which leaves a margin. Of n cases more than k fail with the probability P(X > k), X
-binomial with n and p: allowed is the smallest k for which all tests here together fail an unchanged program in at most
-1 of 1,000 runs. The more cases a sealed run had, the sharper.
+The seeds of the soak run come from the commit, else from the date. The number of failures allowed follows from the
+failures of each scenario in a sealed run with as many pairs, `python -m tests.blind.sealed --pairs ... --scenario ...`,
+recorded in `SEALED`. The true failure rate is taken as the upper end p of the 95 % Clopper-Pearson interval of that
+count, which leaves a margin. More than k of n cases fail with probability P(X > k), X binomial with n and p. The limit
+is the smallest k for which all tests here together fail an unchanged program in at most 1 of 1,000 runs. A sealed run
+with more cases gives a sharper limit.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .judge import TOLD
 from .judgement import Crash, told
 from .sealed import Case, Record, judged, run
 
-# Each is far from undecided: the hidden effects stand out from what resembles them, chi-square of 10 and more.
+# All are clear: chi-square between the hidden effects and their alternatives is 10 or more.
 KNOWN = [
     Case("one", 2, 300),
     Case("two", 3, 300),
@@ -41,15 +41,15 @@ MORE = [
 CASES = {"one": 8, "two": 4, "three": 3, "outliers": 3, "none": 4, "outside": 6}
 PAIRS = {name: 1600 if name == "outside" else 600 for name in CASES}
 NAMED, NOTHING, OUTSIDE = ("one", "two", "three", "outliers"), ("none",), ("outside",)
-# In units of the noise; what is smaller may be taken for what the arm's makers tolerate.
+# In units of the noise; smaller effects may be taken for manufacturing tolerances.
 SMALL = 1.5
-# Failures and cases in the sealed run; what no oracle tells from the table's effects is no failure outside of it.
+# Failures and cases in the sealed run; an outside effect that an oracle cannot distinguish does not count.
 SEALED: dict[tuple[str, ...], tuple[int, int]] = {NAMED: (5, 160), NOTHING: (0, 40), OUTSIDE: (8, 100)}
 BY_CHANCE = 1e-3
 
 
 def _origin() -> str:
-    """What the seeds come from."""
+    """Return the string from which the seeds are derived."""
     asked = ["git", "rev-parse", "HEAD"]
     try:
         done = subprocess.run(asked, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
@@ -59,7 +59,7 @@ def _origin() -> str:
 
 
 def _judged(names: Sequence[str]) -> list[Record]:
-    """The cases of these scenarios; those of one have neighbouring seeds."""
+    """Judge cases of these scenarios; the cases of one have consecutive seeds."""
     origin = _origin()
     first = int.from_bytes(hashlib.sha256(origin.encode()).digest()[:3], "big")
     print(f"seeds from {first}, drawn from {origin}")
@@ -74,12 +74,12 @@ def _failed(record: Record) -> bool:
 
 
 def _allowed(rate: float, cases: int) -> int:
-    """Failures that are exceeded with a probability of at most BY_CHANCE, shared among the tests here."""
+    """Return the number of failures exceeded with a probability of at most BY_CHANCE, shared among the tests here."""
     return int(binom.isf(BY_CHANCE / len(SEALED), cases, rate))
 
 
 def _rate(names: tuple[str, ...]) -> float:
-    """The largest rate of failures that the sealed run leaves room for."""
+    """Return the upper end of the confidence interval of the sealed run's failure rate."""
     return float(binomtest(*SEALED[names]).proportion_ci(method="exact").high)
 
 
@@ -97,7 +97,7 @@ def _check(names: tuple[str, ...]) -> None:
     ids=lambda case: f"{case.scenario}-{case.seed}",
 )
 def test_a_case_of_a_known_seed_is_right_or_below_the_noise(case: Case) -> None:
-    # A camera that stands 0.3 mm and 0.02° off, or a slow drift of 0.8 mm below 4 mm of noise, is tolerated.
+    # A camera 0.3 mm and 0.02° off, or a slow drift of 0.8 mm below 4 mm of noise, is tolerated.
     record = run(case)
     assert not isinstance(record, Crash), record
     assert record is not None

@@ -31,12 +31,12 @@ ROOT = Path(__file__).parents[2]
 
 
 def nominal(case: HiddenCase, taken: Taken) -> np.ndarray:
-    """Marker positions [m] of the described chain at the readings."""
+    """Return marker positions [m] of the described chain at the readings."""
     return RobotDescription.load(case.robot_file).chain.predict(taken.q)
 
 
 def whitened_rms(case: HiddenCase, taken: Taken) -> float:
-    """RMS of the noise-free residual in units of the noise."""
+    """Return the RMS of the noise-free residual in units of the noise."""
     off = taken.x_noise_free - nominal(case, taken)
     return float(np.sqrt(np.mean(np.einsum("ni,nij,nj->n", off, np.linalg.inv(taken.noise), off)) / 3.0))
 

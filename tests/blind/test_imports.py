@@ -1,4 +1,4 @@
-"""The hider shares no code with those who look for what it hides."""
+"""The hiding code shares no code with the code that finds effects."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ GENERATOR = sorted(file for file in HERE.glob("*.py") if not file.name.startswit
 
 
 def imported(file: Path) -> Iterator[str]:
-    """Full names of the modules that a file imports, those of its own folder left out."""
+    """Yield full names of the modules that a file imports, without those of its own folder."""
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)

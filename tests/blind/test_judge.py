@@ -1,4 +1,4 @@
-"""The judge itself: what it calls right and wrong, fed with diagnoses that were made up."""
+"""Judgements of made-up diagnoses."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Hide = Callable[..., Truth]
 
 @pytest.fixture(scope="module")
 def truth_of(tmp_path_factory: pytest.TempPathFactory) -> Hide:
-    """A function that hides effects and gives the truth; each case is made once."""
+    """Return a function that hides effects and returns the ground truth; each case is built once."""
     made: dict[tuple[object, ...], Truth] = {}
 
     def truth(*effects: str, arm: str = "humanoid", size: float = 4.0, **more: object) -> Truth:
@@ -59,7 +59,7 @@ def _hidden(folder: Path, *effects: str, **more: object) -> HiddenCase:
 
 
 def _cause(name: str, *listed: Indistinguishable, probability: float = 0.99, **numbers: Interval) -> Cause:
-    """A cause `effect@where:source`."""
+    """Return a cause from its name `effect@where:source`."""
     effect, _, at = name.partition("@")
     where, _, source = at.partition(":")
     return Cause(
@@ -86,7 +86,7 @@ def _like(name: str, by: str) -> Indistinguishable:
 
 
 def _file(*causes: Cause, verdict: str = "explained", depends_on: tuple[str, ...] = ()) -> DiagnosisFile:
-    """A diagnosis with these causes."""
+    """Return a diagnosis with these causes."""
     errors = Errors(10.0, 10.0, 5.0, 2.0, 2.0)
     return DiagnosisFile(
         verdict=verdict,  # pyright: ignore[reportArgumentType]

@@ -19,7 +19,7 @@ PLAY = 0.01
 
 
 def driven(hinge: Hinge) -> tuple[np.ndarray, np.ndarray]:
-    """Angles of the shoulder's motor, and by how much its link is ahead of it, while it swings once to and fro."""
+    """Return angles of the shoulder's motor, and the lead of its link, during one swing to and fro."""
     urdf = Urdf(MODEL, (0.0, 0.0, 0.0))
     give = urdf.add_give(SHOULDER)
     world = World(urdf.text_for_mujoco, MODEL.joints, {give: hinge}, MARKER)

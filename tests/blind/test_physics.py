@@ -1,4 +1,4 @@
-"""Each effect moves readings and positions in the way of its mechanism."""
+"""Each effect changes readings and positions according to its mechanism."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ NO_TURN = {"rx_rad": 0.0, "ry_rad": 0.0, "rz_rad": 0.0}
 
 
 def shifted(**more: float) -> dict[str, float]:
-    """Parameters of a shift."""
+    """Return the parameters of a shift."""
     return {**dict(zip(("dx_m", "dy_m", "dz_m"), SHIFT, strict=True)), **more}
 
 
 def six(turn: tuple[float, float, float], **more: float) -> dict[str, float]:
-    """Parameters of a shift and a turn."""
+    """Return the parameters of a shift and a turn."""
     return {**shifted(), **dict(zip(NO_TURN, turn, strict=True)), **more}
 
 
@@ -133,7 +133,7 @@ def test_a_late_frame_shows_the_marker_where_it_was(bench: Bench) -> None:
 
 
 def pendulum(axis: tuple[float, float, float]) -> Arm:
-    """One joint at the height of 1 m that bears 2 kg half a metre along x; the marker is there too."""
+    """Return one joint at a height of 1 m that carries 2 kg and the marker half a metre along x."""
     swing = Joint("swing", "revolute", BASE, "bob", axis=axis, lower=-1.5, upper=1.5)
     industrial_arm = industrial(np.random.default_rng(8))
     return replace(
@@ -148,14 +148,14 @@ def pendulum(axis: tuple[float, float, float]) -> Arm:
 
 
 def height(world: World, q: FloatArray) -> FloatArray:
-    """Of the marker above the floor [m]."""
+    """Return the height of the marker above the floor [m]."""
     arm = world.arm
     c, R = np.array(arm.camera_xyz), rotation(arm)
     return (c + world.marker(q, np.zeros(len(q))) @ R.T)[:, 2]
 
 
 def rotation(arm: Arm) -> FloatArray:
-    """Of the described left optical frame in the floor's."""
+    """Return the rotation of the described left optical frame in the floor's frame."""
     return Rotation.from_euler("xyz", arm.camera_rpy).as_matrix()
 
 
@@ -196,7 +196,7 @@ def test_a_soft_mount_reads_as_before(bench: Bench) -> None:
 
 
 def moved(bench: Bench, sight: Sight) -> FloatArray:
-    """How far the measured positions moved [m], shape (n,)."""
+    """Return the distances by which the measured positions moved [m], shape (n,)."""
     return np.linalg.norm(sight.x - bench.nominal.x, axis=1)
 
 

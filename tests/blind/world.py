@@ -1,4 +1,4 @@
-"""The hidden world: what a robot with hidden effects reads and what its cameras see, free of noise."""
+"""The hidden world: readings and images of a robot with hidden effects, free of noise."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .structure import pose, shift, true_structure
 
 @dataclass(frozen=True)
 class Sight:
-    """What was read and seen of n pairs, free of noise and of quantisation.
+    """Readings and images of n pairs, free of noise and of quantisation.
 
     Attributes:
         readings: of the joints [rad or m], shape (n, d).
@@ -35,7 +35,7 @@ class Sight:
     x: FloatArray
 
     def of(self, kept: IntArray) -> Sight:
-        """Some of the pairs."""
+        """Return the pairs at these indices."""
         return Sight(self.readings[kept], self.at[kept], self.pixels[kept], self.x[kept])
 
 
@@ -56,17 +56,17 @@ class World:
         self._body.remove()
 
     def measure(self, motion: Motion) -> Sight:
-        """What is read and seen of a motion."""
+        """Return the readings and images of a motion."""
         taken = motion.stamps - sum(h.parameters["latency_s"] for h in self._named("camera_latency"))
         readings = self.readings(motion.at(motion.shaft, motion.stamps), motion.stamps)
         return self._sight(readings, motion.at(self.outputs(motion), taken), taken)
 
     def standing(self, shaft: FloatArray, t: FloatArray) -> Sight:
-        """What is read and seen of postures (n, d) at the times (n,) when no motion led there."""
+        """Return the readings and images of postures (n, d) at the times (n,) without a preceding motion."""
         return self._sight(self.readings(shaft, t), self._coupled(shaft.copy()), t)
 
     def marker(self, output: FloatArray, t: FloatArray) -> FloatArray:
-        """True marker positions in the true left optical frame [m] at joint positions (n, d), shape (n, 3)."""
+        """Return true marker positions in the true left optical frame [m] at joint positions (n, d), shape (n, 3)."""
         moving = np.zeros((len(output), len(self._body.moving)))
         moving[:, self._columns] = output
         for name, (length, tau_s) in self._true.growth.items():
@@ -86,7 +86,7 @@ class World:
         return x
 
     def readings(self, shaft: FloatArray, t: FloatArray) -> FloatArray:
-        """What the encoders read of shaft positions (n, d) at the times (n,), before they are quantised."""
+        """Return encoder readings of shaft positions (n, d) at the times (n,), before they are quantised."""
         read = shaft.copy()
         for index, name in enumerate(self.arm.read):
             for hidden in self._effects:
@@ -122,7 +122,7 @@ class World:
                 return read
 
     def outputs(self, motion: Motion) -> FloatArray:
-        """True joint positions along the whole path, shape (f, d)."""
+        """Return true joint positions along the whole path, shape (f, d)."""
         output = motion.shaft.copy()
         for h in self._named("backlash"):
             index = self.arm.read.index(str(h.where))
@@ -151,17 +151,17 @@ class World:
 
 
 def time_constant(p: Parameters) -> float:
-    """Of a joint that settles [s]."""
+    """Return the time constant of a settling joint [s]."""
     return p["tau_s"] if "tau_s" in p else lag_that_leaves(p["left"], p["move_s"], p["rest_s"])
 
 
 def residuals(nominal: World, sight: Sight) -> FloatArray:
-    """Seen positions minus those that the nominal robot has at the readings [m], shape (n, 3)."""
+    """Return seen positions minus those that the nominal robot has at the readings [m], shape (n, 3)."""
     return sight.x - nominal.marker(sight.readings, np.zeros(len(sight.readings)))
 
 
 def noise(nominal: World, q: FloatArray, pixels: FloatArray, scatter: float) -> FloatArray:
-    """Covariance [m²] of residuals at readings (n, d), pixels (n, 4) and encoders adding to it, shape (n, 3, 3).
+    """Return the covariance [m²] of residuals at readings (n, d), pixels (n, 4), encoder noise included, (n, 3, 3).
 
     Args:
         scatter: 1-sigma of what encoders scatter before they round [ticks].
@@ -178,6 +178,6 @@ def noise(nominal: World, q: FloatArray, pixels: FloatArray, scatter: float) -> 
 
 
 def whitened(covariances: FloatArray, x: FloatArray) -> FloatArray:
-    """Vectors (n, 3) in units of their noise with covariances (n, 3, 3)."""
+    """Return vectors (n, 3) in units of their noise with covariances (n, 3, 3)."""
     lower = np.linalg.cholesky(covariances)
     return np.asarray(np.linalg.solve(lower, x[:, :, None])[:, :, 0], dtype=np.float64)

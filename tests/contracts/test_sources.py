@@ -1,4 +1,4 @@
-"""The laws of `bodyschema.interfaces.protocols`, held to every source that the sampler may read."""
+"""The laws of `bodyschema.interfaces.protocols`, checked for every source that the sampler may read."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ TIMES = np.cumsum(np.random.default_rng(1).uniform(0.01, 0.1, ROWS))
 
 @dataclass
 class Rig:
-    """A source under test, and what else has to be read for time to go on.
+    """A source under test, and the other sources that must be read for time to pass.
 
     Attributes:
         end: makes the source end; without it the source ends by itself.
@@ -100,7 +100,7 @@ class Rig:
             yield self
 
     def read(self, count: int = SOME) -> list[Any]:
-        """The next `count` items of the source."""
+        """Return the next `count` items of the source."""
         items: list[Any] = []
         deadline = time.monotonic() + LIMIT_S
         while len(items) < count:
@@ -120,7 +120,7 @@ class Rig:
             self.read(1)
 
 
-# --- who has to obey
+# --- implementations under test
 
 
 def recording() -> Recording:
@@ -193,7 +193,7 @@ class Unrectified:
 
 
 def rig_of(camera: StereoCamera) -> StereoRig:
-    """The simulated camera's calibration, as one of two cameras."""
+    """Return the simulated camera's calibration as a rig of two cameras."""
     true = camera.calibration
     lens = Lens("pinhole", (true.focal_px, true.focal_px), true.principal_point_px, (0.0,) * 5)
     place = np.array([-true.baseline_m, 0.0, 0.0])
@@ -215,7 +215,7 @@ def tracked_camera() -> Iterator[Rig]:
 
 @contextmanager
 def eyes(tables: dict[str, Any], open_capture: OpenCapture = lambda _: FakeCapture()) -> Iterator[Rig]:
-    """Cameras as [vision.cameras] asks for them, with what they read in a folder of its own."""
+    """Yield cameras as [vision.cameras] asks for them, with their input in a folder of its own."""
     with TemporaryDirectory() as name:
         folder = Path(name)
         write_pictures(folder)
@@ -276,7 +276,7 @@ def ideal_camera() -> Iterator[Rig]:
 
 @contextmanager
 def tracked_tags() -> Iterator[Rig]:
-    """The demo's cube in the demo's hand."""
+    """Yield a rig that tracks the demo's cube in the demo's hand."""
     robot = RobotDescription.load(model_file("upper_body"))
     tables = cube_tables(-np.array(robot.robot.marker_xyz))
     vision = msgspec.toml.decode(tables, type=dict[str, VisionConfig])["vision"]
@@ -320,7 +320,7 @@ ARM = Path(__file__).parents[2] / "examples" / "desk_arm"
 
 @contextmanager
 def through_a_bench(file: str, tables: str = "") -> Iterator[Rig]:
-    """Joints of another source, read from a bench by the driver that a robot.toml configures."""
+    """Yield joints of another source, read from an emulator by the driver that a robot.toml configures."""
     with TemporaryDirectory() as folder:
         arm = shutil.copytree(ARM, Path(folder) / "arm")
         with (arm / file).open("a", encoding="utf-8") as toml:
@@ -397,7 +397,7 @@ Shared = Callable[[Make], Rig]
 
 @pytest.fixture(scope="module")
 def shared() -> Iterator[Shared]:
-    """A function that gives a closed source of each kind, one for all laws after which it can still be used."""
+    """Yield a function that returns a closed source of each kind, shared by all laws that leave it usable."""
     with ExitStack() as stack:
         yield cache(lambda make: stack.enter_context(make()))
 
@@ -459,7 +459,7 @@ def test_an_error_in_the_block_passes_through_the_closing(rig: Rig) -> None:
 def test_where_nothing_comes_in_time_none_is_returned(make: Make, shared: Shared) -> None:
     rig = shared(make)
     with rig.opened():
-        while rig.source.read(0.01) is not None:  # time stands still until the other side is read too
+        while rig.source.read(0.01) is not None:  # time stands still until the other source is read too
             continue
         assert rig.source.read(0.0) is None
 
@@ -496,7 +496,7 @@ def frames(request: pytest.FixtureRequest, shared: Shared) -> Iterator[tuple[Ste
 
 
 def is_frozen(array: np.ndarray, shape: tuple[int, ...]) -> bool:
-    """Whether it is a finite, read-only float64 array of this shape."""
+    """Return True for a finite, read-only float64 array of this shape."""
     whole = bool(np.isfinite(array).all()) and not array.flags.writeable
     return whole and (array.shape, array.dtype) == (shape, np.float64)
 

@@ -21,7 +21,7 @@ _drawn = _ports()
 
 
 def free_endpoint() -> str:
-    """A zenoh endpoint on this machine that nobody listens on, and another one each time."""
+    """Return an unused zenoh endpoint on this machine, a different one at each call."""
     for port in _drawn:
         with suppress(OSError), socket.create_server(("127.0.0.1", port)):
             return f"tcp/127.0.0.1:{port}"

@@ -1,4 +1,4 @@
-"""A small arm as described and as built, guided along a path: pairs with a truth that the learner does not know."""
+"""A small arm as described and as built, guided along a path: pairs with a ground truth hidden from the learner."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def built_chain(rng: np.random.Generator, axis_deg: float = 2.0, shift_m: float 
 
 
 def path(rng: np.random.Generator, count: int) -> FloatArray:
-    """Straight ways between random waypoints in steps of 2 degrees, shape (count, JOINTS)."""
+    """Return straight paths between random waypoints in steps of 2 degrees, shape (count, JOINTS)."""
     q, goal = [np.zeros(JOINTS)], rng.uniform(-REACH, REACH, JOINTS)
     while len(q) < count:
         if np.linalg.norm(goal - q[-1]) < STEP:
@@ -49,7 +49,7 @@ def path(rng: np.random.Generator, count: int) -> FloatArray:
 
 
 def near(rng: np.random.Generator, q: FloatArray, count: int = 400) -> FloatArray:
-    """Poses within a few degrees of those in q, none of them in it."""
+    """Return poses within a few degrees of those in q, none of them in it."""
     chosen = q[rng.integers(len(q), size=count)]
     return chosen + rng.normal(0.0, np.radians(3.0), chosen.shape)
 
@@ -84,7 +84,7 @@ def new_learning(nominal: NominalModel | None = None, settings: LearnerConfig | 
 
 
 def teach(learning: Learning, pairs: Iterable[Pair], *, background: bool = True, every: int = 5) -> None:
-    """Learn pairs, with all background work done after `every` so many and at the end."""
+    """Learn pairs, with all background work done after each `every` pairs and at the end."""
     for number, pair in enumerate(pairs, 1):
         learning.learn(pair, pair.t)
         while background and number % every == 0 and learning.work():
@@ -108,7 +108,7 @@ class Scene:
         return cls(chain, q, measured(chain, q, rng, sigma_m=sigma_m))
 
     def error_m(self, learning: Learning, seed: int = 0) -> float:
-        """Mean distance between what the learner answers and the truth, near the path."""
+        """Return the mean distance between the learner's answers and the truth, near the path."""
         q = near(np.random.default_rng(seed), self.q)
         miss = learning.snapshot.predict(q).x - self.chain.positions(q)
         return float(np.linalg.norm(miss, axis=1).mean())

@@ -1,4 +1,4 @@
-"""Recordings of units of one type of arm, each with a fault that is hidden in its kinematics by hand."""
+"""Recordings of units of one type of arm, each with a fault planted in its kinematics."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ PAIRS, SIGMA_M = 240, 3e-4
 
 
 def walk(robot: RobotDescription, rng: np.random.Generator) -> FloatArray:
-    """Joint angles (n, d) [rad] of a walk over most of the joints' ranges."""
+    """Return joint angles (n, d) [rad] of a walk over most of the joints' ranges."""
     steps = np.cumsum(rng.normal(size=(PAIRS, len(robot.joints))), axis=0)
     shares = (steps - steps.min(axis=0)) / np.ptp(steps, axis=0)
     return robot.lower + (0.1 + 0.8 * shares) * (robot.upper - robot.lower)
 
 
 def unit(robot: RobotDescription, seed: int, *, scaled: tuple[int, float] | None = None) -> Recording:
-    """One unit's recording.
+    """Return one unit's recording.
 
     Args:
         scaled: a joint's number, and by which factor it turns farther than its encoder says.

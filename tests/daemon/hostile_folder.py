@@ -1,4 +1,4 @@
-"""A folder whose files are called like the modules that our processes import."""
+"""A folder whose files have the names of modules that the project's processes import."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Encoders and a marker that follow a script, below the sampler where hardware would be."""
+"""Scripted encoders and marker in place of the hardware below the sampler."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from kbmaps import RigidChain
 FRAME_S = 1 / 30
 COV = frozen_array(np.eye(3) * 1e-6)
 
-# What a script may hold: something to give, an error to raise, or an event to wait for.
+# Content of a script: an item to return, an error to raise, or an event to wait for.
 Step = JointReading | MarkerFix | MarkerMiss | Exception | threading.Event
 
 
@@ -64,7 +64,7 @@ class Scripted:
 
 
 class ScriptClock(SystemClock):
-    """Shows the time of the newest fix of a script."""
+    """A clock that shows the time of the newest fix of a script."""
 
     def __init__(self, marker: Scripted) -> None:
         self._marker = marker
@@ -74,7 +74,7 @@ class ScriptClock(SystemClock):
 
 
 class Walk:
-    """An arm that moves its first joint by `step_deg` a frame, seen by perfect eyes."""
+    """An arm that moves its first joint by `step_deg` per frame, seen by perfect cameras."""
 
     def __init__(self, robot: RobotDescription, frames: int, step_deg: float = 1.5, start_s: float = 5.0) -> None:
         self.robot = robot

@@ -1,4 +1,4 @@
-"""docs/security.md carried out: its openssl lines, its tables, and the files of deploy/."""
+"""Run the instructions of docs/security.md: its openssl commands, its tables, and the files of deploy/."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ OPENSSL_S = 500.0
 
 
 def blocks(language: str) -> list[str]:
-    """The page's blocks of code in a language, in order."""
+    """Return the page's code blocks in a language, in order."""
     return re.findall(rf"^```{language}\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
 
 
 def carried_out(folder: Path) -> Path:
-    """`folder` with the certificates that the page's lines make there."""
+    """Run the page's commands in `folder` and return it with the certificates."""
     script = "set -eu\n" + "\n".join(blocks("bash"))
     command = ["bash", "-c", script]
     try:
@@ -35,7 +35,7 @@ def carried_out(folder: Path) -> Path:
 
 
 def table(file: Path, **changed: str) -> str:
-    """A file of deploy/ with some strings in the place of others: `old` of the keyword `new=old`."""
+    """Return a file of deploy/ with some strings replaced: `new=old` replaces `old` by the keyword `new`."""
     text = file.read_text(encoding="utf-8")
     for new, old in changed.items():
         assert old in text

@@ -1,4 +1,4 @@
-"""What makes a skipped test run."""
+"""Remedies that let a skipped test run."""
 
 from __future__ import annotations
 

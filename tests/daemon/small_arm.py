@@ -29,7 +29,7 @@ def write_small_arm(folder: Path, tables: str = "") -> Path:
 
 
 def write_long_arm(folder: Path, joints: int) -> Path:
-    """Write robot.toml and URDF of an arm with so many joints that turn into `folder`; the path of robot.toml."""
+    """Write robot.toml and URDF of an arm of revolute joints into `folder`; return the path of robot.toml."""
     links = "".join(f'<link name="link_{k}"/>' for k in range(joints + 1))
     turning = "".join(
         f'<joint name="joint_{k}" type="revolute"><parent link="link_{k}"/><child link="link_{k + 1}"/>'

@@ -151,7 +151,7 @@ def test_the_revolute_difference_is_never_more_than_half_a_turn(angles) -> None:
 def test_live_encoders_never_wait_for_frames_and_the_oldest_readings_go() -> None:
     buffer = JointBuffer(REVOLUTE, max_gap_s=0.1, capacity=10, live=True)
     for step in range(100):
-        buffer.put(reading(0.01 * step, 0.0, 0.0))  # not live, the eleventh would wait for ever
+        buffer.put(reading(0.01 * step, 0.0, 0.0))  # not live, the eleventh would wait forever
     assert buffer.at(0.5, 0.0) is Reason.NO_JOINTS
     assert not isinstance(buffer.at(0.95, 0.0), Reason)
 

@@ -53,7 +53,7 @@ def stored(file: Path) -> list[tuple[int, list[float]]]:
 
 @pytest.fixture
 def config(tmp_path: Path, free_endpoint: Callable[[], str]) -> Config:
-    """A robot with pairs and no checkpoint."""
+    """Return a robot with pairs and no checkpoint."""
     folder = tmp_path / "robot"
     folder.mkdir()
     zenoh = f'[zenoh]\nsampler = "{free_endpoint()}"\nlearner = "{free_endpoint()}"\n'
@@ -150,12 +150,12 @@ def test_a_restored_store_is_another_one_so_that_no_learner_mixes_it_with_the_fi
 
 
 def contents(folder: Path) -> dict[str, bytes | None]:
-    """Everything in a folder; None for what is not a file."""
+    """Return everything in a folder; None for what is not a file."""
     return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
 
 
 def refused(file: Path, robot: Path) -> str:
-    """The message with which a backup is refused; nothing is other than before."""
+    """Return the message that refuses a backup; assert that nothing else changed."""
     robot.parent.mkdir(exist_ok=True)
     before = contents(robot.parent)
     with pytest.raises((BackupError, StoreError)) as refusal:
@@ -193,7 +193,7 @@ def test_a_sampler_that_writes_the_store_is_not_disturbed(config, backed_up) -> 
 
 
 def put_back_in_another_process(file: Path, config: Config) -> None:
-    """The lock is a process's: this one's own would not be in its way."""
+    """Restore in another process: the lock belongs to a process, so this one's own would not block it."""
     done = warm.run("-m", "bodyschema", "restore", file, "--robot", config.file, "--force")
     if done.returncode:
         raise StoreError(done.stderr)
@@ -285,7 +285,7 @@ def test_a_torn_backup_is_refused(backed_up, elsewhere) -> None:
 
 
 def described(change: Callable[[str], str]) -> Callable[[dict[str, bytes]], None]:
-    """An archive whose checksums are right, with another robot.toml."""
+    """Return a change of an archive to another robot.toml with matching checksums."""
 
     def altered_members(members: dict[str, bytes]) -> None:
         members[ROBOT_TOML] = change(members[ROBOT_TOML].decode()).encode()
@@ -498,7 +498,7 @@ def flip_each(bits: Iterable[int], archive: Path, robot: Path) -> Counter[str]:
 
 @pytest.fixture
 def at_rest(monkeypatch) -> None:
-    """No process is asked for: there is none."""
+    """Skip the check for running processes: there are none."""
     monkeypatch.setattr("bodyschema.daemon.restoring.is_alive", lambda *_: False)
 
 

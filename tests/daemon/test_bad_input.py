@@ -1,4 +1,4 @@
-"""What a user does wrong, at the command line and over zenoh, and what he is told."""
+"""User errors at the command line and over zenoh, and the messages they produce."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ WITHOUT_ROOTS_RIGHTS = """import ctypes, os, sys
 PR_CAPBSET_DROP, CAP_DAC_OVERRIDE = 24, 1
 ctypes.CDLL(None).prctl(PR_CAPBSET_DROP, CAP_DAC_OVERRIDE, 0, 0, 0)
 os.execv(sys.executable, [sys.executable, "-m", "bodyschema", *sys.argv[1:]])"""
-# SQLite says of a file that may not grow what it says of a disk that is full.
+# SQLite reports a file size limit in the same words as a full disk.
 
 
 def run(*arguments: object, cwd: Path, by: tuple[str, ...] = DAEMON) -> subprocess.CompletedProcess[str]:
@@ -48,7 +48,7 @@ def run(*arguments: object, cwd: Path, by: tuple[str, ...] = DAEMON) -> subproce
 
 
 def run_here(*arguments: object, cwd: Path, stdin: str = "") -> subprocess.CompletedProcess[str]:
-    """As `run`, for commands that leave no mark on their process."""
+    """Run a command that leaves the process's state unchanged, like `run` but in this process."""
     command, out, err = ["bodyschema", *map(str, arguments)], io.StringIO(), io.StringIO()
     typed = io.TextIOWrapper(io.BytesIO(stdin.encode()))
     with (
@@ -67,7 +67,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def refused(*arguments: object, cwd: Path, stdin: str = "") -> str:
-    """The one line with which the command ends, having changed nothing."""
+    """Return the one line with which the command fails; assert that it changed nothing."""
     before = contents(cwd)
     done = run(*arguments, cwd=cwd) if arguments[0] in PROCESSES else run_here(*arguments, cwd=cwd, stdin=stdin)
     assert contents(cwd) == before
@@ -79,7 +79,7 @@ def refused(*arguments: object, cwd: Path, stdin: str = "") -> str:
 
 @pytest.fixture
 def robot(tmp_path: Path, free_endpoint: Callable[[], str]) -> Path:
-    """robot.toml of an arm whose encoders and camera are the recording walk.csv; the working directory of `run`."""
+    """Return robot.toml of an arm that replays walk.csv as encoders and camera; the working directory of `run`."""
     (tmp_path / "walk.csv").write_text(RECORDING)
     tables = f'[zenoh]\nsampler = "{free_endpoint()}"\nlearner = "{free_endpoint()}"\n[daemon]\nstate_dir = "state"\n'
     return write_small_arm(tmp_path, tables + '[drivers]\nrecording = "walk.csv"\nspeed = 0\n')
@@ -223,7 +223,7 @@ def test_a_folder_that_cannot_be_written_ends_the_sampler(robot, state_dir, said
 
 @contextlib.contextmanager
 def process_running(config: Config, process: str, by: tuple[str, ...] = DAEMON) -> Iterator[None]:
-    """A process that is alive; it is ended in the end."""
+    """Run a process and stop it when the context ends."""
     up = threading.Event()
     with tempfile.TemporaryFile() as log, Bus(connect=getattr(config.tables.zenoh, process)) as bus:
         words = (*by, process, "--robot", config.file)
@@ -251,7 +251,7 @@ def test_a_process_that_takes_the_connection_and_says_nothing_is_not_taken_for_n
 
 @pytest.fixture(scope="module")
 def lonely_learner(tmp_path_factory, free_endpoint) -> Iterator[Config]:
-    """A learner without a sampler that does not know where the camera stands, and may write nothing."""
+    """Yield a learner without a sampler, with an unknown camera pose and a read-only state folder."""
     folder: Path = tmp_path_factory.mktemp("lonely")
     (folder / "arm.urdf").write_text(URDF)
     (folder / "state").mkdir(mode=0o555)

@@ -20,7 +20,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "desk_arm"
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder with an arm of servos in it."""
+    """Return a folder with an arm of servos in it."""
     return Path(shutil.copytree(EXAMPLE, tmp_path / "arm"))
 
 

@@ -1,4 +1,4 @@
-"""What `bodyschema calibrate` finds and says, against planted robots."""
+"""Results and messages of `bodyschema calibrate` for planted robots."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ SIGMA_M = 0.0005
 
 @dataclass(frozen=True, eq=False)
 class Planted:
-    """A desk arm that is not as drawn: its pairs, and the truth about it."""
+    """A desk arm that deviates from nominal: its pairs and the ground truth."""
 
     robot: RobotDescription
     parameters: ChainParameters
@@ -57,21 +57,21 @@ class Planted:
 
 @functools.cache
 def planted(seed: int, *, pairs: int = 100, sigma: float = SIGMA_M, outliers: int = 0) -> Planted:
-    """An arm made to 0.17° and 1 mm, its inner zeros off by 3°, camera and marker anywhere (1-sigma)."""
+    """Return an arm built to 0.17° and 1 mm, its inner joint offsets 3°, camera and marker anywhere (1-sigma)."""
     rng = np.random.default_rng(seed)
     robot = RobotDescription.load(DESK_ARM)
     parameters = ChainParameters(robot.chain)
     made = ChainTolerances(0.003, 0.001, ZEROS_RAD, tool=0.03, base_rotation=0.5, base_translation=0.5)
     change = parameters.standard_deviations(made) * rng.normal(size=parameters.size)
     zeros = change[parameters.zeros]
-    zeros[[0, -1]] = 0.0  # no motion tells them from a turn of camera and marker
+    zeros[[0, -1]] = 0.0  # equivalent to a rotation of camera and marker in any motion
     q = rng.uniform(robot.lower, robot.upper, (pairs, 4))
     x = parameters.positions(change, q) + sigma * rng.normal(size=(pairs, 3))
     x[:outliers] += 0.1
     return Planted(robot, parameters, change, Recording(joints=robot.joints, q=q, x=x))
 
 
-# --- what is found
+# --- results
 
 
 @functools.cache
@@ -95,7 +95,7 @@ def test_the_learnt_arm_is_the_true_one_within_the_noise() -> None:
 
 
 def covered(seeds: range) -> float:
-    """Share of the figures whose true values lie inside their intervals."""
+    """Return the share of the figures whose true values lie inside their intervals."""
     inside: list[bool] = []
     for seed in seeds:
         arm = planted(seed)
@@ -107,7 +107,7 @@ def covered(seeds: range) -> float:
 
 
 def figures_of(arm: Planted) -> np.ndarray:
-    """What a calibration without errors would find."""
+    """Return the figures that an error-free calibration would find."""
     zeros = arm.change[arm.parameters.zeros]
     pose = arm.parameters.base_pose(arm.change)
     chain = arm.parameters.chain(arm.change)
@@ -141,7 +141,7 @@ def test_a_marker_that_never_moved_is_told() -> None:
         Calibration.of(arm.robot, still, sigma_m=None, zeros_rad=ZEROS_RAD)
 
 
-# --- what is said
+# --- messages
 
 
 def said(arm: Planted, **changed) -> str:
@@ -170,7 +170,7 @@ def test_the_scatter_of_the_pairs_is_not_what_their_source_told() -> None:
 
 @pytest.fixture(scope="module")
 def corner() -> CalibrationReport:
-    """Of twelve pairs within a few degrees."""
+    """Return the calibration from twelve pairs within a few degrees."""
     arm = planted(1)
     q = arm.recording.q[0] + 0.05 * np.random.default_rng(0).normal(size=(12, 4))
     x = arm.parameters.positions(arm.change, q) + SIGMA_M * np.random.default_rng(1).normal(size=(12, 3))
@@ -336,7 +336,7 @@ def test_links_worse_than_any_are_not_written(pairs_file, tmp_path) -> None:
 
 
 def retooled(seed: int, at: int, move_m: float, *, walk: bool = False) -> Planted:
-    """An arm whose tool was changed after `at` of its pairs."""
+    """Return an arm whose tool was changed after `at` of its pairs."""
     arm = planted(seed)
     q, rng = arm.recording.q, np.random.default_rng(seed)
     if walk:
@@ -395,7 +395,7 @@ def test_rows_that_are_not_there_are_told(pairs_file) -> None:
 
 @pytest.fixture
 def robot_with_store(tmp_path) -> Path:
-    """robot.toml of an arm whose store has 20 pairs with one tool and 30 with another, as its learner knows."""
+    """Return robot.toml of an arm whose store has 20 pairs with one tool and 30 with another, known to its learner."""
     shutil.copytree(DESK_ARM.parent, tmp_path / "arm")
     robot = tmp_path / "arm" / "robot.toml"
     robot.write_text(robot.read_text() + '\n[daemon]\nstate_dir = "state"\n')

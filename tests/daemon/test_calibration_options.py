@@ -1,4 +1,4 @@
-"""What `bodyschema calibrate` holds, expects on new poses, and tells ROS, against planted robots."""
+"""Options of `bodyschema calibrate`: fixed parameters, expected errors on new poses and the ROS output."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MADE = ChainTolerances(0.003, 0.001, tool=0.03, base_rotation=0.2, base_translat
 
 
 class Arm:
-    """A desk arm whose camera and tool are elsewhere, and whose links and zeros may be."""
+    """A desk arm whose camera and tool, and optionally links and joint offsets, deviate from nominal."""
 
     def __init__(self, made: ChainTolerances, offsets_deg: np.ndarray, seed: int) -> None:
         self.rng = np.random.default_rng(seed)

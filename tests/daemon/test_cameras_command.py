@@ -27,7 +27,7 @@ def called(*arguments: object) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """Pairs of images; beside them cameras.toml, and what was said of it on a terminal of 80 columns."""
+    """Return a folder of image pairs with cameras.toml, and the output on a terminal of 80 columns."""
     folder = tmp_path_factory.mktemp("images")
     for pair in photographed()[1]:
         cv2.imwrite(str(folder / f"left{pair.name}.png"), pair.left)

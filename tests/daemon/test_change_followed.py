@@ -1,4 +1,4 @@
-"""A change that nobody told: it is noticed, dated, followed at once, and can be rolled back."""
+"""An unannounced change is detected, dated and followed at once, and can be rolled back."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ CHANGES = {
 
 @dataclass(frozen=True)
 class Followed:
-    """A learner before and after a change that it was not told of."""
+    """A learner before and after an unannounced change."""
 
     kind: str
     learning: Learning

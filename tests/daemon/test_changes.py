@@ -1,4 +1,4 @@
-"""What the learner says of a change, in the log and in the status."""
+"""The learner's reports of a change, in the log and in the status."""
 
 from __future__ import annotations
 

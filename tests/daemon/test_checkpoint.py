@@ -173,7 +173,7 @@ def test_what_is_set_aside_is_kept_beside_what_was_before(written) -> None:
 
 
 def sealed(file: Path, change: Callable[[dict[str, Any]], None], arrays: Callable[[bytes], bytes] = bytes) -> Path:
-    """The checkpoint with another header and other arrays, and the checksum that goes with them."""
+    """Write the checkpoint with a changed header and changed arrays, under a valid checksum."""
     data = file.read_bytes()
     end = 16 + int.from_bytes(data[12:16], "little")
     header = msgspec.msgpack.decode(data[16:end])
@@ -248,7 +248,7 @@ NASTY = (0, -1, 2**63 - 1, -(2**63), 1e308, math.nan, None, "", "\0", b"\xff", [
 
 
 def altered(value: Any, rng: np.random.Generator) -> Any:
-    """The same with something nasty somewhere in it."""
+    """Return the value with one malformed entry somewhere inside."""
     if isinstance(value, dict) and value and ("learning" in value or rng.random() < 0.9):
         key = list(value)[rng.integers(len(value))]
         return {**value, key: altered(value[key], rng)}
@@ -259,7 +259,7 @@ def altered(value: Any, rng: np.random.Generator) -> Any:
 
 
 def go_on_from_nasty_headers(written: Path, count: int) -> None:
-    """A learner goes on, or says why it does not."""
+    """Assert that a learner resumes from malformed headers, or says why it does not."""
     data, rng = written.read_bytes(), np.random.default_rng(0)
     for _ in range(count):
         written.write_bytes(data)

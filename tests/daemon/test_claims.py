@@ -28,7 +28,7 @@ def new_claims(belief: ChainBelief = DRAWN) -> Claims:
 
 
 def learnt(claims: Claims, q: FloatArray, prior_error_m: float, error_m: float = 0.0) -> None:
-    """Pairs at q: there the prior is wrong by the first, the instant learner by the second error on each axis."""
+    """Learn pairs at q, where the prior errs by the first, the instant learner by the second error on each axis."""
     for row in q:
         x = MODEL.predict(row[None]) + prior_error_m
         claims.predicted(Where(row[None]), x, {PRIOR: x - prior_error_m, INSTANT: x - error_m}, NOISE[None])
@@ -40,7 +40,7 @@ def sigma(claims: Claims, name: str, q: FloatArray) -> float:
 
 
 def sure_belief(shift_m: float = 0.0) -> ChainBelief:
-    """The drawn chain, moved on each axis, and nothing else is possible."""
+    """Return a belief without uncertainty in the nominal chain, shifted on each axis."""
     shift = np.eye(4)
     shift[:3, 3] = shift_m
     return NOMINAL.belief(NOMINAL.chain.transformed(shift), ChainTolerances())
@@ -170,7 +170,7 @@ def test_claims_are_the_same_after_a_restart(walk: FloatArray) -> None:
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 3))])
 def test_the_claim_holds_between_poses_of_a_sweep_in_large_steps(seed: int) -> None:
-    # The gears ripple nine times a turn: what is missed at a pose says nothing of the next one, 25 degrees away.
+    # The gears ripple nine times per turn: the error at a pose is unrelated to the next one, 25 degrees away.
     rng = np.random.default_rng(seed)
     chain, wave = built_chain(rng), rng.normal(0.0, 0.002, (2, JOINTS))
 

@@ -1,4 +1,4 @@
-"""A disk that gives back something else than was written: each true pair is kept, and no other is believed."""
+"""Data corruption on disk: every intact pair is kept, and no damaged one is accepted."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def written(folder: Path, pairs: int) -> Path:
 
 @pytest.fixture(scope="module")
 def short_and_long(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A store of a few pages, and one of many."""
+    """Return a store of a few pages, and one of many."""
     return written(tmp_path_factory.mktemp("short"), PAIRS), written(tmp_path_factory.mktemp("long"), LONG)
 
 
@@ -172,7 +172,7 @@ def zero(file: Path, page: int, pages: int = 1) -> None:
 
 
 def leaves(file: Path) -> list[int]:
-    """The pages that hold pairs, in their order."""
+    """Return the pages that hold pairs, in order."""
     data = file.read_bytes()
     pages = [data[k : k + PAGE_BYTES] for k in range(0, len(data), PAGE_BYTES)]
     return [k for k, page in enumerate(pages, 1) if page[0] == 0x0D and page.count(b"2026-01-01T00:00:") > 2]
@@ -263,7 +263,7 @@ def test_a_rebuild_without_room_leaves_the_damaged_file(mount_small_disk, long) 
 
 
 class Flips:
-    """A store of which one bit after the other is flipped, and what came of it."""
+    """A store whose bits are flipped one after the other, and the results."""
 
     def __init__(self, file: Path, folder: Path) -> None:
         with PairReader(file) as reader:
@@ -414,7 +414,7 @@ def test_a_wrong_type_costs_its_own_pair(file, column, value) -> None:
 
 
 def test_sealed_nonsense_costs_its_own_pairs(file) -> None:
-    """Their checksums are right: whoever made them knew how."""
+    """Check rows whose checksums are valid."""
     rng = np.random.default_rng(0)
     with contextlib.closing(store_schema.connect(file)) as connection:
         for seq in range(1, PAIRS):
@@ -449,7 +449,7 @@ FRAME_BYTES, LOG_HEADER_BYTES = 24 + PAGE_BYTES, 32
 
 
 def left_by_a_killed_sampler(folder: Path) -> Path:
-    """A store whose newest pairs are in the write-ahead log alone."""
+    """Return a store whose newest pairs are in the write-ahead log alone."""
     with PairStore(folder / "live" / "pairs.sqlite", SESSION) as store:
         add(store, PAIRS)
         shutil.copytree(store.file.parent, folder / "killed")

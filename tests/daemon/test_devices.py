@@ -1,4 +1,4 @@
-"""What the joints were read with, kept with the pairs; the status of servos."""
+"""Devices that read the joints, kept with the pairs; the status of servos."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ ELBOW = {
 
 
 class Joints:
-    """Encoders of which only the record is looked at."""
+    """Encoders of which only the device record is used."""
 
     joints = ("elbow",)
 
@@ -46,10 +46,10 @@ class Joints:
         return self
 
     def __exit__(self, *_) -> None:
-        """Nothing was opened."""
+        """Do nothing: nothing was opened."""
 
     def read(self, timeout_s: float) -> None:
-        """Never anything."""
+        """Return None."""
 
 
 @pytest.fixture
@@ -122,7 +122,7 @@ def test_how_fast_a_servo_answers_is_no_other_calibration() -> None:
 
 
 def as_schema_1(file: Path) -> None:
-    """The store as the version before wrote it."""
+    """Convert the store to the previous schema."""
     connection = sqlite3.connect(file)
     connection.executescript(
         "DROP TABLE devices; ALTER TABLE pairs DROP COLUMN R; ALTER TABLE pairs DROP COLUMN cov_R;"

@@ -1,4 +1,4 @@
-"""`bodyschema diagnose` at the command line: what it prints, what it writes, what it refuses."""
+"""`bodyschema diagnose` at the command line: output, files and errors."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def diagnose(*arguments: object, columns: int = 80) -> Ended:
 
 
 def refused(*arguments: object) -> str:
-    """The one line after progress with which the command ends."""
+    """Return the error line after the progress, with which the command fails."""
     ended = diagnose(*arguments)
     assert (ended.code, ended.out) == (1, "")
     line = ended.err.splitlines()[-1]
@@ -114,7 +114,7 @@ def found(recording) -> DiagnosisFile:
     return run(Config.load(DESK_ARM), source, Asked(("joint_scale", "backlash"), (), 0), lambda _: None).file
 
 
-# --- what it prints
+# --- output
 
 
 def test_a_cause_is_told_in_a_sentence_with_its_joint_and_number(told, robot) -> None:
@@ -193,7 +193,7 @@ def test_what_fits_no_effect_is_told_with_its_joints(found) -> None:
     assert "elbow, time. Link 2 bends." in text
 
 
-# --- what it writes
+# --- files
 
 
 def test_without_out_nothing_is_written(file, tmp_path, monkeypatch) -> None:
@@ -227,7 +227,7 @@ def test_effects_that_are_excluded_are_not_looked_for(file) -> None:
 
 
 class Sampler:
-    """Answers for its pairs."""
+    """A fake sampler that serves its pairs."""
 
     def __init__(self, bus: Bus, name: str, recording: Recording) -> None:
         assert recording.t is not None
@@ -243,7 +243,7 @@ class Sampler:
 
 @pytest.fixture
 def live_robot(tmp_path, endpoint, robot) -> Path:
-    """The desk arm with a sampler of its own."""
+    """Return the robot.toml of the desk arm with its own sampler."""
     (tmp_path / robot.robot.urdf).write_bytes(robot.tree.file.read_bytes())
     (tmp_path / "robot.toml").write_text(f'{DESK_ARM.read_text()}\n[zenoh]\nsampler = "{endpoint}"\n')
     return tmp_path / "robot.toml"
@@ -268,7 +268,7 @@ def test_a_sampler_that_does_not_run_is_said_not_to(live_robot) -> None:
     assert "nobody listens on" in refused("--live", "--robot", live_robot)
 
 
-# --- what it refuses
+# --- refusals
 
 
 def written(recording: Recording, folder: Path, **changes) -> Path:

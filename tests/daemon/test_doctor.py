@@ -45,7 +45,7 @@ def called(*arguments: object) -> int:
 
 @pytest.fixture
 def state(tmp_path, monkeypatch, free_endpoint) -> None:
-    """State and endpoints of this test alone."""
+    """Give this test its own state folder and endpoints."""
     monkeypatch.setenv("BODYSCHEMA_ZENOH_SAMPLER", free_endpoint())
     monkeypatch.setenv("BODYSCHEMA_ZENOH_LEARNER", free_endpoint())
 

@@ -17,7 +17,7 @@ NEAR, LIMIT, FAR = 0.001, 0.01, 0.1
 
 
 def meet(doubts: Doubts, number: int, distance_m: float) -> None:
-    """A pair that is known by its number."""
+    """Add an outlier identified by its number."""
     doubts.doubt(np.full(1, float(number)), np.full(3, float(number)), distance_m, LIMIT)
 
 

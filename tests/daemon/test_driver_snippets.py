@@ -1,4 +1,4 @@
-"""Settings of drivers say what was found, in the drivers' own units."""
+"""Driver settings express the findings in the drivers' own units."""
 
 from __future__ import annotations
 

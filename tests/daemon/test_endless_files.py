@@ -1,4 +1,4 @@
-"""Devices, pipes and files without end in the place of every file that is read."""
+"""Devices, pipes and endless files in place of every input file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The map beside a model that is none: whoever wants a file gets the best one."""
+"""The map exported while the current model is not a map: the best map is used."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ X = np.array([pair.x for pair in SCENE.pairs])
 
 
 def map_off_by(metres: float) -> KBMap:
-    """The arm's map, with the marker so far from where it is."""
+    """Return the arm's map with the marker this far from its true position."""
     return SCENE.chain.with_tool([metres, 0.0, 0.0]).to_kbmap(NOMINAL.bases)
 
 
 def beside(era: Era) -> str:
-    """The name of the map that is published."""
+    """Return the name of the published map."""
     return next(name for name, kbmap in era.members.maps.items() if kbmap is era.map)
 
 
 def take(era: Era, name: str, model: LearntModel) -> None:
-    """A solution of all pairs up to now."""
+    """Give the regime a solution of all pairs up to now."""
     pairs = era.memory.count
     era.ask()
     era.take(Solved(era.task_number, pairs, name, model), model, pairs)
@@ -49,7 +49,7 @@ def learn(era: Era, part: slice) -> None:
 
 @pytest.fixture
 def era() -> Era:
-    """The chain with residual answers; of the maps, that of the rigid chain is the best."""
+    """Return a regime with a chain and residual models; the rigid chain's map is the best of the maps."""
     arm = KnownArm(BELIEF, TOLERANCES)
     era = Era(NOMINAL.prior(), arm, Claims(NOMINAL.bases, 0.1), LearnerConfig(), itertools.count())
     learn(era, slice(0, 20))

@@ -22,7 +22,7 @@ MARKER = '[drivers.ros2.marker]\nframe = "eye"\n'
 
 
 class Topic:
-    """Keeps what it is told."""
+    """Recorder of what is published."""
 
     period_s = 0.1
 
@@ -51,7 +51,7 @@ class Joints(Scripted):
 
 
 class Clock:
-    """Shows what it is told."""
+    """A clock that a test sets."""
 
     t = 0.0
 

@@ -36,7 +36,7 @@ def poses(robot: RobotDescription) -> FloatArray:
 
 
 def error_m(nominal: NominalModel, simulation: Simulation) -> float:
-    """Mean error of what the learner says before any pair."""
+    """Return the mean error of the learner's answers before any pair."""
     q = poses(simulation.robot)
     said = Learning(nominal, LearnerConfig(), DirectSolver()).snapshot.predict(q).x
     return float(np.linalg.norm(said - simulation.positions(Motion.still(q)), axis=1).mean())

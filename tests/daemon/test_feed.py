@@ -32,7 +32,7 @@ class HandClock:
         return ""
 
 
-# A step takes one offer; so many more are there for those that only wake the feed, and to catch up.
+# A step takes one offer; these are extra, for offers that only wake the feed and to catch up.
 SPARE_STEPS = 5
 
 
@@ -41,7 +41,7 @@ class Store:
 
     def __init__(self, pairs: list[Pair]) -> None:
         self.pairs, self.store, self.asked, self.answers = pairs, STORE, 0, True
-        self.gone = self.goes = 0  # of the oldest pairs: so many are not kept, and with each answer so many more
+        self.gone = self.goes = 0  # number of the oldest pairs that are deleted, and increase per answer
         self.refusal: str | None = None
         self.last_seq: int | None = None  # where it is not how many pairs there are
 
@@ -217,7 +217,7 @@ def test_pairs_that_a_disk_changed_are_passed_over(lost) -> None:
     assert fed.feed.problem is None
 
 
-# --- what cannot be taken
+# --- invalid pairs
 
 
 def wrong(pair: Pair) -> list[bytes]:

@@ -1,4 +1,4 @@
-"""Too few file descriptors: said at the start, survived later."""
+"""Too few file descriptors: reported at the start, survived later."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Camera, tool and zeros that the learner tells while it runs, and its outlook, against planted arms."""
+"""The learner's reports of camera, tool and joint offsets, and its forecast, against planted arms."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NAMES = ("a", "b", "c", "d")
 
 
 class Ticking:
-    """A clock that stands until it is moved."""
+    """A clock that stands still until it is moved."""
 
     def __init__(self) -> None:
         self.time = 0.0
@@ -41,7 +41,7 @@ class Ticking:
 
 
 class Slow(Ticking):
-    """Whatever is done between two looks at it takes a while."""
+    """Clock on which everything done between two looks takes a while."""
 
     TICK_S = 0.1
 
@@ -52,7 +52,7 @@ class Slow(Ticking):
 
 @dataclass
 class Planted:
-    """A desk arm that is not as drawn, and a learner that has pairs of it."""
+    """A desk arm that deviates from nominal, and a learner that has pairs of it."""
 
     robot: RobotDescription
     parameters: ChainParameters
@@ -67,13 +67,13 @@ class Planted:
         made = ChainTolerances(0.003, 0.001, 0.05, tool=0.03, base_rotation=0.5, base_translation=0.5)
         change = parameters.standard_deviations(made) * rng.normal(size=parameters.size)
         zeros = change[parameters.zeros]
-        zeros[[0, -1]] = 0.0  # no motion tells them from a turn of camera and marker
+        zeros[[0, -1]] = 0.0  # equivalent to a rotation of camera and marker in any motion
         arm = cls(robot, parameters, change, Learning(NominalModel.of(robot), LearnerConfig(), DirectSolver()))
         arm.teach(rng, pairs)
         return arm
 
     def teach(self, rng: np.random.Generator, pairs: int) -> None:
-        """Pairs all over the joints' ranges; then everything that the background has to do but replay."""
+        """Learn pairs all over the joints' ranges; then do all background work but the replay."""
         first = self.learning.counters.last_seq + 1
         q = rng.uniform(self.robot.lower, self.robot.upper, (pairs, 4))
         x = self.parameters.positions(self.change, q) + SIGMA_M * rng.normal(size=(pairs, 3))
@@ -95,7 +95,7 @@ class Planted:
         return known
 
     def covered(self) -> list[bool]:
-        """Which of the figures that are told lie inside their intervals."""
+        """Return a mask of the reported figures whose intervals contain the truth."""
         found, _ = figures(self.robot, self.known())
         off = found.values - figures_of(self)
         off[3:6] = np.remainder(off[3:6] + np.pi, 2.0 * np.pi) - np.pi
@@ -105,7 +105,7 @@ class Planted:
 
 @cache
 def shared(seed: int, pairs: int) -> Planted:
-    """An arm that no test teaches anything more."""
+    """Return an arm that tests share; none of them changes it."""
     return Planted.of(seed, pairs)
 
 
@@ -204,7 +204,7 @@ def guided(seed: int, pairs: int) -> tuple[Learning, Scene]:
 
 @pytest.fixture(scope="module")
 def after_60() -> list[tuple[Learning, Scene, Outlook]]:
-    """Learners that know the first 60 pairs of a path of 160, and their outlook then."""
+    """Return learners that know the first 60 pairs of a path of 160, and their outlook then."""
     found = []
     for seed in range(4):
         scene, learning = Scene.draw(seed, 160), new_learning()
@@ -214,7 +214,7 @@ def after_60() -> list[tuple[Learning, Scene, Outlook]]:
 
 
 def true_error_m(learning: Learning, scene: Scene, pairs: int) -> float:
-    """Near the first `pairs` of the path."""
+    """Return the true error near the first `pairs` of the path."""
     q = near(np.random.default_rng(0), scene.q[:pairs])
     return float(np.linalg.norm(learning.snapshot.predict(q).x - scene.chain.positions(q), axis=1).mean())
 

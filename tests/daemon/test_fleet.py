@@ -1,4 +1,4 @@
-"""Many robots at one place: who is there, and which unit's model is off."""
+"""Many robots at one endpoint: discovery, and finding the unit whose model is off."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def learner_of(robot: str, waist: float = 0.0) -> LearnerStatus:
 
 
 def positions(q: FloatArray, waist: float) -> FloatArray:
-    """Of an arm of two links whose waist stands off by so much [rad]; q (n, 2)."""
+    """Return the positions of an arm of two links with this waist offset [rad]; q (n, 2)."""
     waists, shoulders = q[:, 0] + waist, q[:, 1]
     reach = 0.3 + 0.4 * np.cos(shoulders)
     # A hand off the plane of the links: else a turned waist is a turned camera.
@@ -69,7 +69,7 @@ def positions(q: FloatArray, waist: float) -> FloatArray:
 
 @contextmanager
 def robots(endpoint: str, waists: dict[str, float], *, learners: bool = True) -> Iterator[None]:
-    """Robots that listen at one place, each with its waist off by so much."""
+    """Serve robots at one endpoint, each with its own waist offset."""
     with Bus(listen=endpoint) as bus:
 
         def stand(name: str, waist: float) -> None:

@@ -1,4 +1,4 @@
-"""Many recordings diagnosed on Dask: which unit is off, what fails alone, what ends cleanly."""
+"""Many recordings diagnosed on Dask: the faulty unit, isolated failures and a clean end."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ pytest.importorskip("distributed")
 
 
 def fleet(*words: object) -> tuple[object, str, str]:
-    """Exit code, standard output and standard error of `bodyschema fleet`."""
+    """Return exit code, standard output and standard error of `bodyschema fleet`."""
     out, err = io.StringIO(), io.StringIO()
     with (
         mock.patch.object(sys, "argv", ["bodyschema", "fleet", *map(str, words)]),
@@ -39,7 +39,7 @@ def fleet(*words: object) -> tuple[object, str, str]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two units that are as drawn, one whose elbow turns 2 % farther than it says, and a file that is no recording."""
+    """Return two nominal units, one whose elbow turns 2 % farther than it reads, and a file that is not a recording."""
     folder, robot = tmp_path_factory.mktemp("units"), RobotDescription.load(DESK_ARM)
     unit(robot, 1).write_csv(folder / "left.csv")
     unit(robot, 2, scaled=(2, 1.02)).write_csv(folder / "right.csv")

@@ -1,4 +1,4 @@
-"""Workers of Dask that are started in a folder whose files are called like the modules that they import."""
+"""Dask workers started in a folder whose files have the names of modules that they import."""
 
 from __future__ import annotations
 
@@ -24,6 +24,6 @@ def test_workers_execute_nothing_of_the_current_folder(tmp_path: Path) -> None:
     here.mkdir()
     script.write_text(AT_WORK)
     hostile = HostileFolder(here)
-    # Like the command `bodyschema`: without -P, and a script that stands elsewhere.
+    # Like the command `bodyschema`: without -P, and with a script in another folder.
     subprocess.run([sys.executable, str(script)], cwd=here, capture_output=True, timeout=LIMIT_S, check=True)
     assert hostile.executed == []

@@ -1,4 +1,4 @@
-"""Names, paths and sizes that are something else to the program that reads them next."""
+"""Names, paths and sizes with a special meaning to the next program that reads them."""
 
 from __future__ import annotations
 

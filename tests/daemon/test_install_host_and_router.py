@@ -37,7 +37,7 @@ def write_robot(folder: Path, name: str, tables: str = "") -> Path:
 
 @pytest.fixture
 def robots(tmp_path: Path) -> Path:
-    """The folder of two robots' descriptions."""
+    """Return the folder of two robots' descriptions."""
     write_robot(tmp_path / "robots" / "left", "left", '[zenoh]\nlearner = "tcp/127.0.0.1:7458"\n')
     write_robot(tmp_path / "robots" / "right", "right")
     return tmp_path / "robots"

@@ -68,7 +68,7 @@ def install(*arguments: object) -> None:
 
 
 def written(folder: Path, config: Config) -> dict[Path, str]:
-    """The units of `config` in `folder`, as on a machine."""
+    """Install the units of `config` in `folder`, as on a machine."""
     files = ServiceFiles(config.robot.name, folder=UnitFolder(folder))
     texts = files.texts(config, "daemon", HERE)
     files.install(texts)

@@ -30,7 +30,7 @@ def config() -> Config:
 
 
 def signs(config: Config, *path: tuple[int, float], begin=(0.0, 0.0, 0.5, 0.0)) -> str:
-    """What is said after the joints were moved by so much [rad], one after the other, with a rest between."""
+    """Return the sign check's output after the joints moved by these angles [rad], one after the other, with rests."""
     check, q, t = SignCheck(config.robot), np.array(begin), 0.0
     for joint, turn in path:
         for step in np.linspace(0.0, turn, 30):
@@ -78,7 +78,7 @@ def test_noise_is_no_movement(config) -> None:
     assert signs(config, (YAW, 0.02)) == ""
 
 
-# --- over the bench
+# --- on the emulator
 
 
 def test_the_watch_has_angles_speeds_temperatures_and_ranges(config, tmp_path) -> None:

@@ -1,4 +1,4 @@
-"""Pairs that are judged together, as a host of many robots does: the instant learner waits for nothing."""
+"""Pairs judged in batches, as by a host of many robots: the instant learner does not wait."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ POSE = np.array([0.1, 0.4, 0.6, 0.0])
 
 
 def wiggle(seed: int, latency_s: float, noise_mm: float = 0.5, joints: int = 4, harmonics: int = 6) -> Wiggle:
-    """5 s of uneven motion of an arm that is not quite the drawn one: zeros 3° off, another tool."""
+    """Return 5 s of uneven motion of an arm that deviates from nominal: joint offsets of 3°, another tool."""
     rng = np.random.default_rng(seed)
     pace = 2 * np.pi * rng.uniform(0.3, 1.2, (joints, harmonics))
     width = 0.2 * rng.normal(size=(joints, harmonics)) * np.sqrt(2 / harmonics) / pace * 3.8
@@ -41,9 +41,9 @@ def wiggle(seed: int, latency_s: float, noise_mm: float = 0.5, joints: int = 4, 
 
 
 def latency_by_speed(wiggle: Wiggle, chain: RigidChain) -> float:
-    """The latency by speeds alone [s]: the shift at which those of `chain`'s marker and of the seen one correlate best.
+    """Return the latency [s] from speeds alone: the shift that best correlates the speeds of chain and marker.
 
-    For comparison: the drawn arm's speed is not the real one's, and noise is differentiated.
+    For comparison: the nominal arm's speed is not the real one's, and noise is differentiated.
     """
     t = wiggle.t_marker[(wiggle.t_marker - LATEST_S >= wiggle.t_joints[0])]
     x = wiggle.x[-len(t) :]
@@ -74,7 +74,7 @@ def test_the_claimed_uncertainty_covers() -> None:
 
 
 def guided(seed: int) -> Wiggle:
-    """12 s as a hand guides the arm: from pose to pose at one pace, its zeros 2.5°, axes 0.6° and links 5 mm off."""
+    """Return 12 s of hand guiding from pose to pose at one pace: joint offsets 2.5°, axes 0.6° and links 5 mm off."""
     rng = np.random.default_rng(seed)
     parameters = ChainParameters(ARM.chain)
     made = ChainTolerances(axes=0.01, points=0.005, zeros=0.045, tool=0.01)
@@ -107,7 +107,7 @@ def test_the_95_percent_intervals_of_slowly_guided_arms_cover_95_percent() -> No
 
 
 def in_step(seed: int, latency_s: float) -> Wiggle:
-    """Slow motion, every fourth of the readings at the very time of an image, and readings with noise."""
+    """Return slow motion with noisy readings, every fourth of them exactly at the time of an image."""
     rng = np.random.default_rng(seed)
     pace = 2 * np.pi * rng.uniform(0.3, 1.2, (4, 6))
     width, phase = 0.18 * rng.normal(size=(4, 6)) / pace, rng.uniform(0, 2 * np.pi, (4, 6))
@@ -123,7 +123,7 @@ def in_step(seed: int, latency_s: float) -> Wiggle:
 
 @pytest.mark.parametrize("latency_s", [0.0, 0.04])
 def test_readings_in_step_with_the_images_do_not_draw_the_latency_between_two_readings(latency_s) -> None:
-    """A straight line between two readings has half their noise in the middle: there it would seem to fit best."""
+    """Check midpoints: a straight line between two readings has half their noise there and seems to fit best."""
     found = [latency_of(in_step(seed, latency_s), ARM.chain) for seed in range(12)]
     off = np.array([each.latency_s - latency_s for each in found])
     assert np.sqrt(np.mean(off**2)) < 1e-3
@@ -197,7 +197,7 @@ def test_too_few_fixes_are_named() -> None:
 
 
 def shown(seed: int = 0, *, every: int = 1, seconds: float = 5.0) -> Wiggle:
-    """A wiggle of which the cameras gave every so manieth fix, for so long [s]."""
+    """Return the first `seconds` [s] of a wiggle with every `every`-th fix of the cameras."""
     whole = wiggle(seed, 0.05)
     joints, fixes = whole.t_joints < seconds, whole.t_marker < seconds
     return Wiggle(whole.t_joints[joints], whole.q[joints], whole.t_marker[fixes][::every], whole.x[fixes][::every])
@@ -215,14 +215,14 @@ def test_a_recording_that_is_too_short_is_named_with_its_length() -> None:
 
 @pytest.mark.parametrize("share", [0.0, 0.01])
 def test_joints_that_hardly_moved_are_named(share: float) -> None:
-    """To the tick, or not at all."""
+    """Check joints that moved by less than a tick."""
     moved = wiggle(0, 0.05)
     with pytest.raises(LatencyError, match="the joints hardly moved"):
         latency_of(Wiggle(moved.t_joints, POSE + share * (moved.q - POSE), moved.t_marker, moved.x), ARM.chain)
 
 
 def test_joints_that_do_not_move_the_marker_are_named() -> None:
-    """As the wrist that turns a marker on its axis."""
+    """Check, for example, a wrist that turns a marker about its own axis."""
     moved = wiggle(0, 0.05)
     noise = np.random.default_rng(1).normal(0, 5e-4, moved.x.shape)
     with pytest.raises(LatencyError, match=r"the marker moved by [0-9.]+ mm only"):
@@ -230,7 +230,7 @@ def test_joints_that_do_not_move_the_marker_are_named() -> None:
 
 
 def test_a_marker_that_moves_by_itself_is_named() -> None:
-    """Somebody else's motion, or the joints in another order."""
+    """Check another motion, as when the marker is moved by hand or the joints are in another order."""
     ours, others = wiggle(0, 0.05), wiggle(1, 0.05)
     with pytest.raises(LatencyError, match="does not follow the joints"):
         latency_of(Wiggle(ours.t_joints, ours.q, ours.t_marker, others.x), ARM.chain)

@@ -1,4 +1,4 @@
-"""`bodyschema calibrate latency`: what is collected, and as it is typed."""
+"""`bodyschema calibrate latency`: data collection and command line."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from bodyschema.interfaces.robot import RobotDescription
 
 
 def seen(folder: Path, every: int) -> Sources:
-    """A walk of which every so manieth image has the marker in it; the others are at the border."""
+    """Return a walk in which every `every`-th image shows the marker; in the others it is at the border."""
     walk = Walk(RobotDescription.load(write_small_arm(folder)), 40)
     steps = [
         fix if k % every == 0 or not isinstance(fix, MarkerFix) else MarkerMiss(fix.t, "at_border")

@@ -1,4 +1,4 @@
-"""One robot's learner on a bus that is none: what it says of itself and of how far it is behind."""
+"""One robot's learner on a fake bus: its status and its backlog."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Still:
 
 
 class Wire:
-    """Stands for a session: keeps the handlers, and the sampler's history until that is gone."""
+    """Fake session: keeps the handlers, and serves the sampler's history until that is gone."""
 
     def __init__(self, stored: list[Pair]) -> None:
         self.handlers: dict[str, Callable[..., Any]] = {}
@@ -60,7 +60,7 @@ class Wire:
         self.handlers[key] = changed
 
     def token(self, key: str) -> None:
-        """Nothing watches it."""
+        """Do nothing: no client watches the token."""
 
     def ask_one(self, key: str, **_: object) -> bytes:
         begin = int(key.partition("from=")[2])

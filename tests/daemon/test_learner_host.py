@@ -52,7 +52,7 @@ def robots(tmp_path: Path, free_endpoint: Callable[[], str]) -> list[Config]:
 
 
 def asked(endpoint: str, robot: str) -> LearnerStatus:
-    """The state of a robot's learner, as soon as it answers."""
+    """Return the state of a robot's learner as soon as it answers."""
     deadline = time.monotonic() + LIMIT_S
     while True:
         try:
@@ -77,7 +77,7 @@ def test_every_robot_is_answered_for_by_the_one_process(robots: list[Config]) ->
 
 
 class Attended:
-    """A learner that has a wish come in while it is attended to, and the process end two rounds later."""
+    """A learner that receives a request while it is served, and whose process ends two rounds later."""
 
     def __init__(self, wishes: Wishes, wishing: bool) -> None:
         self.wishes, self.wishing, self.rounds, self.reloads = wishes, wishing, 0, 0
@@ -151,7 +151,7 @@ def test_robots_of_one_endpoint_are_not_parted(robots: list[Config]) -> None:
 
 
 class ScriptedProcess:
-    """Answers nothing until the test says so; may be lost."""
+    """A process that answers at the test's command and may be lost."""
 
     def __init__(self) -> None:
         self.told: list[tuple[str, int]] = []
@@ -241,7 +241,7 @@ def test_a_lost_process_leaves_no_order_behind(shared: SharedSolver, process: Sc
 
 
 class Scripted:
-    """Has so many pieces of work; ends everything after the last."""
+    """A learner with a given number of work items, which stops the host after the last."""
 
     def __init__(self, name: str, pieces: int, done: list[str], end: Callable[[], None]) -> None:
         self._name, self._left, self._done, self._end = name, pieces, done, end

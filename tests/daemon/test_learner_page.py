@@ -1,4 +1,4 @@
-"""docs/learner.md is held to the code."""
+"""docs/learner.md agrees with the code."""
 
 from __future__ import annotations
 

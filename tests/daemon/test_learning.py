@@ -36,7 +36,7 @@ HALF = 150
 
 
 def fingerprint(learning: Learning) -> tuple[object, ...]:
-    """Everything that a refused pair must not change."""
+    """Return everything that a refused pair must not change."""
     state = learning.state()
     return (state.header, {name: array.tobytes() for name, array in state.arrays.items()})
 
@@ -91,7 +91,7 @@ def test_a_bad_pair_is_refused_and_changes_nothing(pair: Pair, said: str) -> Non
 
 @dataclass(frozen=True)
 class Taught:
-    """An arm with a path of 300 pairs, and a learner that has had the first 150; tests go on with copies."""
+    """An arm with a path of 300 pairs, and a learner trained on the first 150; tests continue with copies."""
 
     scene: Scene
     learning: Learning
@@ -105,15 +105,15 @@ class Taught:
 
     @property
     def half(self) -> Scene:
-        """What the learner has seen."""
+        """The pairs that the learner has seen."""
         return self.first(HALF)
 
     def first(self, count: int) -> Scene:
-        """The arm with so many of the pairs."""
+        """Return the arm with the first `count` pairs."""
         return Scene(self.scene.chain, self.scene.q[:count], self.scene.pairs[:count])
 
     def copy(self) -> Learning:
-        """Another learner that knows the same, its solver too."""
+        """Return another learner with the same data and solver state."""
         copy = new_learning()
         copy.restore(self.learning.state())
         while copy.work():
@@ -181,7 +181,7 @@ def test_a_gross_outlier_is_counted_as_doubted_and_as_learnt() -> None:
 
 
 def test_no_listed_model_beats_the_one_that_answers() -> None:
-    """By more than a fifth, on the pairs that are shown, while another tool is learnt."""
+    """Require less than a fifth, on the pairs shown, while another tool is learned."""
     scene, learning = Taught.draw(1).half, Taught.draw(1).copy()
     rng = np.random.default_rng(1)
     q = scene.q[-1] + path(rng, 40)
@@ -368,7 +368,7 @@ def test_predictions_are_finite_whatever_is_measured(seed: int, wild: dict[int, 
 
 
 class SlowSolver(DirectSolver):
-    """Answers only when the test lets it."""
+    """A solver that answers only when the test allows it."""
 
     waiting = True
 

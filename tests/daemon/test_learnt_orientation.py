@@ -20,7 +20,7 @@ TURN = Rotation.from_rotvec([0.3, -1.9, 0.7]).as_matrix()
 
 
 def turned(pairs: Sequence[Pair], chain: RigidChain, seed: int = 0, sigma_rad: float = SIGMA_RAD) -> list[Pair]:
-    """The pairs with the orientation of a tag on the hand, measured with noise."""
+    """Return the pairs with the orientation of a tag on the hand, measured with noise."""
     rng = np.random.default_rng(seed)
     truth = chain.orientation(np.array([pair.q for pair in pairs])) @ TURN
     noisy = Rotation.from_rotvec(sigma_rad * rng.normal(size=(len(pairs), 3))).as_matrix() @ truth
@@ -38,7 +38,7 @@ def learnt(scene: Scene, learning: Learning | None = None) -> Learning:
 
 
 def errors_rad(learning: Learning, chain: RigidChain, q: FloatArray) -> FloatArray:
-    """How far the answers are turned from the truth about each axis (n, 3)."""
+    """Return the orientation error of the answers about each axis (n, 3) [rad]."""
     answer = learning.snapshot.predict(q)
     assert answer.R is not None
     truth = chain.orientation(q) @ TURN
@@ -169,7 +169,7 @@ def test_the_solver_in_its_own_process_finds_the_same_orientations() -> None:
 
 
 def test_where_the_hand_bends_the_maps_of_the_axes_answer() -> None:
-    """An arm that gives way under its load, so that no rigid chain has its orientations."""
+    """Check an arm with compliance, whose orientations no rigid chain has."""
     rng = np.random.default_rng(9)
     chain, q = built_chain(rng), rng.uniform(-1.0, 1.0, (500, 4))
     pairs = turned(measured(chain, q, rng), chain, sigma_rad=0.002)

@@ -57,7 +57,7 @@ def robot_of(arm: str, file: Path, port: object = "/dev/ttyACM0") -> Config:
 
 
 def servos_of(motors: dict[str, MotorCalibration]) -> list[Servo]:
-    """Servos with LeRobot's offsets in their EEPROM, on an arm that stands in POSE_RAD."""
+    """Return servos with LeRobot's offsets in their EEPROM, on an arm that stands in POSE_RAD."""
     servos: list[Servo] = []
     for name, motor in motors.items():
         encoder = motor.homing_offset + motor.middle + POSE_RAD[name] * 4096 / (2 * math.pi)
@@ -139,7 +139,7 @@ def test_written_offsets_correct_the_readings(arm, tmp_path) -> None:
 
 @pytest.mark.parametrize("inverted", [0, 1])
 def test_dynamixel_offsets_correct_the_readings(inverted, tmp_path) -> None:
-    """An elbow of a Koch leader, which LeRobot sets to count the other way in the servo itself."""
+    """Check an elbow of a Koch leader, which LeRobot sets to count the other way in the servo itself."""
     before = MotorCalibration(3, inverted, -512, 900, 3100)
     servo = JointServo("elbow_flex", "dynamixel", 1, before.middle)
     (change,) = corrections({"elbow_flex": before}, [servo], {"elbow_flex": math.radians(3.0)})
@@ -157,7 +157,7 @@ def test_offsets_stay_within_what_a_servo_keeps() -> None:
 
 
 def planted(file: Path, robot: Config) -> None:
-    """A recording of an arm whose shoulder_lift reads 2° too little."""
+    """Write a recording of an arm whose shoulder_lift reads 2° too little."""
     rng = np.random.default_rng(0)
     q = rng.uniform(robot.robot.lower, robot.robot.upper, (150, 5))
     true = q + np.radians([0, 2.0, 0, 0, 0])

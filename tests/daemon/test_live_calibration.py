@@ -34,7 +34,7 @@ RIGHT = ("A1", "B2")
 
 
 class PluggedEyes:
-    """Eyes that follow a script of frames and losses; `serials` are those of each opening, the last one stays."""
+    """Cameras that follow a script of frames and losses; `serials` are those of each opening, the last one stays."""
 
     def __init__(self, script: Iterable[StereoFrame | SourceLost], serials: Iterable[tuple[str, str]] = (RIGHT,)):
         self._script, self._plugged = list(script), list(serials)
@@ -61,7 +61,7 @@ class PluggedEyes:
 
 @pytest.fixture(scope="module")
 def views() -> list[View]:
-    """Views of all kinds: of a person who did what was asked."""
+    """Return views of all kinds, from a user who followed the instructions."""
     rng = np.random.default_rng(21)
     return corner_views(webcams(rng), rng, 30)
 
@@ -72,7 +72,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def held(views: list[View], places: Iterable[int] | None = None) -> tuple[LiveViews, list[StereoFrame]]:
-    """Each view held for two frames."""
+    """Return each view held for two frames."""
     shown = [k for k in (range(len(views)) if places is None else places) for _ in range(2)]
     return LiveViews(BOARD, KnownCorners(views)), [shot(k, 0.1 * n) for n, k in enumerate(shown)]
 
@@ -166,7 +166,7 @@ def test_the_images_of_every_view_are_kept(views, tmp_path) -> None:
     assert len(pair_files(tmp_path / "kept", None, None, side_by_side=False)) == 9
 
 
-# --- what is shown
+# --- pictures
 
 
 def shown_of(views: list[View], frames: int) -> Shown:
@@ -245,7 +245,7 @@ def test_the_check_says_why_no_look_came(views, tmp_path) -> None:
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory) -> Path:
-    """A robot whose cameras show the board, each view for two frames."""
+    """Return a robot whose cameras show the board, each view for two frames."""
     folder = tmp_path_factory.mktemp("robot")
     for k, pair in enumerate(photographed()[1][:9]):
         for eye, image in (("left", pair.left), ("right", pair.right)):

@@ -24,7 +24,7 @@ def root_logger() -> Iterator[None]:
 
 
 def logged(file: Path, environment: Callable[[os.stat_result], dict[str, str]]) -> list[str]:
-    """The lines of a log whose stream is a file, as the journal's is a socket."""
+    """Return the lines of a log whose stream is a file, as the journal's is a socket."""
     with file.open("w") as stream:
         logs.set_up(environment=environment(os.fstat(stream.fileno())), stream=stream)
         log = logging.getLogger("bodyschema.daemon.sampler")

@@ -1,4 +1,4 @@
-"""`bodyschema marker` where it looks through the robot's own cameras, and the pages of tags that it writes."""
+"""`bodyschema marker` with the robot's own cameras, and the pages of tags that it writes."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ NONE = np.zeros(3)
 
 
 def bent(n: int) -> np.ndarray:
-    """A misfit of 3 mm RMS on each axis that changes slowly along a path."""
+    """Return a model discrepancy of 3 mm RMS on each axis that changes slowly along a path."""
     phase = np.linspace(0.0, 12.0 * np.pi, n)
     return 0.003 * np.sqrt(2.0) * np.stack([np.sin(phase), np.cos(phase), np.sin(phase + 1.0)], axis=1)
 

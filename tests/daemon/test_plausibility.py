@@ -1,4 +1,4 @@
-"""What the one plausibility check says of recordings whose columns are read wrongly, and of those that are right."""
+"""Plausibility check of recordings whose columns are misread, and of correct ones."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ class Pairs:
         return plausibility(known, self.q[:rows], self.x[:rows])
 
     def read(self, reading: Reading) -> Pairs:
-        """As `reading` would have to be undone: applied to this recording's columns."""
+        """Apply `reading` to this recording's columns."""
         return replace(self, q=reading.angles(self.q, np.zeros(6, dtype=bool)), x=reading.positions(self.x))
 
 
 def arm() -> RigidChain:
-    """An arm with a shoulder of two axes, an elbow and a wrist of three axes that do not meet."""
+    """Return an arm with a shoulder of two axes, an elbow and a wrist of three axes that do not intersect."""
     fixed = np.tile(np.eye(4), (7, 1, 1))
     fixed[1:4, 0, 3] = 0.0, 0.42, 0.39
     fixed[[1, 4, 5], [2, 1, 2], 3] = 0.15, 0.11, 0.09
@@ -101,7 +101,7 @@ MISREAD = {
 }
 
 
-# Of two columns misread alike, and of more than two, `make soak` knows more.
+# `make soak` tests two columns misread alike, and more than two.
 RARELY = (
     "q2 and q5 count the other way",
     "the columns q1, q2 and q3 are in the order q2, q3, q1",

@@ -1,4 +1,4 @@
-"""Pairs that no sensor can mean: the learner refuses or doubts them, says so, and answers numbers all the same."""
+"""Implausible pairs: the learner rejects them or marks them as outliers, reports it, and still answers numbers."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_a_pair_that_no_sensor_can_mean_is_refused_with_its_reason_and_changes_n
 
 @pytest.fixture(scope="module")
 def clean_error_m(scene: Scene) -> float:
-    """Of a learner that met no wild pair."""
+    """Return the error of a learner that met no wild pair."""
     learning = new_learning()
     teach(learning, scene.pairs, every=NOW_AND_THEN)
     return scene.error_m(learning)

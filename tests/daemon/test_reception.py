@@ -1,4 +1,4 @@
-"""Queries that wait for their turn."""
+"""Queries that wait in the queue."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from bodyschema.interfaces.errors import RequestError
 
 
 class Watch:
-    """A clock that stands still until it is told."""
+    """A clock that stands still until a test moves it."""
 
     t = 0.0
 

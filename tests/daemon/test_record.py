@@ -31,7 +31,7 @@ def pair(seq: int, store: str = "one") -> Pair:
 
 
 class FakeSampler:
-    """Answers for `pairs` as a sampler does, a page at a time."""
+    """A fake sampler that serves `pairs`, a page at a time."""
 
     def __init__(self, bus: Bus) -> None:
         self.pairs: list[Pair] = []
@@ -110,7 +110,7 @@ def test_following_writes_what_comes_until_it_is_stopped(history, sampler, tmp_p
     sampler.pairs = [pair(1)]
 
     def stopped() -> bool:
-        """Each time round one more pair has been accepted."""
+        """Accept one more pair per call; return True when the recording should stop."""
         if len(sampler.pairs) < 6:
             sampler.pairs.append(pair(len(sampler.pairs) + 1))
             sampler.publish(b"")

@@ -38,7 +38,7 @@ def reopening(source: Scripted) -> Reopening[JointReading]:
 
 
 def read_until_reading(source: Reopening[JointReading], timeout_s: float = 0.25) -> int:
-    """How many reads gave nothing before the first that gave a reading."""
+    """Count the empty reads before the first that returns a reading."""
     for nothing in range(10_000):
         if source.read(timeout_s) is not None:
             return nothing
@@ -141,7 +141,7 @@ def test_what_only_a_new_process_may_open_ends_this_one() -> None:
 
 
 class Exchanged:
-    """Eyes that are lost after one frame; what is plugged in then, at each opening: serials and image size."""
+    """Cameras lost after one frame; serials and image size of the replacement are given for each opening."""
 
     def __init__(self, plugged: list[tuple[tuple[str, str], tuple[int, int]]]) -> None:
         self._plugged, self._frames = iter(plugged), 0

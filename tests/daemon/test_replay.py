@@ -34,7 +34,7 @@ def robot(tmp_path: Path) -> Path:
 
 
 def guided(robot: Path, rows: int = 160) -> Recording:
-    """A walk of 2° steps of an arm whose joints and tool are a little off."""
+    """Return a walk of 2° steps of an arm whose joints and tool are slightly off nominal."""
     rng = np.random.default_rng(11)
     angle = np.cumsum(rng.normal(scale=0.2, size=rows))
     q = np.cumsum(np.deg2rad(2.0) * np.column_stack([np.cos(angle), np.sin(angle)]), axis=0) * 0.9

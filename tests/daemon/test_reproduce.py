@@ -47,14 +47,14 @@ def a_run(seed: int = 0, *, real: bool = False) -> Run:
 
 
 def value(experiment: Experiment, *words: str) -> float:
-    """Of the one reading that says all of this."""
+    """Return the value of the one reading that contains all these words."""
     (found,) = [r for r in experiment.readings if all(word in f"{r.what}; {r.read_as}" for word in words)]
     assert found.value is not None
     return found.value
 
 
 def error(experiment: Experiment, model: str, *words: str) -> float:
-    """Of one model, where one column says all of this."""
+    """Return the error of one model in the one column that contains all these words."""
     table = experiment.comparison
     assert table is not None
     (place,) = [k for k, c in enumerate(table.columns) if all(word in f"{c.test} at {c.count}" for word in words)]
@@ -64,7 +64,7 @@ def error(experiment: Experiment, model: str, *words: str) -> float:
 
 
 def planted(joints: int, count: int, seed: int, say: Callable[[str], None]) -> Measured:
-    """As if measured with 1 mm of noise, in a walk of large steps."""
+    """Return a measured walk of large steps with 1 mm of noise."""
     rng, nominal = np.random.default_rng(seed), arm(joints)
     say("planted")
     q = np.arctan(np.cumsum(rng.normal(0.0, 0.3, (count, joints)), axis=0))

@@ -1,4 +1,4 @@
-"""What `bodyschema reproduce` shows while it runs, on the terminal and in the pictures."""
+"""Output of `bodyschema reproduce` while it runs, on the terminal and in the pictures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An arm that sags: the chain with residual answers, survives a restart, and knows the arm with another tool."""
+"""An arm that sags: the chain with residual is published, survives a restart, and follows a tool change."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A learner that goes on from a state learns and answers as the one that was saved."""
+"""A learner restored from a saved state learns and answers like the one that was saved."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TAUGHT, LATER = 100, 40
 
 
 class OnlyUntilSaved(DirectSolver):
-    """Answers no more when the learner has been saved."""
+    """A solver that stops answering once the learner has been saved."""
 
     saved = False
 
@@ -32,7 +32,7 @@ def same(a: Prediction, b: Prediction) -> None:
 
 
 class Saved:
-    """A learner that was taught and saved, and one that goes on from there; neither has solutions any more."""
+    """A learner that was trained and saved, and one restored from it; neither receives solutions any more."""
 
     def __init__(self, pairs: list[Pair], *, tool_changed_at: int | None = None, unknown: bool = False) -> None:
         solver, known = OnlyUntilSaved(), not unknown
@@ -56,7 +56,7 @@ class Saved:
 
 
 def scene_with(case: str) -> tuple[Saved, list[Pair], FloatArray]:
-    """A saved learner, further pairs, and poses to compare at."""
+    """Return a saved learner, further pairs, and poses to compare at."""
     rng, scene = np.random.default_rng(1), Scene.draw(0, TAUGHT + LATER)
     q = np.vstack([scene.q, rng.uniform(-np.pi, np.pi, (50, scene.q.shape[1]))])
     pairs = scene.pairs
@@ -77,7 +77,7 @@ CASES = ["as drawn", "frame to be found", "other tool", "amid doubts"]
 
 @pytest.fixture(scope="module", params=CASES)
 def case(request: pytest.FixtureRequest) -> tuple[Saved, list[Pair], FloatArray]:
-    """Taught once for both claims; the first compares before the second goes on."""
+    """Train once for both tests; the first compares before the second continues."""
     return scene_with(request.param)
 
 

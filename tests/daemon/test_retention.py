@@ -1,4 +1,4 @@
-"""What a store lets go, and who notices."""
+"""Deletion of old pairs from a store, and its consequences for readers."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def days_ago(days: float) -> str:
 
 
 def fill(store: PairStore, ages: list[float]) -> None:
-    """Pairs that are so many days old."""
+    """Store one pair of each age [days]."""
     for age in ages:
         fix = MarkerFix(0.0, frozen_array([0.1, 0.2, 1.0]), COV, (1.0, 2.0, 3.0, 4.5))
         store.append(1, days_ago(age), frozen_array([0.1, -0.1]), fix)

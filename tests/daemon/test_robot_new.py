@@ -31,7 +31,7 @@ def scan(file: Path, *servos: tuple[int, str], port: str = "/dev/ttyUSB0", **mor
 
 @pytest.fixture
 def four(tmp_path: Path) -> Path:
-    """A kept scan with a servo for each joint."""
+    """Return a saved scan with a servo for each joint."""
     return scan(tmp_path / "found.json", (3, "XL330-M288"), (1, "XM430-W350"), (2, "XM430-W350"), (7, "MX-28"))
 
 

@@ -54,7 +54,7 @@ def sampling(config: Config, sources: Sources, *, exit_at_end: bool = False) -> 
 
 
 def sample(config: Config, sources: Sources) -> tuple[list[Pair], SamplerStatus]:
-    """Sample to the end of the sources: the pairs in the store, and the last status."""
+    """Sample to the end of the sources; return the pairs in the store and the last status."""
     with sampling(config, sources, exit_at_end=True) as sampler:
         sampler.run()
         return sampler._store.read(), sampler.status()
@@ -62,7 +62,7 @@ def sample(config: Config, sources: Sources) -> tuple[list[Pair], SamplerStatus]
 
 @contextmanager
 def running(config: Config, sources: Sources) -> Iterator[Bus]:
-    """A client of a sampler that runs in a thread until the block ends."""
+    """Yield a client of a sampler that runs in a thread until the block ends."""
     with sampling(config, sources) as sampler:
         thread = threading.Thread(target=sampler.run)
         with client(config.tables.zenoh.sampler) as asking:
@@ -79,7 +79,7 @@ def running(config: Config, sources: Sources) -> Iterator[Bus]:
 
 
 def status_when(bus: Bus, true: Callable[[SamplerStatus], bool]) -> SamplerStatus:
-    """The first published status for which `true` holds."""
+    """Return the first published status for which `true` holds."""
     published: Queue[bytes] = Queue()
     bus.subscribe(KEYS.status("sampler"), published.put)
     status = decode(bus.ask_one(KEYS.status("sampler")), SamplerStatus)
@@ -92,7 +92,7 @@ def command(bus: Bus, name: str) -> str:
     return json.loads(bus.ask_one(KEYS.command("sampler"), encode(CommandRequest(name))))["message"]
 
 
-# --- the way of a pair
+# --- the path of a pair
 
 
 def test_each_frame_of_a_walk_becomes_a_pair_with_the_angles_of_its_time(config) -> None:
@@ -176,7 +176,7 @@ def test_encoders_of_other_joints_are_refused(config) -> None:
 
 @pytest.fixture
 def impatient(monkeypatch) -> None:
-    """Lost sources are opened again at once."""
+    """Reopen lost sources at once."""
     monkeypatch.setattr("bodyschema.daemon.reopen.FIRST_WAIT_S", 0.0)
 
 
@@ -262,7 +262,7 @@ def test_a_position_that_is_no_number_makes_no_pair(config) -> None:
     assert (len(pairs), status.rejected) == (9, {"not_finite": 1})
 
 
-# --- what others see
+# --- published data
 
 
 def test_pairs_are_published_in_order(config) -> None:
@@ -280,7 +280,7 @@ def test_pairs_are_published_in_order(config) -> None:
 
 @pytest.fixture(scope="module")
 def ended(tmp_path_factory, free_endpoint) -> Iterator[Bus]:
-    """A client of a sampler whose 1,200 pairs are all stored."""
+    """Yield a client of a sampler whose 1,200 pairs are all stored."""
     config = small_arm(tmp_path_factory.mktemp("ended"), free_endpoint())
     walk = Walk(config.robot, 1200, step_deg=1.01)
     with running(config, walk.sources()) as bus:

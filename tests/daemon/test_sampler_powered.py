@@ -27,7 +27,7 @@ LIMIT_S = 500.0
 
 
 class Powered:
-    """Joints that answer as told."""
+    """Joints with scripted answers."""
 
     name, state = "zero_force", "off"
 
@@ -103,7 +103,7 @@ def test_its_complaints_are_in_the_status(config) -> None:
 
 
 class Head(Powered):
-    """A head that stands still and keeps what it is told."""
+    """A head that stands still and records its commands."""
 
     name, head = "gaze", ("neck_yaw", "neck_pitch")
     lower, upper = frozen_array([-1.0, -1.0]), frozen_array([1.0, 1.0])
@@ -169,7 +169,7 @@ def test_while_zero_force_bears_the_arm_pairs_are_taken(borne) -> None:
 
 
 class Cameras:
-    """Eyes with a complaint."""
+    """Cameras with a health warning."""
 
     health = ("the left camera's image is black: is the lens cap on?",)
 

@@ -1,4 +1,4 @@
-"""`bodyschema scan`: what was found, held against robot.toml."""
+"""`bodyschema scan`: findings compared with robot.toml."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def port(config) -> str:
 
 @pytest.fixture
 def arm(port) -> list[FoundServo]:
-    """The servos of robot.toml as they should be."""
+    """Return the servos of robot.toml as they should be."""
     return [
         FoundServo(port, 1_000_000, "Dynamixel 2.0", id, model, "46", 12.0, 31.0, False)
         for id, model in enumerate(MODELS, 1)

@@ -1,4 +1,4 @@
-"""Who may do what over zenoh: real sessions as every role and as strangers, with the page's certificates."""
+"""Permissions over zenoh: real sessions in every role and of strangers, with the page's certificates."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from bodyschema.daemon.router import RouterConfig
 from bodyschema.interfaces.errors import BusError, ConfigError, RequestError
 
 LIMIT_S = 500.0
-SILENCE_S = 0.3  # in which what was dropped would have arrived
+SILENCE_S = 0.3  # time in which a dropped message would have arrived
 KEYS = Keys("arm")
 QUESTIONS = {name: getattr(KEYS, name) for name in ("predict", "jacobian", "ik", "model", "pairs")}
 STATES = {f"status/{process}": KEYS.status(process) for process in ("sampler", "learner")}
@@ -37,7 +37,7 @@ OWNERS = {"viewer": "anna", "operator": "bert", "sampler": "arm.sampler", "learn
 
 @pytest.fixture(scope="module")
 def pki(tmp_path_factory) -> Path:
-    """A folder with certificates, made by the lines of the page; and one of a foreign authority in `foreign/`."""
+    """Return a folder with certificates made by the page's commands, and one of a foreign authority in `foreign/`."""
     folder = tmp_path_factory.mktemp("pki")
     (folder / "foreign").mkdir()
     carried_out(folder / "foreign")
@@ -50,7 +50,7 @@ def identity_of(folder: Path, name: str | None, ca: Path | None = None) -> Ident
 
 
 def write_robot(folder: Path, zenoh_table: str, pki: Path) -> Config:
-    """A robot.toml with this table, among the certificates."""
+    """Write a robot.toml with this table next to the certificates."""
     for file in pki.glob("*.*"):
         if not (folder / file.name).exists():
             (folder / file.name).symlink_to(file)
@@ -74,7 +74,7 @@ class Site:
 
 @pytest.fixture(scope="module")
 def site(pki: Path, tmp_path_factory, free_endpoint) -> Iterator[Site]:
-    """The files of deploy/several_machines on one machine: other endpoints, the same everything else."""
+    """Run the files of deploy/several_machines on one machine, with only the endpoints changed."""
     endpoint = free_endpoint().replace("tcp/", "tls/")
     router_file = pki / "router.toml"
     router_file.write_text((SEVERAL / "router.toml").read_text().replace("tls/192.0.2.10:7450", endpoint))
@@ -120,7 +120,7 @@ def site(pki: Path, tmp_path_factory, free_endpoint) -> Iterator[Site]:
 
 
 def drained(queue: Queue[bytes]) -> list[bytes]:
-    """What arrives until nothing has for a while."""
+    """Return all that arrives until a period of silence."""
     found = []
     while True:
         try:
@@ -175,7 +175,7 @@ def test_pairs_that_the_sampler_did_not_publish_teach_the_learner_nothing(site: 
     with client(site.as_somebody(name)) as bus:
         bus.publisher(KEYS.pair)(b"poison")
         bus.ask(KEYS.predict)
-        site.publish(b"a pair")  # what was published before would have come before
+        site.publish(b"a pair")  # earlier messages would have arrived before it
         assert drained(site.heard) == [b"a pair"]
 
 
@@ -254,7 +254,7 @@ def test_programs_on_the_samplers_machine_need_no_certificate(site: Site) -> Non
 
 @pytest.fixture
 def two(pki: Path, tmp_path: Path, free_endpoint) -> Iterator[tuple[Config, Queue[bytes]]]:
-    """The files of deploy/two_machines on one machine: the learner's configuration and what it hears."""
+    """Run the files of deploy/two_machines on one machine; yield the learner's configuration and what it receives."""
     ends = {"tls/192.0.2.20:7447": free_endpoint(), "tls/192.0.2.30:7448": free_endpoint()}
     heard: Queue[bytes] = Queue()
     with ExitStack() as stack:
@@ -330,7 +330,7 @@ def test_name_and_password_open_the_router_and_nothing_else_does(pki: Path, endp
                 pass
 
 
-# --- what robot.toml and router.toml may say
+# --- valid settings of robot.toml and router.toml
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What systemd is told: when a process is ready, that all of its loops work, how it is."""
+"""Notifications to systemd: readiness, watchdog and status."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class HandClock(SystemClock):
 
 
 class Heard:
-    """A socket that hears what systemd would."""
+    """A socket that receives systemd's notifications."""
 
     def __init__(self, address: str) -> None:
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -167,7 +167,7 @@ def test_a_systemd_that_is_gone_is_logged_once_and_ends_nothing(tmp_path, caplog
 
 
 class Permissions:
-    """Whether systemd lets the service open its devices."""
+    """Stub for systemd's permission to open devices."""
 
     granted = True
 

@@ -29,7 +29,7 @@ class Bench:
         self.dry_run, self.robot = dry_run, robot
 
     def __call__(self, *words: str) -> int:
-        """The exit code of `bodyschema servos` with these words."""
+        """Return the exit code of `bodyschema servos` with these words."""
         try:
             command_line()(
                 ["servos", *words, "--robot", str(self.robot)], exit_on_error=False, result_action="return_none"
@@ -39,7 +39,7 @@ class Bench:
         return 0
 
     def elbow(self, name: str) -> int:
-        """What stands in a register of the elbow's servo."""
+        """Return the value of a register of the elbow's servo."""
         return self.dry_run.arm.servo("elbow_pitch")[name]
 
     @property

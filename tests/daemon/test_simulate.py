@@ -26,7 +26,7 @@ def called(*arguments: object) -> None:
 
 
 def measured(file: Path, *, times: bool = True, sigma_m: float | None = None, rows: int = ROWS) -> Recording:
-    """A recording of the small arm, written to `file`."""
+    """Write a recording of the small arm to `file` and return it."""
     rng = np.random.default_rng(1)
     q = rng.uniform(-1, 1, (ROWS, 2))[:rows]
     x = np.column_stack([np.cos(q[:, 0]), np.sin(q[:, 0]), q[:, 1]]) * 0.2

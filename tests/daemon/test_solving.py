@@ -17,7 +17,7 @@ Q, X = np.zeros((10, JOINTS)), np.zeros((10, 3))
 
 
 class ScriptedSolver:
-    """Remembers what it was told; answers when the test says so."""
+    """A solver that records its tasks and answers at the test's command."""
 
     def __init__(self) -> None:
         self.told: list[object] = []

@@ -73,7 +73,7 @@ def test_what_is_read_is_what_was_appended_bit_by_bit(store) -> None:
 
 
 def stored(row: tuple[object, ...]) -> tuple[object, ...]:
-    """A row as SQLite gives it back."""
+    """Return a row as SQLite gives it back."""
     with contextlib.closing(sqlite3.connect(":memory:")) as connection:
         connection.text_factory = bytes
         connection.execute(f"CREATE TABLE pairs (seq, session, segment, t REAL, {', '.join('abcdefg')})")
@@ -213,7 +213,7 @@ def test_a_second_sampler_on_the_store_is_refused(file, store) -> None:
 
 
 def refused(file: Path) -> str:
-    """The message with which the store is refused; the file is the same before and after."""
+    """Return the message that refuses the store; assert that the file does not change."""
     before = file.read_bytes()
     with pytest.raises(StoreError) as refusal, PairStore(file, SESSION):
         pass
@@ -299,7 +299,7 @@ def test_a_store_that_was_killed_while_it_was_made_is_made_anew(file) -> None:
 
 
 def fill_until_refused(store: PairStore) -> tuple[str, int]:
-    """The message, and how many pairs were appended before it."""
+    """Return the error message and the number of pairs appended before it."""
     for appended in range(100_000):
         try:
             fill(store, 1)

@@ -35,7 +35,7 @@ def wait_until(true: Callable[[], bool]) -> None:
 
 
 def started(file: Path) -> list[int]:
-    """The process ids that were written so far."""
+    """Return the process ids written so far."""
     return [int(line) for line in file.read_text().splitlines()] if file.exists() else []
 
 
@@ -45,7 +45,7 @@ def gone(pid: int) -> bool:
 
 @pytest.fixture
 def supervise():
-    """A function that supervises children in a thread until the test ends."""
+    """Yield a function that supervises children in a thread until the test ends."""
     running: list[tuple[Supervisor, threading.Thread]] = []
 
     def start(*children: Child) -> Supervisor:
@@ -132,7 +132,7 @@ def test_the_command_run_with_a_port_in_use_ends_with_its_message(tmp_path, free
 
 @contextmanager
 def running(robot: Path, log: Path) -> Iterator[warm.Child]:
-    """`bodyschema run`, with both processes at work."""
+    """Run `bodyschema run`, with both processes at work."""
     with log.open("wb") as stream:
         run = warm.Child("-m", "bodyschema", "run", "--robot", robot, stderr=stream)
     try:

@@ -1,4 +1,4 @@
-"""What the page shows of the course of learning and of the newest pairs."""
+"""The page's view of the course of learning and of the newest pairs."""
 
 from __future__ import annotations
 

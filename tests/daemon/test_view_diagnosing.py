@@ -1,4 +1,4 @@
-"""Diagnoses that the page asks for, as the processes that they are."""
+"""Diagnoses started from the page, as real processes."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from bodyschema.daemon.view.documents import DiagnosisDocument
 from bodyschema.interfaces.errors import BusError, RequestError
 from bodyschema.interfaces.records import Pair, frozen_array
 
-# The limit only ends what would never end.
+# only ends a diagnosis that would never end
 LIMIT_S = 500.0
 OVER = ("done", "failed", "stopped")
 
 
 class Stored:
-    """A sampler's history with so many pairs; it waits for `go` before its first page."""
+    """A sampler's history of stored pairs; it waits for `go` before its first page."""
 
     def __init__(self, config: Config, pairs: int) -> None:
         rng = np.random.default_rng(7)
@@ -41,7 +41,7 @@ class Stored:
 
 
 class Said:
-    """What was told of the diagnoses."""
+    """Recorder of the published states of diagnoses."""
 
     def __init__(self) -> None:
         self.states: list[str] = []

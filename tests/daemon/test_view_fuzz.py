@@ -1,4 +1,4 @@
-"""The page's addresses under arbitrary requests: each is answered as meant, at once."""
+"""The page's addresses under arbitrary requests: each gets the intended answer at once."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def short_heartbeat() -> Iterator[None]:
 
 
 class Refusing:
-    """Processes that do not answer, and a diagnosis that is not to be begun."""
+    """Processes that do not answer, and diagnoses that may not start."""
 
     def command(self, *_: str) -> str:
         raise BusError("nobody listens")

@@ -1,4 +1,4 @@
-"""The page's addresses, without a browser: what they answer, and whom they refuse."""
+"""The page's addresses, without a browser: answers and refusals."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ADDRESSES = ["/", "/api/state", "/api/events", "/report", "/static/style.css", "
 
 @dataclass
 class Processes:
-    """Stands for both processes and the diagnoses; remembers what it was told."""
+    """Stub of both processes and the diagnoses that records its commands."""
 
     told: list[tuple[str, ...]] = field(default_factory=list)
     error: Exception | None = None
@@ -84,7 +84,7 @@ def test_a_button_s_command_reaches_the_process_and_its_words_come_back(ask, pro
 @pytest.mark.parametrize("address", ADDRESSES)
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:8420", "127.0.0.1.evil.example", "localhost@evil", ""])
 def test_who_asks_for_another_host_is_refused_everywhere(ask, address: str, host: str) -> None:
-    """As after DNS rebinding, when the name of another site leads here."""
+    """Check the case of DNS rebinding, when another site's name resolves to this server."""
     assert ask("GET", address, {"Host": host}).status_code == 403
 
 
@@ -204,7 +204,7 @@ def test_all_documents_are_one_object_for_programs(ask, hub) -> None:
 
 
 async def opened_streams(hub: Hub, count: int) -> list[int]:
-    """The status codes of so many event streams that are asked for at the same time and stay open for a while."""
+    """Return the status codes of `count` event streams requested at the same time and kept open for a while."""
     app, codes, enough = application(hub, Processes(), Processes()), [], asyncio.Event()
 
     async def send(message: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""The page as a process beside those that work."""
+"""The page as a process beside the working ones."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def robot(tmp_path: Path, free_endpoint) -> Path:
 
 
 def page(port: int) -> str | None:
-    """The page; None while nobody answers."""
+    """Return the page; None while the server does not answer."""
     connection = http.client.HTTPConnection("127.0.0.1", port)
     try:
         connection.request("GET", "/")

@@ -60,7 +60,7 @@ def document(hub: Hub, topic: str) -> Any:
 def process(
     endpoint: str, name: str, status: object, answers: dict[str, Callable[..., bytes]], router: str = ""
 ) -> Iterator[None]:
-    """One of the two processes, as zenoh shows it; it says its state all the while."""
+    """Run one of the two processes as zenoh shows it; it publishes its state continuously."""
     with Bus(listen=endpoint, connect=router or None, settings={"mode": "router"} if router else None) as bus:
         for key, answer in answers.items():
             bus.answer(key, answer)
@@ -119,7 +119,7 @@ def test_a_learner_that_goes_is_missed_and_one_that_comes_back_is_seen(config, h
     with learner(config):
         until(answers)
     until(lambda: not answers())
-    assert document(hub, "learner")["status"]["pairs"] == LEARNER.pairs  # what it knew last is still to be seen
+    assert document(hub, "learner")["status"]["pairs"] == LEARNER.pairs  # the last known state is still shown
     with learner(config):
         until(answers)
 

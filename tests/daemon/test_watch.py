@@ -1,4 +1,4 @@
-"""What the learner holds against an earlier model."""
+"""Comparison of the learner with an earlier model."""
 
 from __future__ import annotations
 

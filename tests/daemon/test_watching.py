@@ -1,4 +1,4 @@
-"""`bodyschema watch cameras`, and what the other commands say of cameras."""
+"""`bodyschema watch cameras`, and the other commands' messages about cameras."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def write_robot(folder: Path, tables: str, stereo: str = STEREO) -> Path:
 
 
 def write_images(folder: Path, count: int = 4) -> None:
-    """A red ball at 0.5 m before a grey wall; in the last pair the right image is 4 rows lower."""
+    """Write images of a red ball at 0.5 m before a grey wall; in the last pair the right image is 4 rows lower."""
     for number in range(count):
         for eye, u in (("l", 160), ("r", 100)):
             image = np.full((240, 320, 3), 128, np.uint8)
@@ -69,7 +69,7 @@ def test_pictures_are_written_with_what_was_seen_in_them(tmp_path, capsys) -> No
     assert [picture.name for picture in pictures] == [f"{number:06}.jpg" for number in (1, 2, 3, 4)]
     picture = cv2.imread(str(pictures[0]))
     assert picture is not None
-    row = picture[120, :60].astype(int)  # of the other eye, through the ball: yellow on grey
+    row = picture[120, :60].astype(int)  # the other camera's ray, through the ball: yellow on grey
     assert (row[:, 2] - row[:, 0]).min() > 60
 
 
@@ -99,7 +99,7 @@ def test_a_browser_gets_the_newest_picture() -> None:
 @pytest.mark.parametrize("path", ["/", "/stream", "/else"])
 @pytest.mark.parametrize("hosts", [["evil.example:8080"], [""], [], ["127.0.0.1", "evil.example"], ["127.0.0.1.evil"]])
 def test_pictures_are_refused_under_another_host(path: str, hosts: list[str]) -> None:
-    """As after DNS rebinding, when the name of another site leads here."""
+    """Check the case of DNS rebinding, when another site's name resolves to this server."""
     with MjpegServer(0) as server:
         server.show(b"secret")
         answer = asked(server, path, hosts)

@@ -1,4 +1,4 @@
-"""How well an arm is made: which chain is taken, and what other pairs are added to."""
+"""Selection of an arm's tolerances: the chain chosen, and the one to which further pairs are added."""
 
 from __future__ import annotations
 

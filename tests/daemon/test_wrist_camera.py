@@ -37,7 +37,7 @@ def recorded(robot: RobotDescription, T_gripper_camera: FloatArray, marker: Floa
 
 @pytest.fixture(scope="module")
 def found() -> tuple[FloatArray, Calibration]:
-    """Where the camera is on the gripper, and the calibration of 60 views, the arm being as it is drawn."""
+    """Return the camera's pose on the gripper and the calibration from 60 views of the nominal arm."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = Rotation.from_rotvec([0.2, 1.0, -0.4]).as_matrix(), (0.03, -0.04, 0.06)
     robot = wrist_camera()

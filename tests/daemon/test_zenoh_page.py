@@ -1,4 +1,4 @@
-"""docs/zenoh.md and the clients in examples/ are held to the code, and to a running sampler and learner."""
+"""docs/zenoh.md and the clients in examples/ agree with the code and with a running sampler and learner."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_the_page_shows_the_example_as_it_is() -> None:
 
 @pytest.fixture(scope="module")
 def learner(tmp_path_factory, free_endpoint) -> Iterator[Config]:
-    """robot.toml of a learner that answers, without a sampler."""
+    """Yield robot.toml of a learner that answers, without a sampler."""
     folder = tmp_path_factory.mktemp("robot")
     zenoh = f'[zenoh]\nsampler = "{free_endpoint()}"\nlearner = "{free_endpoint()}"\n'
     robot = write_small_arm(folder, zenoh + '[daemon]\nstate_dir = "state"\n')
@@ -120,7 +120,7 @@ def learner(tmp_path_factory, free_endpoint) -> Iterator[Config]:
 
 
 def run_example(name: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """The example as a program of its own that cannot import ours."""
+    """Run the example as a separate program that cannot import the project."""
     command = [sys.executable, "-I", str(ROOT / "examples" / name), *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False, cwd=os.sep)
 
@@ -247,7 +247,7 @@ def test_the_example_follows_stored_and_new_pairs_in_order(tmp_path, endpoint) -
         subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=os.sep) as follower,
     ):
         try:
-            lines = [follower.stdout.readline() for _ in range(10)]  # it has begun with what is stored
+            lines = [follower.stdout.readline() for _ in range(10)]  # it has started with the stored pairs
             go_on.set()
             lines += follower.stdout.readlines()
         finally:

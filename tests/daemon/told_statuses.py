@@ -1,4 +1,4 @@
-"""Statuses of a sampler and of a learner, as they tell them."""
+"""Published statuses of a sampler and of a learner."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ PAIRS, SIGMA_M = 300, 3e-4
 
 
 def walked(robot: RobotDescription, *effects: Effect, seed: int = 3, timed: bool = True) -> Recording:
-    """A walk of an arm that has `effects`, at 4 pairs a second."""
+    """Return a walk of an arm that has `effects`, at 4 pairs per second."""
     rng = np.random.default_rng(seed)
     walk = np.cumsum(rng.normal(size=(PAIRS, len(robot.joints))), axis=0)
     walk = (walk - walk.min(axis=0)) / np.ptp(walk, axis=0)

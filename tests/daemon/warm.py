@@ -110,7 +110,7 @@ def run(
 
 @functools.cache
 def _server() -> socket.socket:
-    """The way to the process that forks; it ends with this one."""
+    """Return the socket to the forking process, which ends with this one."""
     ours, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     environment = {"OPENBLAS_NUM_THREADS": "1"} | os.environ
     with its:
@@ -119,7 +119,7 @@ def _server() -> socket.socket:
             stdin=subprocess.DEVNULL,
             env=environment,
             pass_fds=[its.fileno()],
-        ).returncode = 0  # nobody waits for it
+        ).returncode = 0  # never waited for
     atexit.register(ours.close)
     return ours
 
@@ -134,7 +134,7 @@ def _import_all() -> None:
 
 
 def _serve(wire: socket.socket) -> list[str]:
-    """Fork for each request, until the other end closes; return in the fork what it is to run."""
+    """Fork for each request, until the other end closes; return in the fork the program to run."""
     alive: dict[int, tuple[int, int]] = {}  # pidfd: pid, where its exit code goes
     while True:
         for ready in select.select([wire.fileno(), *alive], [], [])[0]:
@@ -156,7 +156,7 @@ def _serve(wire: socket.socket) -> list[str]:
 
 
 def _settle(request: tuple[list[str], str, dict[str, str]], files: list[int]) -> list[str]:
-    """Be as a process that has just begun; return its arguments."""
+    """Reset the process to the state of a new one; return its arguments."""
     arguments, folder, environment = request
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     os.dup2(files[1], 1)

@@ -1,4 +1,4 @@
-"""ROS bags written by rosbags itself: joint states and what a tracker says of a marker."""
+"""ROS bags written by rosbags itself: joint states and a tracker's marker positions."""
 
 from __future__ import annotations
 

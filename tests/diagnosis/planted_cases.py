@@ -1,4 +1,4 @@
-"""Small recordings of the desk arm of which it is known what was hidden in them."""
+"""Small recordings of the desk arm with known hidden effects."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BASE, SHOULDER, ELBOW, WRIST = "base_yaw", "shoulder_pitch", "elbow_pitch", "wri
 
 
 def desk_arm(changes: Mapping[str, str] | None = None) -> RobotDescription:
-    """The desk arm with lines of its robot.toml changed."""
+    """Return the desk arm with lines of its robot.toml changed."""
     text = DESK_ARM.read_text()
     for old, new in (changes or {}).items():
         assert old in text
@@ -31,17 +31,17 @@ def desk_arm(changes: Mapping[str, str] | None = None) -> RobotDescription:
 
 
 def surveyed_arm() -> RobotDescription:
-    """The desk arm with camera and marker that are known."""
+    """Return the desk arm with known camera and marker."""
     return desk_arm({"_known = false": "_known = true"})
 
 
 def motion_of(q: FloatArray) -> Motion:
-    """Readings (n, d) in one run, four a second."""
+    """Return readings (n, d) in one run, at four per second."""
     return Motion(q, INTERVAL_S * np.arange(len(q)), np.zeros(len(q), np.int64))
 
 
 def walk(robot: RobotDescription, seed: int, rows: int = 300) -> Motion:
-    """A walk over most of the joints' range."""
+    """Return a walk over most of the joints' range."""
     rng = np.random.default_rng(seed)
     steps = np.cumsum(rng.normal(size=(rows, len(robot.joints))), axis=0)
     shares = (steps - steps.min(axis=0)) / np.ptp(steps, axis=0)
@@ -49,36 +49,36 @@ def walk(robot: RobotDescription, seed: int, rows: int = 300) -> Motion:
 
 
 def scattered(robot: RobotDescription, seed: int, rows: int = 300) -> Motion:
-    """Poses that have nothing to do with each other, over most of the joints' range."""
+    """Return unrelated poses over most of the joints' range."""
     shares = np.random.default_rng([seed, 2]).uniform(0.1, 0.9, size=(rows, len(robot.joints)))
     return motion_of(robot.lower + shares * (robot.upper - robot.lower))
 
 
 def seen(robot: RobotDescription, motion: Motion, effects: tuple[Effect, ...], seed: int) -> Recording:
-    """What is measured of an arm with `effects`, with round noise that is stated as it is."""
+    """Return a recording of an arm with `effects`, with isotropic noise whose stated covariance is correct."""
     n = len(motion)
     noise = SIGMA_M * np.random.default_rng([seed, 1]).normal(size=(n, 3))
     return measured(robot, motion, Simulation(robot, effects).positions(motion) + noise)
 
 
 def measured(robot: RobotDescription, motion: Motion, x: FloatArray) -> Recording:
-    """Positions x (n, 3) [m], their noise stated as `SIGMA_M`."""
+    """Return a recording of positions x (n, 3) [m], their noise stated as `SIGMA_M`."""
     cov = np.broadcast_to(SIGMA_M**2 * np.eye(3), (len(motion), 3, 3))
     return Recording(joints=robot.joints, q=motion.q, x=x, t=motion.t, cov=cov, segment=motion.segment)
 
 
 def observed(robot: RobotDescription, motion: Motion, effects: tuple[Effect, ...], seed: int) -> Observations:
-    """`seen`, as the diagnosis takes it."""
+    """Return `seen` as observations of the diagnosis."""
     return Observations.of(seen(robot, motion, effects, seed), Simulation(robot))
 
 
 def start_of(robot: RobotDescription, motion: Motion, effects: tuple[Effect, ...], seed: int) -> Fit:
-    """The fit that knows of no cause yet."""
+    """Return the fit without any cause."""
     return aligned(observed(robot, motion, effects, seed), Simulation(robot))
 
 
 def at_rest(effect: Effect) -> Effect:
-    """The same with amounts of zero; moments and periods stay."""
+    """Return the effect with amounts of zero; moments and periods stay."""
     values = effect.values.copy()
     values[effect.amounts] = 0.0
     return effect.with_values(values)

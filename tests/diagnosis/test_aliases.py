@@ -1,4 +1,4 @@
-"""Ripples at regular angles look like other ripples, and the report says so."""
+"""Ripples at regular angles are aliased to other ripples, and the report says so."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ GRID_RAD = np.radians(5.0)  # 72 angles a turn
 
 
 def fitted(q_of_joint):
-    """A fit with the ripple of 50 cycles a turn that a joint has, read at angles (n,)."""
+    """Return a fit with a ripple of 50 cycles per turn in one joint, read at angles (n,)."""
     robot, rng = surveyed_arm(), np.random.default_rng(1)
     q = rng.uniform(-0.5, 0.5, (len(q_of_joint), len(robot.joints)))
     q[:, 1] = q_of_joint

@@ -1,4 +1,4 @@
-"""What nobody knows where a run begins is not asked of the rows after it."""
+"""The unknown state at the start of a run is not assumed for the rows that depend on it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def robot() -> RobotDescription:
 
 
 def in_runs(robot: RobotDescription, *effects: Effect) -> Fit:
-    """The effects fitted to what is seen of a walk on which every few rows the marker is lost."""
+    """Return the effects fitted to a walk on which the marker is lost every few rows."""
     way = walk(robot, 3, 600)
     x = seen(robot, way, effects, 3).x
     kept = np.arange(len(way)) % (RUN + UNSEEN) < RUN

@@ -1,4 +1,4 @@
-"""Which causes stay beside what has no name, and what counts as predicting rows that were not fitted."""
+"""Causes kept beside an unnamed alternative, and the criterion for predicting held-out rows."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from bodyschema.effects import Effect, Simulation
 
 
 class Believing:
-    """Takes what has no name to predict whatever it is asked about, and looking for causes to cost nothing."""
+    """Stub: the unnamed alternative predicts everything, and the search costs nothing."""
 
     def predicts(self, *_: object) -> bool:
         return True
@@ -31,7 +31,7 @@ class Believing:
 
 
 def explained_beside(fits: list[Fit], worths: list[float], monkeypatch: pytest.MonkeyPatch) -> Explanation:
-    """What is taken of fits of these worths, the last without any way and the others beside one and the same."""
+    """Return the explanation chosen from fits of these worths: the last has no direction, the others share one."""
     way = SimpleNamespace(family=SimpleNamespace(what="something", is_specific=False))
     apart = cast(Any, SimpleNamespace(chosen=(way,)))
     known = {

@@ -1,4 +1,4 @@
-"""Eyes that are turned against each other are told from a wrong scale where the data tell, and left open where not."""
+"""A vergence error is distinguished from a wrong scale if the data allow it, and left open otherwise."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def points(seed: int = 0) -> FloatArray:
 
 
 def triangulated(x: FloatArray, turn: FloatArray) -> FloatArray:
-    """By pixels: each eye's own camera matrix, the rows averaged."""
+    """Triangulate pixels: each camera's own matrix, the rows averaged."""
     c = CALIBRATION
     K = np.array([[c.focal_px, 0.0, c.principal_point_px[0]], [0.0, c.focal_px, c.principal_point_px[1]], [0, 0, 1]])
     left = K @ x.T

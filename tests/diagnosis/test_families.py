@@ -1,4 +1,4 @@
-"""What the families of errors without a name move, and by how much."""
+"""Unnamed error families: their columns and numbers agree with the motions they describe."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Amounts are recovered within what is stated of them, and fixes that are not the marker do not matter."""
+"""Amounts are recovered within their stated uncertainty, and outliers do not matter."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def amounts(fit: Fit) -> FloatArray:
 
 
 def covariance(fit: Fit) -> FloatArray:
-    """Of the causes' amounts alone."""
+    """Return the covariance of the causes' amounts alone."""
     first = fit.covariance.shape[0] - len(amounts(fit))
     return fit.covariance[first:, first:]
 
@@ -152,7 +152,7 @@ def test_a_jump_of_30_percent_of_the_recording_is_found_from_a_fit_that_knows_no
 
 
 def triangulated(pixels: FloatArray, calibration: StereoCalibration) -> FloatArray:
-    """The point (3,) [m] of (ul, vl, ur, vr) [px], its row the mean of both eyes'."""
+    """Return the point (3,) [m] of (ul, vl, ur, vr) [px], with the mean row of both images."""
     ul, vl, ur, vr = pixels
     cx, cy = calibration.principal_point_px
     z = calibration.focal_px * calibration.baseline_m / (ul - ur)

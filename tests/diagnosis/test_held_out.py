@@ -1,4 +1,4 @@
-"""Errors on rows that were not fitted, and p-values that mean what they say."""
+"""Held-out errors and calibrated p-values."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from bodyschema.interfaces.robot import RobotDescription
 
 CHANCE = 1e-4
 SEEDS, MANY_SEEDS = range(100), range(300)
-# Of so many poses each is read so many times, in coarse ticks.
+# Number of poses, and of readings of each, in coarse ticks.
 POSES, ALIKE, TICK_RAD = 120, 5, 2.0 * np.pi / 512
 
 
@@ -42,7 +42,7 @@ def robot() -> RobotDescription:
 
 
 def converged(fit: Fit) -> Fit:
-    """The fit, fitted again from where it ended."""
+    """Return the fit, fitted again from where it ended."""
     for _ in range(3):
         fit = fitted(fit.observations, fit.simulation, fit.nuisances, fit.noise)
     return fit
@@ -50,7 +50,7 @@ def converged(fit: Fit) -> Fit:
 
 @pytest.fixture(scope="module")
 def small(robot) -> Fit:
-    """Sixty poses, each a run of its own: what is left of them is measured as before."""
+    """Return sixty poses, each a run of its own."""
     motion = walk(robot, 1, 60)
     alone = Motion(motion.q, motion.t, np.arange(60))
     truth = (
@@ -115,7 +115,7 @@ def test_a_gain_of_nothing_is_none() -> None:
 
 
 def chances(robot: RobotDescription, starts: list[Fit], name: str, where: str | None) -> FloatArray:
-    """p-values of an effect that is not there."""
+    """Return p-values of an effect that is not there."""
     effect = Effect.at(robot, name, where)
     return np.array(
         [
@@ -126,7 +126,7 @@ def chances(robot: RobotDescription, starts: list[Fit], name: str, where: str | 
 
 
 def chances_of_independent_rows(robot: RobotDescription, starts: list[Fit], name: str, where: str) -> FloatArray:
-    """The same if each row were a measurement of its own."""
+    """Return the same probabilities if each row were an independent measurement."""
     found = [Scan(fit).candidate(Effect.at(robot, name, where)) for fit in starts]
     return np.array([stats.chi2.sf(candidate.gain, candidate.dof) for candidate in found if candidate is not None])
 
@@ -136,7 +136,7 @@ def is_uniform(p_values: FloatArray) -> bool:
 
 
 def read_in_ticks(robot: RobotDescription, seed: int) -> Fit:
-    """An arm that stands still for some rows and is read in whole ticks: they all have the same error."""
+    """Return a fit of an arm that rests for some rows, read in whole ticks, so that these rows share one error."""
     rows = ALIKE * POSES
     q = np.repeat(scattered(robot, seed, POSES).q, ALIKE, axis=0)
     motion = motion_of(TICK_RAD * np.round(q / TICK_RAD))

@@ -1,4 +1,4 @@
-"""What a recording cannot test is said, and not tested."""
+"""Hypotheses that a recording cannot test are reported and not tested."""
 
 from __future__ import annotations
 

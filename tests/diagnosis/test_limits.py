@@ -1,4 +1,4 @@
-"""What a diagnosis could not find out is told, with the reason."""
+"""Limits of a diagnosis are reported with their reasons."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers of moves that follow a few functions together are found as such."""
+"""Families of numbers that follow a few common functions are found at low rank."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What to do about a cause: done as it says, it makes the simulation right."""
+"""Remedies for a cause: following the instructions makes the simulation correct."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SIX = {"x_m": 0.004, "y_m": -0.003, "z_m": 0.002, "rx_rad": 0.01, "ry_rad": -0.0
 
 @pytest.fixture
 def robot(tmp_path: Path) -> RobotDescription:
-    """The desk arm, in a folder of its own, with camera and marker that are known."""
+    """Return the desk arm, in a folder of its own, with known camera and marker."""
     text = DESK_ARM.read_text().replace("_known = false", "_known = true")
     (tmp_path / "robot.toml").write_text(text)
     (tmp_path / "desk_arm.urdf").write_text((DESK_ARM.parent / "desk_arm.urdf").read_text())
@@ -73,7 +73,7 @@ def positions(robot: RobotDescription, *effects: Effect) -> FloatArray:
 
 
 def edited(robot: RobotDescription, keys: str) -> RobotDescription:
-    """The robot with lines of robot.toml changed, as `xyz = [...], rpy = [...]`."""
+    """Return the robot with lines of robot.toml changed, given as `xyz = [...], rpy = [...]`."""
     text = robot.file.read_text()
     for key, value in re.findall(r"(\w+) = (\[[^]]*\]|[0-9.]+)", keys):
         text, count = re.subn(rf"^{key} = (\[[^]]*\]|[0-9.]+)", f"{key} = {value}", text, flags=re.MULTILINE)

@@ -1,4 +1,4 @@
-"""report.html of planted causes: well-formed, of one piece, and with everything in it."""
+"""report.html of planted causes: well-formed, self-contained and complete."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def html(planted, file) -> str:
 
 
 class Nesting(HTMLParser):
-    """Collects elements that are not closed in their order, and what elements refer to."""
+    """Parser that collects elements not closed in order, and the references of elements."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""What else a cause could be: the same in any motion, or in this one, and which motion would tell."""
+"""Alternatives to a cause: the same in any motion or in this one only, and the motion that would distinguish them."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ PLANTED = (("joint_scale", 0.03), ("joint_offset", 0.03))
 
 
 def narrow(robot: RobotDescription) -> Motion:
-    """All joints but one move widely: that stays near one place."""
+    """Return a motion in which one joint stays near one position and all others move widely."""
     q = walk(robot, 2, ROWS).q.copy()
     q[:, 1] = 1.0 + 0.002 * np.sin(np.arange(len(q)))
     return motion_of(q)
@@ -83,7 +83,7 @@ def test_causes_that_a_narrow_motion_cannot_tell_apart_are_told_as_rivals_in_thi
 
 
 def advised(robot: RobotDescription, advice: str) -> Motion:
-    """The narrow motion with the joint that is advised moved as is advised."""
+    """Return the narrow motion with the recommended joint moved as recommended."""
     match = ADVISED.search(advice)
     assert match is not None
     joint, low, high = match[1], *np.radians([float(match[2]), float(match[3])])

@@ -1,4 +1,4 @@
-"""What a hypothesis would explain, and its moment, period or width, before anything is refitted."""
+"""Gain of a hypothesis with its moment, period or width, before any refit."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def robot() -> RobotDescription:
 
 
 def scanned(robot: RobotDescription, planted: Effect, seed: int) -> Candidate:
-    """The effect as it is found again, whatever its numbers are."""
+    """Return the effect as the scan recovers it from its name and place alone."""
     candidate = Scan(start_of(robot, walk(robot, seed), (planted,), seed)).candidate(
         Effect.at(robot, planted.name, planted.where, planted.source)
     )
@@ -101,7 +101,7 @@ def test_the_moment_of_a_barely_visible_jump_lies_in_its_interval_as_often_as_st
 @pytest.mark.parametrize("cycles", [2.0, 8.0, 12.4, 50.0, 81.0])
 def test_a_ripple_is_found_with_its_cycles_a_turn(robot, cycles) -> None:
     found = scanned(robot, Effect.at(robot, "joint_ripple", SHOULDER, values=[0.006, -0.004, cycles]), 6)
-    # The grid's step beside the best one: a sixtieth of what turns the phase by one over the range.
+    # The grid's step next to the best one: a sixtieth of the period that changes the phase by one over the range.
     step = 2.0 * np.pi / np.ptp(walk(robot, 6).q[:, 1]) / 60.0
     assert found.effect.value("cycles_per_turn") == pytest.approx(cycles, abs=3.0 * step)
 

@@ -1,4 +1,4 @@
-"""What single readings scatter is not taken for a joint's memory of its way; a memory still is."""
+"""Noise of single readings is not mistaken for a joint's hysteresis; real hysteresis is found."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ def robot() -> RobotDescription:
 
 
 def slow_way(robot: RobotDescription, rng: np.random.Generator) -> Motion:
-    """From pair to pair the joints move by about as much as their readings scatter, to and fro."""
+    """Return a motion to and fro whose steps are about as large as the readings' noise."""
     speeds, phases = rng.uniform(0.01, 0.02, len(robot.joints)), rng.uniform(0.0, 6.0, len(robot.joints))
     shares = 0.5 + 0.03 * np.sin(speeds * np.arange(ROWS)[:, None] + phases)
     return motion_of(robot.lower + shares * (robot.upper - robot.lower))
 
 
 def way_with_rests(robot: RobotDescription, rng: np.random.Generator) -> Motion:
-    """From posture to posture by a degree a row or so; of each joint every other move is a rest."""
+    """Return a motion between postures by about a degree per row; every other move of each joint is a rest."""
     shares = 0.5 + 0.3 * rng.uniform(-1.0, 1.0, (ROWS // 40 + 2, len(robot.joints)))
     rests = rng.random(shares.shape) < 0.5
     for row in range(1, len(shares)):
@@ -50,14 +50,14 @@ def way_with_rests(robot: RobotDescription, rng: np.random.Generator) -> Motion:
 
 
 def poses(robot: RobotDescription, rng: np.random.Generator) -> Motion:
-    """Poses that have nothing to do with each other."""
+    """Return unrelated poses."""
     return motion_of(robot.lower + rng.uniform(0.2, 0.8, (ROWS, len(robot.joints))) * (robot.upper - robot.lower))
 
 
 def fit_of(
     robot: RobotDescription, seed: int, *effects: Effect, way: Way = slow_way, scatter_rad: float = SCATTER_RAD
 ) -> Fit:
-    """The simulation without effects, laid on readings that scatter."""
+    """Return the simulation without effects, aligned to noisy readings."""
     rng = np.random.default_rng([seed, 21])
     motion = way(robot, rng)
     x = Simulation(robot, effects).positions(motion) + SIGMA_M * rng.normal(size=(ROWS, 3))
@@ -91,7 +91,7 @@ def test_a_play_of_several_times_the_scatter_is_clearly_seen_beside_it(robot, se
 
 @pytest.mark.parametrize("name", ["backlash", "settling"])
 def test_of_memories_that_no_joint_has_one_in_a_hundred_is_as_improbable_as_one_in_a_hundred(robot, name) -> None:
-    """However much the readings scatter, and though joints rest. More than 4 of 80 are so in 1 of 700 such tests."""
+    """More than 4 of 80 p-values below 0.01 occur by chance in 1 of 700 such tests."""
     chances = []
     for seed in range(20):
         fit = fit_of(robot, seed, way=way_with_rests, scatter_rad=(0.2, 1.0, 3.0)[seed % 3] * SCATTER_RAD)
@@ -113,7 +113,7 @@ def test_a_memory_is_seen_on_ways_with_rests_and_from_pose_to_pose(robot, name, 
 
 
 def with_false_play(robot: RobotDescription, seed: int) -> tuple[Fit, Search]:
-    """A play that the joint has not, fitted to readings that scatter: the likelihood speaks for it."""
+    """Return a fit with a backlash that the joint does not have; noisy readings make the likelihood favour it."""
     fit, search = fit_of(robot, seed), Search([Effect.at(robot, "backlash", ELBOW)], lambda _: None)
     false = fit.with_causes([Effect.at(robot, "backlash", ELBOW, values=[0.3 * SCATTER_RAD])])
     assert nats(2.0 * (false.log_likelihood - fit.log_likelihood), 1) > NAMED

@@ -1,4 +1,4 @@
-"""Causes are named only where they are worth their numbers, the simplest of equals, and the search ends."""
+"""Causes are named only if their evidence exceeds their cost, the simplest of equals; and the search ends."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_the_more_hypotheses_there_are_the_more_one_of_them_has_to_explain(robot
 
 
 class Undecided(Search):
-    """Exchanges one cause for the other whenever it is asked."""
+    """Stub that exchanges one cause for the other at each request."""
 
     asked = 0
 

@@ -1,4 +1,4 @@
-"""An error without a name depends on the joints that hold a twentieth of its variance or more."""
+"""An unnamed error depends on the joints that hold a twentieth of its variance or more."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A mount that gives under the arm's weight is not taken for a joint that does, nor the other way round."""
+"""A mount's compliance is not mistaken for a joint's, nor the other way round."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MASSES = {"turret": 0.6, "upper_arm": 0.5, "forearm": 0.35, "wrist": 0.15, "grip
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory) -> RobotDescription:
-    """The desk arm, held by its motors, with masses half way along its links; camera and marker are known."""
+    """Return the desk arm, held by its motors, with masses half way along its links and known camera and marker."""
     folder: Path = tmp_path_factory.mktemp("heavy")
     urdf = DESK_ARM.with_name("desk_arm.urdf").read_text()
     for link, kg in MASSES.items():
@@ -34,14 +34,14 @@ def robot(tmp_path_factory) -> RobotDescription:
 
 
 def moments_about_the_floor(robot: RobotDescription, q: np.ndarray) -> np.ndarray:
-    """Of the arm's weight (n, 3) [N·m], by how much the height of its centre changes as the floor is tilted."""
+    """Return the weight's moments (n, 3) [N·m]: the change of height of its centre as the floor is tilted."""
     moments, forces = Simulation(robot).gravity.loads(q)
     (T, *_) = Simulation(robot).gravity.in_supports(0)
     return moments[:, 0] @ T[:3, :3].T + np.cross(T[:3, 3], forces[:, 0] @ T[:3, :3].T)
 
 
 def on_a_soft_mount(robot: RobotDescription, times_the_noise: float, seed: int) -> Recording:
-    """Seen when the floor turns about its origin, alike about all axes, in proportion to the moment on it."""
+    """Return the positions on a mount that turns about the floor's origin, in proportion to the moment on it."""
     motion, camera = walk(robot, seed), robot.camera.pose
     x = Simulation(robot).positions(motion)
     floor = x @ camera[:3, :3].T + camera[:3, 3]
@@ -56,7 +56,7 @@ def found(recording: Recording, robot: RobotDescription) -> DiagnosisFile:
 
 
 def with_a_link_that_bends(robot: RobotDescription, times_the_noise: float, seed: int) -> Recording:
-    """Seen when the upper arm turns about its middle, across it alone, in proportion to the moment on it there."""
+    """Return the positions with an upper arm that bends across its middle, in proportion to the moment there."""
     motion, k = walk(robot, seed), robot.joints.index(ELBOW)
     run, (T, *_) = Simulation(robot).run(motion), Simulation(robot).gravity.in_supports(robot.joints.index(ELBOW))
     moments, forces = (load[:, k] for load in Simulation(robot).gravity.loads(motion.q))

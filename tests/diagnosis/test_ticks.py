@@ -1,4 +1,4 @@
-"""Readings in whole ticks are seen as such, and how much of the noise is theirs."""
+"""Readings in whole ticks are recognised, with their share of the noise."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.interfaces.robot import RobotDescription
 
 TICK_RAD = 2.0 * np.pi / 4096
-# A coarser encoder: what its readings add to the noise is about as large as the instrument's own.
+# A coarser encoder: its readings add about as much noise as the instrument has.
 COARSE_RAD = 2.0 * np.pi / 512
 
 
@@ -50,7 +50,7 @@ def test_a_joint_that_was_read_at_few_places_has_no_tick(robot) -> None:
 
 
 def noisy(robot: RobotDescription, factor: float, tick: float, seed: int) -> Observations:
-    """An instrument whose noise is `factor` times as large as it says, and encoders that read whole ticks."""
+    """Return observations with `factor` times the stated noise, from encoders that read whole ticks."""
     motion = walk(robot, seed, 400)
     noise = factor * SIGMA_M * np.random.default_rng([seed, 1]).normal(size=(len(motion), 3))
     x = Simulation(robot).positions(motion) + noise

@@ -1,4 +1,4 @@
-"""An arm that is a little off everywhere: what is larger than its tolerances is named, and nothing else."""
+"""An arm with tolerances everywhere: only errors larger than its tolerances are named."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LENGTH_M, ANGLE_RAD, DRIVE_RAD = 4e-4, 1.2e-3, 2e-4
 
 
 def made(robot: RobotDescription, rng: np.random.Generator) -> tuple[Effect, ...]:
-    """Every link and every drive as a workshop makes them."""
+    """Return a robot with realistic tolerances of every link and drive."""
     found = []
     for joint in robot.joints:
         link = np.concatenate([LENGTH_M * rng.normal(size=3), ANGLE_RAD * rng.normal(size=3)])

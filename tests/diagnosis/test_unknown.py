@@ -1,4 +1,4 @@
-"""What none of the effects can do is told as such, and what is not there is not found."""
+"""Errors outside the effects table are reported as such, and effects that are not there are not found."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def robot() -> RobotDescription:
 
 
 def squared_positions(robot: RobotDescription, motion: Motion) -> FloatArray:
-    """Of an arm whose shoulder errs by `PER_RAD` times the elbow's square."""
+    """Return positions of an arm whose shoulder errs by `PER_RAD` times the elbow's square."""
     q = motion.q.copy()
     q[:, robot.joints.index(SHOULDER)] += PER_RAD * np.square(motion.q[:, robot.joints.index(ELBOW)])
     return Simulation(robot).positions(motion_of(q))

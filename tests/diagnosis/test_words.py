@@ -10,7 +10,7 @@ TURN = {"rx_rad": 0.0, "ry_rad": 0.01, "rz_rad": 0.0}
 
 
 def _link(untold_m: float) -> Cause:
-    """A link of which the recording tells a shift in x and the turns, and nothing of the other shifts."""
+    """Return a link whose shift in x and turns are identified, and whose other shifts are not."""
     told = {name: Interval(value, (value - 1e-4, value + 1e-4)) for name, value in (SHIFT | TURN).items()}
     untold = {name: Interval(0.05, (0.05 - untold_m, 0.05 + untold_m)) for name in ("y_m", "z_m")}
     return Cause("link_geometry", "elbow", None, told | untold, 1.0, 100.0, 80.0, 100.0, (), (), "")

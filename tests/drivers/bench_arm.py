@@ -1,4 +1,4 @@
-"""Arms of Dynamixel servos on the bench in virtual time, and what they were told."""
+"""Arms of emulated Dynamixel servos in virtual time, and the instructions that they received."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bodyschema.drivers.dynamixel.models import BY_NAME
 
 
 class HeardPort(VirtualPort):
-    """Keeps what is sent."""
+    """A port that records what is sent."""
 
     def __init__(self, *args, **kwargs) -> None:
         super().__init__(*args, **kwargs)
@@ -28,14 +28,14 @@ class HeardPort(VirtualPort):
         super().write(data)
 
     def writes(self) -> list[tuple[int, bytes]]:
-        """Address and data of all that was written to servos."""
+        """Return address and data of all writes to servos."""
         wide = {1: 1, 2: 2}
         told = [i for i in self.heard if i.code in (Code.WRITE, Code.REG_WRITE, Code.SYNC_WRITE, Code.BULK_WRITE)]
         return [(int.from_bytes(i.params[: wide[i.protocol]], "little"), i.params[wide[i.protocol] :]) for i in told]
 
 
 class Arm(ServoArm):
-    """A driver of Dynamixel servos with a bench behind it."""
+    """A driver of Dynamixel servos on an emulator."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Arms of Feetech servos on the bench in virtual time."""
+"""Arms of emulated Feetech servos in virtual time."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bodyschema.drivers.feetech.models import BY_NAME
 
 
 class HeardPort(VirtualPort):
-    """Keeps what is sent."""
+    """A port that records what is sent."""
 
     def __init__(self, *args, **kwargs) -> None:
         super().__init__(*args, **kwargs)
@@ -28,13 +28,13 @@ class HeardPort(VirtualPort):
         super().write(data)
 
     def writes(self) -> list[tuple[int, bytes]]:
-        """Address and data of all that was written to servos."""
+        """Return address and data of all writes to servos."""
         told = [i for i in self.heard if i.code in (Code.WRITE, Code.REG_WRITE, Code.SYNC_WRITE, Code.RESET)]
         return [(i.params[0], i.params[1:]) for i in told]
 
 
 class FeetechArm(ServoArm):
-    """A driver of Feetech servos with a bench behind it."""
+    """A driver of Feetech servos on an emulator."""
 
     def __init__(
         self,

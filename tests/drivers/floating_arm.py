@@ -1,4 +1,4 @@
-"""Arms on the bench that servos move: pendulums, driven by the currents that the driver commands."""
+"""Emulated arms moved by servos: pendulums driven by the currents that the driver commands."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Pendulum:
         self.times, self.path = [0.0], [q]
 
     def shaft(self, t: float) -> float:
-        """The servo's angle [rad]; also of the past."""
+        """Return the servo's angle [rad], also in the past."""
         self.move(t)
         place = bisect_right(self.times, t) - 1
         return self.direction * self.path[max(place, 0)]
@@ -74,7 +74,7 @@ class Pendulum:
 
 
 def holding(q: np.ndarray) -> np.ndarray:
-    """What bears the pendulums [N·m]."""
+    """Return the torques that hold the pendulums [N·m]."""
     return WEIGHT_N_M * np.cos(q)
 
 
@@ -125,7 +125,7 @@ class FloatingArm:
         )
 
     def run(self, seconds: float) -> int:
-        """Read for so long; how many readings came."""
+        """Read for this time and return the number of readings."""
         end, readings = self.clock.now() + seconds, 0
         while self.clock.now() < end:
             readings += self.joints.read(0.02) is not None
@@ -143,26 +143,26 @@ class FloatingArm:
         return answer.result()
 
     def let_go(self) -> None:
-        """The hand that held the arm is gone."""
+        """Release the arm from the hand."""
         for pendulum in self.pendulums:
             pendulum.held_until = self.clock.now()
 
     def float(self) -> None:
-        """On, ramped in while a hand holds the arm, and then let go."""
+        """Switch on, ramp in while a hand holds the arm, and then let go."""
         self.switch_on()
         self.run(self.table.ramp_s + 0.1)
         self.let_go()
 
     @property
     def q(self) -> list[float]:
-        """Where the pendulums are [rad]."""
+        """Positions of the pendulums [rad]."""
         return [pendulum.q for pendulum in self.pendulums]
 
     @property
     def torque(self) -> list[int]:
-        """Whose torque is on."""
+        """Torque register of each servo."""
         return [servo["torque"] for servo in self.chain.servos]
 
     def currents(self) -> list[float]:
-        """What the servos regulate now [A]."""
+        """Return the currents that the servos regulate now [A]."""
         return [servo.motor_current(self.clock.now()) for servo in self.chain.servos]

@@ -1,4 +1,4 @@
-"""The demonstration's upper body on the bench: its arm moves along a path, its head as its servos turn it."""
+"""The demonstration's upper body on the emulator: its arm moves along a path, its head follows its servos."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ LOOK_S = 0.04
 
 
 def nobody(payload: bytes) -> bytes:
-    """No learner answers."""
+    """Return None: no learner answers."""
     raise BusError("nobody answers")
 
 
 class GazingRobot:
-    """A driver with gaze over the bench, in virtual time; `truth` is the arm as it really is."""
+    """A driver with gaze on the emulator, in virtual time; `truth` is the true arm."""
 
     def __init__(self, predict=nobody, truth: RigidChain | None = None, **settings) -> None:
         self.clock = VirtualClock()
@@ -88,7 +88,7 @@ class GazingRobot:
         return answer.result()
 
     def run(self, seconds: float, *, looking: bool = True) -> np.ndarray:
-        """Read for so long; where the hand was in the left image at each reading [px] (n, 2)."""
+        """Read for this time and return the hand's position in the left image at each reading [px] (n, 2)."""
         end, next_look, seen = self.clock.now() + seconds, 0.0, []
         while self.clock.now() < end:
             reading = self.joints.read(0.02)
@@ -101,18 +101,18 @@ class GazingRobot:
         return np.array(seen)
 
     def q(self) -> np.ndarray:
-        """Where all joints are [rad] (d,)."""
+        """Return the positions of all joints [rad] (d,)."""
         return np.array([servo.angle(self.clock.now()) for servo in self.chain.servos])
 
     def pixel(self) -> np.ndarray:
-        """Where the hand is in the left image [px] (2,)."""
+        """Return the hand's position in the left image [px] (2,)."""
         calibration = self.robot.calibration
         assert calibration is not None
         x, y, z = self.truth.positions(self.q()[None])[0]
         return np.array([x, y]) / z * calibration.focal_px + calibration.principal_point_px
 
     def in_view(self, pixels: np.ndarray) -> np.ndarray:
-        """Which are in the image (n,)."""
+        """Return a mask of the pixels inside the image (n,)."""
         calibration = self.robot.calibration
         assert calibration is not None
         size = np.array(calibration.image_size_px)

@@ -1,4 +1,4 @@
-"""A ROS 2 robot on the bench in virtual time, and who listens to it."""
+"""An emulated ROS 2 robot in virtual time, and its reader."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PATHS: dict[str, Callable[[float], float]] = {
 
 
 class Robot:
-    """A driver with nodes behind it: by default one that publishes three joints at 100 Hz."""
+    """A driver connected to nodes: by default one that publishes three joints at 100 Hz."""
 
     def __init__(
         self,
@@ -47,7 +47,7 @@ class Robot:
         )
 
     def read(self, seconds: float) -> list[JointReading]:
-        """All readings of so long."""
+        """Return all readings of this time span."""
         end, readings = self.clock.now() + seconds, []
         while (left := end - self.clock.now()) > 1e-9:
             reading = self.joints.read(left)
@@ -56,6 +56,6 @@ class Robot:
         return readings
 
     def error(self, reading: JointReading) -> float:
-        """Largest error of the reading's positions against the truth at its time [rad]."""
+        """Return the largest error of the reading's positions against the truth at its time [rad]."""
         names = self.joints.joints
         return max(abs(q - self.paths[name](reading.t)) for q, name in zip(reading.q, names, strict=True))

@@ -1,4 +1,4 @@
-"""Arms of servos on a bench in virtual time, whatever their make."""
+"""Arms of emulated servos of any vendor in virtual time."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ Path = Callable[[float], float]
 
 
 def swing(phase: float) -> Path:
-    """A joint that is moved by hand, at up to 50°/s."""
+    """Return the path of a joint moved by hand, at up to 50°/s."""
     return lambda t: 1.2 * math.sin(0.7 * t + phase)
 
 
 class ServoArm:
-    """A driver with a bench behind it.
+    """A driver connected to an emulator.
 
     Args:
         servo: makes one of a model's name, an ID and its path.
         port: a class of ports, which may keep what is sent.
-        held_s: questions are held up by up to so long.
+        held_s: largest delay of a request.
     """
 
     joints: ServoJoints
@@ -57,7 +57,7 @@ class ServoArm:
         self._latency_s, self._models = latency_s, models
 
     def entries(self, kind: Callable[[str, int, str], Any]) -> tuple[Any, ...]:
-        """The servos as robot.toml would tell of them."""
+        """Return the servos as entries of robot.toml."""
         fitted = zip(self.names, self._models, strict=True)
         return tuple(kind(name, k, model) for k, (name, model) in enumerate(fitted, 1))
 
@@ -67,9 +67,9 @@ class ServoArm:
         self.joints = driver(config, self.names, self.clock, open_port=lambda *_: opened, **settings)
 
     def error(self, reading) -> float:
-        """Largest error of the reading's angles against the truth at its time [rad]."""
+        """Return the largest error of the reading's angles against the truth at its time [rad]."""
         return max(abs(q - path(reading.t)) for q, path in zip(reading.q, self.paths, strict=True))
 
     def sampled(self) -> float:
-        """The middle of the times at which the positions were really taken [s]."""
+        """Return the mean time at which the positions were really sampled [s]."""
         return sum(sampling.t for sampling in self.chain.samplings.values()) / len(self.chain.samplings)

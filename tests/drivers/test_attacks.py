@@ -1,4 +1,4 @@
-"""Buses that do more than to lose answers: adapters that echo, answers that come twice, bytes without end."""
+"""Buses with faults beyond lost answers: adapters that echo, duplicate answers, endless bytes."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ WEAK = {
 
 
 class Wire(OnlyAnswers):
-    """A device whose answers are changed on their way."""
+    """A device whose answers are changed on the wire."""
 
     def __init__(self, device: Device, change: Change) -> None:
         self._device, self._change = device, change
@@ -56,7 +56,7 @@ class Wire(OnlyAnswers):
 
 
 def echo(data: bytes, replies: list[Reply], t: float) -> list[Reply]:
-    """The adapter sends back what is sent."""
+    """Prepend the sent bytes to the replies, like an adapter that echoes."""
     return [Reply(0, t, data), *replies]
 
 
@@ -128,7 +128,7 @@ class Babble:
         self._clock, self.received = clock, 0
 
     def write(self, data: bytes) -> None:
-        """Nobody listens."""
+        """Ignore the data."""
 
     def receive(self, until: float) -> bytes:
         self._clock.wait_until(self._clock.now() + 1e-4)
@@ -137,10 +137,10 @@ class Babble:
         return b"\x55"
 
     def flush(self) -> None:
-        """More comes."""
+        """Do nothing: more data come."""
 
     def close(self) -> None:
-        """More comes."""
+        """Do nothing: more data come."""
 
 
 @pytest.mark.parametrize("model", WEAK)
@@ -152,7 +152,7 @@ def test_noise_without_end_does_not_hold_the_driver(model) -> None:
 
 
 def once(arm: Any, place: int, value: int) -> Change:
-    """The first answer to a question for torque has another byte, and a checksum that fits."""
+    """Change one byte in the first answer to a torque query, with a valid checksum."""
     state, left = arm.chain.servo(1).model.layout.state, [1]
 
     def change(data: bytes, replies: list[Reply], _t: float) -> list[Reply]:

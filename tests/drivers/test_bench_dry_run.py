@@ -1,4 +1,4 @@
-"""The servos of a configuration on a bench, and the faults that are asked for."""
+"""The servos of a configuration on an emulator, and the requested faults."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ LINES_CONFIG = SerialLinesConfig(
         EncoderConfig("elbow", zero_ticks=1000, ticks_per_turn=16384),
     ),
 )
-# Of each make: its bench, the configured arm, the kinds of faults, and the driver.
+# For each vendor: its emulator, the configured arm, the kinds of faults, and the driver.
 MAKES: dict[str, tuple[Any, Any, FaultKinds, Any]] = {
     "Dynamixel": (DynamixelArm, CONFIG, KINDS, DynamixelJoints),
     "Feetech": (FeetechArm, FEETECH_CONFIG, FEETECH_KINDS, FeetechJoints),
@@ -193,7 +193,7 @@ GAZING = msgspec.structs.replace(CONFIG, gaze=GazeConfig(joints=("waist", "shoul
 
 
 def turning(*faults: str) -> DynamixelArm:
-    """An arm whose joints all move with time, but for those that its servos turn."""
+    """Return an arm whose joints all move with time, except those that its servos turn."""
     asked = [AskedFault.parsed(fault, JOINTS, KINDS) for fault in faults]
     return DynamixelArm(GAZING, dict.fromkeys(JOINTS, lambda t: 0.1 * t), faults=asked, now=lambda: 2.0)
 
@@ -223,7 +223,7 @@ def test_a_turned_shaft_knows_where_it_was() -> None:
     assert waist.angle(2.5) == pytest.approx(0.2)
 
 
-# --- what is asked for
+# --- requested faults
 
 
 @pytest.mark.parametrize(("make", "kind"), [(make, kind) for make in MAKES for kind in MAKES[make][2].names])
@@ -282,7 +282,7 @@ def test_a_swing_stays_within_the_limits() -> None:
 
 
 class Scripted:
-    """Gives prepared readings."""
+    """A source of prepared readings."""
 
     joints = JOINTS
 

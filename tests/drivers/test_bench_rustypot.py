@@ -1,4 +1,4 @@
-"""The benches on a pseudo-terminal, spoken to by rustypot as it is: a client that shares no code with ours."""
+"""The emulators on a pseudo-terminal with the unmodified rustypot: a client that shares no code with the project."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ rustypot = pytest.importorskip("rustypot")
 
 IDS = (1, 2, 7)
 ANGLES = (0.5, -1.0, 0.3)
-TIMEOUT_S = 1.0  # of a real client on a busy machine; who is not there costs as much
-SCANS = 200  # a scan of rustypot waits some 5 ms for each servo, whatever its timeout, and a busy bench answers later
+TIMEOUT_S = 1.0  # timeout of a real client on a busy machine; an absent servo costs as much
+SCANS = 200  # rustypot waits some 5 ms for each servo, whatever its timeout, and a busy emulator answers later
 
 
 def dynamixel(model: str) -> DynamixelChain:
@@ -49,7 +49,7 @@ CONTROLLERS = {
     "AX-12A": "AxPyController", "STS3215": "Sts3215PyController", "SCS0009": "Scs0009PyController",
 }  # fmt: skip
 MODELS = DYNAMIXEL | FEETECH
-# Who answers SYNC_READ by the manuals: neither Protocol 1.0 of Dynamixel nor the SCS series of Feetech.
+# Models that answer SYNC_READ by the manuals: neither Protocol 1.0 of Dynamixel nor the SCS series of Feetech.
 TOGETHER = ["XL330-M288", "XL430-W250", "STS3215"]
 EACH = pytest.mark.parametrize("model", CONTROLLERS)
 
@@ -72,12 +72,12 @@ class Bench:
         self.shell.unplug()
 
     def ticks(self, id: int) -> int:
-        """Where the servo stands."""
+        """Return the servo's position in ticks."""
         return self.model.zero_ticks + round(ANGLES[IDS.index(id)] / self.model.rad_per_tick)
 
 
 def scanned(scan: Callable[[], dict[int, int]], there: dict[int, int]) -> bool:
-    """Scan until all that are there have answered in time; nothing else may answer."""
+    """Scan until all servos present have answered in time; fail if any other answers."""
     for _ in range(SCANS):
         found = scan()
         assert found.items() <= there.items()

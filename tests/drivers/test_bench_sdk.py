@@ -1,4 +1,4 @@
-"""The bench, spoken to by dynamixel-sdk as it is, in virtual time; unplugging on a pseudo-terminal."""
+"""The emulator with the unmodified dynamixel-sdk, in virtual time; unplugging on a pseudo-terminal."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def chain() -> Chain:
 
 
 class VirtualHandler(sdk.PortHandler):
-    """The SDK's port with the bench behind it. Time passes while the SDK looks for bytes, which it does in a loop."""
+    """The SDK's port connected to the emulator. Time passes while the SDK polls for bytes, which it does in a loop."""
 
     def __init__(self, chain: Chain) -> None:
         super().__init__("virtual")
@@ -299,7 +299,7 @@ def test_a_fault_shows_at_the_sdk_and_passes(port, chain, fault, result) -> None
 
 
 def test_a_program_that_has_it_open_notices_the_unplugging(chain, tmp_path, monkeypatch) -> None:
-    # The SDK spins while it waits, in this process: the bench may get its turn late.
+    # The SDK spins while it waits, in this process: the emulator may be scheduled late.
     monkeypatch.setattr(sdk.port_handler, "LATENCY_TIMER", 1000)
     with PtyShell(chain, tmp_path / "bus") as shell:
         port = sdk.PortHandler(str(shell.link))

@@ -1,4 +1,4 @@
-"""Checks of ports and servos: what is found, and the command that mends it."""
+"""Checks of ports and servos: findings and the commands that fix them."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ EACH = pytest.mark.parametrize("make", MAKES)
 
 
 class Machine:
-    """A file system with what the checks look at."""
+    """A fake file system with the entries that the checks read."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -139,11 +139,11 @@ def test_a_port_of_another_group_is_told_with_the_command(machine, monkeypatch) 
     assert check.mend.startswith("sudo usermod -aG ")
 
 
-# --- servos on a bench
+# --- emulated servos
 
 
 class Told:
-    """What the doctor says of servos on a bench."""
+    """Doctor's findings about emulated servos."""
 
     def __init__(self, make: str, tmp_path: Path, *faults: str, delay_s: float = 0.0) -> None:
         arm_of, config, the_make, open_port, *_ = MAKES[make]

@@ -1,4 +1,4 @@
-"""examples/correction/ros2_node.py publishes corrected joint states beside the raw ones."""
+"""examples/correction/ros2_node.py publishes corrected joint states in addition to the raw ones."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LIMIT_S = 300.0
 
 @pytest.fixture
 def correction(tmp_path: Path) -> str:
-    """Offsets of 0.1, 0.2, ... rad at the emulated robot's joints."""
+    """Return offsets of 0.1, 0.2, ... rad at the emulated robot's joints."""
     links = "".join(f'<link name="l{k}"/>' for k in range(len(NAMES) + 1))
     joints = "".join(
         f'<joint name="{name}" type="revolute"><parent link="l{k}"/><child link="l{k + 1}"/><origin xyz="0.1 0 0.1"/>'

@@ -1,4 +1,4 @@
-"""Question and answer at a port that says anything."""
+"""Requests and answers at a port that sends arbitrary bytes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PIECES = st.lists(
 
 
 class TalkingPort:
-    """Says its pieces, a millisecond apart, whatever it is asked."""
+    """A port that sends its pieces, a millisecond apart, whatever the request."""
 
     baud = 1_000_000
 
@@ -33,7 +33,7 @@ class TalkingPort:
         self._clock, self._pieces = clock, pieces
 
     def write(self, data: bytes) -> None:
-        """It does not listen."""
+        """Ignore the data."""
 
     def receive(self, until: float) -> bytes:
         next_s = self._clock.now() + 1e-3
@@ -41,10 +41,10 @@ class TalkingPort:
         return self._pieces.pop(0) if next_s <= until and self._pieces else b""
 
     def flush(self) -> None:
-        """Nothing waits."""
+        """Do nothing: nothing waits."""
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Do nothing: there is nothing to close."""
 
 
 def fitted(model: str) -> FittedServo:

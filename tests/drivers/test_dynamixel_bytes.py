@@ -1,4 +1,4 @@
-"""Parsers of bytes from outside, fuzzed, and held against dynamixel-sdk's own arithmetic and data."""
+"""Parsers of bytes from outside, fuzzed, and compared with dynamixel-sdk's own arithmetic and data."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_a_common_answer_is_taken_apart_or_refused_when_a_byte_is_wrong(blocks, 
     wrong = bytearray(packet)
     wrong[place] ^= draw.draw(st.integers(1, 255))
     with suppress(Garbled):
-        assert PACKETS2.take_fast(wrong, 0, len(blocks), 16) is None  # its length says that more is to come
+        assert PACKETS2.take_fast(wrong, 0, len(blocks), 16) is None  # its length announces more bytes
 
 
 @given(st.integers(0, 252), st.integers(0, 600), NOISE.filter(bool))

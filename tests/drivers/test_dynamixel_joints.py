@@ -1,4 +1,4 @@
-"""The driver over the bench, in virtual time."""
+"""The driver on the emulator, in virtual time."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from bodyschema.interfaces.records import JointReading
 
 FAULTS = [mute, late(0.02), wrong_checksum, corrupt(), half, garbage(), swapped]
 MIXED = ("XM430-W350", "PH54-200-S500", "MX-28", "AX-12A", "MX-64(2.0)", "XL330-M288")
-FAST = 0.9  # [rad/s], what the arm moves at most; half a tick besides
+FAST = 0.9  # [rad/s], the arm's largest speed; plus half a tick
 
 
 def read(arm: Arm, count: int = 1) -> list[JointReading]:
@@ -149,7 +149,7 @@ def test_what_each_servo_is_set_to_is_on_record() -> None:
     assert (kept["model"], kept["firmware"], kept["homing_offset_ticks"]) == ("XM430-W350", 46, -17)
 
 
-# --- who is there
+# --- servos present
 
 
 def test_a_missing_servo_and_a_wrong_one_are_shown_in_one_table() -> None:

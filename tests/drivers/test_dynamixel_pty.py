@@ -1,4 +1,4 @@
-"""The driver over the bench on a pseudo-terminal: real time, a real port."""
+"""The driver with the emulator on a pseudo-terminal: real time, a real port."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LIMIT_S = 300.0
 
 @pytest.fixture
 def shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    # Bench and driver share this process: on a busy machine the bench itself may be silent for a while.
+    # Emulator and driver share this process: on a busy machine the emulator itself may be silent for a while.
     monkeypatch.setattr("bodyschema.drivers.servos.joints.LOST_AFTER_S", LIMIT_S)
     servos = [Servo(BY_NAME["XM430-W350"], id, swing(id), return_delay_s=0, booted_s=id * 0.1234) for id in SIX]
     with PtyShell(Chain(servos), tmp_path / "bus") as shell:

@@ -1,4 +1,4 @@
-"""Feetech's bytes: parsers fuzzed, and the bench's rules."""
+"""Feetech's bytes: fuzzed parsers, and the emulator's rules."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_a_model_s_number_is_read_in_its_order(model) -> None:
     assert int.from_bytes(reply.data[5:7], order) == model.number
 
 
-# --- the bench's rules
+# --- the emulator's rules
 
 
 def told(chain: Chain, address: int, size: int, t: float = 1.0) -> bytes:

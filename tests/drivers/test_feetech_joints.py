@@ -1,4 +1,4 @@
-"""The Feetech driver over its bench, in virtual time."""
+"""The Feetech driver on its emulator, in virtual time."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def test_what_each_servo_is_set_to_is_on_record() -> None:
     assert version == "3.10"
 
 
-# --- who is there
+# --- servos present
 
 
 def test_a_missing_servo_and_a_wrong_one_are_shown_in_one_table() -> None:

@@ -1,4 +1,4 @@
-"""Gaze of the demonstration's upper body on the bench, in virtual time."""
+"""Gaze of the demonstration's upper body on the emulator, in virtual time."""
 
 from __future__ import annotations
 
@@ -223,7 +223,7 @@ def test_nothing_is_written_to_an_eeprom() -> None:
 
 @pytest.fixture
 def often_switched() -> Iterator[None]:
-    """Threads that take turns a thousand times as often as usual."""
+    """Switch threads a thousand times as often as usual."""
     usual = sys.getswitchinterval()
     sys.setswitchinterval(1e-3 * usual)
     yield

@@ -1,4 +1,4 @@
-"""The laws of guard and currents, whatever numbers come."""
+"""Invariants of guard and currents for arbitrary numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What docs/hardware.md shows is true of the code."""
+"""Examples in docs/hardware.md agree with the code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What lost and late answers cost, and that a late one never passes for the answer to a later question."""
+"""Cost of lost and late answers; a late answer is never taken for the answer to a later request."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ BUSES = {
 
 
 class LosesAnswersTo:
-    """The wire of a chain whose answers to one instruction are lost so many times."""
+    """The wire of a chain that loses a given number of answers to one instruction."""
 
     def __init__(self, arm, code: int, times: float) -> None:
         self._arm, self._code, self.left = arm, code, times
@@ -99,7 +99,7 @@ def test_a_lost_answer_costs_one_reading(make, missing) -> None:
 
 
 def rig(model: str, angles: list[float]):
-    """A bus with one servo, whose shaft is at the next angle whenever it is asked."""
+    """Return a bus with one servo, whose shaft is at the next angle at each request."""
     bus_of, chain_of, servo_of, models = BUSES[model]
     clock, faults = VirtualClock(), Planned()
     chain = chain_of([servo_of(models[model], 1, lambda t: angles[0], return_delay_s=0.0)], faults)
@@ -141,7 +141,7 @@ def test_a_late_answer_does_not_hold_the_next_question_up(model) -> None:
 
 
 class RepeatsItself:
-    """The wire of a chain on which some answers carry what the servo told several answers of their length before."""
+    """The wire of a chain on which some answers repeat the data of an earlier answer of the same length."""
 
     def __init__(self, before: int, share: float) -> None:
         self._told: dict[tuple[int, int], deque[bytes]] = {}

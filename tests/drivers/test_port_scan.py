@@ -1,4 +1,4 @@
-"""Scanning ports: who is there, at whatever rate, in whatever protocol."""
+"""Port scans: servos found at any baud rate, in any protocol."""
 
 from __future__ import annotations
 
@@ -240,7 +240,7 @@ def test_a_scan_of_a_real_port_finds_its_servos(tmp_path: Path) -> None:
     servos = [servo("XM430-W350", 1, booted_s=0.0), servo("MX-28", 2)]
     port = str(tmp_path / "bus")
     with PtyShell(Chain(servos), tmp_path / "bus"):
-        for _ in range(20):  # a scan does not wait for a bench that gets its turn late on a busy machine
+        for _ in range(20):  # a scan does not wait for an emulator that is scheduled late on a busy machine
             told = scan_port(port, SCANNERS, SystemClock(), lambda _: None, bauds=[1_000_000])
             found = [(s.id, s.model) for s in told.servos]
             assert set(found) <= set(there)

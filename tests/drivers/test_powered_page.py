@@ -1,4 +1,4 @@
-"""What docs/hardware.md says of zero-force and gaze is true of the code."""
+"""Statements of docs/hardware.md about zero-force and gaze agree with the code."""
 
 from __future__ import annotations
 

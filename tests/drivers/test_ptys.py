@@ -81,7 +81,7 @@ def wait_for_reading(source: Any) -> JointReading:
 
 @EACH
 def test_readings_are_right_with_wire_time(make: Make, tmp_path, monkeypatch) -> None:
-    # Bench and driver share this process: on a busy machine the bench itself may be silent for a while.
+    # Emulator and driver share this process: on a busy machine the emulator itself may be silent for a while.
     monkeypatch.setattr("bodyschema.drivers.servos.joints.LOST_AFTER_S", LIMIT_S)
     with make(tmp_path) as (_, driver), driver() as joints:
         readings = [wait_for_reading(joints) for _ in range(50)]

@@ -1,4 +1,4 @@
-"""Messages at the bytes, against bytes that other programs made."""
+"""Messages as bytes, compared with bytes that other programs wrote."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ ROSBAGS_POINT = bytes.fromhex(
 )
 
 # A Universal Robots arm's message as rclpy serialised it (Fast-CDR), found in the tests of a public telemetry gateway.
-# Its padding is not zero, but what was in memory there.
+# Its padding is uninitialised memory, not zeros.
 RCLPY = bytes.fromhex(
     "00010000"
     "00f1536515cd5b07"
@@ -133,7 +133,7 @@ def test_foxglove_s_example_is_written() -> None:
     assert writer.to_bytes() == FOXGLOVE_TF
 
 
-# --- what is published
+# --- published messages
 
 
 def test_a_point_is_written_as_rosbags_writes_it() -> None:
@@ -146,7 +146,7 @@ def test_a_pose_is_written_as_rmw_cyclonedds_writes_it() -> None:
     assert encode_pose(Header(7 * NANO + 8, "map"), (1.5, -2.25, 0.0), turn, covariance) == CYCLONE_POSE
 
 
-# --- what is refused
+# --- refused messages
 
 
 @pytest.mark.parametrize("data", [ROSBAGS_LITTLE, ROSBAGS_BIG, ROSBAGS_GERMAN, RCLPY])

@@ -1,4 +1,4 @@
-"""What `bodyschema doctor` says of a ROS 2 robot, in virtual time."""
+"""Findings of `bodyschema doctor` about a ROS 2 robot, in virtual time."""
 
 from __future__ import annotations
 

@@ -18,17 +18,17 @@ from bodyschema.drivers.ros2.senders import Refusal
 from bodyschema.interfaces.errors import SourceError, SourceLost
 
 FASTEST = 1.2 * 0.7  # [rad/s]
-CLOCKS = dict.fromkeys(PATHS, lambda t: t)  # joints that tell the time
+CLOCKS = dict.fromkeys(PATHS, lambda t: t)  # joints whose position shows the time
 # There is no checksum in the bytes, TCP's is all: another bit of a position is another position.
 SEEN_BY_THE_GATE = (Fault.BIT, Fault.WORD, Fault.SWAPPED_NAMES)
 
 
 def said(name: str, *joints: str, rate_hz: float = 100.0, **settings) -> Node:
-    """A node that publishes some of the joints."""
+    """Return a node that publishes some of the joints."""
     return Node({joint: PATHS[joint] for joint in joints}, rate_hz, name=name, **settings)
 
 
-# --- what is read
+# --- readings
 
 
 def test_joints_come_in_our_order_with_the_time_of_their_stamp() -> None:
@@ -66,7 +66,7 @@ def test_messages_that_take_their_time_are_told_at_the_time_of_their_stamps() ->
     with robot.joints:
         robot.read(2.0)
         worst = max(map(robot.error, robot.read(5.0)))
-    assert worst < FASTEST * 0.003  # the quickest takes 2 ms, which nothing tells
+    assert worst < FASTEST * 0.003  # the quickest takes 2 ms, which is not observable
 
 
 @pytest.mark.parametrize("delays_per_s", [100.0, 500.0, 2000.0])
@@ -159,7 +159,7 @@ def test_a_node_that_was_restarted_is_believed_again_after_a_second() -> None:
         assert 90 <= len(robot.read(2.0)) <= 110
 
 
-# --- what is refused
+# --- refusals
 
 
 @pytest.mark.parametrize(
@@ -238,7 +238,7 @@ def test_messages_that_do_not_tell_where_a_joint_is_are_refused(names, positions
 
 
 def feed(robot: Robot, messages: list[JointState]):
-    """Instead of a link's `receive`: these messages, and then nothing."""
+    """Replace a link's `receive` by these messages, and then nothing."""
 
     def receive(until: float) -> Sample | None:
         robot.clock.wait_until(min(until, robot.clock.now() + 0.01) if messages else until)
@@ -272,7 +272,7 @@ def test_any_number_of_strangers_costs_bounded_memory() -> None:
         assert len(robot.joints._senders) <= 64
 
 
-# --- what happens to the robot
+# --- events on the robot
 
 
 @pytest.mark.parametrize("seconds", [-3600.0, -7.0, 0.5, 3600.0])

@@ -1,4 +1,4 @@
-"""What docs/hardware.md shows of ROS 2 is true of the code."""
+"""ROS 2 examples in docs/hardware.md agree with the code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The same over zenoh on the loopback interface: router, reader and publisher in one process."""
+"""ROS 2 over zenoh on the loopback interface: router, reader and publisher in one process."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def joints(endpoint: str, **settings) -> Ros2Joints:
 
 
 def first(source: Ros2Joints):
-    """The first reading that comes."""
+    """Return the first reading that arrives."""
     deadline = time.monotonic() + LIMIT_S
     while time.monotonic() < deadline:
         reading = source.read(0.5)
@@ -126,7 +126,7 @@ def test_the_marker_s_topic_is_in_the_graph_while_it_is_open(router) -> None:
 
 
 def tokens_as_they_come(session: zenoh.Session, key: str) -> Iterator[str]:
-    """Those that the router knows of already, and those that reach it within the limit."""
+    """Yield the tokens that the router already knows, and those that reach it within the limit."""
     channel = zenoh.handlers.FifoChannel(100)
     subscriber = session.liveliness().declare_subscriber(key, channel, history=True)
     deadline = time.monotonic() + LIMIT_S

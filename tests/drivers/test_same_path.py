@@ -1,5 +1,4 @@
-"""One hand-guided path of the simulated arm through every driver: the same model is learnt, to within the encoders'
-resolution."""
+"""One hand-guided path of the simulated arm through every driver gives the same model, to within encoder resolution."""
 
 from __future__ import annotations
 
@@ -37,19 +36,19 @@ pytestmark = pytest.mark.skipif(find_spec("pybullet") is None, reason="no pybull
 ROBOT = Path(__file__).parents[2] / "examples" / "desk_arm" / "robot.toml"
 CONFIG = SimConfig()
 SECONDS, RATE_HZ = 30.0, 60.0
-BEGIN_S = 101.0  # of the path on the benches' clocks, which stand at 100 at first: until then drivers open
+BEGIN_S = 101.0  # time of the path on the emulators' clocks, which start at 100: until then drivers open
 LATENCY_S = 1e-3
 
 
 @dataclass(frozen=True)
 class Guided:
-    """An arm, and where the virtual hand guided it."""
+    """An arm, and the path along which the virtual hand guided it."""
 
     robot: RobotDescription
     path: FloatArray  # (n, d) [rad]
 
     def angles(self, begin_s: float) -> list[Angle]:
-        """Of each joint its angle at a time, the path beginning at `begin_s`."""
+        """Return the angle of each joint as a function of time, the path beginning at `begin_s`."""
         return played(self.path, CONFIG.encoders.rate_hz, begin_s)
 
     @property
@@ -62,7 +61,7 @@ class Guided:
         return sum(float(np.linalg.norm(T[:3, 3])) for T in self.robot.chain.fixed[1:])
 
     def learnt(self, q: FloatArray, true_q: FloatArray) -> KBMap:
-        """What is learnt of readings `q` and a camera without errors, (n, d) [rad] both."""
+        """Return the map learned from readings `q` and an error-free camera, (n, d) [rad] both."""
         bases = (JointBasis.orthonormal(-1.0, 1.0),) * len(self.robot.joints)
         learner = ExactLearner(KBMap(bases, np.zeros((3,) * (len(bases) + 1))))
         learner.learn(q, self.robot.chain.positions(true_q))
@@ -76,7 +75,7 @@ def guided() -> Guided:
 
 
 class PacedLink:
-    """A robot's messages over zenoh, each sent when virtual time has come to it: no wait but zenoh's own."""
+    """A robot's messages over zenoh, each sent at its virtual time: no wait but zenoh's own."""
 
     def __init__(self, inner: Link, robot: ZenohRobot, node: Node, clock: VirtualClock) -> None:
         self._inner, self._robot, self._node, self._clock = inner, robot, node, clock

@@ -55,7 +55,7 @@ PIECES = st.lists(
 
 
 class BoardArm:
-    """A driver with a bench behind it."""
+    """A driver connected to an emulator."""
 
     def __init__(
         self,
@@ -91,7 +91,7 @@ class BoardArm:
         )
 
     def error(self, reading) -> float:
-        """Largest error of the reading's angles against the truth at its time [rad]."""
+        """Return the largest error of the reading's angles against the truth at its time [rad]."""
         return max(abs(q - path(reading.t)) for q, path in zip(reading.q, self.paths, strict=True))
 
     def read(self, count: int = 1) -> list[JointReading]:
@@ -182,7 +182,7 @@ def test_a_reading_is_where_each_joint_was_at_its_time(drift) -> None:
 
 
 def test_times_are_those_of_the_measurements_to_half_a_millisecond() -> None:
-    steep = [lambda t: 8.0 * (t - 100.0)]  # 8 rad/s tell the time to 0.1 ms
+    steep = [lambda t: 8.0 * (t - 100.0)]  # 8 rad/s show the time to 0.1 ms
     with (arm := BoardArm(steep, ticks=16384, latency_s=4e-3, limits=[(-1e9, 1e9)], drift=1e-4)).joints:
         readings = arm.read(2000)[400:]
     off = [abs(reading.q[0] / 8.0 + 100.0 - reading.t) for reading in readings]
@@ -191,12 +191,12 @@ def test_times_are_those_of_the_measurements_to_half_a_millisecond() -> None:
 
 
 def time_error(reading: JointReading) -> float:
-    """By how much the time is wrong [s] of a reading of `STEEP`, modulo a turn of it."""
+    """Return the time error [s] of a reading of `STEEP`, modulo a turn of it."""
     turn_s = 2 * math.pi / 8.0
     return (reading.t - reading.q[0] / 8.0 - 100.0 + turn_s / 2) % turn_s - turn_s / 2
 
 
-STEEP = (lambda t: 8.0 * (t - 100.0),)  # 8 rad/s tell the time to 0.05 ms, with 16,384 ticks
+STEEP = (lambda t: 8.0 * (t - 100.0),)  # 8 rad/s show the time to 0.05 ms, with 16,384 ticks
 
 
 def steep_arm(**settings) -> BoardArm:
@@ -260,7 +260,7 @@ def test_a_joint_whose_turn_cannot_be_told_is_named() -> None:
         pass
 
 
-# --- who is there
+# --- boards present
 
 
 def test_an_encoder_that_is_not_announced_and_one_with_other_ticks_are_shown_in_one_table() -> None:
@@ -375,7 +375,7 @@ def test_an_encoder_s_glitch_is_not_believed() -> None:
     with (arm := BoardArm()).joints:
         arm.read(10)
         arm.board.glitch_ticks["joint2"] = 300
-        while arm.joints.dropped == 0:  # what was on its way before is right
+        while arm.joints.dropped == 0:  # lines sent before are right
             reading = arm.joints.read(0.01)
             assert reading is None or arm.error(reading) < 2 * TICK
         arm.board.glitch_ticks.clear()

@@ -1,4 +1,4 @@
-"""What an arm of servos tells of their health, and what is asked when a joint lost its turns."""
+"""Health reports of a servo arm, and the question asked when a joint lost its turn count."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def test_what_was_accepted_once_is_not_accepted_the_next_time() -> None:
     arm = Arm(paths=[lambda t: 0.1, lambda t: 0.2 + turned[0], lambda t: 0.3])
     for angle in (0.0, 100.0):
         turned[0] = math.radians(angle)
-        arm.joints.accept_turns()  # nobody asked
+        arm.joints.accept_turns()  # without a question
         if angle:
             with pytest.raises(SourceLost, match="turn count"), arm.joints:
                 pytest.fail("it was opened")

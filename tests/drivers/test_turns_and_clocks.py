@@ -1,4 +1,4 @@
-"""Turns, speeds and device clocks, whatever the device."""
+"""Turns, speeds and device clocks of any device."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_a_stream_s_clock_is_known_in_offset_and_rate_through_its_wrap(drift, he
     rng, clock, off = Random(3), StreamClock(1e-6, 2**32), []
     for k in range(6000):
         true = 100.0 + k * 5e-3
-        stamp = int((true * (1 + drift) + 4175) / 1e-6) % 2**32  # wraps on the way
+        stamp = int((true * (1 + drift) + 4175) / 1e-6) % 2**32  # wraps in between
         t = clock.time(true + rng.uniform(0, held_s), stamp)
         assert t is not None
         off.append(abs(t - true))

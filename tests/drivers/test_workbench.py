@@ -1,4 +1,4 @@
-"""What is written to EEPROMs, on the bench in virtual time."""
+"""Writes to servo EEPROMs, on the emulator in virtual time."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ARMS = [("XM430-W350", "XM430-W350"), ("MX-28", "MX-28"), ("STS3215", "STS3215")
 
 
 class Arm:
-    """Two servos, IDs 1 and 2, and a workbench."""
+    """Two servos, IDs 1 and 2, and an EEPROM editor."""
 
     def __init__(self, models: tuple[str, ...] = ("XM430-W350", "XM430-W350"), angle: float = 0.3) -> None:
         self.clock = VirtualClock()

@@ -1,4 +1,4 @@
-"""Zero-force over pendulums on the bench, in virtual time."""
+"""Zero-force of emulated pendulums, in virtual time."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from bodyschema.drivers.dynamixel.powered_config import FloatingJoint, ZeroForce
 from bodyschema.drivers.dynamixel.zero_force import ZeroForce
 from bodyschema.interfaces.errors import RequestError, SourceError, SourceLost
 
-DRIFT_RAD = math.radians(0.5)  # what the arm may drift in ten seconds after it is let go
-LATE_S = 0.015  # from too fast to torque off: the servo's measuring, a cycle, and the way
+DRIFT_RAD = math.radians(0.5)  # allowed drift of the arm in ten seconds after its release
+LATE_S = 0.015  # from overspeed to torque off: the servo's measurement, a cycle, and the motion meanwhile
 TORQUE, GOAL_CURRENT, WATCHDOG = 64, 102, 98
 
 
@@ -324,7 +324,7 @@ def test_a_servo_that_takes_no_goals_ends_it() -> None:
     with (arm := FloatingArm()).joints:
         arm.float()
         servo = arm.chain.servo(1)
-        servo["current_limit"] = 100  # what is more it refuses, and nobody is told of that
+        servo["current_limit"] = 100  # larger values are refused without an error
         arm.pendulums[0].pushed = 0.05
         assert "does not take its goal" in dropped(arm)
 
@@ -399,7 +399,7 @@ def test_after_a_kill_the_watchdogs_stop_the_servos_and_the_next_program_frees_t
     with arm.joints:
         arm.float()
         sent = [i.code for i in arm.port.heard]
-        arm.clock.wait_until(arm.clock.now() + 0.13)  # heartbeat of 100 ms; nobody says anything any more
+        arm.clock.wait_until(arm.clock.now() + 0.13)  # heartbeat of 100 ms; all is silent
         assert sent.count(Code.SYNC_WRITE) > 100
         assert not any(arm.currents())
         assert [servo["watchdog"] for servo in arm.chain.servos] == [-1, -1]

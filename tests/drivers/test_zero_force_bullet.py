@@ -1,4 +1,4 @@
-"""Zero-force with the weight that the URDF states, on an arm that an independent simulator lets fall."""
+"""Zero-force with the weight stated in the URDF, on an arm that falls in an independent simulator."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class BulletArm:
         self.times, self.path = [0.0], [np.array(BEGIN)]
 
     def angle(self, joint: int, t: float) -> float:
-        """Of a joint at `t` [rad]; also of the past."""
+        """Return the angle of a joint at `t` [rad], also in the past."""
         while self.servos and self.times[-1] + STEP_S <= t:
             self._step(self.times[-1])
         return float(self.path[max(bisect_right(self.times, t) - 1, 0)][joint])
@@ -70,7 +70,7 @@ class BulletArm:
 
 
 def moved(tmp_path: Path, *, on: bool, seconds: float) -> np.ndarray:
-    """How far each joint goes when the arm is let go, with zero-force or without [rad] (2,)."""
+    """Return the distance each joint moves when the arm is released, with zero-force or without [rad] (2,)."""
     config = Config.load(write_robot(tmp_path))
     servos_config, clock = config.tables.drivers.dynamixel, VirtualClock()
     assert servos_config is not None

@@ -1,4 +1,4 @@
-"""Zero-force of a real process, with dynamixel-sdk and a pseudo-terminal, and how it ends."""
+"""Zero-force of a real process, with dynamixel-sdk and a pseudo-terminal, and its end."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE, POSITION_MODE
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError
 
-HEARTBEAT_S = 0.5  # generous: bench, driver and test share the machine with others
+HEARTBEAT_S = 0.5  # generous: emulator, driver and test share the machine with others
 ANGLES = {"shoulder": 0.3, "elbow": -0.5}
 LINK = '<link name="{name}">{inertial}</link>'
 INERTIAL = (
@@ -89,7 +89,7 @@ def bench(tmp_path: Path) -> Iterator[DryRun]:
 
 
 class Floating:
-    """`bodyschema joints --zero-force`, begun."""
+    """A running `bodyschema joints --zero-force`."""
 
     def __init__(self, folder: Path) -> None:
         words = ["joints", "--json", "--zero-force", "--robot", "robot.toml"]
@@ -116,13 +116,13 @@ class Floating:
         raise AssertionError(self.errors())
 
     def ended(self) -> int:
-        """Its exit code."""
+        """Return its exit code."""
         for _ in self._said:
             pass
         return self.process.wait()
 
     def errors(self) -> str:
-        """What it wrote to stderr."""
+        """Return its stderr output."""
         self._errors.seek(0)
         return self._errors.read()
 
@@ -180,7 +180,7 @@ def test_another_mode_is_refused_with_the_command(tmp_path) -> None:
         assert torque(bench) == [0, 0]
 
 
-# --- what robot.toml has to say
+# --- requirements on robot.toml
 
 
 @pytest.mark.parametrize("hold", ["torque_free", "held"])
@@ -207,6 +207,6 @@ def test_the_currents_bear_the_weight_that_the_urdf_states(bench, floating) -> N
     q1, q2 = ANGLES.values()
     elbow = mass * g * lever * math.cos(q1 + q2)
     shoulder = elbow + mass * g * (lever + length) * math.cos(q1)
-    # A turn about y lowers what lies in front, so the torque that holds it is negative.
+    # A turn about y lowers the parts in front, so the holding torque is negative.
     expected = [-torque / (4.1 / 2.3) for torque in (shoulder, elbow)]
     assert currents(bench, 0.0) == pytest.approx(expected, abs=0.01)

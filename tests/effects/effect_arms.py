@@ -1,4 +1,4 @@
-"""An arm with all that an effect can meet: a head that carries the camera, a slide, masses, a joint held still."""
+"""An arm with all that effects act on: a head that carries the camera, a prismatic joint, masses, a held joint."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ image_size_px = [1280, 960]
 
 
 def arm(folder: Path, hold: str = "held", tables: str = STEREO) -> RobotDescription:
-    """The arm in files of its own."""
+    """Write the arm to files of its own and load it."""
     links = "".join(
         f'<link name="{name}"><inertial><origin xyz="{centre}"/><mass value="{mass}"/>{INERTIA}</inertial></link>'
         for name, (mass, centre) in LINKS.items()
@@ -76,7 +76,7 @@ def arm(folder: Path, hold: str = "held", tables: str = STEREO) -> RobotDescript
 
 
 def walk(seed: int = 0, rows: int = 120) -> Motion:
-    """A smooth motion in three runs; the camera sees the marker all the while."""
+    """Return a smooth motion in three runs; the camera sees the marker throughout."""
     rng = np.random.default_rng(seed)
     t = np.sort(rng.uniform(0.0, 0.08 * rows, rows)) + 0.002 * np.arange(rows)
     d = len(ALL)
@@ -87,7 +87,7 @@ def walk(seed: int = 0, rows: int = 120) -> Motion:
 
 
 def everywhere(robot: RobotDescription) -> list[tuple[str, str | None, str | None]]:
-    """Every effect at every joint that it can sit at; a coupling from one other joint each."""
+    """Return every effect at every possible joint; a coupling from one other joint each."""
     found: list[tuple[str, str | None, str | None]] = []
     for kind in KINDS.values():
         for k, joint in enumerate(robot.joints if kind.at_joint else (None,)):
@@ -98,7 +98,7 @@ def everywhere(robot: RobotDescription) -> list[tuple[str, str | None, str | Non
 
 
 def sized(robot: RobotDescription, where: tuple[str, str | None, str | None], share: float, seed: int = 0) -> Effect:
-    """An effect with amounts of that share of the usual, of random signs, that begins in the middle of the walk."""
+    """Return an effect that begins in the middle of the walk, with this share of its usual amounts and random signs."""
     effect = Effect.at(robot, *where)
     rng = np.random.default_rng(seed)
     values: FloatArray = np.array(effect.values)

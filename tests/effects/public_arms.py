@@ -1,4 +1,4 @@
-"""Arms of public URDFs, with masses and meshes, as robots that are measured."""
+"""Arms of public URDFs, with masses and meshes, as measured robots."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ rpy = [-2.1, 0.0, 1.4]
 
 
 def public_arm(name: str, folder: Path) -> RobotDescription:
-    """One of `ARMS`, described in `folder`."""
+    """Return one of `ARMS`, described in `folder`."""
     data = Path(pytest.importorskip("pybullet_data").getDataPath())
     urdf, joint, count, marker_link, camera_link = ARMS[name]
     joints = ", ".join(f'"{joint.format(k + 1)}"' for k in range(count))
@@ -42,7 +42,7 @@ def public_arm(name: str, folder: Path) -> RobotDescription:
 
 
 def readings(robot: RobotDescription, rows: int, seed: int = 0) -> Motion:
-    """Rows at which every joint turns back now and then, inside two thirds of its range."""
+    """Return rows in which every joint reverses now and then, inside two thirds of its range."""
     rng = np.random.default_rng(seed)
     middle, half = 0.5 * (robot.lower + robot.upper), 0.33 * np.minimum(robot.upper - robot.lower, 2.0 * np.pi)
     return Motion(middle + rng.uniform(-half, half, (rows, len(half))), None, np.zeros(rows, dtype=np.int64))

@@ -1,4 +1,4 @@
-"""A corrected URDF says by itself what a URDF can say of the effects."""
+"""A corrected URDF contains all effects that a URDF can express."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def robot(tmp_path_factory) -> RobotDescription:
 
 
 def seen(robot: RobotDescription, file) -> np.ndarray:
-    """The marker in the camera's frame, by the URDF alone."""
+    """Return the marker in the camera's frame, from the URDF alone."""
     chain = chain_between(
         UrdfTree.load(file),
         robot.joints,

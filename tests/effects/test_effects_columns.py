@@ -1,4 +1,4 @@
-"""The derivatives that the fit takes are those of what the simulation measures."""
+"""The Jacobians of the fit are the derivatives of the simulated measurement."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def drawn(data, robot):
 
 
 def numerical(simulation, place, number, step):
-    """Derivative (n, 3) by one number of the effect at `place`."""
+    """Return the numerical derivative (n, 3) with respect to one number of the effect at `place`."""
     outcomes = []
     for change in (step, -step):
         effects = list(simulation.effects)
@@ -56,7 +56,7 @@ def numerical(simulation, place, number, step):
 
 
 def sprung(robot, kind):
-    """The spring without which a payload does not show."""
+    """Return the joint compliance without which a payload has no effect."""
     return (sized(robot, ("joint_compliance", "elbow", None), 1.0),) if kind == "payload" else ()
 
 
@@ -101,7 +101,7 @@ def test_with_nominal_amounts_nothing_changes(robot, kind) -> None:
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_half_the_usual_size_moves_positions(robot, kind) -> None:
     for place in everywhere(robot):
-        if place[0] == kind and place != ("joint_compliance", "neck_yaw", None):  # whose axis stands upright
+        if place[0] == kind and place != ("joint_compliance", "neck_yaw", None):  # whose axis is vertical
             beside = sprung(robot, kind)
             nominal = Simulation(robot, beside).positions(MOTION)
             moved = Simulation(robot, (*beside, sized(robot, place, 0.5))).positions(MOTION) - nominal

@@ -24,7 +24,7 @@ def robot(tmp_path_factory) -> RobotDescription:
 
 
 def extended(tmp_path, entry: str):
-    """A robot.toml with this text behind its tables, read."""
+    """Load a robot.toml with this text after its tables."""
     file = arm(tmp_path).file
     file.write_text(file.read_text() + entry)
     return load_simulation(file)
@@ -37,7 +37,7 @@ def refused(tmp_path, entry: str) -> RobotError:
 
 
 def line_with(error: ConfigError, text: str) -> int:
-    """The number of the line that says `text` in the file which the error names."""
+    """Return the number of the line that contains `text` in the file that the error names."""
     lines = Path(str(error.file)).read_text().splitlines()
     return next(number for number, line in enumerate(lines, 1) if text in line)
 

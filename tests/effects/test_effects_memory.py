@@ -1,4 +1,4 @@
-"""Effects that depend on the order of the readings: plays, and the first stage reading by reading."""
+"""Effects that depend on the order of the readings: backlash, and the first stage reading by reading."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_reading_by_reading_the_first_stage_is_that_of_the_whole_motion(robot, n
     simulation = Simulation(
         robot, tuple(sized(robot, place, 1.0, 5) for place in everywhere(robot) if place[0] == name)
     )
-    # Before it has moved, a live play does not know where it will be led.
+    # Before its first move, a live backlash has no known side.
     after = slice(1, None)
     expected = simulation.unloaded(motion)
     np.testing.assert_allclose(reading_by_reading(simulation, motion)[after], expected[after], rtol=0, atol=1e-14)

@@ -1,4 +1,4 @@
-"""docs/effects.md says what the code does."""
+"""docs/effects.md agrees with the code."""
 
 from __future__ import annotations
 

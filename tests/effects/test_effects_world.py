@@ -1,4 +1,4 @@
-"""The simulated world shows what the simulation says at every joint: a head's, a slide, behind one held still."""
+"""The simulated world agrees with the simulation at every joint: a head's, a prismatic one, one behind a held joint."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NO_ERRORS = ErrorConfig(
 
 
 class NoRenderer:
-    """In the renderer's place: nothing is painted."""
+    """Replacement of the renderer that paints nothing."""
 
     def __init__(self, *arguments) -> None: ...
 
@@ -34,7 +34,7 @@ def robot(tmp_path_factory):
 
 
 def shown(simulation: Simulation, postures, monkeypatch):
-    """What an ideal tracker would measure in the posed world (n, 3)."""
+    """Return the positions (n, 3) [m] that an ideal tracker would measure in the posed world."""
     monkeypatch.setattr("bodyschema.sim_backend.posed.RenderProcess", NoRenderer)
     with PosedWorld(simulation.robot, SimConfig(errors=NO_ERRORS), postures, simulation) as world:
         return np.array([world.scene(number).x_seen for number in range(len(postures))])

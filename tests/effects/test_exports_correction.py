@@ -26,7 +26,7 @@ NAMES = tuple(name for name in KINDS if name not in NOT_OF_THE_ARM | NOT_IN_THE_
 
 @pytest.fixture(scope="module")
 def commands(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
-    """How to run each reader that this machine can run."""
+    """Return the command of each reader that this machine can run."""
     found = {"python": [sys.executable, str(READERS / "correction.py")]}
     if node := shutil.which("node"):
         found["javascript"] = [node, str(READERS / "correction.js")]
@@ -46,12 +46,12 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
 
 
 def steady(rows: int = 40) -> Motion:
-    """A walk in one run, whose rows come at the usual time."""
+    """Return a walk in one run, whose rows come at the usual interval."""
     return Motion(walk(rows=rows).q, 0.1 * np.arange(rows), np.zeros(rows, dtype=np.int64))
 
 
 def corrected(command: list[str], file: Path, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """True joint angles (n, d) and positions (n, 3) by a reader."""
+    """Return true joint angles (n, d) and positions (n, 3) computed by a reader."""
     lines = "\n".join(" ".join(map(repr, row)) for row in q.tolist())
     run = subprocess.run([*command, str(file)], input=lines, capture_output=True, text=True, check=True)
     found = np.array([line.split() for line in run.stdout.splitlines()], dtype=np.float64)
@@ -59,7 +59,7 @@ def corrected(command: list[str], file: Path, q: FloatArray) -> tuple[FloatArray
 
 
 def began(effect: Effect) -> Effect:
-    """The effect with its moment before the first row."""
+    """Return the effect with its moment before the first row."""
     return effect.with_values(np.append(effect.values[:-1], -1.0)) if effect.kind.begins else effect
 
 
@@ -77,7 +77,7 @@ def test_python_agrees_effect_by_effect(name, robot, tmp_path) -> None:
         reader = Correction((tmp_path / "c.json").read_text())
         found = [reader.read(row.tolist()) for row in motion.q]
         run = simulation.run(motion)
-        # On which side a play begins is known when the joint has moved.
+        # The side on which a backlash starts is known once the joint has moved.
         np.testing.assert_allclose([angles for angles, _ in found][1:], run.q[1:], rtol=0, atol=1e-12)
         np.testing.assert_allclose([pose[3::4] for _, pose in found][1:], run.measured[1:], rtol=0, atol=1e-9)
 

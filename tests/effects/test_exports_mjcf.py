@@ -1,4 +1,4 @@
-"""MuJoCo puts the marker of an exported model where the simulation has it."""
+"""MuJoCo puts the marker of an exported model at the simulation's position."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ MOVE_S, REST_S, STIFF = 1.0, 1.0, [0.9999, 0.9999, 0.001, 0.5, 2.0]
 
 @pytest.fixture(autouse=True)
 def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """MuJoCo writes what it warns of into a file in the current folder."""
+    """Change to a temporary folder: MuJoCo writes its warnings to a file in the current one."""
     monkeypatch.chdir(tmp_path)
 
 
@@ -52,7 +52,7 @@ def effect(robot, name: str) -> Effect:
 
 
 def stepped(file: Path, joints: tuple[str, ...], motion: Motion) -> FloatArray:
-    """Where MuJoCo's own dynamics bring the marker, the joints that are read led from row to row."""
+    """Return the marker positions of MuJoCo's dynamics, with the read joints driven from row to row."""
     spec = mujoco.MjSpec.from_file(str(file))
     for actuator in list(spec.actuators):
         spec.delete(actuator)
@@ -64,7 +64,7 @@ def stepped(file: Path, joints: tuple[str, ...], motion: Motion) -> FloatArray:
     held = [model.equality(f"held {name}").id for name in joints]
     read = [model.joint(name).qposadr[0] for name in joints]
     zero, found = model.qpos0[read], []
-    # A play begins on the side to which the first move leads: it is reached from there.
+    # A backlash starts on the side of the first move: it is approached from there.
     last = motion.q[0] - 0.05 * np.sign(motion.q[1] - motion.q[0])
     data.qpos[read] = last
     for row in motion.q:

@@ -1,4 +1,4 @@
-"""Plays that hang on one flank, payloads that springs show, friction that lags."""
+"""Backlash that rests on one flank, payloads that springs reveal, friction that lags."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_a_payload_loads_springs_as_a_mass_of_the_urdf_does(tmp_path) -> None:
     payload = Effect.at(robot, "payload", values=[0.4, 0.4 * 0.03, 0.0, 0.4 * 0.02])
     loaded = Simulation(robot, (spring, payload)).positions(MOTION)
     urdf = tmp_path / "everything.urdf"
-    urdf.write_text(urdf.read_text().replace('value="0.4"', 'value="0.8"'))  # the hand, whose centre is at 0.03 0 0.02
+    urdf.write_text(urdf.read_text().replace('value="0.4"', 'value="0.8"'))  # the hand, with its centre at 0.03 0 0.02
     heavier = type(robot).load(robot.file)
     spring = Effect.at(heavier, "joint_compliance", JOINT, values=[0.003])
     np.testing.assert_allclose(loaded, Simulation(heavier, (spring,)).positions(MOTION), rtol=0, atol=1e-12)

@@ -1,4 +1,4 @@
-"""What robot.toml does not know is written into the file itself, and not among the effects."""
+"""Parameters unknown in robot.toml are written to the file itself, and not to the effects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A smooth function of the readings becomes a KB-Map: exactly where it is a sum of harmonics, else nearly."""
+"""A smooth function of the readings becomes a KB-Map: exactly for a sum of harmonics, otherwise approximately."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def robot(tmp_path_factory) -> RobotDescription:
 
 
 def elbows_error(robot: RobotDescription, q: FloatArray) -> FloatArray:
-    """By how much the marker moves when the elbow errs by a series in the lift's reading."""
+    """Return the marker's displacement for an elbow error that is a series in the lift's reading."""
     lift = q[:, ALL.index("shoulder_lift")]
     error = 0.01 * np.sin(lift) - 0.004 * np.cos(2.0 * lift) + 0.003 * np.sin(4.0 * lift)
     return Simulation(robot).run(Motion.still(q)).by_joint[:, :, ALL.index("elbow")] * error[:, None]

@@ -1,4 +1,4 @@
-"""The numbered scripts in examples/ do what their texts say."""
+"""The numbered scripts in examples/ do as their texts say."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SCRIPTS = sorted((ROOT / "examples").glob("[0-9]_*.py"))
 
 
 def main_of(number: int, *arguments: Path) -> Any:
-    """What the `main` of a script returns."""
+    """Call the `main` of a script and return its result."""
     return runpy.run_path(str(SCRIPTS[number - 1]))["main"](*arguments)
 
 

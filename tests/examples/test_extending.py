@@ -36,7 +36,7 @@ CAMERAS = StereoCalibration(
 
 @pytest.fixture(scope="module")
 def packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the example installed in it."""
+    """Return a folder with the example installed in it."""
     folder = tmp_path_factory.mktemp("packages")
     source = shutil.copytree(ROOT / "examples" / "extending", tmp_path_factory.mktemp("source") / "extending")
     options = ["--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--disable-pip-version-check"]
@@ -52,7 +52,7 @@ def installed(packages: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def robot_toml(tmp_path: Path) -> Path:
-    """The desk arm with the lines of the page."""
+    """Copy the desk arm to a folder of its own and return its robot.toml."""
     for name in ("robot.toml", "desk_arm.urdf"):
         shutil.copy(ROOT / "examples" / "desk_arm" / name, tmp_path)
     return tmp_path / "robot.toml"
@@ -97,7 +97,7 @@ def test_a_driver_that_nobody_installed_is_named_with_its_line(installed, robot_
 
 
 def dotted(*eyes: tuple[float, float] | None) -> StereoFrame:
-    """Both eyes' images of a green dot at these places (column, row)."""
+    """Return both cameras' images of a green dot at these places (column, row)."""
     v, u = np.mgrid[0:480, 0:640]
     images = []
     for place in eyes:

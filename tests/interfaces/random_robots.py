@@ -13,7 +13,7 @@ INERTIAL = '<inertial><mass value="0.7"/><inertia ixx="1" ixy="0" ixz="0" iyy="1
 
 
 def random_robot(rng: np.random.Generator, folder: Path, *, head: str, arm: str) -> RobotDescription:
-    """A robot whose joints from camera to marker are `head` (walked from link to parent) and then `arm`.
+    """Return a robot whose joints from camera to marker are `head` (walked from link to parent) and then `arm`.
 
     Letters: R revolute, P prismatic, F fixed, H one that stands still at a place of robot.toml's.
     """

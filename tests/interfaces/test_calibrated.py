@@ -1,4 +1,4 @@
-"""A learnt chain written as URDF and robot.toml gives the same positions to everybody who reads them."""
+"""A calibrated chain written as URDF and robot.toml gives the same positions in every reader."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ARMS = st.text("RPFH", max_size=4).map(lambda kinds: kinds + "R")
 
 
 def learnt(robot: RobotDescription, rng: np.random.Generator) -> tuple[RigidChain, CalibratedGeometry]:
-    """A chain some degrees and centimetres off the nominal one, a camera far off, and the files' terms for it."""
+    """Return a chain some degrees and centimetres off nominal, a camera far off, and the files' terms for it."""
     parameters = ChainParameters(robot.chain)
     change = 0.05 * rng.normal(size=parameters.size)
     change[parameters.base_turn] = rng.uniform(-1.5, 1.5, 3)
@@ -80,7 +80,7 @@ def test_pybullet_reads_the_learnt_positions(seed, head, arm) -> None:
 
 
 def without_visuals(urdf: Path) -> Path:
-    """pybullet loads no URDF whose meshes are missing."""
+    """Return a URDF without visuals: pybullet loads no URDF whose meshes are missing."""
     tree = ElementTree.parse(urdf)
     for link in tree.iterfind("link"):
         for visual in link.findall("visual"):
@@ -91,7 +91,7 @@ def without_visuals(urdf: Path) -> Path:
 
 
 def bullet_position(pybullet, client: int, body: int, robot: RobotDescription, q: np.ndarray) -> np.ndarray:
-    """The marker in the camera's frame (3,) as pybullet has it.
+    """Return the marker in the camera's frame (3,) computed by pybullet.
 
     It hands out frames of links in single precision and centres of mass in double; in these two links they coincide.
     """
@@ -136,7 +136,7 @@ def test_a_second_calibration_replaces_the_frames_of_the_first(tmp_path) -> None
     assert again.tree.links.count(CAMERA_LINK) == 1
 
 
-# --- what else is in the files
+# --- other contents of the files
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Our child processes import nothing from the folder that the user stands in."""
+"""Child processes import nothing from the user's working directory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ROS bags as recordings: what is taken of them, and what is asked."""
+"""ROS bags as recordings: the data used, and the questions asked."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ def load(folder: Path, robot: str = ROBOT, urdf: str | None = URDF) -> RobotDesc
     return RobotDescription.load(folder / "robot.toml")
 
 
-# --- what is understood
+# --- valid files
 
 
 def test_the_chain_leads_from_the_camera_to_the_marker(tmp_path) -> None:
@@ -102,7 +102,7 @@ def test_a_joint_that_does_not_move_the_marker_is_told_with_those_that_do(tmp_pa
         load(tmp_path, ROBOT.replace('"tip"', '"upper"'))
 
 
-# --- a robot.toml that is none
+# --- an invalid robot.toml
 
 
 def test_a_folder_in_the_place_of_robot_toml_is_told(tmp_path) -> None:
@@ -120,7 +120,7 @@ def test_a_byte_order_mark_is_no_mistake(tmp_path) -> None:
     assert load(tmp_path, "\ufeff" + ROBOT.replace("\n", "\r\n")).name == "arm"
 
 
-# --- a URDF that is none
+# --- an invalid URDF
 
 
 def test_a_urdf_that_is_not_there_is_told_with_the_key_to_mend(tmp_path) -> None:

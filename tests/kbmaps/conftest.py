@@ -9,7 +9,7 @@ from kbmaps.maps import kernels
 
 @pytest.fixture(scope="module", params=["compiled", "numpy"])
 def kernel_path(request: pytest.FixtureRequest) -> Iterator[str]:
-    """Everything made in the module takes this path: once the compiled one, once NumPy's."""
+    """Run the module's tests on each kernel path: once the compiled one, once NumPy's."""
     if request.param not in kernels.available():
         pytest.skip("no compiled kernels; to run it: unset BODYSCHEMA_PURE, apt-get install gcc, make clean setup")
     with kernels.using(request.param):

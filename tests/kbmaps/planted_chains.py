@@ -13,7 +13,7 @@ LINK_M = 0.15
 
 
 def random_chain(rng: np.random.Generator, kinds: str) -> RigidChain:
-    """A chain with one joint for each letter of `kinds`: R revolute, P prismatic."""
+    """Return a chain with one joint for each letter of `kinds`: R revolute, P prismatic."""
     joints = len(kinds)
     fixed = np.tile(np.eye(4), (joints + 1, 1, 1))
     fixed[:, :3, :3] = Rotation.random(joints + 1, rng=rng).as_matrix()
@@ -24,7 +24,7 @@ def random_chain(rng: np.random.Generator, kinds: str) -> RigidChain:
 
 
 def half_ranges(kinds: str, revolute_deg: float) -> np.ndarray:
-    """Half ranges (d,): revolute_deg for a revolute joint [rad], 0.3 m for a prismatic one."""
+    """Return half ranges (d,): revolute_deg for a revolute joint [rad], 0.3 m for a prismatic one."""
     return np.array([np.radians(revolute_deg) if kind == "R" else 0.3 for kind in kinds])
 
 
@@ -47,7 +47,7 @@ def control_points_needed(kinds: str) -> int:
 
 
 def literal_joint_weights(theta: float, alpha: float) -> np.ndarray:
-    """The three normalised weights of one joint exactly as eqs. (9) and (10) print them."""
+    """Return the three normalised weights of one joint exactly as eqs. (9) and (10) print them."""
     tau = np.tan(theta / 2) / (2 * np.tan(alpha / 2)) + 0.5
     gamma = np.array([1.0, np.cos(alpha), 1.0])
     bernstein = np.array([(1 - tau) ** 2, 2 * tau * (1 - tau), tau**2])
@@ -55,7 +55,7 @@ def literal_joint_weights(theta: float, alpha: float) -> np.ndarray:
 
 
 def literal_weights(q: np.ndarray, alpha: float) -> np.ndarray:
-    """The weight vector w of eq. (15) for all joints: products over the joints in index order."""
+    """Return the weight vector w of eq. (15) for all joints: products over the joints in index order."""
     w = np.ones(1)
     for theta in q:
         w = np.array([a * b for a in w for b in literal_joint_weights(theta, alpha)])

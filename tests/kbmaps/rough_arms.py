@@ -1,4 +1,4 @@
-"""Arms that differ from their drawing as their tolerances say, for the tests of the rigid learners."""
+"""Arms that deviate from nominal within their tolerances, for the tests of the rigid learners."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Arm:
         return q, self.real.positions(q) + sigma * rng.normal(size=(n, 3))
 
     def error(self, model, rng: np.random.Generator) -> float:
-        """Mean distance [m] to the truth."""
+        """Return the mean distance [m] to the truth."""
         q = random_q(rng, self.kinds, 300, REACH_DEG)
         return float(np.linalg.norm(model.predict(q) - self.real.positions(q), axis=1).mean())
 

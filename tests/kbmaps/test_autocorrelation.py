@@ -7,7 +7,7 @@ from kbmaps.autocorrelation import shared_by
 
 
 def series(rng: np.random.Generator, n: int, rho: float) -> np.ndarray:
-    """A first-order autoregressive series of variance 1: neighbours correlate by rho."""
+    """Return a first-order autoregressive series of variance 1: neighbours correlate by rho."""
     values = rng.normal(size=(n, 3))
     for k in range(1, n):
         values[k] = rho * values[k - 1] + np.sqrt(1.0 - rho**2) * values[k]

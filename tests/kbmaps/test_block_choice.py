@@ -22,7 +22,7 @@ SEEDS = range(10)
 
 
 def path(rng: np.random.Generator, count: int, joints: int = JOINTS) -> FloatArray:
-    """Straight ways between random waypoints, (count, joints) [rad]."""
+    """Return straight paths between random waypoints, (count, joints) [rad]."""
     q, goal = [np.zeros(joints)], rng.uniform(-1.0, 1.0, joints)
     while len(q) < count:
         if np.linalg.norm(goal - q[-1]) < STEP:
@@ -33,7 +33,7 @@ def path(rng: np.random.Generator, count: int, joints: int = JOINTS) -> FloatArr
 
 
 def shared_errors(rng: np.random.Generator, count: int, sigma_m: float, memory: float = 0.9) -> FloatArray:
-    """Measurement errors (count, 3) [m] of which neighbours share most."""
+    """Return measurement errors (count, 3) [m] that are strongly correlated between neighbours."""
     fresh = rng.normal(size=(count, 3))
     errors = [fresh[0]]
     for row in fresh[1:]:
@@ -42,7 +42,7 @@ def shared_errors(rng: np.random.Generator, count: int, sigma_m: float, memory: 
 
 
 def wrong_prior(chain: RigidChain) -> KBMap:
-    """The map of the chain with its marker and its frame a few centimetres off."""
+    """Return the map of the chain with its marker and its frame a few centimetres off."""
     bases = learning_bases(np.full(chain.joints, -np.pi), np.full(chain.joints, np.pi))
     fixed = chain.fixed.copy()
     fixed[0, :3, 3] += [0.02, -0.03, 0.01]
@@ -51,7 +51,7 @@ def wrong_prior(chain: RigidChain) -> KBMap:
 
 
 def kernel_scale(prior: KBMap, q: FloatArray) -> float:
-    """Mean squared length of the weight vectors at q."""
+    """Return the mean squared length of the weight vectors at q."""
     return float(np.square(prior.weights(q)).sum(axis=1).mean())
 
 

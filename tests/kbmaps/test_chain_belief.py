@@ -29,7 +29,7 @@ def test_what_was_believed_before_and_new_pairs_give_what_all_pairs_give(seed, f
     arm = rough_arm(rng, "RRRR", SLIGHT)
     q, x = arm.pairs(rng, 40, 1e-4)
     at_once, before = RigidLearner(arm.nominal, SLIGHT), RigidLearner(arm.nominal, SLIGHT)
-    # Told to be noisier than they are: no part of them looks by chance as if the chain did not fit.
+    # Stated noisier than they are, so that by chance no part of them contradicts the chain.
     at_once.learn(q, x, 3e-4)
     before.learn(q[:first], x[:first], 3e-4)
     after = RigidLearner(arm.nominal, SLIGHT, before.belief)

@@ -1,4 +1,4 @@
-"""A change is noticed, dated and named from the errors of a model; no change is not."""
+"""A change is detected, dated and named from a model's errors; without a change there is no alarm."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ KINDS = {"tool": None, "camera": None, "joint": 2}
 
 
 def isotropic(sigma_m: float, pairs: int) -> np.ndarray:
-    """Covariances of so many errors (pairs, 3, 3) [m²]."""
+    """Return isotropic covariances (pairs, 3, 3) [m²]."""
     return np.broadcast_to(sigma_m**2 * np.eye(3), (pairs, 3, 3))
 
 
 class Arm:
-    """An arm that is as drawn within its tolerances, along a smooth path that it goes on with after a change."""
+    """An arm that is nominal within its tolerances, on a smooth path that continues after a change."""
 
     def __init__(self, seed: int, pairs: int = BEFORE + AFTER, speed: float = 1.0) -> None:
         self.rng = np.random.default_rng(seed)
@@ -45,7 +45,7 @@ class Arm:
         self.x = self.parameters.positions(self.truth, self.q) + SIGMA * self.rng.normal(size=(pairs, 3))
 
     def change(self, kind: str, size_m: float) -> None:
-        """From the pair `BEFORE` on, by about so much at the marker."""
+        """Change the positions from the pair `BEFORE` on, by about this size at the marker."""
         chosen = next(
             each for each in change_kinds(self.parameters, 0.5) if (each.name, each.joint) == (kind, KINDS[kind])
         )
@@ -56,12 +56,12 @@ class Arm:
         self.x[BEFORE:] += shift[BEFORE:]
 
     def bend(self, size_m: float) -> None:
-        """The joints yield as they will, by about so much at the marker."""
+        """Add a smooth random compliance of the joints, about `size_m` at the marker."""
         waves = self.rng.normal(size=(3, self.q.shape[1])) * 0.7
         self.x += size_m * np.sin(waves @ self.q.T + self.rng.uniform(0.0, 6.0, (3, 1))).T
 
     def err(self, size_m: float) -> None:
-        """Each encoder sits beside its axis: it errs as a wave of its joint's turn, by about so much at the marker."""
+        """Make each encoder eccentric: its error is a wave of the joint's turn, of about this size at the marker."""
         phases = self.rng.uniform(0.0, 6.0, self.q.shape[1])
         read_wrongly = self.q + size_m / self.parameters.reach * np.sin(self.q + phases)
         self.x += self.parameters.positions(self.truth, read_wrongly) - self.parameters.positions(self.truth, self.q)
@@ -74,7 +74,7 @@ class Arm:
         detector.add(q, x - self.belief.predict(q), isotropic(SIGMA, len(q)))
 
     def noticed(self) -> tuple[ChangeDetector, int]:
-        """The detector when it raised an alarm, and how many pairs it had seen."""
+        """Return the detector when it raised an alarm, and the number of pairs it had seen."""
         detector = self.detector()
         for k in range(len(self.q)):
             self.feed(detector, slice(k, k + 1))
@@ -223,7 +223,7 @@ def test_a_change_of_an_arm_that_bends_is_noticed_and_dated(seed: int) -> None:
 
 
 def test_errors_that_the_axes_share_count_once() -> None:
-    """A camera is thrice as bad along one direction: a pair that is off along it by two sigmas is nothing strange."""
+    """A camera is three times as bad along one direction: an error of two sigmas along it is not unusual."""
     arm, along = Arm(0), np.array([2.0, -1.0, 2.0]) / 3.0
     covariances = isotropic(SIGMA, len(arm.q)) + 8.0 * SIGMA**2 * np.outer(along, along)
     turned, plain = arm.detector(), arm.detector()

@@ -11,7 +11,7 @@ TRUSTED = ("rigid", "bent")
 
 
 def squares(measured: np.ndarray, offsets: tuple[float, float]) -> dict[str, float]:
-    """Of two models that are wrong by so much along x."""
+    """Return the squared errors of two models that have these offsets along x."""
     return {
         name: float(np.square(measured + np.array([offset, 0.0, 0.0])).sum())
         for name, offset in zip(TRUSTED, offsets, strict=True)
@@ -107,7 +107,7 @@ def test_errors_of_different_numbers_of_pairs_are_refused():
 
 @pytest.mark.parametrize("failing", [5, 10, 40])
 def test_a_model_that_fails_lately_does_not_answer(failing: int):
-    """However well it did before, and however large its errors are now."""
+    """Check recent failures, however good the model was before and however large its errors are now."""
     held = Contest()
     for k in range(100):
         held.add({"rigid": 0.002**2, "bent": 0.0005**2 if k < 100 - failing else 0.1**2})
@@ -134,7 +134,7 @@ def test_before_any_pair_no_errors_are_told():
 
 
 def test_neighbours_that_fare_alike_count_as_one():
-    """One stretch of a path where a model does better is no proof, however many pairs were taken there."""
+    """Check that one stretch of a path where a model does better is no proof, however many pairs were taken there."""
     held = Contest()
     for k in range(60):
         held.add({"rigid": 1.0 + 0.01 * k, "bent": 1.0})

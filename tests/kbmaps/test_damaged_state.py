@@ -1,4 +1,4 @@
-"""Stored models whose checksum is right and whose parts do not fit each other."""
+"""Stored models with a valid checksum and inconsistent parts."""
 
 from __future__ import annotations
 
@@ -39,15 +39,15 @@ from kbmaps.packed import MAGIC, VERSION, pack
 KINDS = "RPR"
 BASES = bases_for(KINDS)
 PREFIX = struct.Struct("<8sII")
-# What a number, a text or an object is replaced by: nothing of its type.
+# Replacements of a number, a text or an object: values of another type.
 WRONG = ([], "1e400", "1" + "0" * 400, "-Infinity", [[1.0]])
-# NaN says something here: not told, not predicted.
+# NaN has a meaning here: not given, not predicted.
 WITH_NAN = ("sigma", "errors")
 
 
 @functools.cache
 def stored() -> dict[str, tuple[Any, bytes]]:
-    """By name, the class that reads them and the bytes of taught models."""
+    """Return, by name, the reading class and the bytes of trained models."""
     rng = np.random.default_rng(1)
     arm = rough_arm(rng, KINDS)
     q, x = arm.pairs(rng, 40, 0.01)
@@ -119,7 +119,7 @@ def opened(data: bytes) -> tuple[str, dict[str, Any], dict[str, np.ndarray]]:
 
 
 def closed(kind: str, fields: dict[str, Any], arrays: dict[str, np.ndarray]) -> bytes:
-    """As `kbmaps.packed.pack` writes them, with numbers that JSON has and float64 has not in the place of texts."""
+    """Pack data like `kbmaps.packed.pack`, with numbers valid in JSON but not in float64 in place of texts."""
     shapes = {name: list(array.shape) for name, array in arrays.items()}
     header = json.dumps({"kind": kind, "fields": fields, "arrays": shapes})
     for text in WRONG:
@@ -130,7 +130,7 @@ def closed(kind: str, fields: dict[str, Any], arrays: dict[str, np.ndarray]) -> 
 
 
 def places(value: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Where something is in nested objects and lists."""
+    """Yield the path of each value in nested objects and lists."""
     entries = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for key, entry in entries:
         yield (*place, key)

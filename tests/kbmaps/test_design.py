@@ -16,7 +16,7 @@ kinds = st.text("RP", min_size=1, max_size=4)
 
 
 def planted(rng: np.random.Generator, joint_kinds: str, pairs: int) -> tuple[Design, np.ndarray, np.ndarray]:
-    """A design, its matrix and its scaled targets, formed in the plain way."""
+    """Return a design, its matrix and its scaled targets, computed directly."""
     choices = [bases_for(joint_kinds), bases_for(joint_kinds, 20)]
     if "P" not in joint_kinds:
         choices.append((JointBasis.bernstein(1.0, 0.2),) * len(joint_kinds))

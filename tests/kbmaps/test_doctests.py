@@ -1,4 +1,4 @@
-"""What a newcomer calls first shows how; `--doctest-modules` runs what is shown."""
+"""Doctests of the functions that a newcomer calls first; `--doctest-modules` runs them."""
 
 from __future__ import annotations
 

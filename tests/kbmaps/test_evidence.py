@@ -1,4 +1,4 @@
-"""The search for the scale of the greatest evidence."""
+"""The search for the scale of maximum evidence."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LOW, HIGH = 1e-9, 1e9
 
 
 def peaked(at: float, asked: list[float]) -> Callable[[float], float]:
-    """A parabola of the scale's logarithm, which notes what it is asked for."""
+    """Return a parabola in the logarithm of the scale, which records each scale it is asked for."""
 
     def log_evidence(scale: float) -> float:
         asked.append(scale)

@@ -16,7 +16,7 @@ MIXED = ["RRPRR", "PPPRR", "RPRP", "PRRRR"]
 
 
 def exactness_error(rng: np.random.Generator, joint_kinds: str, *, cluster_deg: float, times: int) -> float:
-    """Largest error [m] within ±80° after learning times·3^R·2^P noise-free samples of a cluster around zero."""
+    """Return the largest error [m] within ±80° after times·3^R·2^P noise-free samples of a cluster around zero."""
     chain, prior = random_chain(rng, joint_kinds), random_chain(rng, joint_kinds)
     q = random_q(rng, joint_kinds, times * control_points_needed(joint_kinds), cluster_deg)
     learner = ExactLearner(prior.to_kbmap(bases_for(joint_kinds)), bases_for(joint_kinds, cluster_deg))
@@ -177,7 +177,7 @@ def test_the_chosen_ridge_has_the_greatest_evidence_of_a_grid(pairs):
 
 
 def held_out_ratio(seed: int) -> float:
-    """Held-out error with the evidence's ridge over the best of a grid: noisy pairs on a nominal chain that is off."""
+    """Return the held-out error of the evidence's ridge over the best of a grid, with noisy pairs and a wrong prior."""
     rng = np.random.default_rng(seed)
     chain = random_chain(rng, "RRRR")
     fixed = chain.fixed.copy()

@@ -19,7 +19,7 @@ def learner_of(arm, rng, pairs, reach_deg=80.0, told=0.01):
 
 
 def foretold_and_found(seeds, first, first_deg, further, motion, told):
-    """Mean errors [m] that were foretold and came, now and after further pairs, over many arms."""
+    """Return predicted and observed mean errors [m], now and after further pairs, over many arms."""
     rows = []
     for seed in range(seeds):
         rng = np.random.default_rng(seed)

@@ -21,7 +21,7 @@ from kbmaps import (
 from kbmaps.planning.design import mean_distances
 
 seeds = st.integers(0, 2**32 - 1)
-# An arm that stands anywhere within 3 m.
+# An arm at any pose within 3 m.
 LOST = ChainTolerances(ROUGH.axes, ROUGH.points, tool=ROUGH.tool, base_rotation=3.0, base_translation=3.0)
 
 
@@ -43,7 +43,7 @@ class Waves:
         return self.features(q) @ self.root
 
     def covariances_after(self, q, region):
-        """By the textbook: (Σ⁻¹ + BᵀB/σ²)⁻¹ in the weights themselves."""
+        """Return the textbook covariance (Σ⁻¹ + BᵀB/σ²)⁻¹ of the weights themselves."""
         seen = self.features(q).reshape(-1, 12)
         covariance = np.linalg.inv(np.linalg.inv(self.root @ self.root.T) + seen.T @ seen / self.noise**2)
         shown = self.features(region)
@@ -95,7 +95,7 @@ def test_the_rms_errors_fall_by_at_least_the_gain(seed, floor):
 @given(seed=seeds)
 @settings(max_examples=15)
 def test_gains_are_those_of_the_textbook_to_first_order(seed):
-    """With noise so large that a pair changes little the tangent is the curve; with more, rounding is what is seen."""
+    """With large noise a pair changes little and the linearisation is exact; with more, rounding dominates."""
     model, region, q = planted(seed)
     model.noise = 1e3
     before = np.sqrt(np.trace(model.covariances_after(q[:0], region), axis1=1, axis2=2)).mean()
@@ -208,7 +208,7 @@ def test_what_does_not_fit_is_refused():
 
 
 def test_chosen_poses_teach_more_than_random_ones():
-    """The errors that the learner really makes, over arms that none of the choice was made on."""
+    """Compare the learner's true errors over arms that were not used for the choice."""
     errors = []
     for seed in range(10):
         rng = np.random.default_rng(seed)

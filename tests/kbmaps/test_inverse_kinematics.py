@@ -28,14 +28,14 @@ RANGE_DEG = 100.0
 
 
 class PositionsOnly:
-    """A chain as a model that has nothing but positions and their derivative."""
+    """A chain as a model with positions and their derivative only."""
 
     def __init__(self, chain: RigidChain) -> None:
         self.joints, self.predict, self.jacobian = chain.joints, chain.positions, chain.jacobian
 
 
 def planted(rng: np.random.Generator, kinds: str, *, deg: float = RANGE_DEG) -> tuple[KBMap, np.ndarray]:
-    """A random chain as a map of poses, and its half ranges."""
+    """Return a random chain as a map of poses, and its half ranges."""
     return random_chain(rng, kinds).to_kbmap(bases_for(kinds, deg), orientation=True), half_ranges(kinds, deg)
 
 
@@ -50,7 +50,7 @@ def planar_map(*links_m: float) -> KBMap:
 
 
 def share_converged(joint_kinds: str, *, arms: int, targets: int, pose: bool, deg: float = RANGE_DEG) -> float:
-    """Of poses that random configurations within the limits have, the share that is found again to 1e-6 m (and rad)."""
+    """Return the share of reachable random poses for which a solution is found to 1e-6 m (and rad)."""
     found = []
     for seed in range(arms):
         rng = np.random.default_rng(seed)
@@ -173,7 +173,7 @@ def test_a_start_near_the_target_gives_an_answer_near_the_start():
 
 @pytest.mark.parametrize("pose", [False, True])
 def test_the_posture_is_followed_as_far_as_the_target_leaves_a_choice(pose):
-    """The objective is that of an independent solver that begins at our answer."""
+    """Compare the objective with that of an independent solver started at our answer."""
     for seed in range(4):
         rng = np.random.default_rng(seed)
         kbmap, half = planted(rng, "RRRRRRR")
@@ -212,7 +212,7 @@ def test_a_model_of_positions_alone_is_enough_for_positions():
 
 
 def test_the_reaching_error_of_the_true_arm_is_that_of_the_model():
-    """A map that is wrong by some millimetres leads the true arm astray by as much, and no more."""
+    """A map that is wrong by some millimetres misplaces the true arm by as much, and no more."""
     rng = np.random.default_rng(6)
     chain, half = random_chain(rng, "RRRRRRR"), half_ranges("RRRRRRR", RANGE_DEG)
     exact = chain.to_kbmap(bases_for("RRRRRRR", RANGE_DEG))
@@ -261,7 +261,7 @@ def test_targets_of_the_wrong_shape_are_refused():
 
 
 def humanoid() -> RigidChain:
-    """Twenty joints, links of 60 mm, axes in turn about z, y and x."""
+    """Return a chain of twenty joints, links of 60 mm, axes in turn about z, y and x."""
     fixed = np.tile(np.eye(4), (21, 1, 1))
     fixed[1:, :3, 3] = [0.05, 0.02, 0.03]
     return RigidChain(fixed, np.eye(3)[[2 - k % 3 for k in range(20)]], np.zeros(20, dtype=bool))

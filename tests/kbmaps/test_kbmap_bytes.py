@@ -18,7 +18,7 @@ STORED = MAP.to_bytes()
 
 
 def forged(header: bytes, net: bytes = b"") -> bytes:
-    """A byte string with a right checksum around a header of one's choice."""
+    """Return a byte string with a valid checksum around an arbitrary header."""
     body = struct.pack("<8sII", MAGIC, 1, len(header)) + header + net
     return body + hashlib.blake2b(body, digest_size=16).digest()
 

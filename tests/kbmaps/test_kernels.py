@@ -1,4 +1,4 @@
-"""The two paths of the innermost loops do the same."""
+"""The two implementations of the innermost loops agree."""
 
 from __future__ import annotations
 

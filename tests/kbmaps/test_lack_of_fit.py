@@ -8,7 +8,7 @@ from kbmaps import ChainPosterior, RigidLearner, SettingError, ShapeError, syste
 
 
 def found(seed, pairs, eccentric_deg):
-    """What is found of encoders that are eccentric, and what there is of it on other poses of the same kind [m]."""
+    """Return the estimated effect of eccentric encoders and the true one on other poses of the same kind [m]."""
     rng = np.random.default_rng(seed)
     arm = rough_arm(rng)
     phase = rng.uniform(-np.pi, np.pi, 6)

@@ -26,7 +26,7 @@ LIMIT = np.full(3, np.radians(90.0))
 
 
 class Scripted:
-    """A model that says what it is told to."""
+    """A model with scripted answers."""
 
     joints = 3
 
@@ -79,7 +79,7 @@ def test_the_model_that_predicts_best_answers(arm):
 
 
 def bent(arm: Arm, q: np.ndarray) -> np.ndarray:
-    """Positions of an arm that no rigid chain follows."""
+    """Return positions of an arm that no rigid chain fits."""
     return arm.real.positions(q) + 0.05 * np.sin(2.0 * q)
 
 
@@ -128,7 +128,7 @@ def test_a_model_that_comes_back_with_nonsense_stays_out(arm):
 
 
 def test_a_model_that_came_back_is_compared_by_what_it_predicts_since(arm):
-    """It was right before, and is wrong ever since."""
+    """The model was right before, and is wrong since."""
     other = Scripted(lambda q: bent(arm, q) if other.pairs < 60 else np.zeros((len(q), 3)), breaks_at=40, mends_at=60)
     held, failed = ladder(arm, other), False
     for q in arm.pairs(np.random.default_rng(13), 120)[0]:

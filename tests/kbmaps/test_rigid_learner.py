@@ -181,14 +181,14 @@ def test_a_marker_far_off_its_place_is_found_without_noise():
     np.testing.assert_allclose(learner.predict(test), moved.positions(test), atol=1e-9)
 
 
-# Camera and tool anywhere, links as drawn: a turn of the base does what the first zero does, one of the tool the last.
+# Camera and tool anywhere, links nominal: turning the base is equivalent to the first offset, the tool to the last.
 MOUNTED = ChainTolerances(zeros=0.03, tool=0.1, base_rotation=0.5, base_translation=1.0)
 UNMEASURED = replace(MOUNTED, tool=math.inf, base_rotation=math.inf, base_translation=math.inf)
 NAMED = ("base_rotation", "base_translation", "tool_shift", "zeros")
 
 
 def over_half_widths(arms: int, pairs: int = 200, sigma: float = 0.001) -> dict[str, np.ndarray]:
-    """Errors in half widths (arms, k) of each kind of number in the report."""
+    """Return errors in half widths (arms, k) of each kind of number in the report."""
     off: dict[str, list[np.ndarray]] = {name: [] for name in NAMED}
     for seed in range(arms):
         rng = np.random.default_rng(seed)

@@ -77,7 +77,7 @@ def test_a_full_set_thins_out_and_goes_on():
 
 
 def test_the_claimed_spread_is_the_posterior_standard_deviation_of_a_fit():
-    """Errors of maps drawn from the prior, after an exact fit, have the spread that the support set claims."""
+    """Errors of maps sampled from the prior, after an exact fit, have the spread that the support set predicts."""
     rng = np.random.default_rng(3)
     kinds, noise_std = "RRR", 0.05
     bases = bases_for(kinds)

@@ -27,7 +27,7 @@ AT_ONCE = TensorSettings(refit_every=1)
 
 
 def perturbed(chain: RigidChain, rng: np.random.Generator) -> RigidChain:
-    """The chain with every link turned by about 3 degrees and shifted by about 15 mm a component."""
+    """Return the chain with every link turned by about 3 degrees and shifted by about 15 mm per component."""
     turns = [random_small_turn(rng, np.radians(3.0)) for _ in range(len(chain.fixed))]
     fixed = chain.fixed.copy()
     fixed[:, :3, :3] = fixed[:, :3, :3] @ np.array(turns)
@@ -42,7 +42,7 @@ def random_small_turn(rng: np.random.Generator, std: float) -> np.ndarray:
 
 
 def case(kinds: str, n: int, seed: int, sigma: float = 0.0, revolute_deg: float = 80.0):
-    """A true chain, a rough prior of it, and n pairs."""
+    """Return a true chain, a rough prior of it, and n pairs."""
     rng = np.random.default_rng(seed)
     chain = random_chain(rng, kinds)
     q = random_q(rng, kinds, n, revolute_deg)
@@ -56,7 +56,7 @@ def largest_error(learner, chain: RigidChain, kinds: str, revolute_deg: float = 
 
 @functools.cache
 def noisy_fit():
-    """Four joints from a rough prior and 200 pairs with 10 mm of noise, a tenth of them off by about 0.3 m."""
+    """Return a fit of a rough prior to 200 pairs of four joints: 10 mm of noise, 10 % outliers of about 0.3 m."""
     chain, prior, q, x = case("RRRR", 200, 5, SIGMA_M)
     x[::10] += 0.3 * np.random.default_rng(1).choice([-1.0, 1.0], size=(20, 3))
     learner = TensorLearner.around(prior, bases_for("RRRR"))
@@ -139,7 +139,7 @@ def test_the_claimed_sigma_holds_two_thirds_of_the_errors():
 
 
 def stretched(q):
-    """What the joints really do: encoders eccentric by 2 degrees, as joints read them."""
+    """Return the true joint angles: encoders eccentric by 2 degrees."""
     return q + np.radians(2.0) * np.sin(q + np.arange(q.shape[1]))
 
 
@@ -249,7 +249,7 @@ def test_a_given_sigma_weighs_the_pairs():
 
 
 def changed_tool(settings_: TensorSettings | None = None):
-    """A learner that has seen 200 pairs, the chain after its marker moved by 200 mm, and further pairs of that."""
+    """Return a learner that has seen 200 pairs, the chain after its marker moved by 200 mm, and further pairs of it."""
     chain, prior, q, x = case("RRRR", 300, 9, 1e-3)
     learner = TensorLearner.around(prior, bases_for("RRRR"), settings_)
     learner.learn(q[:200], x[:200])
@@ -295,7 +295,7 @@ def test_a_window_keeps_no_more_than_its_pairs():
 
 
 def test_the_gauge_of_the_prior_does_not_show_in_what_is_learnt():
-    """Turning the frame between two links, mean and covariance alike, is no other prior."""
+    """Turning the frame between two links, mean and covariance alike, gives the same prior."""
     _, prior, q, x = case("RR", 60, 1, SIGMA_M)
     bases = bases_for("RR")
     turn = random_small_turn(np.random.default_rng(0), 2.0)

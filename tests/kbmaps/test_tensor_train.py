@@ -13,7 +13,7 @@ small_chains = st.tuples(st.text("RP", min_size=1, max_size=5), st.integers(0, 1
 
 
 def random_train(kinds: str, seed: int) -> TensorTrain:
-    """No chain: cores of normal numbers, as a learner might leave them."""
+    """Return random cores, like those of a learner and unlike any chain's."""
     bases = bases_for(kinds)
     cores = 0.5 * np.random.default_rng(seed).normal(size=(len(kinds), 3, 3, 4))
     for k, basis in enumerate(bases):

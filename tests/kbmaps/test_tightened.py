@@ -1,4 +1,4 @@
-"""Beliefs whose tolerances are made narrower afterwards."""
+"""Beliefs whose tolerances are narrowed afterwards."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ SHIFT = np.array([0.1, -0.2, 0.12])
 def seen(
     chain: RigidChain, rng: np.random.Generator, joint_kinds: str, n: int, sigma: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of the chain with a tool of `SHIFT`."""
+    """Return pairs of the chain with a tool of `SHIFT`."""
     q = random_q(rng, joint_kinds, n, 80)
     return q, chain.with_tool(SHIFT).positions(q) + sigma * rng.normal(size=(n, 3))
 
@@ -211,7 +211,7 @@ def test_what_the_arm_itself_is_unsure_of_is_claimed_too():
     batch.learn(*arm.pairs(rng, 100, 0.005, reach_deg=15.0))
 
     class Oriented:
-        """The learner's claims with its chain's orientations."""
+        """The learner's predictions with its chain's orientations."""
 
         joints = 4
         predict, jacobian, estimate = batch.predict, batch.jacobian, batch.estimate

@@ -1,4 +1,4 @@
-"""What makes single pairs err is told apart: the camera, and each joint's reading."""
+"""Noise of single pairs is attributed to the camera and to each joint's reading."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ def rng() -> np.random.Generator:
 
 @pytest.fixture
 def derivatives(rng: np.random.Generator) -> np.ndarray:
-    """Of an arm of a metre that is all about, shape (PAIRS, 3, JOINTS)."""
+    """Return the derivatives of an arm about a metre long, shape (PAIRS, 3, JOINTS)."""
     return 0.5 * rng.normal(size=(PAIRS, 3, JOINTS))
 
 
 @pytest.fixture
 def covariances(rng: np.random.Generator) -> np.ndarray:
-    """A camera's, five times as bad along its view, shape (PAIRS, 3, 3)."""
+    """Return covariances of a camera, 25 times as large along its view, shape (PAIRS, 3, 3)."""
     view = rng.normal(size=(PAIRS, 3))
     view /= np.linalg.norm(view, axis=1)[:, None]
     return 1e-8 * (np.eye(3) + 24.0 * view[:, :, None] * view[:, None, :])
@@ -50,7 +50,7 @@ def test_a_camera_that_claims_too_little_is_seen_to(claimed, rng, derivatives, c
 
 
 def test_a_camera_is_not_taken_for_better_than_it_claims_to_be(rng, derivatives, covariances) -> None:
-    """What neighbours share does not show in their differences."""
+    """Check that errors shared by neighbours do not show in their differences."""
     assert WhiteNoise.of(drawn(0.1 * covariances, rng), covariances, derivatives).claimed == 1.0
 
 

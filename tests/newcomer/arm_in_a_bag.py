@@ -1,4 +1,4 @@
-"""A desk arm in ROS 2, as a bag has it: joint states at 100 Hz, a ball seen by a camera at 30 Hz."""
+"""A desk arm in a ROS 2 bag: joint states at 100 Hz, a ball seen by a camera at 30 Hz."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ OFFSETS_DEG = (0.0, 2.0, -1.5, 0.0)
 
 
 class ArmInABag:
-    """An arm whose links are made to 0.1° and 0.5 mm and whose zeros are off; its camera stands on the desk."""
+    """An arm whose links are built to 0.1° and 0.5 mm, with joint offsets; its camera stands on the desk."""
 
     def __init__(self, robot: RobotDescription, seed: int) -> None:
         self.rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""An SO-101 in virtual time, read by its driver at the bytes, and a camera that sees a marker on its hand."""
+"""An SO-101 in virtual time, read by its driver byte by byte, and a camera that sees a marker on its hand."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ NOISE_M = 5e-4
 
 
 class So101:
-    """An arm whose middle was found by eye, so that it stands `offsets_deg` from where its readings say.
+    """An arm whose middle was set by eye, so that its true angles differ by `offsets_deg` from its readings.
 
-    Its links are made to 0.1° and 0.3 mm, its camera stands anywhere, its marker is 20 mm off the drawn place.
+    Its links are built to 0.1° and 0.3 mm, its camera stands anywhere, its marker is 20 mm off nominal.
     """
 
     def __init__(self, robot: RobotDescription, motors: Calibrations, offsets_deg: Sequence[float], seed: int) -> None:
@@ -54,7 +54,7 @@ class So101:
         return self
 
     def record(self, robot: Config, rows: int) -> Recording:
-        """Guide the arm for `rows` readings; joints as its driver reads them, positions as a camera does."""
+        """Guide the arm for `rows` readings; return joints as its driver reads them and positions as a camera does."""
         config, clock = robot.tables.drivers.feetech, VirtualClock()
         assert config is not None
         port = VirtualPort(Chain(self.servos), clock)

@@ -1,4 +1,4 @@
-"""Wheel and sdist hold the same files, no links, and live beside a package that brings its own `daemon`."""
+"""Wheel and sdist hold the same files, no links, and coexist with a package that brings its own `daemon`."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def tracked() -> set[str]:
-    """The files of the parts, as they are to be named in a wheel."""
+    """Return the tracked files of the parts, under their names in a wheel."""
     links = [link for link in (ROOT / "bodyschema").iterdir() if link.is_symlink()]
     files = [(file, f"bodyschema/{file.relative_to(ROOT)}") for link in links for file in (ROOT / link.name).rglob("*")]
     return {name for file, name in files if file.is_file() and "__pycache__" not in name}
@@ -63,7 +63,7 @@ def test_the_sdist_has_no_link_and_makes_the_same_wheel(sdist: Path, wheel: Path
 
 
 def test_links_that_came_as_text_are_mended(tmp_path: Path) -> None:
-    """As a zip archive of the repository is unpacked by pip."""
+    """Check the case of a zip archive of the repository that pip unpacked."""
     source = tmp_path / "source"
     for name in ("interfaces", "bodyschema", "kbmaps"):
         shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
@@ -78,7 +78,7 @@ def test_links_that_came_as_text_are_mended(tmp_path: Path) -> None:
 
 
 def wheel_of_another(folder: Path) -> Path:
-    """A wheel with a top-level package `daemon`, as python-daemon's."""
+    """Return a wheel with a top-level package `daemon`, like python-daemon's."""
     file, info = folder / "other_daemon-1.0-py3-none-any.whl", "other_daemon-1.0.dist-info"
     named = {
         **OTHER,

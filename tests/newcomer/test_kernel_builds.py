@@ -18,7 +18,7 @@ SAY = "import kbmaps; print(kbmaps.__file__, kbmaps.kernels_in_use(), kbmaps.Joi
 
 @dataclass(frozen=True)
 class Built:
-    """A wheel's file name, what the build printed, and what an interpreter says that imports it."""
+    """A wheel's file name, the build's output, and the output of an interpreter that imports it."""
 
     wheel: str
     log: str

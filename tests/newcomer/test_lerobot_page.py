@@ -1,4 +1,4 @@
-"""The way of docs/lerobot.md, typed as it stands there, on an SO-101 emulated at the bytes."""
+"""The commands of docs/lerobot.md, typed as printed, on an SO-101 emulated at the byte level."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ INIT, EXPORT, DIFFERENCE, WRITE = (
 
 @pytest.fixture
 def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> TypedPage:
-    """The page, with the example's files in the present folder and a robot.toml."""
+    """Return the page, with the example's files in the working directory and a robot.toml."""
     shutil.copytree(SO101, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     return TypedPage(PAGE, capsys)

@@ -1,4 +1,4 @@
-"""The way of docs/mujoco_tutorial.md, typed as it stands there."""
+"""The commands of docs/mujoco_tutorial.md, typed as printed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def blocks(language: str) -> list[str]:
 
 
 def figures(table: str) -> dict[str, list[float]]:
-    """The numbers of each row, by the first two words of its name."""
+    """Return the numbers of each row, by the first two words of its name."""
     rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in table.splitlines() if line.count("│") > 3]
     return {" ".join(row[0].split()[:2]): [float(cell) for cell in row[1:] if cell] for row in rows}
 

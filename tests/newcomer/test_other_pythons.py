@@ -1,4 +1,4 @@
-"""Installed without extras on every Python of this machine that it is for: no pybullet, and both processes learn."""
+"""Installation without extras on every supported Python of this machine: no pybullet, and both processes learn."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ VERSIONS = ("3.11", "3.12", "3.13")
 
 
 def python(version: str) -> Path:
-    """The interpreter of this version; the test is skipped where there is none."""
+    """Return the interpreter of this version, or skip the test if there is none."""
     found = shutil.which(f"python{version}")
     if found is None or subprocess.run([found, "-c", ""], capture_output=True, check=False).returncode:
         pytest.skip(f"no Python {version}; to run it: pyenv install {version}")
@@ -38,7 +38,7 @@ def run(*command: object) -> str:
 
 
 def write_recording(robot: Path) -> Path:
-    """A walk of 2° steps of an arm whose tool is 37 mm from where it is drawn."""
+    """Write a walk of 2° steps of an arm whose tool is 37 mm off nominal."""
     rng = np.random.default_rng(11)
     angle = np.cumsum(rng.normal(scale=0.2, size=ROWS))
     q = np.cumsum(np.deg2rad(2.0) * np.column_stack([np.cos(angle), np.sin(angle)]), axis=0)

@@ -1,4 +1,4 @@
-"""The way of docs/own_robot.md, typed as it stands there."""
+"""The commands of docs/own_robot.md, typed as printed."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ COMMANDS = re.findall(r"^\$ (bodyschema .*)$", PAGE, re.MULTILINE)
 
 
 def output_of(command: str) -> str:
-    """What the page shows under a command."""
+    """Return the output that the page shows for a command."""
     return re.search(rf"```console\n\$ {re.escape(command)}\n(.*?)```", PAGE, re.DOTALL)[1]
 
 
 def table(heading: str) -> list[list[str]]:
-    """Rows of the table whose first column has this heading."""
+    """Return the rows of the table whose first column has this heading."""
     body = re.search(rf"^\| {re.escape(heading)} \|.*\n\| ---.*\n((?:\|.*\n)+)", PAGE, re.MULTILINE)[1]
     return [[cell.strip() for cell in line.split(" | ")] for line in re.findall(r"^\| (.*) \|$", body, re.MULTILINE)]
 
@@ -45,7 +45,7 @@ def code(cell: str) -> str:
 
 @pytest.fixture
 def desk(tmp_path: Path) -> Path:
-    """A folder of one's own with the example in it."""
+    """Return a folder of the user's own with the example in it."""
     return Path(shutil.copytree(EXAMPLE, tmp_path / "desk_arm"))
 
 
@@ -122,7 +122,7 @@ def test_the_page_has_every_key_of_the_description(section, heading: str) -> Non
 
 
 def guided_recording(robot: RobotDescription, rows: int) -> str:
-    """CSV of a guided path of an arm that is not quite as `robot` describes it, seen with 0.5 mm noise."""
+    """Return the CSV of a guided path of an arm that deviates from `robot`, with 0.5 mm of noise."""
     rng = np.random.default_rng(0)
     fixed = robot.chain.fixed.copy()
     for transform in fixed:

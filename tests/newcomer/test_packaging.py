@@ -1,4 +1,4 @@
-"""The distribution is what it says."""
+"""The distribution matches its metadata."""
 
 from __future__ import annotations
 

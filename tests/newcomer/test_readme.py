@@ -1,4 +1,4 @@
-"""What the README shows is true."""
+"""Statements of the README are true."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_every_command_in_the_readme_is_understood(command: str) -> None:
 
 
 def test_the_commands_for_a_real_arm_go_through_on_a_bench(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """As the README has them, the arm being a bench: its port and one rate are named, and nobody is there to ask."""
+    """Run the README's commands on an emulated arm: the port and one baud rate are given, and there are no prompts."""
     with BenchRun(Config.load(ROOT / "examples" / "desk_arm" / "servos.toml", {}), tmp_path / "bus") as run:
         port = ["--port", str(tmp_path / "bus"), "--baud", "1000000"]
         urdf, robot = str(ROOT / "examples" / "desk_arm" / "desk_arm.urdf"), str(tmp_path / "robot.toml")
@@ -84,6 +84,6 @@ def test_what_a_page_links_to_is_there(page: Path, target: str) -> None:
 
 
 def anchors(page: Path) -> list[str]:
-    """Of a page's headings, as they are linked to."""
+    """Return the anchors of a page's headings."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
     return [re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings]

@@ -1,4 +1,4 @@
-"""The way of docs/ros2_bag.md, typed as it stands there, with bags that rosbags wrote."""
+"""The commands of docs/ros2_bag.md, typed as printed, with bags that rosbags wrote."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ TESTS = Path(__file__).parents[1]
 
 
 def reasons(source: str) -> list[str]:
-    """The texts, as far as they are written there, of all calls that skip."""
+    """Return the literal texts of all calls that skip."""
     calls = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call)]
     skipping = [call for call in calls if getattr(call.func, "attr", "") in ("skip", "skipif")]
     spoken = [[*call.args, *(word.value for word in call.keywords if word.arg == "reason")][-1] for call in skipping]

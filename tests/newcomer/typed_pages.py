@@ -16,11 +16,11 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 @dataclass(frozen=True)
 class TypedPage:
-    """A page whose commands are typed in the present folder.
+    """A page whose commands are typed in the working directory.
 
     Attributes:
         text: of the page.
-        printed: what went to the terminal.
+        printed: terminal output.
     """
 
     text: str
@@ -38,7 +38,7 @@ class TypedPage:
         return found[1]
 
     def type(self, command: str) -> str:
-        """Type a command of the page, and return what it prints, in lines as long as they are."""
+        """Type a command of the page, and return its output with unwrapped lines."""
         assert command in self.commands, command
         words = shlex.split(command)[1:]
         self.printed.readouterr()

@@ -1,4 +1,4 @@
-"""A stretch of hand guiding without cameras, recorded, for tests to judge."""
+"""A recorded stretch of hand guiding without cameras, for tests to check."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from bodyschema.sim_backend.truth import TrueRobot
 
 @dataclass(frozen=True)
 class Run:
-    """What was recorded at 30 Hz.
+    """Recording at 30 Hz.
 
     Attributes:
         q: readings (n, d).
         x: true ball in the true left eye (n, 3) [m].
-        visible: whether both eyes see the ball, in view and not hidden (n,).
+        visible: mask of the frames in which both cameras see the ball, in view and not hidden (n,).
     """
 
     robot: RobotDescription
@@ -38,7 +38,7 @@ def shipped() -> RobotDescription:
 
 
 def learning(joints: tuple[str, ...]) -> RobotDescription:
-    """The shipped robot with other joints learnt."""
+    """Return the shipped robot with other joints to learn."""
     file = model_file("upper_body")
     tables, text = read_toml(file)
     tables["robot"]["joints"] = list(joints)
@@ -46,14 +46,14 @@ def learning(joints: tuple[str, ...]) -> RobotDescription:
 
 
 def described(folder: Path, urdf: str, toml: str) -> RobotDescription:
-    """A robot of one's own."""
+    """Write and load a robot of the user's own."""
     (folder / "robot.urdf").write_text(urdf, encoding="utf-8")
     (folder / "robot.toml").write_text(toml, encoding="utf-8")
     return RobotDescription.load(folder / "robot.toml")
 
 
 def in_eye(scene: Scene) -> FloatArray:
-    """The ball (3,) in the left eye [m]."""
+    """Return the ball (3,) in the left eye [m]."""
     return (np.linalg.inv(scene.T_world_camera) @ np.append(scene.x_world, 1.0))[:3]
 
 
@@ -64,7 +64,7 @@ def guide(
     tool: tuple[float, float, float] | None = None,
     settle: float = 0.0,
 ) -> Run:
-    """Guide the robot and record it, after a tool change and some time to settle where that is asked for."""
+    """Guide the robot and record it, optionally after a tool change and some time to settle."""
     assert robot.calibration is not None
     truth = TrueRobot.draw(robot, config)
     readings, fixes, visible = [], [], []
@@ -88,10 +88,10 @@ def guide(
 
 @cache
 def shipped_run(seed: int) -> Run:
-    """Twenty seconds of the shipped robot."""
+    """Return twenty seconds of the shipped robot."""
     return guide(shipped(), SimConfig(seed=seed), 20.0)
 
 
 def step_degrees(run: Run) -> FloatArray:
-    """Joint-space distance between neighbouring frames [deg]."""
+    """Return the joint-space distance between neighbouring frames [deg]."""
     return np.degrees(np.linalg.norm(np.diff(run.q, axis=0), axis=1))

@@ -1,4 +1,4 @@
-"""What the world shows is what `bodyschema.effects.Simulation` says that it shows, effect by effect."""
+"""The rendered world agrees with `bodyschema.effects.Simulation`, effect by effect."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from bodyschema.vision.tracker import StereoTracker
 
 CLOSE_M = 1e-6
 FRAME_STEPS = 8
-# After so many frames, nothing is remembered of what was before the first.
+# After this many frames, nothing depends on the state before the first.
 FORGOTTEN = 25
 # Readings as fine as numbers are, at every step of the physics.
 EXACT = EncoderConfig(ticks_per_turn=2**44, ticks_per_metre=2**44, noise_ticks=0.0, rate_hz=240)
@@ -60,7 +60,7 @@ EFFECTS = [
 ]  # fmt: skip
 
 
-# What happens to images on their way to the tracker.
+# Effects on images on their way to the tracker.
 SEEN = (("camera_scale", "camera_focal", "lens_distortion"), ("camera_moved", "thermal_drift"))
 # Those without a memory of their own go through the same lines of the guided world.
 TOGETHER = (
@@ -71,10 +71,10 @@ TOGETHER = (
 
 
 def groups() -> list[list]:
-    """The effects as the guided world tries them: in three groups, and each other one alone."""
+    """Return the groups of effects that the guided world tries together, then each other effect alone."""
     grouped = [[case for case in EFFECTS if case[0] in names] for names in TOGETHER]
     alone = [case for case in EFFECTS if not any(case[0] in names for names in TOGETHER)]
-    return grouped + [[case] for case in alone if case[0] != "camera_latency"]  # whose formula is of smooth paths
+    return grouped + [[case] for case in alone if case[0] != "camera_latency"]  # whose formula holds for smooth paths
 
 
 def named(case) -> str:
@@ -82,7 +82,7 @@ def named(case) -> str:
 
 
 def held() -> RobotDescription:
-    """The shipped robot, whose joints bear its weight."""
+    """Return the shipped robot, whose joints hold its weight."""
     file = model_file("upper_body")
     tables, text = read_toml(file)
     tables["robot"]["hold"] = "held"
@@ -95,7 +95,7 @@ def extended(*cases) -> Simulation:
 
 
 def guided(simulation: Simulation, config: SimConfig = CONFIG, seconds: float = 1.5) -> tuple[Motion, np.ndarray]:
-    """Readings at every step from the start, and what an ideal tracker sees in the frames; NaN between them."""
+    """Return readings at every step from the start, and an ideal tracker's positions; NaN between frames."""
     robot = simulation.robot
     assert robot.calibration is not None
     truth = TrueRobot.draw(robot, config, simulation)
@@ -110,7 +110,7 @@ def guided(simulation: Simulation, config: SimConfig = CONFIG, seconds: float = 
 
 
 def frames(motion: Motion) -> Motion:
-    """The rows at which frames were taken."""
+    """Return the rows at which frames were taken."""
     at = slice(FRAME_STEPS, None, FRAME_STEPS)
     assert motion.t is not None
     return Motion(motion.q[at], motion.t[at], motion.segment[at])
@@ -155,11 +155,11 @@ def test_on_a_smooth_path_a_late_stamp_is_what_the_simulation_says(latency_s: fl
     motion = Motion(np.array(read), t, np.zeros(len(t), dtype=np.int64))
     well_inside = slice(20, -20)  # where the lag leads to no moment before the first or after the last row
     said = motion.earlier(simulation.latency_s).q
-    assert np.abs(np.array(seen) - said)[well_inside].max() < 1e-5  # a path between readings is not told exactly
+    assert np.abs(np.array(seen) - said)[well_inside].max() < 1e-5  # the path between readings is not known exactly
 
 
 class NoRenderer:
-    """In the renderer's place: nothing is painted."""
+    """Replacement of the renderer that paints nothing."""
 
     def __init__(self, *arguments) -> None: ...
 

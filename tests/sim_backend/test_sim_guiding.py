@@ -17,7 +17,7 @@ SEEDS = (1, pytest.param(2, marks=pytest.mark.soak))
 
 @pytest.fixture
 def free_arm():
-    """The arm stretched out forward with nobody holding it; a function that lets one second pass."""
+    """Yield the arm stretched out forward and not held, with a function that lets one second pass."""
     robot = shipped()
     truth, roles = TrueRobot.draw(robot, SimConfig()), JointRoles.of(robot)
     start = np.array([0.0, 0.3, 1.2, 0.3, 0.0, 0.4, 0.0])

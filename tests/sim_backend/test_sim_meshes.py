@@ -36,7 +36,7 @@ def obj(triangles):
 
 
 def collada(triangles=WEDGE, *, unit="0.1", faces=None, count=None, scene='<instance_geometry url="#g"/>', more=""):
-    """The triangles ten times as large, in a unit of 0.1 m, shifted to and fro by two nodes."""
+    """Return COLLADA text: the triangles ten times as large, in a unit of 0.1 m, shifted to and fro by two nodes."""
     corners = 10.0 * np.reshape(triangles, (-1, 3)) - [0, 0, 4]
     faces = " ".join(map(str, range(len(corners)))) if faces is None else faces
     values = " ".join(map(str, corners.ravel()))
@@ -142,7 +142,7 @@ def test_meshes_are_limited_together(tmp_path, monkeypatch) -> None:
 
 
 def ball(count):
-    """A unit sphere of 2 count² triangles."""
+    """Return a unit sphere of 2 count² triangles."""
     u, v = np.meshgrid(np.linspace(0, 2 * np.pi, count + 1), np.linspace(0, np.pi, count + 1))
     points = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
     a, b, c, d = points[:-1, :-1], points[1:, :-1], points[1:, 1:], points[:-1, 1:]
@@ -210,7 +210,7 @@ image_size_px = [640, 480]
 
 
 def robot_of(tmp_path, base="", more="", offset="0.3 0 0.1"):
-    """A robot of two links, with elements in the first of them."""
+    """Return a robot of two links, with elements in the first of them."""
     urdf = f"""<robot name="r"><material name="sky"><color rgba="0.1 0.2 0.9 1"/></material>
     <link name="base">{base}</link><link name="tip"/>
     <joint name="turn" type="continuous"><parent link="base"/><child link="tip"/>
@@ -230,7 +230,7 @@ def written(robot):
 
 
 def shapes_of(robot):
-    """What pybullet shows of the robot, after it looked for collisions: kind and colour by link, and what was said."""
+    """Return pybullet's shapes of the robot after a collision check: kind and colour by link, and the output."""
     urdf = written(robot)
     with Body(urdf, robot.joints) as body:
         body.bullet.performCollisionDetection(physicsClientId=body.client)
@@ -341,7 +341,7 @@ def test_links_without_mass_have_a_small_one(tmp_path) -> None:
 
 
 def frame(name):
-    """A link without anything, fixed to the base."""
+    """Return an empty link, fixed to the base."""
     joint = f'<joint name="to_{name}" type="fixed"><parent link="base"/><child link="{name}"/></joint>'
     return f'<link name="{name}"/>{joint}'
 

@@ -22,7 +22,7 @@ RADIUS = CameraConfig().marker_radius_m
 
 @pytest.fixture
 def bullet():
-    """An empty pybullet world and its module."""
+    """Yield an empty pybullet world and its module."""
     module = load_pybullet()
     client = module.connect(module.DIRECT)
     yield module, client
@@ -30,7 +30,7 @@ def bullet():
 
 
 def painted(bullet, x, config=PLAIN, seed=0, T_world_camera=None, turn=UNTURNED):
-    """Left and right image of a marker at `x` in the left eye."""
+    """Return left and right image of a marker at `x` in the left optical frame."""
     T = np.eye(4) if T_world_camera is None else T_world_camera
     images = tuple(np.zeros((480, 640, 3), dtype=np.uint8) for _ in range(2))
     eyes = StereoEyes(Raster(*bullet, CALIBRATION, TO_LIGHT), CALIBRATION, config, seed)
@@ -39,7 +39,7 @@ def painted(bullet, x, config=PLAIN, seed=0, T_world_camera=None, turn=UNTURNED)
 
 
 def ellipse_centre(x):
-    """Centre of the outline (u, v) of a ball at `x` in an eye: the projected centre, drawn outward by z²/(z²-r²)."""
+    """Return the outline's centre (u, v) of a ball at `x`: the projected centre, shifted outward by z²/(z²-r²)."""
     stretch = x[2] ** 2 / (x[2] ** 2 - RADIUS**2)
     return np.array([319.5, 239.5]) + CALIBRATION.focal_px * stretch * x[:2] / x[2]
 
@@ -50,7 +50,7 @@ def weighted_centre(weight):
 
 
 def ball_centre(image):
-    """Centroid of the ball in an image with a plain light wall behind: clipped green contrast, free of shading."""
+    """Return the ball's centroid in an image with a plain light wall: clipped green contrast, free of shading."""
     contrast = 1.0 - image[..., 1] / 120.0
     return weighted_centre(np.clip(contrast, 0.0, 0.5))
 
@@ -116,7 +116,7 @@ def test_an_edge_half_across_the_ball_hides_half_of_it(bullet):
     shape = module.createVisualShape(
         module.GEOM_BOX, halfExtents=[0.1, 0.2, 0.001], rgbaColor=[0.5, 0.5, 0.5, 1], physicsClientId=client
     )
-    module.createMultiBody(0, -1, shape, [0.1, 0, 0.5], physicsClientId=client)  # its edge is the left eye's axis
+    module.createMultiBody(0, -1, shape, [0.1, 0, 0.5], physicsClientId=client)  # its edge is the left camera's axis
     x = np.array([0.0, 0.0, 0.6])
     whole_area = np.pi * (CALIBRATION.focal_px * RADIUS) ** 2 / (0.6**2 - RADIUS**2)
     assert red_pixels(painted(bullet, x)[0]) == pytest.approx(whole_area / 2, rel=0.1)
@@ -158,7 +158,7 @@ def test_the_background_avoids_the_balls_hue(hue_deg, gap_deg):
     hue, saturation, _ = np.moveaxis(cv2.cvtColor(room, cv2.COLOR_BGR2HSV).astype(float), -1, 0)
     apart_deg = np.abs((2.0 * hue - hue_deg + 180.0) % 360.0 - 180.0)[saturation > 100]
     assert len(apart_deg) > 1000
-    assert (apart_deg < gap_deg - 8.0).mean() < 0.01  # what lies between two things in a blurred edge
+    assert (apart_deg < gap_deg - 8.0).mean() < 0.01  # a blurred edge mixes two things
 
 
 def test_a_lamp_is_brighter_than_all_else(bullet):

@@ -18,7 +18,7 @@ WAIT_S = 300.0
 
 @pytest.fixture
 def world():
-    """An open world with both sources open."""
+    """Yield an open world with both sources open."""
     with SimWorld(shipped(), SimConfig(seed=2)) as world, world.joints, world.camera:
         yield world
 

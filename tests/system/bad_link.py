@@ -1,4 +1,4 @@
-"""A TCP connection that is slow, silent or cut, between two processes that do not know of it."""
+"""A TCP connection that is slow, silent or cut, between two processes unaware of it."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ CHUNK = 4096
 
 
 class BadLink:
-    """Listens on a port of its own and passes on to `endpoint` what comes, as badly as it is told.
+    """TCP proxy to `endpoint` with adjustable delay and bandwidth.
 
     Attributes:
-        endpoint: where it listens, as zenoh writes it.
-        delay_s: how much later than it came each piece goes on.
-        bytes_per_s: how many of them; None: as many as come.
+        endpoint: address on which it listens, in zenoh's notation.
+        delay_s: delay of each piece of data.
+        bytes_per_s: limit of the bandwidth; None for none.
     """
 
     def __init__(self, to: str) -> None:
@@ -46,7 +46,7 @@ class BadLink:
         self._loop.close()
 
     def part(self) -> None:
-        """Pass nothing on until `meet`; nobody is told, as when a cable is pulled somewhere between."""
+        """Pass nothing on until `meet`, without an error, as when a cable is pulled somewhere between."""
         self._loop.call_soon_threadsafe(self._passing.clear)
 
     def meet(self) -> None:

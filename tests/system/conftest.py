@@ -19,7 +19,7 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def disk_shim(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The library that makes disks fail and clocks jump."""
+    """Return the library that makes disks fail and clocks jump."""
     found = failing_disk.compiled(tmp_path_factory.mktemp("disk_shim"))
     if found is None:
         pytest.skip("a shim in C stands between a process and its disk; to run it: apt-get install gcc")

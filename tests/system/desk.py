@@ -1,4 +1,4 @@
-"""At a desk somewhere on the network: waits until the learner has all pairs, then asks as a viewer and as an operator.
+"""A desk somewhere on the network: wait until the learner has all pairs, then ask as a viewer and as an operator.
 
 It looks on as the page does, too.
 
@@ -38,7 +38,7 @@ def asked(where: Route, key: str, **request: object) -> dict[str, object]:
 
 
 def shown() -> dict[str, object]:
-    """What the page knows of both processes, once they are there or at the end of its patience."""
+    """Return the page's data on both processes, once both are there or the time limit has passed."""
     hub = Hub()
     until = time.monotonic() + LIMIT_S
     with Watch(Config.load(Path("robot.toml"), {}), hub):

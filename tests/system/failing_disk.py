@@ -1,4 +1,4 @@
-"""A folder whose disk fails on demand, below any process that `disk_shim/shim.c` is preloaded into."""
+"""A folder whose disk fails on demand, through the preloaded library `disk_shim/shim.c`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RECORD = struct.Struct("<2I3Q")
 
 
 def compiled(folder: Path) -> Path | None:
-    """The shim, compiled into `folder`; None where there is no compiler."""
+    """Compile the shim into `folder`; return None if there is no compiler."""
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
         return None
@@ -29,11 +29,11 @@ def compiled(folder: Path) -> Path | None:
 
 
 class FailingDisk:
-    """What is wrong with the disk of a folder, and with the wall clock of whoever works with it.
+    """Faults of the disk of a folder, and of the wall clock of the processes that use it.
 
     Attributes:
-        environment: of a process for which it is so.
-        log: where all is noted that is done to the folder.
+        environment: environment of a process that uses this disk.
+        log: file with all operations on the folder.
     """
 
     def __init__(self, folder: Path, library: Path) -> None:
@@ -51,17 +51,17 @@ class FailingDisk:
         }
 
     def refuse(self, number: int) -> None:
-        """Whatever is written fails with this errno; 0: it does not."""
+        """Fail every write with this errno; 0 stops that."""
         self._errno = number
         self._tell()
 
     def slow(self, milliseconds: int) -> None:
-        """Whatever is written takes so long."""
+        """Delay every write by this time."""
         self._slow_ms = milliseconds
         self._tell()
 
     def move_clock(self, seconds: int) -> None:
-        """The wall clock is so far ahead."""
+        """Set the wall clock ahead by this time."""
         self._clock_s = seconds
         self._tell()
 
@@ -70,7 +70,7 @@ class FailingDisk:
 
 
 class Operation(IntEnum):
-    """What was done to the folder."""
+    """Kind of operation on the folder."""
 
     WRITE = 1
     TRUNCATE = 2
@@ -94,7 +94,7 @@ class Done:
 
 
 def read_log(log: Path) -> Iterator[Done]:
-    """All that was done, in its order."""
+    """Yield all operations in order."""
     notes, at = log.read_bytes(), 0
     while at < len(notes):
         operation, name_size, inode, offset, data_size = RECORD.unpack_from(notes, at)

@@ -1,4 +1,4 @@
-"""Runs both processes in a network namespace of their own and makes its network bad, as the kernel can.
+"""Run both processes in a network namespace of their own and degrade its network by kernel means.
 
 unshare --net python kernel_network.py down|slow FOLDER PAIRS
 """
@@ -26,7 +26,7 @@ def ip(*words: str) -> None:
 
 
 def stored(config: Config, pairs: int) -> int:
-    """How many pairs are in the store, as soon as there are so many; nobody can be asked."""
+    """Count the pairs in the store once there are at least `pairs`, without asking a process."""
     deadline = time.monotonic() + LIFE_LIMIT_S
     with PairReader(config.store_file) as store:
         while (last := store.last_seq()) < pairs:
@@ -36,7 +36,7 @@ def stored(config: Config, pairs: int) -> int:
 
 
 def lose_the_link(config: Config, pairs: int) -> None:
-    """No packet passes until the store has so many more pairs and every session is over."""
+    """Block all packets until the store has this many more pairs and every session is over."""
     begun, done = time.monotonic(), stored(config, 1)
     ip("link", "set", "lo", "down")
     stored(config, done + pairs)
@@ -46,7 +46,7 @@ def lose_the_link(config: Config, pairs: int) -> None:
 
 
 def go_slowly(config: Config, pairs: int) -> None:
-    """The kernel lets so little pass that pairs and statuses queue up."""
+    """Limit the kernel's bandwidth so that pairs and statuses queue up."""
     shape = ("rate", "400kbit", "burst", "3000", "latency", "300ms")
     subprocess.run(["tc", "qdisc", "add", "dev", "lo", "root", "tbf", *shape], check=True)
     learner_with(config, sampler_with(config, 0).pairs + pairs)

@@ -1,8 +1,8 @@
-"""Runs `bodyschema` and kills it, as by SIGKILL from outside, at a named point of its work.
+"""Run `bodyschema` and kill it, as by SIGKILL from outside, at a named point of its work.
 
 python killed_at.py POINT NTH JOURNAL sampler --robot robot.toml
 
-Whatever the point, the sequence number of each pair that was accepted stands in JOURNAL, a line each.
+The sequence number of each accepted pair is written to JOURNAL, one per line.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ NOWHERE = "at a random moment"  # from outside
 
 
 class Countdown:
-    """Kills the process when it is called for the nth time."""
+    """Counter that kills the process at its nth call."""
 
     def __init__(self, nth: int) -> None:
         self._left = nth
 
     @property
     def last(self) -> bool:
-        """Whether the next call kills."""
+        """True if the next call kills."""
         return self._left == 1
 
     def __call__(self) -> None:
@@ -60,7 +60,7 @@ def at_the_commit(kill: Countdown) -> None:
 
 
 def at_the_publication(kill: Countdown, *, before: bool) -> None:
-    """Die before or after a pair, which is in the store, is handed to zenoh."""
+    """Die before or after a stored pair is handed to zenoh."""
     declare = Bus.publisher
 
     def publisher(bus: Bus, key: str, *, cache: int = 0) -> Callable[[bytes], None]:
@@ -90,7 +90,7 @@ def in_the_middle_of_a_checkpoint(kill: Countdown) -> None:
 
 
 def at_the_rename(kill: Countdown, *, before: bool) -> None:
-    """Die before or after a whole checkpoint takes the place of the old one."""
+    """Die before or after a complete checkpoint replaces the old one."""
     replace = os.replace
 
     def doomed(source: Path, target: Path) -> None:

@@ -18,7 +18,7 @@ FOLDER = Path("/etc/systemd/system")
 TARGETS = ("basic", "local-fs", "multi-user", "network", "network-online", "paths", "shutdown", "slices", "sockets")
 JOURNAL = ("systemd-journald.service", "systemd-journald.socket", "systemd-journald-dev-log.socket")
 COPIED = (*(f"{target}.target" for target in (*TARGETS, "swap", "sysinit", "timers")), *JOURNAL)
-# The address of the router is there as late as on a machine whose network is slow.
+# The router's address appears as late as on a machine with a slow network.
 SLOW_NETWORK = """[Unit]
 Before=network-online.target
 [Service]

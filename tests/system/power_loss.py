@@ -1,7 +1,7 @@
-"""What a disk holds after the power went: what was synced, and of the rest whatever had reached it by then.
+"""Contents of a disk after a power loss: all that was synced, and a random part of the rest.
 
-Of writes that were not synced, each sector is there or not, whatever the others are. Of names (made, renamed, removed)
-that were not synced, the first few are there, as many as by chance: file systems write these down in their order.
+Each sector of a write that was not synced is there or not, independently of the others. Of name changes (create,
+rename, remove) that were not synced, a random number of the first is there: file systems write them in order.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def _cut(content: bytearray, size: int) -> None:
 
 
 class File:
-    """A file: as it is read now, as it is on the disk, and what lies between."""
+    """A file: its contents as read now, its contents on the disk, and the pending operations."""
 
     def __init__(self) -> None:
         self.present, self._safe = bytearray(), bytearray()
@@ -41,12 +41,12 @@ class File:
             _cut(self.present, done.offset)
 
     def sync(self) -> None:
-        """All that was done is on the disk."""
+        """Mark all operations as being on the disk."""
         self._safe = bytearray(self.present) if self._pending else self._safe
         self._pending.clear()
 
     def after_power_loss(self, rng: np.random.Generator) -> bytes:
-        """As the disk has it."""
+        """Return the contents that the disk has after a power loss."""
         left, share = bytearray(self._safe), rng.random()
         for done in self._pending:
             if done.operation is Operation.TRUNCATE:
@@ -66,10 +66,10 @@ Names = dict[str, File]
 
 
 class Disk:
-    """A folder on a disk whose power may go.
+    """A folder on a disk whose power may fail.
 
     Attributes:
-        names: the files as they are read now.
+        names: the files by their present names.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""A sampler process over servos of the bench, what its cameras see, and what it says."""
+"""A sampler process with emulated servos, its cameras' images, and its output."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ LIMIT_S = 500.0
 
 
 def limb(x: FloatArray, radius_m: float) -> FloatArray:
-    """Where rays from the origin touch a sphere at x (3,) [m], points (n, 3) of a circle."""
+    """Return points (n, 3) of the contour circle where rays from the origin touch a sphere at x (3,) [m]."""
     shrunk = 1.0 - radius_m**2 / float(x @ x)
     across = np.linalg.svd(x[None])[2][1:]
     turns = np.linspace(0.0, 2.0 * math.pi, 180, endpoint=False)
@@ -39,12 +39,12 @@ def limb(x: FloatArray, radius_m: float) -> FloatArray:
 
 
 def drawn(config: Config, q: FloatArray) -> tuple[np.ndarray, np.ndarray]:
-    """What the two eyes see of the marker ball."""
+    """Render the two cameras' images of the marker ball."""
     return eyes_at(config, config.robot.chain.positions(q[None])[0])
 
 
 def eyes_at(config: Config, x: FloatArray) -> tuple[np.ndarray, np.ndarray]:
-    """What the two eyes see of the marker ball at x (3,) [m] in front of the left one."""
+    """Render the two cameras' images of the marker ball at x (3,) [m] in front of the left one."""
     calibration = config.robot.calibration
     assert calibration is not None
     width, height = calibration.image_size_px
@@ -61,7 +61,7 @@ def eyes_at(config: Config, x: FloatArray) -> tuple[np.ndarray, np.ndarray]:
 
 @contextlib.contextmanager
 def on_the_bench(config: Config, folder: Path, angle: Callable[[float], FloatArray]) -> Iterator[tuple[Config, DryRun]]:
-    """The same arm with its servos on a bench, moving as `angle` says; and that bench."""
+    """Yield the same arm with emulated servos moving along `angle`, and the emulator."""
     motion = {name: lambda t, j=j: float(angle(t)[j]) for j, name in enumerate(config.robot.joints)}
     bench = open_bench(config, folder / "bus", Motion(motion, "test"), return_delay_s=0.0, seed=0)
     file = bench_robot_file(config, bench, folder / "bus")
@@ -70,23 +70,23 @@ def on_the_bench(config: Config, folder: Path, angle: Callable[[float], FloatArr
 
 
 class SamplerProcess:
-    """`bodyschema sampler`, begun."""
+    """A running `bodyschema sampler`."""
 
     def __init__(self, config: Config, bus: Bus, process: subprocess.Popen[bytes] | warm.Child, log: Path) -> None:
         self.process, self._bus, self._log = process, bus, log
         self._keys = Keys(config.robot.name)
 
     def status(self) -> SamplerStatus:
-        """What it says of itself; waits until it does."""
+        """Return the sampler's status once it answers."""
         return decode(self._answer(lambda: self._bus.ask_one(self._keys.status("sampler"))), SamplerStatus)
 
     def command(self, name: CommandName) -> str:
-        """As `bodyschema command`; what it says."""
+        """Send a command like `bodyschema command` and return the reply."""
         reply = self._bus.ask_one(self._keys.command("sampler"), encode(CommandRequest(name)))
         return decode(reply, CommandReply).message
 
     def said(self) -> str:
-        """On its terminal, so far."""
+        """Return its terminal output so far."""
         return self._log.read_text()
 
     def _answer(self, ask: Callable[[], bytes]) -> bytes:
@@ -101,11 +101,11 @@ class SamplerProcess:
 
 @contextlib.contextmanager
 def sampling(config: Config, environment: dict[str, str] | None = None) -> Iterator[SamplerProcess]:
-    """A sampler process."""
+    """Run a sampler process."""
     words = ["-m", "bodyschema", "sampler", "--robot", config.file]
     log = config.file.with_suffix(".log")
     with log.open("w") as errors:
-        if environment:  # it works on what starts
+        if environment:  # the environment applies to new processes
             process = subprocess.Popen([sys.executable, *words], env=environment, stderr=errors)
         else:
             process = warm.Child(*words, stderr=errors)
@@ -121,7 +121,7 @@ def sampling(config: Config, environment: dict[str, str] | None = None) -> Itera
 
 
 def until(sampler: SamplerProcess, holds: Callable[[SamplerStatus], bool]) -> SamplerStatus:
-    """Its status, when that holds."""
+    """Return the sampler's status once the condition holds."""
     limit = time.monotonic() + LIMIT_S
     while not holds(said := sampler.status()):
         assert time.monotonic() < limit, (said.rejected, said)

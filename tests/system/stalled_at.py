@@ -1,4 +1,4 @@
-"""Runs `bodyschema` and lets a loop hang, as a device or a disk would, as long as a file of its name is in a folder.
+"""Run `bodyschema` and let a loop hang, as a device or a disk would, while a file of its name is in a folder.
 
 python stalled_at.py FOLDER sampler --robot robot.toml
 """
@@ -14,7 +14,7 @@ from typing import Any
 
 from bodyschema.daemon.cli import main
 
-# What each loop does in its round.
+# The work of each loop in one round.
 WORK = {
     "encoders": ("bodyschema.daemon.reopen", "Reopening", "read", "the encoders"),
     "frames": ("bodyschema.daemon.reopen", "Reopening", "read", "the cameras"),

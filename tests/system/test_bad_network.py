@@ -1,4 +1,4 @@
-"""Sampler and learner with a bad network between them, and with others who burden them: no pair is lost or doubled."""
+"""Sampler and learner with a bad network between them, and with clients that load them: no pair is lost or doubled."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SOME, MORE = 20, 60
 
 
 def over(link: BadLink, config: Config) -> Config:
-    """The configuration of a learner that reaches the sampler over the link."""
+    """Return the configuration of a learner that reaches the sampler over the link."""
     text = config.file.read_text().replace(config.tables.zenoh.sampler, link.endpoint)
     file = config.file.with_name("far.toml")
     file.write_text(text)
@@ -45,7 +45,7 @@ def over(link: BadLink, config: Config) -> Config:
 
 @contextlib.contextmanager
 def apart(folder: Path, free_endpoint) -> Iterator[tuple[Config, BadLink]]:
-    """Both processes with a link between them, and some pairs learnt."""
+    """Run both processes with a link between them until some pairs are learned."""
     config = write_robot(folder, free_endpoint)
     with (
         BadLink(config.tables.zenoh.sampler) as link,
@@ -61,7 +61,7 @@ def predicts(config: Config) -> None:
 
 
 def lose_each_other(config: Config, link: BadLink, pairs: int) -> None:
-    """Part them until the learner has noticed and the sampler has so many more pairs; then let them meet."""
+    """Block the link until the learner has noticed and the sampler has this many more pairs; then restore it."""
     link.part()
     noticed = status_when(config, "learner", LearnerStatus, lambda status: not status.sampler_alive)
     sampler_with(config, noticed.last_seq + pairs)
@@ -112,7 +112,7 @@ def test_a_learner_that_is_gone_for_a_while_catches_up(tmp_path, free_endpoint) 
 
 
 def in_a_namespace(how: str, folder: Path, pairs: int) -> int:
-    """How many pairs were accepted, and learnt once each, by processes whose kernel makes the network bad."""
+    """Count the pairs accepted, and learned once each, by processes whose kernel degrades the network."""
     if subprocess.run(["unshare", "--net", "true"], capture_output=True, check=False).returncode:
         pytest.skip("no network namespaces; to run it: be root")
     script = Path(__file__).with_name("kernel_network.py")
@@ -160,7 +160,7 @@ def test_a_subscriber_that_takes_nothing_delays_nobody_else(tmp_path, free_endpo
 
 
 class Flood:
-    """Clients that ask for as large a batch as they may, each as soon as it was answered."""
+    """Clients that each ask for the largest batch allowed as soon as the last one was answered."""
 
     def __init__(self, config: Config, clients: int) -> None:
         self._config, self._end = config, threading.Event()

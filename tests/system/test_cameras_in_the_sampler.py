@@ -1,4 +1,4 @@
-"""`bodyschema sampler` over servos of the bench and cameras below OpenCV, or images in a folder."""
+"""`bodyschema sampler` with emulated servos and cameras below OpenCV, or images in a folder."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ TURNS = np.array([[2, 7], [3, 5], [5, 11], [7, 3]])  # while all images are show
 
 
 def angles(t: float) -> FloatArray:
-    """The joints at a time: they come back to where they were when the camera's images do."""
+    """Return the joints at a time; they repeat with the camera's images."""
     swing = np.sin(2 * math.pi * t * FPS / FRAMES * TURNS + np.array([[0.0, 0.7], [0.7, 1.9], [1.5, 0.2], [2.0, 1.0]]))
     return MIDDLE + SWING * (swing @ [0.6, 0.4])
 
@@ -58,7 +58,7 @@ exposure_s = 0.005
 
 @pytest.fixture
 def moving(tmp_path: Path, free_endpoint: Callable[[], str]) -> Iterator[tuple[Config, ShimCamera]]:
-    """An arm that moves, and a stereo camera that sees it as it was 70 ms before each time stamp."""
+    """Yield a moving arm, and a stereo camera that sees it as it was 70 ms before each time stamp."""
     device = tmp_path / "dev" / "usb-Stereo_1234-video-index0"
     config = write_arm(tmp_path, free_endpoint, CAMERA.format(device=device, latency=LATENCY_S))
     images = [np.hstack(drawn(config, angles(k / FPS - LATENCY_S))) for k in range(FRAMES)]
@@ -92,7 +92,7 @@ def test_a_hidden_latency_is_found_by_moving_the_arm(library, moving) -> None:
     file = config.file
     file.write_text(file.read_text().replace(f"latency_s = {LATENCY_S}", "latency_s = 0.01"))
     command = [sys.executable, "-m", "bodyschema", "calibrate", "latency", "--robot", str(file), "--json"]
-    for attempt in range(TRIES):  # a busy machine takes images late or too few, and says so: it has longer then
+    for attempt in range(TRIES):  # a busy machine takes images late or too few, and reports it: it then has more time
         longer = [*command, "--seconds", str(SECONDS * 2**attempt)]
         done = subprocess.run(
             longer, check=False, env=preloaded(library), capture_output=True, text=True, timeout=LIMIT_S

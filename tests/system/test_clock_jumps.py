@@ -1,4 +1,4 @@
-"""The wall clock jumps under working processes: only what is written in UTC follows it."""
+"""The wall clock jumps under working processes: only times written in UTC follow it."""
 
 from __future__ import annotations
 

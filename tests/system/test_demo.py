@@ -1,4 +1,4 @@
-"""The demo as a newcomer runs it, only shorter."""
+"""The demo as a newcomer runs it, but shorter."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_without_a_terminal_the_demo_prints_plain_lines(demo: Demo) -> None:
 @pytest.mark.soak
 @pytest.mark.parametrize("seed", range(5))
 def test_the_demo_reaches_its_figures_and_claims_what_is_true(tmp_path: Path, seed: int) -> None:
-    """At most 20 mm after 600 pairs and 30 mm 300 pairs after the tool change; the claim is right within a factor 2."""
+    """Require 20 mm after 600 pairs, 30 mm 300 pairs after the tool change, and predicted errors within a factor 2."""
     command = [sys.executable, "-m", "bodyschema", "demo", "--out", str(tmp_path / "out"), "--seed", str(seed)]
     done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=LIMIT_S)
     first, second = re.findall(r"│ +([\d.]+) mm │ +([\d.]+) mm │ +(\d+) % │", done.stdout)

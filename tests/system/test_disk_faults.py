@@ -38,7 +38,7 @@ SOME, MORE = 20, 20
 
 
 def health(config: Config, process: str, kind: type, said: str) -> str:
-    """What the process says of its health, as soon as `said` is in it."""
+    """Return the process's health message that contains `said`, as soon as there is one."""
     found = status_when(config, process, kind, lambda status: any(said in text for text in status.health))
     return next(text for text in found.health if said in text)
 
@@ -140,7 +140,7 @@ def zeroed(data: bytes) -> bytes:
 
 @pytest.fixture(scope="module")
 def worked(tmp_path_factory: pytest.TempPathFactory, free_endpoint) -> Config:
-    """A robot whose two processes have worked and ended, with two generations of checkpoints."""
+    """Return a robot whose two processes have run and ended, with two generations of checkpoints."""
     config = write_robot(tmp_path_factory.mktemp("worked"), free_endpoint, rows=60)
     with ExitStack() as stack:
         children = [stack.enter_context(running(config, name)) for name in ("sampler", "learner")]
@@ -161,7 +161,7 @@ def damage(config: Config, how: Callable[[bytes], bytes], generation: int) -> No
 
 @pytest.fixture
 def kept(worked: Config) -> Config:
-    """The same, to be damaged: what it was is put back."""
+    """Yield the same robot, to be damaged; its files are restored afterwards."""
     files = {file: file.read_bytes() for file in generations(worked.checkpoint_file)}
     for aside in worked.state_dir.glob("*.unusable-*"):
         aside.unlink()

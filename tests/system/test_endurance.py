@@ -27,7 +27,7 @@ MB = 2**20
 
 
 def tree(pid: int) -> list[int]:
-    """The process and all below it."""
+    """Return the process and all its descendants."""
     below = [
         int(child) for task in Path(f"/proc/{pid}/task").iterdir() for child in (task / "children").read_text().split()
     ]
@@ -35,19 +35,19 @@ def tree(pid: int) -> list[int]:
 
 
 def resident_bytes(pid: int) -> int:
-    """Memory that the process and those below it have for themselves."""
+    """Return the memory private to the process and its descendants."""
     pages = (int(Path(f"/proc/{each}/statm").read_text().split()[1]) for each in tree(pid))
     return os.sysconf("SC_PAGE_SIZE") * sum(pages)
 
 
 def cpu_s(pid: int) -> float:
-    """Processor time that they took so far."""
+    """Return the processor time that they have used."""
     fields = (Path(f"/proc/{each}/stat").read_text().rpartition(")")[2].split() for each in tree(pid))
     return sum(int(each[11]) + int(each[12]) for each in fields) / os.sysconf("SC_CLK_TCK")
 
 
 def latency_s(ask: Callable[[], object]) -> float:
-    """How long an answer takes when nothing else is in the way: the quickest quarter."""
+    """Return the answer time without other load: the lower quartile."""
     taken: list[float] = []
     for _ in range(ASKED):
         begun = time.perf_counter()
@@ -83,7 +83,7 @@ def look(pids: tuple[int, int], sampler: Bus, learner: Bus, idle: Bus) -> Look:
 
 
 def watched(config: Config, endpoint: str) -> list[Look]:
-    """After warming up, and after each further part; `endpoint` is free."""
+    """Measure after the warm-up and after each further part; `endpoint` is free."""
     zenoh = config.tables.zenoh
     with Bus(listen=endpoint) as idle, running(config, "sampler") as sampler, running(config, "learner") as learner:
         idle.answer(NOTHING, lambda _: b"")

@@ -1,4 +1,4 @@
-"""`bodyschema sampler` with gaze: a head of two servos on the bench, which carries cameras below OpenCV."""
+"""`bodyschema sampler` with gaze: an emulated head of two servos, which carries cameras below OpenCV."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PACE = np.array([0.0, 0.0, 0.65, 0.5, 0.75, 0.5, 0.5])  # so slow that a busy ma
 AT_FIRST_S, FOUND_S, WATCHED_S = 2.0, 1.0, 8.4  # the head has found the hand; once to and fro
 EVERY_S = 0.05
 SPEED_DEG_S, YAW_DEG = 60.0, (-30.0, 40.0)
-FPS, LATENCY_S = 10.0, 0.25  # the images of a busy machine are drawn late
+FPS, LATENCY_S = 10.0, 0.25  # a busy machine renders images late
 PAIRS = 25  # a busy machine makes fewer in a second
 GREY = np.full((480, 1280, 3), 128, np.uint8)
 OVERLOAD = 0x20
@@ -78,7 +78,7 @@ direction = {direction}
 
 
 def looking_at_the_hand(robot: RobotDescription) -> FloatArray:
-    """The pose in which the arm waits, its head turned so that the cameras see the hand."""
+    """Return the pose in which the arm waits, its head turned so that the cameras see the hand."""
     assert robot.calibration is not None
     pointing = Pointing(robot.calibration, HEAD, robot.lower[HEAD], robot.upper[HEAD])
     q = MIDDLE[None].copy()
@@ -88,7 +88,7 @@ def looking_at_the_hand(robot: RobotDescription) -> FloatArray:
 
 
 class Guided:
-    """A hand that guides the arm, once it begins; the head is nobody's."""
+    """A hand that guides the arm, once it begins; the head is left alone."""
 
     def __init__(self, start: FloatArray) -> None:
         self.start, self.begin_s = start, math.inf
@@ -99,13 +99,13 @@ class Guided:
 
 @dataclass(frozen=True)
 class Watched:
-    """What was so for a while.
+    """Observations over a while.
 
     Attributes:
-        t, q: where the joints were, and when [s], shapes (n,) and (n, d) [rad].
-        torque: of each servo; all that it was.
-        pairs: that were made meanwhile.
-        health: what the sampler said in the end.
+        t, q: times [s] and positions of the joints [rad], shapes (n,) and (n, d).
+        torque: all observed torque registers of the servos.
+        pairs: pairs made meanwhile.
+        health: the sampler's last health messages.
     """
 
     t: FloatArray
@@ -117,7 +117,7 @@ class Watched:
 
 @dataclass(frozen=True)
 class Episode:
-    """A sampler from its start to its end: first without gaze, then with it, then a servo of the head failed.
+    """A sampler from start to end: first without gaze, then with it, then with a failed servo of the head.
 
     Attributes:
         torque_again: after it was asked for once more. torque_at_exit: after SIGTERM.
@@ -132,34 +132,34 @@ class Episode:
 
 
 class Stage:
-    """An arm with a head on the bench, and the cameras that the head carries."""
+    """An arm with an emulated head, and the cameras that the head carries."""
 
     def __init__(self, config: Config, bench: DryRun, guided: Guided) -> None:
         self.config, self._bench, self._guided = config, bench, guided
         self.head = [bench.arm.servo(joint) for joint in config.robot.joints[:2]]
 
     def q(self, t: float) -> FloatArray:
-        """Where the joints were [rad] (d,)."""
+        """Return the joint positions [rad] (d,)."""
         q = self._guided(t)
         q[HEAD] = [way * servo.angle(t) for way, servo in zip(DIRECTIONS, self.head, strict=False)]
         return q
 
     def seen(self, t: float) -> np.ndarray:
-        """What the cameras see, side by side."""
+        """Return the cameras' images side by side."""
         return np.hstack(drawn(self.config, self.q(t)))
 
     @property
     def torque(self) -> tuple[int, ...]:
-        """Of each servo."""
+        """Torque register of each servo."""
         return tuple(self._bench.arm.servo(joint)["torque"] for joint in self.config.robot.joints)
 
     def watch(self, sampler: SamplerProcess, seconds: float, pairs: int = 0) -> Watched:
-        """Look on for so long, and until so many pairs were made."""
+        """Observe for at least this time and this many pairs."""
         begin, first, torque, seen = time.monotonic(), len(pairs_of(self.config)), set(), []
         while time.monotonic() < begin + seconds or len(pairs_of(self.config)) < first + pairs:
             assert time.monotonic() < begin + LIMIT_S
             torque.add(self.torque)
-            t = time.monotonic() - EVERY_S  # the bench was asked since
+            t = time.monotonic() - EVERY_S  # the emulator was asked since
             seen.append((t, self.q(t)))
             time.sleep(EVERY_S)
         t, q = zip(*seen, strict=True)
@@ -167,7 +167,7 @@ class Stage:
 
 
 def write_robot(folder: Path, free_endpoint: Callable[[], str], device: Path) -> Config:
-    """The demonstration's upper body, of servos, with gaze and a camera."""
+    """Write the demonstration's upper body, with servos, gaze and a camera."""
     shutil.copytree(demonstration_model().parent, folder, dirs_exist_ok=True)
     toml = folder / "robot.toml"
     servos = [
@@ -199,7 +199,7 @@ def episode(library, tmp_path_factory, free_endpoint) -> Episode:
             gazing = stage.watch(sampler, WATCHED_S, PAIRS)
             stage.head[1].fail(OVERLOAD)
             until(sampler, lambda said: any("gaze ended" in text for text in said.health))
-            time.sleep(EVERY_S)  # what is looked at next was after the end
+            time.sleep(EVERY_S)  # later observations are after the end
             failed = stage.watch(sampler, 0.5)
             stage.head[1].reboot(time.monotonic())
             sampler.command("gaze_on")
@@ -208,7 +208,7 @@ def episode(library, tmp_path_factory, free_endpoint) -> Episode:
 
 
 def in_view(robot: RobotDescription, q: FloatArray) -> np.ndarray:
-    """At which of q (n, d) both eyes have the marker's centre in their images (n,)."""
+    """Return a mask (n,) of the rows of q (n, d) at which both cameras have the marker's centre in view."""
     calibration = robot.calibration
     assert calibration is not None
     x, eyes = robot.chain.positions(q), [[0.0, 0.0], [calibration.baseline_m, 0.0]]
@@ -217,7 +217,7 @@ def in_view(robot: RobotDescription, q: FloatArray) -> np.ndarray:
 
 
 def with_the_head_still(episode: Episode, q: FloatArray) -> FloatArray:
-    """q (n, d), the head where it stood before the gaze began."""
+    """Return q (n, d) with the head at its position before the gaze began."""
     q = q.copy()
     q[:, HEAD] = episode.without.q[0, HEAD]
     return q

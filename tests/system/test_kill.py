@@ -25,12 +25,12 @@ LATEST_PAIR, LATEST_CHECKPOINT, LATEST_S = 40, 3, 1.0
 
 @dataclass(frozen=True)
 class Kill:
-    """How one life of a process ends.
+    """End of one life of a process.
 
     Attributes:
         point: a named point, at whose nth time the process dies; or NOWHERE.
         after_s: with NOWHERE, the time from its first sign of life, or from its start, to its death from outside.
-        alive: whether to wait for the sign of life; otherwise it may die while it starts.
+        alive: True to wait for the sign of life; otherwise it may die while it starts.
     """
 
     point: str
@@ -40,7 +40,7 @@ class Kill:
 
 
 def plan(rng: np.random.Generator, points: list[str], kills: int, latest: int) -> list[Kill]:
-    """So many kills in random order: every third at a random moment, the others at the points in turn."""
+    """Return kills in random order: every third at a random moment, the others at the points in turn."""
     named = [points[k % len(points)] for k in range(kills - kills // 3)]
     order = rng.permutation([*named, *[NOWHERE] * (kills // 3)]).tolist()
     return [
@@ -49,12 +49,12 @@ def plan(rng: np.random.Generator, points: list[str], kills: int, latest: int) -
 
 
 def doomed(config: Config, process: str, kill: Kill) -> contextlib.AbstractContextManager[subprocess.Popen[bytes]]:
-    """A process of ours that has a `kill` before it."""
+    """Run a process that is to die by `kill`."""
     return running(config, process, fate=(kill.point, str(kill.nth)))
 
 
 class Lives:
-    """The lives of one process, each ended by its kill, and then a last one that goes on until `__exit__`."""
+    """The lives of one process, each ended by its kill, and a last one that continues until `__exit__`."""
 
     def __init__(self, config: Config, process: str, kills: list[Kill]) -> None:
         self.deaths: list[str] = []
@@ -88,7 +88,7 @@ class Lives:
             self._enough.wait()
 
     def _death(self, child: subprocess.Popen[bytes], kill: Kill) -> str:
-        """The point where the process died; or what came instead."""
+        """Return the point where the process died, or the event that came instead."""
         if kill.point == NOWHERE:
             return self._death_from_outside(child, kill)
         try:
@@ -108,10 +108,10 @@ class Lives:
 
 @dataclass(frozen=True)
 class Aftermath:
-    """What is left when all kills are over and the learner had the time to catch up.
+    """State after all kills, once the learner had time to catch up.
 
     Attributes:
-        planned, deaths: where processes were to die, and where they died.
+        planned, deaths: planned and actual points of death.
         accepted: numbers of the pairs that a sampler had accepted before it died.
         published: the pairs that were heard on zenoh.
         unusable: checkpoints that a learner could not go on from.

@@ -1,4 +1,4 @@
-"""Files that older versions wrote, kept in tests/daemon/older_versions: what a robot has after an upgrade."""
+"""Files of older versions, kept in tests/daemon/older_versions: the state of a robot after an upgrade."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ ROWS = 60
 
 @pytest.fixture
 def config(tmp_path: Path, free_endpoint: Callable[[], str]) -> Config:
-    """A robot with the pairs of the first version."""
+    """Return a robot with the pairs of the first version."""
     config = write_robot(tmp_path, free_endpoint, rows=ROWS)
     config.state_dir.mkdir()
     shutil.copy(OLDER / "pairs_1.sqlite", config.store_file)
@@ -50,7 +50,7 @@ def schema(file: Path) -> int:
 
 @pytest.fixture(params=[1, 4])
 def older(config: Config, request: pytest.FixtureRequest) -> Config:
-    """The robot with the pairs of an older schema."""
+    """Return the robot with the pairs of an older schema."""
     shutil.copy(OLDER / f"pairs_{request.param}.sqlite", config.store_file)
     return config
 

@@ -1,4 +1,4 @@
-"""Pairs that are none, on the wire and in the store, before a real learner."""
+"""Invalid pairs, on the wire and in the store, with a real learner."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PAIRS, SPOILT = 60, 30
 
 @pytest.fixture
 def config(tmp_path, free_endpoint) -> Config:
-    """A robot with a store of pairs, and no process."""
+    """Return a robot with a store of pairs, and no process."""
     config = write_robot(tmp_path, free_endpoint, rows=PAIRS)
     t = np.arange(PAIRS) / 10.0
     q = np.stack([1.5 * np.sin(0.3 * t), 1.2 * np.sin(0.17 * t + 1.0)], axis=1)
@@ -42,7 +42,7 @@ def config(tmp_path, free_endpoint) -> Config:
 
 
 def built(config: Config) -> RigidChain:
-    """The arm as it is: with another place of the marker than robot.toml says."""
+    """Return the arm as built: with a marker position that differs from robot.toml."""
     return config.robot.chain.with_tool([0.03, 0.01, -0.02])
 
 
@@ -56,7 +56,7 @@ def spoil(config: Config, column: str, numbers: str) -> None:
 
 @contextlib.contextmanager
 def history(config: Config) -> Iterator[Bus]:
-    """What is left of a sampler: it answers for the store and publishes what it is given."""
+    """Yield the remains of a sampler: it serves the store and publishes what it is given."""
     with Bus(listen=config.tables.zenoh.sampler) as bus, PairReader(config.store_file) as store:
         bus.answer(KEYS.pairs, lambda request: answer_pairs(store, request))
         bus.token(KEYS.alive("sampler"))
@@ -64,7 +64,7 @@ def history(config: Config) -> Iterator[Bus]:
 
 
 def expect_numbers(config: Config, pairs: int) -> None:
-    """The learner answers numbers at once, and in time right ones: to 2 cm, where the drawing is 4 cm off."""
+    """Assert that the learner answers at once, and in time to 2 cm, where the nominal model is 4 cm off."""
     q = [[0.1, 0.9], [0.5, 1.0], [-0.3, 0.8]]
     truth, deadline = built(config).positions(np.array(q)), time.monotonic() + LIFE_LIMIT_S
     while True:

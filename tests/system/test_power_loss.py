@@ -1,4 +1,4 @@
-"""The power goes at any moment of two working processes: what was accepted is there, the checkpoint is one that was."""
+"""A power loss at any moment of two working processes: accepted pairs survive, and the checkpoint is a valid one."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ CHECKPOINT = "learner.ckpt"
 
 @dataclass
 class Promised:
-    """What has to be there, whatever the disk lost.
+    """State that must survive whatever the disk lost.
 
     Attributes:
         accepted: number of the last pair that a sampler had accepted.
-        possible: checkpoints, the last that was safe and those after it; None stands for none at all.
-        previous: those that the one before may be. It may always be none: it gives its name away before the present
-            one takes it.
+        possible: possible checkpoints: the last safe one and those after it; None for no checkpoint.
+        previous: possible previous checkpoints. It may always be absent: it loses its name before the present one
+            takes it.
     """
 
     accepted: int = 0
@@ -41,7 +41,7 @@ class Promised:
     previous: list[bytes | None] = field(default_factory=lambda: [None])
 
     def follow(self, done: Done, disk: Disk) -> None:
-        """What was done adds to it."""
+        """Record an operation."""
         if done.operation is Operation.RENAME and done.data.decode() == CHECKPOINT:
             self.previous += self.possible
             self.possible.append(bytes(disk.names[CHECKPOINT].present))
@@ -53,7 +53,7 @@ class Promised:
 
 
 def work(config: Config, disk_shim: Path, pairs: int) -> Path:
-    """Let both processes do so many pairs, end them, and give the log of what they did to the disk."""
+    """Let both processes handle this many pairs, end them, and return the log of their disk operations."""
     disk = FailingDisk(config.state_dir, disk_shim)
     with ExitStack() as stack:
         children = [
@@ -69,7 +69,7 @@ def work(config: Config, disk_shim: Path, pairs: int) -> Path:
 
 
 class Losses:
-    """Loses the power again and again while what was done is done anew, and holds what is left to the promise."""
+    """Repeated power losses during a replay of the disk operations, each checked against the promise."""
 
     def __init__(self, config: Config, folder: Path) -> None:
         self._config, self._folder = config, folder
@@ -115,7 +115,7 @@ class Losses:
 def lose_power(
     folder: Path, endpoint: Callable[[], str], disk_shim: Path, pairs: int, losses: int, seed: int
 ) -> Losses:
-    """At random moments, half of them around what was done to the checkpoint and to the folder."""
+    """Lose power at random moments, half of them around operations on the checkpoint and the folder."""
     config = write_robot(folder, endpoint, pairs_per_s=400.0)
     log = list(read_log(work(config, disk_shim, pairs)))
     rng = np.random.default_rng(seed)

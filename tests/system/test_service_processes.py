@@ -1,4 +1,4 @@
-"""A real sampler and a real learner under something that listens as systemd does."""
+"""A real sampler and a real learner under a stand-in for systemd."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Systemd:
         self._socket.bind(str(file))
 
     def hear(self, limit_s: float) -> str | None:
-        """What is said next, or None when nothing is in time."""
+        """Return the next notification, or None if none comes in time."""
         self._socket.settimeout(limit_s)
         try:
             said = self._socket.recv(4096).decode()
@@ -57,7 +57,7 @@ class Systemd:
         raise AssertionError(f"{words} was never said, but {self.heard}")
 
     def is_starved(self) -> bool:
-        """Whether the watchdog, which was fed, is not for longer than systemd waits."""
+        """Return True if the watchdog, once fed, is not fed for longer than systemd waits."""
         deadline = time.monotonic() + LIMIT_S
         fed_at = time.monotonic()
         while time.monotonic() < deadline:
@@ -86,13 +86,13 @@ def config(tmp_path: Path, free_endpoint: Callable[[], str]) -> Config:
 def started(
     config: Config, systemd: Systemd, process: str, *wrapper: object
 ) -> contextlib.AbstractContextManager[warm.Child]:
-    """A process of ours under `systemd`, its log beside robot.toml."""
+    """Run a process under `systemd`, with its log beside robot.toml."""
     return running(systemd, log_of(config), *(wrapper or ("-m", "bodyschema")), process, "--robot", config.file)
 
 
 @contextlib.contextmanager
 def running(systemd: Systemd, log_file: Path, *arguments: object) -> Iterator[warm.Child]:
-    """Python with these arguments under `systemd`."""
+    """Run Python with these arguments under `systemd`."""
     environment = os.environ | {"NOTIFY_SOCKET": str(systemd.file), "WATCHDOG_USEC": str(round(1e6 * WATCHDOG_S))}
     with log_file.open("ab") as log:
         child = warm.Child(*arguments, stderr=log, env=environment)

@@ -25,7 +25,7 @@ DESK = Path(__file__).with_name("desk.py")
 
 @dataclass
 class Network:
-    """Hosts on one bridge, which is a namespace too; all are gone with `close`."""
+    """Hosts on one bridge, which is a namespace too; `close` removes all."""
 
     prefix: str
     made: list[str] = field(default_factory=list)
@@ -47,7 +47,7 @@ class Network:
             subprocess.run(["ip", "netns", "delete", name], capture_output=True, check=False)
 
     def on(self, host: str) -> list[str]:
-        """What a command on the host begins with."""
+        """Return the beginning of a command on the host."""
         return ["ip", "netns", "exec", self.prefix + host]
 
     def _host(self, name: str) -> str:
@@ -76,7 +76,7 @@ def network() -> Iterator[Network]:
 
 @pytest.fixture(scope="module")
 def desk(network: Network, tmp_path_factory) -> Iterator[dict[str, Any]]:
-    """What is heard at the desk, while router, sampler and learner run on their hosts."""
+    """Yield what is received at the desk, while router, sampler and learner run on their hosts."""
     pki = carried_out(tmp_path_factory.mktemp("pki"))
     shutil.copy(SEVERAL / "router.toml", pki)
     write_small_arm(pki, (SEVERAL / "viewer.toml").read_text())

@@ -63,7 +63,7 @@ def booted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
 
 @pytest.fixture
 def machine(booted: Machine) -> Iterator[Machine]:
-    """The machine, on which nothing of ours is installed."""
+    """Yield the machine, with nothing of the project installed."""
     yield booted
     booted.run("systemctl", "stop", "bodyschema-*.service", check=False)
     booted.run("sh", "-c", "rm -rf /etc/systemd/system/* /var/lib/bodyschema")

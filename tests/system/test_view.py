@@ -37,7 +37,7 @@ SIZES = {"desktop": {"width": 1280, "height": 900}, "phone": {"width": 360, "hei
 
 
 class PageServer:
-    """`bodyschema view` on a port of its own, which can be ended and started again."""
+    """`bodyschema view` on a port of its own, which can be stopped and restarted."""
 
     def __init__(self, robot: Path, port: str) -> None:
         self._command = [sys.executable, "-m", "bodyschema", "view", "--robot", str(robot), "--port", port]
@@ -45,20 +45,20 @@ class PageServer:
         self.start()
 
     def start(self) -> None:
-        """Return when a browser may ask."""
+        """Start the page's process and wait until a browser may connect."""
         self._process = subprocess.Popen(self._command, stdout=subprocess.PIPE, text=True)
         assert self._process.stdout is not None
         assert self._process.stdout.readline() == f"look at {self.address}\n"
 
     def end(self) -> None:
-        """By SIGTERM, in order, whoever looks."""
+        """End the process by SIGTERM, in order, even with open pages."""
         self._process.terminate()
         assert self._process.wait() == 0
         self._process.communicate()
 
 
 def recorded(config: Config) -> Recording:
-    """A quarter of an hour, with a tool that is 5 cm off."""
+    """Return a recording of a quarter of an hour, with a tool that is 5 cm off."""
     t = np.arange(9_000) / 10.0
     turns, begin = np.random.default_rng(3).uniform([[0.2], [0.0]], [[0.6], [6.0]], (2, 7))
     middle, swing = 0.5 * (config.robot.upper + config.robot.lower), 0.3 * (config.robot.upper - config.robot.lower)
@@ -69,7 +69,7 @@ def recorded(config: Config) -> Recording:
 
 @pytest.fixture(scope="module")
 def robot_file(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Of an upper body whose sampler and learner run."""
+    """Yield the robot.toml of an upper body whose sampler and learner run."""
     scene = prepare(tmp_path_factory.mktemp("view") / "demo", 3)
     file, config = scene.robot_file, Config.load(scene.robot_file, {})
     recorded(config).write_csv(file.with_name("walk.csv"))
@@ -116,7 +116,7 @@ def page(browser, address: str) -> Iterator[Any]:
 
 @contextmanager
 def opened(browser, address: str, size: str = "desktop", scheme: str = "light") -> Iterator[Any]:
-    """The page; whatever the browser complains of, or fetches from elsewhere, is an error."""
+    """Yield the page; any browser complaint or request to elsewhere is an error."""
     context = browser.new_context(viewport=SIZES[size], color_scheme=scheme)
     complaints: list[str] = []
     page = context.new_page()
@@ -135,7 +135,7 @@ def says(page, name: str, text: str) -> None:
 
 
 def child_of(name: str, robot: Path) -> int:
-    """The process of this robot that `bodyschema run` started under this name."""
+    """Return the process of this robot that `bodyschema run` started under this name."""
     for folder in Path("/proc").iterdir():
         try:
             words = (folder / "cmdline").read_bytes().decode().split("\0") if folder.name.isdigit() else []
@@ -233,7 +233,7 @@ def test_nothing_is_wider_than_the_screen_and_all_text_can_be_read(browser, addr
         assert page.evaluate(CONTRASTS) == []
 
 
-# What has less contrast than WCAG 2.2 asks of text, 4.5 to 1: its relative luminance, of what is written on what.
+# Texts with less contrast than the 4.5 to 1 of WCAG 2.2: relative luminance of text and background.
 CONTRASTS = """() => {
   const numbers = (color) => color.match(/[\\d.]+/g).map(Number);
   const light = (color) => {

@@ -1,4 +1,4 @@
-"""The base installation has no extras: all that needs neither simulator nor cameras works without them."""
+"""The base installation has no extras: all functions that need neither simulator nor cameras work without them."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ sys.meta_path[:] = map(Without, sys.meta_path)
 
 @pytest.fixture
 def guarded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder whose sitecustomize keeps every Python that is started from importing the simulator."""
+    """Return a folder whose sitecustomize keeps every Python that is started from importing the simulator."""
     folder = tmp_path / "guard"
     folder.mkdir()
     (folder / "sitecustomize.py").write_text(GUARD)

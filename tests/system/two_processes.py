@@ -1,4 +1,4 @@
-"""A small robot whose sampler plays a recording, its two processes, and what they say."""
+"""A small robot whose sampler plays a recording, its two processes, and their answers."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def write_robot(
     pairs_per_s: float = PAIRS_PER_S,
     state_dir: Path = Path("state"),
 ) -> Config:
-    """A robot whose encoders and camera are the recording of a walk."""
+    """Write a robot whose encoders and camera are the recording of a walk."""
     (folder / "arm.urdf").write_text(URDF)
     robot_file = folder / "robot.toml"
     values = {"state_dir": state_dir, "checkpoint_every_s": CHECKPOINT_EVERY_S}
@@ -87,18 +87,18 @@ def running(
     environment: Mapping[str, str] | None = None,
     prefix: tuple[str, ...] = (),
 ) -> Iterator[Process]:
-    """A process of ours; it is gone after the with statement, if it has not ended before.
+    """Run a process of the project; kill it at the end of the with statement if it still runs.
 
     Args:
         fate: at which point of `killed_at`, and at whose which time, it dies.
-        journal: where the numbers of accepted pairs are written; else beside robot.toml.
+        journal: file for the numbers of accepted pairs; beside robot.toml if None.
         environment: variables beside those of this process.
-        prefix: what the command begins with.
+        prefix: words before the command.
     """
     wrapper, notes = Path(__file__).with_name("killed_at.py"), journal or config.file.with_name("journal")
     words = [wrapper, *fate, notes, process, "--robot", config.file]
     with (config.file.parent / f"{process}.log").open("ab") as log:
-        if environment or prefix:  # they work on what starts
+        if environment or prefix:  # the environment applies to new processes
             command, variables = [*prefix, sys.executable, *words], {**os.environ, **(environment or {})}
             child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=log, env=variables)
         else:
@@ -117,7 +117,7 @@ def ended_well(child: Process) -> bool:
 
 
 def answer(config: Config, process: str, key: str, payload: bytes = b"") -> bytes:
-    """What the process answers, as soon as it does."""
+    """Return the process's answer, as soon as it answers."""
     deadline = time.monotonic() + LIFE_LIMIT_S
     while True:
         try:
@@ -131,7 +131,7 @@ def answer(config: Config, process: str, key: str, payload: bytes = b"") -> byte
 def status_when(
     config: Config, process: str, kind: type[S], true: Callable[[S], bool], limit_s: float = LIFE_LIMIT_S
 ) -> S:
-    """The process's status, as soon as `true` holds for it."""
+    """Return the process's status as soon as `true` holds for it."""
     deadline = time.monotonic() + limit_s
     while not true(status := decode(answer(config, process, KEYS.status(process)), kind)):
         assert time.monotonic() < deadline, status
@@ -140,12 +140,12 @@ def status_when(
 
 
 def learner_with(config: Config, pairs: int, limit_s: float = LIFE_LIMIT_S) -> LearnerStatus:
-    """The learner's status as soon as it has so many pairs."""
+    """Return the learner's status as soon as it has at least `pairs` pairs."""
     return status_when(config, "learner", LearnerStatus, lambda status: status.last_seq >= pairs, limit_s)
 
 
 def sampler_with(config: Config, pairs: int) -> SamplerStatus:
-    """The sampler's status as soon as it has so many pairs."""
+    """Return the sampler's status as soon as it has at least `pairs` pairs."""
     return status_when(config, "sampler", SamplerStatus, lambda status: status.pairs >= pairs)
 
 

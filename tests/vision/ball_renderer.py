@@ -1,4 +1,4 @@
-"""A small ray tracer for one ball before a picture: rays against a sphere, nothing about ellipses.
+"""A small ray tracer for one ball in front of a picture: rays against a sphere, without the geometry of ellipses.
 
 Every sub-pixel sends a ray from the eye through the image plane; where it meets the sphere, the surface is lit
 (ambient, diffuse, specular); elsewhere the picture behind shows. Blur, exposure and noise come after.
@@ -21,7 +21,7 @@ VGA = StereoCalibration(
     image_size_px=(640, 480),
     pixel_sigma=1e-6,
 )
-# The same eyes with a smaller picture: quicker to render.
+# The same cameras with a smaller image: quicker to render.
 SMALL = StereoCalibration(
     focal_px=600.0, principal_point_px=(159.5, 119.5), baseline_m=0.06, image_size_px=(320, 240), pixel_sigma=1e-6
 )
@@ -32,7 +32,7 @@ _INSTANTS = 9
 
 @dataclass(frozen=True)
 class Look:
-    """How a scene is lit and taken; levels are fractions of white.
+    """Lighting and exposure of a scene; levels are fractions of white.
 
     Attributes:
         ball_rgb: reflectance of the ball.
@@ -42,7 +42,7 @@ class Look:
         noise_sd: 1-sigma of each channel [grey levels] in the dark ...
         shot: ... and the variance that each grey level of light adds [grey levels].
         jpeg: quality of the compression that the camera applies, 4:2:0 as most do; None for none.
-        moved_m: how far the ball goes while the shutter is open, (x, y, z) [m]; it is at its place half-way.
+        moved_m: motion of the ball while the shutter is open, (x, y, z) [m]; it is at its place half-way.
         distortion: lens distortion that rectification left over: radial, relative at the image's corner.
         wall: an even grey behind the ball instead of clutter.
     """
@@ -65,12 +65,12 @@ class Look:
 
 
 def backdrop(rng: np.random.Generator, size_px: tuple[int, int], wall: float | None) -> FloatArray:
-    """A picture (height, width, 3) RGB of 0..1: an even wall, or clutter when `wall` is None."""
+    """Return a picture (height, width, 3) RGB of 0..1: an even wall, or clutter when `wall` is None."""
     return clutter(rng, size_px) if wall is None else np.full((size_px[1], size_px[0], 3), wall)
 
 
 def clutter(rng: np.random.Generator, size_px: tuple[int, int]) -> FloatArray:
-    """A picture (height, width, 3) RGB of 0..1: smooth wall, boxes, some of them brown and brick red, and lines."""
+    """Return a picture (height, width, 3) RGB of 0..1: smooth wall, boxes (some brown or brick red) and lines."""
     width, height = size_px
     coarse = rng.uniform(0.25, 0.7, (6, 8, 1)) * np.array([1.0, 0.98, 0.94])
     picture = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
@@ -97,7 +97,7 @@ def render_pair(
     calibration: StereoCalibration,
     t: float = 0.0,
 ) -> StereoFrame:
-    """Both eyes' view of a ball around `x` (3,) [m] in the left optical frame, before the two pictures."""
+    """Render both images of a ball around `x` (3,) [m] in the left optical frame, on the two backgrounds."""
     left, right = (
         take(paint_ball(picture, x_eye, radius_m, look, calibration), look, rng)
         for picture, x_eye in zip(pictures, in_eyes(x, calibration), strict=True)
@@ -106,12 +106,12 @@ def render_pair(
 
 
 def in_eyes(x: FloatArray, calibration: StereoCalibration) -> tuple[FloatArray, FloatArray]:
-    """A point (3,) [m] of the left optical frame, in the left and in the right one."""
+    """Return a point (3,) [m] of the left optical frame in the left frame and in the right one."""
     return x, x - np.array([calibration.baseline_m, 0.0, 0.0])
 
 
 class Room:
-    """Two pictures, photographed once; only a ball's neighbourhood is rendered and taken anew for each frame."""
+    """Two backgrounds, rendered once; only a ball's neighbourhood is rendered again for each frame."""
 
     def __init__(self, calibration: StereoCalibration, look: Look, rng: np.random.Generator) -> None:
         """Draw the pictures and an exposure; `look` says how they are taken."""
@@ -121,7 +121,7 @@ class Room:
         self._images = [take(picture, self._look, rng) for picture in self._pictures]
 
     def photograph(self, x: FloatArray, radius_m: float, t: float) -> StereoFrame:
-        """Both eyes' view of a ball around `x` (3,) [m] in the left optical frame, in a random light."""
+        """Photograph a ball around `x` (3,) [m] in the left optical frame with both cameras, in a random light."""
         look = random_light(self._rng, self._look)
         eyes = zip(self._pictures, self._images, in_eyes(x, self._calibration), strict=True)
         return StereoFrame(t, *(self._eye(*eye, radius_m, look) for eye in eyes))
@@ -140,7 +140,7 @@ class Room:
 def paint_ball(
     picture: FloatArray, x_eye: FloatArray, radius_m: float, look: Look, calibration: StereoCalibration
 ) -> FloatArray:
-    """`picture` with the ball before it; both RGB of 0..1, shape (height, width, 3)."""
+    """Return `picture` with the ball in front; both RGB of 0..1, shape (height, width, 3)."""
     moved = np.array(look.moved_m)
     instants = np.linspace(-0.5, 0.5, _INSTANTS) if moved.any() else np.zeros(1)
     rows, columns = _neighbourhood(x_eye, radius_m, calibration, 2.0 + _reach_px(x_eye, moved, look, calibration))
@@ -159,7 +159,7 @@ def paint_ball(
 
 
 def _reach_px(x_eye: FloatArray, moved: FloatArray, look: Look, calibration: StereoCalibration) -> float:
-    """How far from its undistorted, resting image the ball may show [px]."""
+    """Return the largest distance at which the ball may show from its undistorted, resting image [px]."""
     return float(np.abs(moved).max() * calibration.focal_px / x_eye[2]) + abs(look.distortion) * max(
         calibration.image_size_px
     )
@@ -168,7 +168,7 @@ def _reach_px(x_eye: FloatArray, moved: FloatArray, look: Look, calibration: Ste
 def _neighbourhood(
     x_eye: FloatArray, radius_m: float, calibration: StereoCalibration, margin_px: float
 ) -> tuple[slice, slice]:
-    """Rows and columns of the image that hold the ball and a margin."""
+    """Return rows and columns of the image that contain the ball and a margin."""
     size = np.array(calibration.image_size_px)
     centre = calibration.project(x_eye)[:2]
     reach = 1.3 * calibration.focal_px * radius_m / x_eye[2] + margin_px
@@ -178,7 +178,7 @@ def _neighbourhood(
 
 
 def take(picture: FloatArray, look: Look, rng: np.random.Generator) -> ImageArray:
-    """What the camera makes of a picture: lens blur, exposure, noise of light and sensor, eight bits, JPEG; BGR."""
+    """Expose a picture: lens blur, exposure, shot and sensor noise, eight bits, JPEG; BGR."""
     grey_levels = 255.0 * look.exposure * picture[..., ::-1]
     if look.blur_px > 0:
         grey_levels = cv2.GaussianBlur(grey_levels, (0, 0), look.blur_px)
@@ -197,7 +197,7 @@ def take(picture: FloatArray, look: Look, rng: np.random.Generator) -> ImageArra
 
 
 def random_light(rng: np.random.Generator, look: Look) -> Look:
-    """`look` with a light and gloss of its own."""
+    """Return `look` with a random light and gloss."""
     light = (float(rng.uniform(-1.5, 1.5)), float(rng.uniform(-1.5, 0.3)), -1.0)
     return replace(
         look,

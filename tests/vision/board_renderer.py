@@ -1,10 +1,10 @@
-"""A ray caster for a board seen by two distorting eyes. It shares no code with what it tests.
+"""A ray caster for a board seen by two distorting cameras, which shares no code with the product.
 
 The ray through each pixel's middle is found by inverting the lens with Newton steps, at every fourth pixel, and by a
 cubic spline between (good to 1e-8); where it meets the board's plane, the square or the marker's cell is looked up.
-A pixel that sees something else than its neighbours sends 34 rays from all over it, in an order without rows: rows
-see an edge that lies along them jump by as much as they are apart. No picture is warped or interpolated: edges are
-smooth because a pixel has many rays. Uneven light, lens blur, exposure, noise and JPEG come after.
+A pixel that differs from its neighbours sends 34 rays from all over it, not arranged in rows: rows would make an edge
+along them jump by their spacing. No picture is warped or interpolated: edges are smooth because a pixel has many rays.
+Uneven light, lens blur, exposure, noise and JPEG are added afterwards.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ class TrueLens:
     fisheye: bool = False
 
     def image(self, x: FloatArray) -> FloatArray:
-        """Image coordinates (n, 2) of points (n, 3) in the eye's frame."""
+        """Return image coordinates (n, 2) of points (n, 3) in the camera's frame."""
         a, b = x[:, 0] / x[:, 2], x[:, 1] / x[:, 2]
         distorted = self._equidistant(a, b) if self.fisheye else self._radial_tangential(a, b)
         return np.column_stack(distorted) * self.focal_px + self.principal_point_px
 
     def rays(self, px: FloatArray) -> FloatArray:
-        """Directions (n, 2) with z = 1, by Newton's method: on the angle of a fisheye lens, else on `image`."""
+        """Return directions (n, 2) with z = 1, by Newton's method: on the angle of a fisheye lens, else on `image`."""
         goal = px
         at = (px - self.principal_point_px) / np.array(self.focal_px)
         if self.fisheye:
@@ -60,7 +60,7 @@ class TrueLens:
         return at
 
     def _angle(self, bent: FloatArray) -> FloatArray:
-        """The angle off the axis whose image is at this distance from the centre, in focal lengths."""
+        """Return the angle off the axis that is imaged at this distance from the centre, in focal lengths."""
         k = np.array(self.distortion)
         t = bent
         for _ in range(12):
@@ -87,7 +87,7 @@ class TrueLens:
 
 @dataclass(frozen=True)
 class TrueRig:
-    """Two eyes; a point of the left eye's frame is at R x + t in the right one's."""
+    """Two cameras; a point x of the left camera's frame is at R x + t in the right one's."""
 
     left: TrueLens
     right: TrueLens
@@ -102,7 +102,7 @@ class TrueRig:
 
 @dataclass(frozen=True)
 class Printed:
-    """A board as it lies on the table.
+    """A printed board on the table.
 
     Attributes:
         columns, rows: squares.
@@ -145,7 +145,7 @@ class Printed:
 
 @dataclass(frozen=True)
 class Taken:
-    """How an image is taken; levels are those of an 8-bit image."""
+    """Exposure of an image; levels are those of an 8-bit image."""
 
     blur_px: float = 0.7
     motion_px: float = 0.0
@@ -159,7 +159,7 @@ class Taken:
 
 @dataclass
 class Photographer:
-    """Takes stereo images of a board; remembers the rays of each eye."""
+    """Photographer of stereo images of a board, which caches the rays of each camera."""
 
     rig: TrueRig
     board: Printed
@@ -168,17 +168,17 @@ class Photographer:
     _rays: dict[int, FloatArray] = field(default_factory=dict)
 
     def pair(self, R: FloatArray, t_m: FloatArray, time: float = 0.0) -> StereoFrame:
-        """Both eyes' images of the board at a pose in the left eye's frame (R board -> eye, t its origin)."""
+        """Return both images of the board at a pose in the left camera's frame (R board -> camera, t its origin)."""
         left = self.left(R, t_m)
         right = self._image(1, self.rig.right, self.rig.R @ R, self.rig.R @ t_m + self.rig.t_m)
         return StereoFrame(time, left, right)
 
     def left(self, R: FloatArray, t_m: FloatArray) -> ImageArray:
-        """The left eye's image alone."""
+        """Return the left image alone."""
         return self._image(0, self.rig.left, R, t_m)
 
     def corners(self, R: FloatArray, t_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Where the board's inner corners are in both eyes' images, in exact arithmetic, shape (n, 2) each [px]."""
+        """Return the exact image positions of the board's inner corners in both cameras, shape (n, 2) each [px]."""
         c, r = np.meshgrid(np.arange(1, self.board.columns), np.arange(1, self.board.rows))
         x = self.board.square_m * np.column_stack([c.ravel(), r.ravel(), np.zeros(c.size)]) @ R.T + t_m
         return self.rig.left.image(x), self.rig.right.image(x @ self.rig.R.T + self.rig.t_m)
@@ -199,7 +199,7 @@ class Photographer:
         return self._photograph(picture)
 
     def _met(self, rays: FloatArray, M: FloatArray) -> FloatArray:
-        """What rays (n, 2) meet."""
+        """Return the grey levels where rays (n, 2) meet the board."""
         x, y, w = (rays[:, 0] * M[k, 0] + rays[:, 1] * M[k, 1] + M[k, 2] for k in range(3))
         with np.errstate(divide="ignore", invalid="ignore"):
             return self._levels(x / w, y / w, w > 0)
@@ -243,7 +243,7 @@ class Photographer:
 
 
 def _difference(field: FloatArray, v: FloatArray, u: FloatArray, axis: int) -> FloatArray:
-    """By how much the rays at rows v and columns u change from one place to the next along an axis, shape (n, 2)."""
+    """Return the change of the rays at rows v and columns u from one place to the next along an axis, shape (n, 2)."""
     at = (v, u)[axis]
     low, high = np.maximum(at - 1, 0), np.minimum(at + 1, field.shape[axis] - 1)
     ends = [field[each, u] if axis == 0 else field[v, each] for each in (low, high)]
@@ -251,7 +251,7 @@ def _difference(field: FloatArray, v: FloatArray, u: FloatArray, axis: int) -> F
 
 
 def ray_field(lens: TrueLens, u: FloatArray, v: FloatArray) -> FloatArray:
-    """Directions of the rays through all columns u and rows v, shape (len(v), len(u), 2)."""
+    """Return directions of the rays through all columns u and rows v, shape (len(v), len(u), 2)."""
     nodes_u, nodes_v = (np.arange(axis[0] - 8, axis[-1] + 9, 4.0) for axis in (u, v))
     grid = np.stack(np.meshgrid(nodes_u, nodes_v), axis=-1)
     known = lens.rays(grid.reshape(-1, 2)).reshape(grid.shape)
@@ -260,7 +260,7 @@ def ray_field(lens: TrueLens, u: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def webcams(rng: np.random.Generator, *, fisheye: bool = False, size_px: tuple[int, int] = (640, 480)) -> TrueRig:
-    """Two webcams on a bar, mounted by hand: toed in or out, a little rolled."""
+    """Return two webcams on a bar, mounted by hand: toed in or out, a little rolled."""
     width, height = size_px
 
     def lens() -> TrueLens:
@@ -282,7 +282,7 @@ def webcams(rng: np.random.Generator, *, fisheye: bool = False, size_px: tuple[i
 def poses(
     rng: np.random.Generator, rig: TrueRig, board: Printed, count: int = 20
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Poses as a careful person shows the board: all over both images, tilted each way, near and far."""
+    """Return poses of a board shown with care: all over both images, tilted each way, near and far."""
     found: list[tuple[FloatArray, FloatArray]] = []
     width, height = rig.size_px
     middle = 0.5 * board.square_m * np.array([board.columns, board.rows, 0.0])
@@ -294,7 +294,7 @@ def poses(
             "z", rng.normal(0, 0.3)
         )
         share = rng.uniform(0.35, 0.75)
-        nearest = 2.0 * rig.baseline_m  # below that the eyes hardly share a view
+        nearest = 2.0 * rig.baseline_m  # below that the cameras hardly share a view
         z = max(rig.left.focal_px[0] * board.square_m * board.columns / (share * width), nearest)
         cell = np.array([wanted % 3, wanted // 3 % 3])
         at = (cell + rng.uniform(0.1, 0.9, 2)) / 3 * (0.5 + 0.5 * (1 - share)) + 0.25 * share
@@ -313,7 +313,7 @@ def poses(
 
 
 def _seen(rig: TrueRig, board: Printed, R: FloatArray, t_m: FloatArray) -> float:
-    """Share of the board's corners in the image that shows fewer of them."""
+    """Return the share of the board's corners in the image that shows fewer of them."""
     c, r = np.meshgrid(np.arange(1, board.columns), np.arange(1, board.rows))
     x = board.square_m * np.column_stack([c.ravel(), r.ravel(), np.zeros(c.size)]) @ R.T + t_m
     eyes = rig.left.image(x), rig.right.image(x @ rig.R.T + rig.t_m)

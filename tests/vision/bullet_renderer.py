@@ -13,7 +13,7 @@ from bodyschema.interfaces.records import FloatArray, ImageArray, StereoFrame
 NEAR_M, FAR_M = 0.05, 5.0
 BROWN, BRICK = (0.45, 0.28, 0.18, 1.0), (0.55, 0.22, 0.16, 1.0)
 GREY, BLUE, DARK = (0.75, 0.75, 0.78, 1.0), (0.2, 0.3, 0.6, 1.0), (0.12, 0.12, 0.13, 1.0)
-# Optical frame (x right, y down, z forward) to the renderer's eye frame (x right, y up, z backward), column-major.
+# Optical frame (x right, y down, z forward) to the renderer's frame (x right, y up, z backward), column-major.
 VIEW = (1, 0, 0, 0, 0, -1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1)
 
 
@@ -48,7 +48,7 @@ class BulletScene:
     def render(
         self, x: FloatArray, light: FloatArray, noise_sd: float, rng: np.random.Generator, t: float = 0.0
     ) -> StereoFrame:
-        """Both eyes' view with the ball at `x` (3,) [m], lit from the direction `light` (3,)."""
+        """Render both images with the ball at `x` (3,) [m], lit from the direction `light` (3,)."""
         self._place(self._ball, x)
         left, right = (self._eye(shift, light) for shift in (0.0, self.calibration.baseline_m))
         return StereoFrame(t, *(_noisy(image, noise_sd, rng) for image in (left, right)))
@@ -87,7 +87,7 @@ class BulletScene:
         return rgb[..., ::-1].astype(np.uint8)
 
     def _projection(self) -> list[float]:
-        """Frustum in which pixel centres have integer image coordinates.
+        """Return a frustum in which pixel centres have integer image coordinates.
 
         TinyRenderer samples column i at its left edge and row j at its lower edge, so the frustum is shifted by half
         a (sub)pixel to either side.

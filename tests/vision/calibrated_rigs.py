@@ -1,4 +1,4 @@
-"""Rigs drawn at random, calibrated from rendered images, beside what they are."""
+"""Random rigs, calibrated from rendered images and compared with the ground truth."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Figures:
 
 
 def places(rig: TrueRig) -> FloatArray:
-    """Points (n, 3) in the left eye's frame all over the plane 0.6 m ahead, as far as both eyes see it."""
+    """Return points (n, 3) in the left camera's frame on the plane 0.6 m ahead, as far as both cameras see it."""
     grid = np.stack(np.meshgrid(np.linspace(-0.3, 0.4, 15), np.linspace(-0.25, 0.25, 11)), axis=-1).reshape(-1, 2)
     x = np.column_stack([grid, np.full(len(grid), DISTANCE_M)])
     eyes = rig.left.image(x), rig.right.image(x @ rig.R.T + rig.t_m)
@@ -45,7 +45,7 @@ def places(rig: TrueRig) -> FloatArray:
 
 
 def aligned(x: FloatArray, to: FloatArray) -> FloatArray:
-    """`x` moved as a rigid body to where it is nearest to `to`."""
+    """Return `x` moved as a rigid body to the best fit to `to`."""
     turn, _ = Rotation.align_vectors(to - to.mean(axis=0), x - x.mean(axis=0))
     return turn.apply(x - x.mean(axis=0)) + to.mean(axis=0)
 
@@ -75,7 +75,7 @@ def figures(truth: TrueRig, found: Calibrated) -> Figures:
 
 
 def calibrated_rig(seed: int, *, fisheye: bool, model: ModelChoice = "auto") -> Figures | str:
-    """The figures of a rig drawn at random, or why its calibration was refused."""
+    """Return the figures of a random rig, or the reason why its calibration was refused."""
     rng = np.random.default_rng(seed)
     truth = webcams(rng, fisheye=fisheye)
     photographer = Photographer(truth, Printed(), Taken(), rng)

@@ -17,10 +17,10 @@ _BITS = 4
 def paint_fingers(
     picture: FloatArray, x_eye: FloatArray, radius_m: float, turn: float, reach: float, calibration: StereoCalibration
 ) -> FloatArray:
-    """`picture` (RGB of 0..1) with three fingers that come from the direction `turn` [rad].
+    """Paint three fingers on `picture` (RGB of 0..1) that come from the direction `turn` [rad].
 
     Args:
-        reach: where their tips end, in radii from the ball's centre: above 1 they stay clear of it.
+        reach: distance of their tips from the ball's centre, in radii: above 1 they stay clear of it.
     """
     painted = picture.astype(np.float64, copy=True)
     centre = calibration.project(x_eye)[:2]

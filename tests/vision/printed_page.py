@@ -1,4 +1,4 @@
-"""Pages as their files have them, read back from the files' own numbers."""
+"""Printed pages, read back from the numbers in their files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PX_A_MM = 4
 
 
 def from_pdf(data: bytes) -> tuple[tuple[float, float], FloatArray]:
-    """The sheet and its black rectangles (x, y, width, height) from its upper left corner [mm]."""
+    """Return the sheet and its black rectangles (x, y, width, height) from its upper left corner [mm]."""
     mm = 25.4 / 72
     text = data.decode("latin-1")
     box = re.search(r"MediaBox\[0 0 ([\d.]+) ([\d.]+)\]", text)
@@ -34,7 +34,7 @@ def from_svg(data: bytes) -> tuple[tuple[float, float], FloatArray]:
 
 
 def rasterised(sheet: tuple[float, float], black: FloatArray) -> ImageArray:
-    """The page as an image, at `PX_A_MM`; pixel k covers k to k + 1."""
+    """Return the page as an image, at `PX_A_MM`; pixel k covers k to k + 1."""
     image = np.full((round(sheet[1] * PX_A_MM), round(sheet[0] * PX_A_MM)), 255, np.uint8)
     for x, y, w, h in black * PX_A_MM:
         image[round(y) : round(y + h), round(x) : round(x + w)] = 0

@@ -1,4 +1,4 @@
-"""Balls at random places in random light, and what a tracker makes of them."""
+"""Balls at random places in random light, and the errors of a tracker."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Ball:
 
 @dataclass(frozen=True)
 class Slab:
-    """A grey board that faces the eyes: corners (x, y) and depth z [m] in the left optical frame."""
+    """A grey board that faces the cameras: corners (x, y) and depth z [m] in the left optical frame."""
 
     low: tuple[float, float]
     high: tuple[float, float]
@@ -42,7 +42,7 @@ def stage(
     t: float = 0.0,
     seed: int = 0,
 ) -> StereoFrame:
-    """Both eyes' view of `things`, the farthest first, before a grey wall."""
+    """Render both images of `things`, the farthest first, on a grey wall."""
     rng = np.random.default_rng(seed)
     width, height = calibration.image_size_px
     images = []
@@ -60,12 +60,12 @@ def stage(
 
 
 def reason(answer: MarkerFix | MarkerMiss | None) -> Reason | None:
-    """Why there is no fix; None when there is one."""
+    """Return the reason of a missing fix; None if there is a fix."""
     return answer.reason if isinstance(answer, MarkerMiss) else None
 
 
 def sigmas_off(answer: MarkerFix | MarkerMiss, ball: Ball) -> float:
-    """How far a fix is from the ball in the metric of its own covariance; infinite for a miss."""
+    """Return the distance of a fix from the ball in the metric of its own covariance; infinite for a miss."""
     if isinstance(answer, MarkerMiss):
         return np.inf
     error = answer.x - np.array(ball.x)
@@ -84,7 +84,7 @@ class Errors:
 
     Attributes:
         x: errors (n, 3) [m].
-        sigma: claimed 1-sigma (n, 3) [m].
+        sigma: stated 1-sigma (n, 3) [m].
         centres_px: errors of (ul, vl, ur, vr), shape (n, 4) [px].
         misses: reasons of the frames without a fix.
     """
@@ -95,12 +95,12 @@ class Errors:
     misses: tuple[Reason, ...]
 
     def covered(self, sigmas: float = 1.0) -> FloatArray:
-        """Share of errors within so many claimed sigmas, per axis (3,)."""
+        """Return the share of errors within this multiple of the stated sigma, per axis (3,)."""
         return np.mean(np.abs(self.x) < sigmas * self.sigma, axis=0)
 
 
 def place(calibration: StereoCalibration, radius_px: float, rng: np.random.Generator) -> FloatArray:
-    """A random point (3,) [m] where a ball of RADIUS_M has about this radius and is well inside both images."""
+    """Return a random point (3,) [m] where a ball of RADIUS_M has about this radius and is well inside both images."""
     z = calibration.focal_px * RADIUS_M / radius_px
     disparity = calibration.focal_px * calibration.baseline_m / z
     width, height = calibration.image_size_px
@@ -113,7 +113,7 @@ def place(calibration: StereoCalibration, radius_px: float, rng: np.random.Gener
 def measure_errors(
     calibration: StereoCalibration, look: Look, frames: int, seed: int, radii_px: tuple[float, float] = (5.0, 30.0)
 ) -> Errors:
-    """Track `frames` unrelated frames: every place, size and light is drawn anew, rooms and exposures change."""
+    """Track `frames` unrelated frames: position, size and light are random in each, rooms and exposures change."""
     rng = np.random.default_rng(seed)
     rooms = [Room(calibration, look, rng) for _ in range(min(frames, max(16, frames // 8)))]
     tracker = StereoTracker(calibration)
@@ -126,7 +126,7 @@ def measure_errors(
 
 
 def compare(answers: Sequence[tuple[FloatArray, MarkerFix | MarkerMiss]], calibration: StereoCalibration) -> Errors:
-    """True places (3,) [m] and what the tracker said to each."""
+    """Return the errors of the tracker's answers against true positions (3,) [m]."""
     fixes = [(x, answer) for x, answer in answers if isinstance(answer, MarkerFix)]
     true = np.array([x for x, _ in fixes])
     return Errors(

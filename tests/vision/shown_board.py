@@ -1,4 +1,4 @@
-"""Views of a board with exact truth: rendered, or its corners alone, which is quick."""
+"""Views of a board with ground truth: rendered images, or the corners alone, which is quick."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ NOISE_PX = 0.04
 
 
 def true_vector(rig: TrueRig) -> FloatArray:
-    """The rig's parameters in the order of `StereoRig.vector`."""
+    """Return the rig's parameters in the order of `StereoRig.vector`."""
     lenses = ([*lens.focal_px, *lens.principal_point_px, *lens.distortion] for lens in (rig.left, rig.right))
     return np.concatenate([*lenses, Rotation.from_matrix(rig.R).as_rotvec(), rig.t_m])
 
 
 def known_rig(rig: TrueRig, serials: tuple[str, str] = ("A1", "B2")) -> StereoRig:
-    """The true rig as a calibration that is all but certain."""
+    """Return the true rig as a calibration with negligible uncertainty."""
     model: Model = "fisheye" if rig.left.fisheye else "pinhole"
     n = len(parameter_names(model))
     made = Made("2026-01-01T00:00:00Z", BOARD.name, 20, 0, 0.03, 0.03, 0.0)
@@ -37,7 +37,7 @@ def known_rig(rig: TrueRig, serials: tuple[str, str] = ("A1", "B2")) -> StereoRi
 
 
 def corner_views(rig: TrueRig, rng: np.random.Generator, count: int = 20, noise_px: float = NOISE_PX) -> list[View]:
-    """Views whose corners are the exact ones and noise."""
+    """Return views with the exact corners plus noise."""
     photographer = Photographer(rig, Printed(), Taken(), rng)
     return [
         view_of(f"{k:02d}", photographer, pose, rng, noise_px)
@@ -52,7 +52,7 @@ def view_of(
     rng: np.random.Generator,
     noise_px: float = NOISE_PX,
 ) -> View:
-    """The exact corners of a pose that are in the images, with noise."""
+    """Return the exact corners of a pose that are in the images, with noise."""
     eyes = []
     for px in photographer.corners(*pose):
         inside = ((px > 2) & (px < np.array(photographer.rig.size_px) - 3)).all(axis=1)
@@ -64,7 +64,7 @@ def view_of(
 def photographed(
     seed: int = 7, count: int = 12
 ) -> tuple[TrueRig, tuple[ImagePair, ...], tuple[tuple[FloatArray, FloatArray], ...]]:
-    """A rig, its images of the board, and the board's poses in them."""
+    """Return a rig, its images of the board, and the board's poses in them."""
     rng = np.random.default_rng(seed)
     rig = webcams(rng)
     photographer = Photographer(rig, Printed(), Taken(), rng)
@@ -74,7 +74,7 @@ def photographed(
 
 
 def shot(number: int, t: float | None = None) -> StereoFrame:
-    """Images that show nothing but which one they are: `KnownCorners` tells what would be seen in them."""
+    """Return images that show only their own number: `KnownCorners` knows the corners in them."""
     marked = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
     marked[0, 0, :2] = divmod(number, 256)
     right = marked.copy()
@@ -83,7 +83,7 @@ def shot(number: int, t: float | None = None) -> StereoFrame:
 
 
 class KnownCorners:
-    """A detector of what views have, by the numbers of `shot`."""
+    """A detector that returns known corners, by the numbers of `shot`."""
 
     def __init__(self, views: Sequence[View]) -> None:
         self._views = views
@@ -95,7 +95,7 @@ class KnownCorners:
 
 
 class Eyes:
-    """Cameras that give the frames they were made with."""
+    """Cameras that return given frames."""
 
     def __init__(self, frames: list[StereoFrame], serials: tuple[str, str] = ("A1", "B2")) -> None:
         self.frames, self.serials = iter(frames), serials

@@ -20,7 +20,7 @@ BLACK, WHITE = 0.07, 0.85
 
 
 def pattern(id: int, dictionary: int = cv2.aruco.DICT_APRILTAG_36h11) -> np.ndarray:
-    """A tag's 8 by 8 squares (rows from the top), True where it is black."""
+    """Return a tag's 8 by 8 squares (rows from the top), True where it is black."""
     found = cv2.aruco.getPredefinedDictionary(dictionary)
     return cv2.aruco.generateImageMarker(found, id, 8, borderBits=1) < 128
 
@@ -67,7 +67,7 @@ def photograph(
     t: float = 0.0,
     pictures: Sequence[FloatArray] | None = None,
 ) -> StereoFrame:
-    """Both eyes' view of sheets before clutter, or before an even wall where the look has one."""
+    """Photograph sheets with both cameras on clutter, or on an even wall if the look has one."""
     behind = pictures or [backdrop(rng, calibration.image_size_px, look.wall) for _ in range(2)]
     images = []
     for eye, picture in enumerate(behind):
@@ -110,7 +110,7 @@ def _painted(
 
 
 def _window(things: Sequence[Sheet | Card], eye: FloatArray, calibration: StereoCalibration) -> tuple[slice, slice]:
-    """Rows and columns that hold all of the things."""
+    """Return rows and columns that contain all of the things."""
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for thing in things:
         x = thing.x - eye

@@ -39,7 +39,7 @@ def joined(kinds: Iterable[Errors]) -> Errors:
 
 
 def report(name: str, found: Errors) -> None:
-    """One row of the table in docs/vision.md; shown by `pytest -s`."""
+    """Print one row of the table in docs/vision.md; shown by `pytest -s`."""
     ones, twos = (" ".join(f"{100 * share:.0f}" for share in found.covered(sigmas)) for sigmas in (1.0, 2.0))
     median_px = np.median(np.abs(found.centres_px))
     missed = 100 * len(found.misses) / (len(found.x) + len(found.misses))
@@ -90,7 +90,7 @@ def test_a_bar_behind_the_ball_along_its_limb_hardly_pulls_its_centre():
         fix = StereoTracker(SMALL).track(frame)
         assert isinstance(fix, MarkerFix)
         off_px.append(fix.centres_px[0] - u)
-    # 0.07 px where all rays that tell an edge are believed alike.
+    # 0.07 px if all rays that show an edge have the same weight.
     assert abs(np.mean(off_px)) < 0.05, off_px
 
 

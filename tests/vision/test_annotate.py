@@ -1,4 +1,4 @@
-"""What is drawn into the images is what the tracker looks for."""
+"""Annotations in the images agree with the marker that the tracker looks for."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ AT = (160, 120)
 
 
 def disc(bgr: tuple[int, int, int]) -> np.ndarray:
-    """A disc of this colour before dark grey, softened as a lens does it."""
+    """Return a disc of this colour on dark grey, blurred as by a lens."""
     image = np.full((240, 320, 3), 40, dtype=np.uint8)
     cv2.circle(image, AT, 20, bgr, -1, cv2.LINE_AA)
     return cv2.GaussianBlur(image, (0, 0), 0.7)
@@ -54,7 +54,7 @@ FACING = np.diag([1.0, -1.0, -1.0])
 
 
 def shown(ids: tuple[int, ...], wanted: int) -> tuple[np.ndarray, MarkerFix | None]:
-    """The left half of the picture of tags side by side of which one is looked for, and the fix."""
+    """Return the left half of the picture of tags side by side, one of which is wanted, and the fix."""
     tags = [Sheet(id, FACING, np.array([0.06 * k - 0.02, 0.0, 0.5]), 0.04) for k, id in enumerate(ids)]
     frame = photograph(tags, SMALL, Look(wall=0.4, samples=2), np.random.default_rng(0))
     config = VisionConfig(marker="tag", tag=TagConfig(id=wanted, side_m=0.04))

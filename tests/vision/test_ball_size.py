@@ -1,4 +1,4 @@
-"""The ball's size, learnt while it is followed."""
+"""The ball's size, learned during tracking."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FRAME_S = 1 / 30
 
 
 def located(smaller: float = 0.0, pulled_px: float = 0.0, radius_m: float = RADIUS_M) -> Location:
-    """A ball whose discs both seem smaller by this share and are pulled to the right by so much."""
+    """Return the location of a ball whose discs are both smaller by this share and shifted right by `pulled_px`."""
     eye = Pinhole(SMALL.focal_px, SMALL.principal_point_px)
     discs = []
     for x_eye in in_eyes(X, SMALL):

@@ -1,4 +1,4 @@
-"""The board's page, and finding a board in images."""
+"""The board's printed page, and board detection in images."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_a_board_that_there_is_not_is_refused(wrong, said) -> None:
 
 
 def shown(taken: Taken, printed: Printed | None = None, turned: float = 0.2) -> tuple[ImageArray, FloatArray]:
-    """The left eye's image of a board about half a metre away, and where its corners are."""
+    """Return the left image of a board about half a metre away, and the positions of its corners."""
     rng = np.random.default_rng(3)
     rig = webcams(rng)
     photographer = Photographer(rig, printed or Printed(), taken, rng)

@@ -1,4 +1,4 @@
-"""Two cameras' calibration against planted ones, and what it refuses."""
+"""Stereo calibration against planted cameras, and its refusals."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def planted() -> tuple:
     return rig, corner_views(rig, rng)
 
 
-# --- what is found
+# --- results
 
 
 def test_rendered_images_give_the_planted_rig() -> None:
@@ -151,7 +151,7 @@ def test_a_board_of_unsure_size_makes_the_baseline_as_unsure(planted) -> None:
     assert unsure.baseline_sigma_m == pytest.approx(expected, rel=1e-6)
 
 
-# --- what is refused, and how it is named
+# --- refusals and their reasons
 
 
 def test_swapped_cameras_are_named(planted) -> None:

@@ -1,4 +1,4 @@
-"""What cameras are configured as, how their images are dated and paired, files in their place."""
+"""Configuration of cameras, time stamps and pairing of their images, and files used as cameras."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PIXEL = np.zeros((1, 1, 3), np.uint8)
 
 
 class HandClock:
-    """Shows what it is set to; sleeping sets it."""
+    """A clock that a test sets; sleeping moves it."""
 
     def __init__(self) -> None:
         self.t = 100.0

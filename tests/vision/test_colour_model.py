@@ -87,7 +87,7 @@ def test_a_file_that_is_no_image_is_named(tmp_path):
 
 
 def test_the_band_follows_light_that_grows_warm():
-    # At the end the ball's hue is 24° from where the band began, whose half-width is 20°.
+    # At the end the ball's hue is 24° from the band's initial centre, whose half-width is 20°.
     tracker = StereoTracker(SMALL, VisionConfig(colour=HueBand(120.0, half_width_deg=30.0)))
     hues = np.linspace(120.0, 82.0, 75)
     fixes = [tracker.track(stage(ball(float(hue)), t=n / 30, seed=n)) for n, hue in enumerate(hues)]
@@ -115,5 +115,5 @@ def test_a_bright_ball_is_found_by_its_brightness_over_exposed_or_not(exposure):
     frame = stage(white, Slab((-1, -1), (1, 1), 0.8, rgb=(0.2, 0.2, 0.2)), white, look=look)
     fix = StereoTracker(SMALL, VisionConfig(marker="bright_ball")).track(frame)
     assert isinstance(fix, MarkerFix)
-    # Where pixels are over-exposed the claim does not cover what is cut off: a sixth of a pixel here.
+    # In over-exposed pixels the stated uncertainty does not cover the clipping: a sixth of a pixel here.
     assert np.abs(fix.x - np.array(white.x))[:2].max() < 4e-4

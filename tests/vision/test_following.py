@@ -23,7 +23,7 @@ def tracker_that_saw(ball: Ball, t: float = 0.0) -> StereoTracker:
 
 
 def walk(frames: int) -> list[Ball]:
-    """A ball that goes to and fro at up to 0.6 m/s, 14 px a frame."""
+    """Return a ball that moves to and fro at up to 0.6 m/s, 14 px per frame."""
     phase = 2 * np.pi * np.arange(frames) / 20
     return [Ball((0.05 + 0.06 * np.sin(p), 0.06 * np.cos(p), 0.8 + 0.1 * np.sin(2 * p))) for p in phase.tolist()]
 
@@ -163,7 +163,7 @@ def test_a_followed_ball_stays_the_marker_though_another_one_was_in_view_beside_
 
 
 class Camera:
-    """Gives the frames it was given, one a read."""
+    """A camera that returns given frames, one per read."""
 
     calibration = SMALL
 

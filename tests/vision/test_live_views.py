@@ -1,4 +1,4 @@
-"""Views taken by themselves from cameras that send images now."""
+"""Views taken automatically from live cameras."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def outcomes(shown: list[View]) -> tuple[LiveViews, list[Outcome]]:
 
 
 def moved(view: View, px: float) -> View:
-    """The board somewhat further to the right."""
+    """Return the view with the board further to the right."""
     left, right = (
         replace(corners, px=corners.px + np.array([px, 0.0])) for corners in (view.left, view.right) if corners
     )
@@ -50,7 +50,7 @@ def test_a_board_that_only_tilts_is_a_new_view() -> None:
 
 
 def tilted_in_place(degrees: float) -> View:
-    """The board in the middle of both images, its middle where it is whatever the tilt."""
+    """Return the board in the middle of both images, its centre fixed for any tilt."""
     x = BOARD.corners_m - BOARD.corners_m.mean(axis=0)
     turn = np.radians(degrees)
     x = np.stack([x[:, 0] * np.cos(turn), x[:, 1], 0.6 + x[:, 0] * np.sin(turn)], axis=1)

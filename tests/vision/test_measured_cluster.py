@@ -1,4 +1,4 @@
-"""Where tags are on a cluster, measured from images that show several at once."""
+"""Positions of tags on a cluster, measured from images that show several at once."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Places = dict[int, tuple[FloatArray, FloatArray]]
 
 
 def built(rng: np.random.Generator) -> Places:
-    """A cube of tags that were glued on by hand: each turned and shifted by a little, the first one too."""
+    """Return a cube of tags glued on by hand: each turned and shifted slightly, including the first."""
     faces = [np.eye(3), *(Rotation.from_euler("xyz", turn, degrees=True).as_matrix() for turn in TURNS)]
     turned = [face @ Rotation.from_rotvec(rng.normal(0.0, 0.03, 3)).as_matrix() for face in faces]
     places = [0.03 * face[:, 2] + rng.normal(0, 1e-3, 3) for face in faces]
@@ -47,7 +47,7 @@ TURNS = ([0, 90, 0], [0, -90, 0], [90, 0, 0], [-90, 0, 0])
 
 
 def poses(rng: np.random.Generator, count: int) -> list[tuple[FloatArray, FloatArray]]:
-    """The cluster turned by 35° to 65° to all sides in turn, about 0.5 m ahead."""
+    """Return poses of the cluster turned by 35° to 65° to all sides in turn, about 0.5 m ahead."""
     ways = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False) + 0.4
     turns = [rng.uniform(0.6, 1.1) * np.array([np.cos(way), np.sin(way), 0.0]) for way in ways]
     facing = np.diag([1.0, -1.0, -1.0])
@@ -58,7 +58,7 @@ def poses(rng: np.random.Generator, count: int) -> list[tuple[FloatArray, FloatA
 def looked(
     places: Places, rng: np.random.Generator, count: int = 20, sides_m: Mapping[int, float] | None = None
 ) -> list[ClusterView]:
-    """Exact corners and noise, of the tags that face an eye by 70° or less; some may have sides of their own [m]."""
+    """Return noisy corners of the tags that face a camera by 70° or less; some may have sides of their own [m]."""
     views = []
     for k, (turn, x) in enumerate(poses(rng, count)):
         eyes = []
@@ -78,7 +78,7 @@ def looked(
 
 
 def errors(found: MeasuredCluster, places: Places) -> tuple[FloatArray, FloatArray]:
-    """Of place [m] and turn [rad] of each tag but the first, in the first one's frame, (n, 3) each."""
+    """Return errors of position [m] and turn [rad] of all tags but the first, in the first one's frame, (n, 3) each."""
     first = min(places)
     R, x = places[first]
     off, turns = [], []
@@ -152,7 +152,7 @@ def test_a_tag_that_moved_in_one_view_is_left_out_and_named() -> None:
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 2))])
 def test_a_number_that_is_there_twice_is_no_rigid_body_and_named(seed: int) -> None:
-    """On opposite faces, so that no image shows both."""
+    """Check duplicate numbers on opposite faces, so that no image shows both."""
     rng = np.random.default_rng(seed)
     places = built(rng)
     views = [renumbered(view, {4: 7}) for view in looked({id: places[id] for id in (3, 4, 7, 8)}, rng)]
@@ -161,7 +161,7 @@ def test_a_number_that_is_there_twice_is_no_rigid_body_and_named(seed: int) -> N
 
 
 def renumbered(view: ClusterView, numbers: Mapping[int, int]) -> ClusterView:
-    """With other numbers of some tags; where both are seen, neither is."""
+    """Return the cluster with other numbers of some tags; if both are seen, neither is."""
 
     def eye(tags: Mapping[int, TagImage]) -> dict[int, TagImage]:
         both = {new for old, new in numbers.items() if old in tags and new in tags}

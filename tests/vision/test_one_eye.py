@@ -1,4 +1,4 @@
-"""One camera alone: the marker's pose from one image, and what that leaves open."""
+"""One camera alone: the marker's pose from one image, and its ambiguity."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def at(rotation: FloatArray, x: ArrayLike, id: int = 0) -> Sheet:
 
 
 def turned_off(fix: MarkerFix, rotation: FloatArray) -> FloatArray:
-    """By how much the fix is turned from the truth (3,) [rad]."""
+    """Return the rotation error of the fix (3,) [rad]."""
     assert fix.R is not None
     return (Rotation.from_quat(fix.R) * Rotation.from_matrix(rotation).inv()).as_rotvec()
 
@@ -78,7 +78,7 @@ def test_depth_is_claimed_to_be_several_times_less_sure_than_what_is_across() ->
 
 
 def film_of_a_small_tag_that_turns_to_the_camera() -> tuple[FloatArray, list[StereoFrame]]:
-    """How it is turned in the end, and the frames."""
+    """Return the final orientation of a small tag that turns to the camera, and the frames."""
     turns = [tilted(float(degrees)) for degrees in np.linspace(25.0, 7.0, 10)]
     frames = [seen(at(turn, [0.0, 0.0, 0.65]), t=0.03 * k, noise=10.0, seed=k) for k, turn in enumerate(turns)]
     return turns[-1], frames
@@ -144,7 +144,7 @@ def test_no_ball_is_none() -> None:
 
 @pytest.fixture(scope="module")
 def calibrated() -> tuple[TrueRig, Calibrated]:
-    """One camera of a pair drawn at random, and its calibration of 20 views."""
+    """Return one camera of a random pair, and its calibration from 20 views."""
     rng = np.random.default_rng(31)
     rig = webcams(rng)
     views = [replace(view, right=None) for view in corner_views(rig, rng)]

@@ -1,4 +1,4 @@
-"""Tags as they are printed, cut out and folded are what the tracker looks for."""
+"""Tags as printed, cut out and folded agree with those that the tracker looks for."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def ids_of(shape: Shape, first: int = 0) -> list[int]:
 
 
 def tracked(text: str, frame: StereoFrame) -> MarkerFix:
-    """What the tracker that tables of robot.toml describe finds."""
+    """Return the fix of the tracker that these tables of robot.toml describe."""
     config = msgspec.convert(tomllib.loads(text)["vision"], VisionConfig)
     found = tracker_of(EYES, config).track(frame)
     assert isinstance(found, MarkerFix), found
@@ -44,7 +44,7 @@ def tracked(text: str, frame: StereoFrame) -> MarkerFix:
 
 
 def photographed(page: Page, shape: Shape, rotation: FloatArray, x: FloatArray) -> StereoFrame:
-    """The printed sheet, folded and held at a pose in the left eye's frame: each face is the page's own piece."""
+    """Render the printed sheet, folded and held at a pose in the left optical frame: each face is cut from the page."""
     printed = cv2.GaussianBlur(rasterised(*from_pdf(pdf(page))), (0, 0), 1.0)
     return StereoFrame(
         0.0, *(seen(printed, page, shape, rotation, x - [EYES.baseline_m * eye, 0, 0]) for eye in (0, 1))
@@ -77,7 +77,7 @@ def seen(printed: ImageArray, page: Page, shape: Shape, rotation: FloatArray, x:
 
 
 def facing(*rotvec_deg: float) -> FloatArray:
-    """A body whose z axis points back at the eyes, then turned."""
+    """Return the orientation of a body whose z axis points back at the cameras, then turned."""
     return Rotation.from_rotvec(rotvec_deg, degrees=True).as_matrix() @ np.diag([1.0, -1.0, -1.0])
 
 
@@ -124,7 +124,7 @@ def test_single_tags_are_of_the_size_that_was_asked_for_and_have_their_numbers(w
 
 
 def edge(shape: Shape, cell: tuple[int, int], other: tuple[int, int]) -> FloatArray:
-    """Both ends of the edge between two neighbouring cells, on the folded body, as the face in `cell` has it."""
+    """Return both ends of the edge between two neighbouring cells on the folded body, in the frame of `cell`'s face."""
     face = next(face for face in shape.faces if face.cell == cell)
     step = np.array([other[0] - cell[0], cell[1] - other[1]]) * 0.5
     across = np.abs(step[::-1])

@@ -1,4 +1,4 @@
-"""Rectified images against exact truth, and the check of a calibration that no longer holds."""
+"""Rectified images against ground truth, and the check of a calibration that no longer holds."""
 
 from __future__ import annotations
 

@@ -29,13 +29,13 @@ def answer(*things, config=None, **staging):
 
 
 def at_pixel(u: float, v: float, z: float = 0.8) -> Ball:
-    """A ball whose centre the left eye sees at (u, v) [px]."""
+    """Return a ball whose centre the left camera sees at (u, v) [px]."""
     cx, cy = SMALL.principal_point_px
     return Ball(((u - cx) * z / SMALL.focal_px, (v - cy) * z / SMALL.focal_px, z))
 
 
 def seen_discs(ball: Ball, level: float) -> list[Disc]:
-    """The discs of a ball in the left and in the right eye."""
+    """Return the discs of a ball in the left and in the right image."""
     eye = Pinhole(SMALL.focal_px, SMALL.principal_point_px)
     outlines = [eye.outline(x_eye, ball.radius_m) for x_eye in in_eyes(np.array(ball.x), SMALL)]
     return [Disc(one.centre_px, one.radius_px, 1e-4 * np.eye(2), 0.01, level) for one in outlines if one is not None]
@@ -71,7 +71,7 @@ def test_a_ball_too_far_away_to_be_measured_is_no_marker():
     assert reason(answer(Ball((0.1, 0.0, 5.0)))) is Reason.NO_MARKER
 
 
-# The ball's radius is 15 px, the image 320x240; the right eye sees it 45 px farther left.
+# The ball's radius is 15 px, the image 320x240; in the right image it is 45 px farther left.
 @pytest.mark.parametrize(
     ("u", "v"), [(200, 8), (200, 16), (200, 230), (310, 120), (302, 120), (62, 120), (50, 120), (200, -5)]
 )
@@ -105,7 +105,7 @@ def test_a_ball_partly_behind_something_is_occluded(slab):
 
 
 def test_a_ball_hidden_from_one_eye_only_is_occluded():
-    # At half the depth a board that covers half of the ball for the left eye is beside it for the right one.
+    # At half the depth a board that covers half of the ball in the left image is beside it in the right one.
     assert reason(answer(BALL, Slab((0.012, -0.1), (0.03, 0.1), 0.4))) is Reason.OCCLUDED
 
 
@@ -138,7 +138,7 @@ def test_fingertips_a_tenth_of_the_radius_over_a_small_ball_do_not_pass():
             ball = paint_ball(clutter(rng, SMALL.image_size_px), x_eye, RADIUS_M, look, SMALL)
             images.append(take(paint_fingers(ball, x_eye, RADIUS_M, turn, 0.9, SMALL), look, rng))
         passed += isinstance(tracker.track(StereoFrame(0.0, *images)), MarkerFix)
-    # 8 of 180 pass where each eye is looked at by itself.
+    # 8 of 180 pass if each image is checked by itself.
     assert passed <= 1
 
 
@@ -150,7 +150,7 @@ def test_a_limb_uneven_in_both_eyes_is_covered_and_in_one_eye_it_is_what_is_behi
 
 
 def test_a_ball_out_of_round_by_half_a_percent_is_found_however_little_noise_there_is():
-    # OpenCV draws a circle as a polygon, the same in both eyes.
+    # OpenCV draws a circle as a polygon, the same in both images.
     images = []
     for u in (160, 100):
         image = np.full((240, 320, 3), 128, np.uint8)
@@ -210,7 +210,7 @@ def test_a_wrong_radius_in_the_configuration_fails_the_size_check():
 
 def test_eyes_that_see_balls_of_different_sizes_fail_the_size_check():
     left, right = stage(BALL), stage(replace(BALL, radius_m=0.026))
-    # Within the limit against depth, so that only the comparison of the eyes can tell.
+    # Within the depth limit, so that only the comparison of the two images can detect it.
     tracker = StereoTracker(SMALL, VisionConfig(radius_m=0.023))
     assert reason(tracker.track(StereoFrame(0.0, left.left, right.right))) is Reason.SIZE_MISMATCH
 

@@ -1,4 +1,4 @@
-"""cameras.toml: written whole, read strictly."""
+"""cameras.toml: complete when written, strict when read."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bodyschema.vision.rig_file import read_rig, write_rig
 
 @pytest.fixture(params=[False, True], ids=["pinhole", "fisheye"])
 def rig(request) -> StereoRig:
-    """A rig with a covariance that is not diagonal."""
+    """Return a rig with a covariance that is not diagonal."""
     rng = np.random.default_rng(2)
     known = known_rig(webcams(rng, fisheye=request.param))
     half = rng.normal(size=(len(known.vector), 60)) * 10.0 ** rng.uniform(-6, 0, len(known.vector))[:, None]

@@ -1,4 +1,4 @@
-"""Tags at random poses in random light before clutter: errors against the exact truth, and whether the claims cover."""
+"""Tags at random poses in random light on clutter: errors against ground truth, and coverage of the uncertainty."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ pytestmark = pytest.mark.soak
 
 
 def pose(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Rotation (3, 3) and place (3,) [m] of a tag that both eyes see whole."""
+    """Return rotation (3, 3) and position (3,) [m] of a tag that both cameras see whole."""
     z = rng.uniform(0.3, 0.8)
     disparity = VGA.focal_px * VGA.baseline_m / z
     u, v = rng.uniform((disparity + 80, 80), (560, 400))
@@ -72,7 +72,7 @@ def test_place_and_turn_of_a_tag_are_as_sure_as_claimed(name, capsys) -> None:
             f"{' '.join(f'{value:.0f}' for value in within)} | {' '.join(f'{value:.0f}' for value in twice)} | "
             f"{dict(misses)} |"
         )
-    # Where the blur is a third of a module and more, as of far and oblique tags here, no edge is told.
+    # With a blur of a third of a module or more, as of far and oblique tags here, edges cannot be resolved.
     assert len(errors) > (0.80 if name == "blurred" else 0.85) * FRAMES
     # Two standard errors of the mean of six that are not independent are 6.
     assert 60.0 < within.mean() < 76.0

@@ -55,7 +55,7 @@ def seen(*things: Sheet | Card, seed: int = 0, t: float = 0.0, look: Look = WALL
 
 
 def cube_at(rotation: FloatArray, x: FloatArray) -> list[Sheet]:
-    """The two tags of the cube where it is."""
+    """Return the two tags of the cube at this pose."""
     return [
         sheet(tag.id, rotation @ Rotation.from_euler("xyz", tag.rpy).as_matrix(), x + rotation @ np.array(tag.xyz))
         for tag in PLACED
@@ -63,7 +63,7 @@ def cube_at(rotation: FloatArray, x: FloatArray) -> list[Sheet]:
 
 
 def off(answer: MarkerFix | MarkerMiss, rotation: FloatArray, x: FloatArray) -> tuple[float, float]:
-    """Errors of place and turn in units of their own claimed covariance; infinite for a miss."""
+    """Return errors of position and turn in units of their own stated covariance; infinite for a miss."""
     if isinstance(answer, MarkerMiss) or answer.R is None or answer.cov_R is None:
         return np.inf, np.inf
     turned = rotation_vectors((Rotation.from_quat(answer.R).as_matrix() @ rotation.T)[None])[0]
@@ -82,7 +82,7 @@ def test_a_tag_is_found_where_and_as_it_is(degrees) -> None:
 
 
 def sigmas_off(frames: int, seed: int) -> FloatArray:
-    """Errors of place and turn (n, 6) in units of their claimed sigmas, tags at random poses."""
+    """Return errors of position and turn (n, 6) in units of their stated sigmas, tags at random poses."""
     rng, off_by = np.random.default_rng(seed), []
     found = tracker()
     for number in range(frames):

@@ -1,4 +1,4 @@
-"""docs/tags.md is held to the code."""
+"""docs/tags.md agrees with the code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cameras as OpenCV's V4L2 backend reads them, emulated below it, with everything that goes wrong with webcams."""
+"""Cameras under OpenCV's V4L2 backend, emulated below it, with the usual faults of webcams."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def camera(tmp_path):
-    """A function that plugs a camera in."""
+    """Yield a function that plugs a camera in."""
     with ExitStack() as stack:
 
         def plug(name: str, images=GREY, **settings: Any) -> ShimCamera:

@@ -1,4 +1,4 @@
-"""cv2.VideoCapture played, for tests that need no process of their own; the shim stands in at the lower level."""
+"""A fake cv2.VideoCapture, for tests that need no process of their own; the shim works at a lower level."""
 
 from __future__ import annotations
 
@@ -51,4 +51,4 @@ class FakeCapture:
         return True, self._image.copy()
 
     def release(self) -> None:
-        """Nothing is held."""
+        """Do nothing: nothing is held."""

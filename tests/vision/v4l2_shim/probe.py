@@ -1,4 +1,4 @@
-"""Opens the cameras of a table [vision.cameras] (JSON on standard input) for so many frames, tells as JSON what came.
+"""Program that reads frames from cameras given as [vision.cameras] (JSON on standard input) and reports them as JSON.
 
 python probe.py FRAMES
 """

@@ -1,4 +1,4 @@
-"""Cameras for `shim.c`: files that OpenCV opens like devices where the shim is preloaded."""
+"""Cameras for `shim.c`: files that OpenCV opens like devices if the shim is preloaded."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ CONTROLS: dict[str, tuple[int, int, int, int]] = {
 
 
 def compiled(folder: Path) -> Path | None:
-    """The shim, compiled into `folder`; None where there is no compiler, or none with V4L2's headers."""
+    """Compile the shim into `folder`; return None if there is no compiler or no V4L2 header."""
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None or not Path("/usr/include/linux/videodev2.h").exists():
         return None
@@ -53,14 +53,14 @@ def compiled(folder: Path) -> Path | None:
 
 
 def preloaded(library: Path) -> dict[str, str]:
-    """The environment of a process that shall see the cameras."""
+    """Return the environment of a process that sees the cameras."""
     return {**os.environ, "LD_PRELOAD": str(library)}
 
 
 class ShimCamera:
-    """One camera: its file, and what is wrong with it, which may change while it is read.
+    """One camera: its file and its faults, which may change while it is read.
 
-    What it shows at a time of CLOCK_MONOTONIC: image floor(t·fps − phase) modulo their number.
+    At a time t of CLOCK_MONOTONIC it shows image floor(t·fps − phase) modulo their number.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class ShimCamera:
         """Write the file.
 
         Args:
-            told_fps: what it says of its rate. without: controls that it does not have.
+            told_fps: frame rate that it reports. without: controls that it does not have.
         """
         self.file = file
         height, width = images[0].shape[:2]
@@ -115,15 +115,15 @@ class ShimCamera:
 
     @property
     def served(self) -> int:
-        """How many frames were taken."""
+        """Number of frames taken."""
         return HEADER.unpack_from(self._memory)[FIELDS.index("served")]
 
     def control(self, name: str) -> int:
-        """The value of a control."""
+        """Return the value of a control."""
         return CONTROL.unpack_from(self._memory, self._place(name))[4]
 
     def make_deaf(self, name: str) -> None:
-        """The control keeps its value whatever it is told."""
+        """Make the control keep its value whatever is written to it."""
         id, _, *rest = CONTROL.unpack_from(self._memory, self._place(name))
         CONTROL.pack_into(self._memory, self._place(name), id, 1, *rest)
 
@@ -132,12 +132,12 @@ class ShimCamera:
 
 
 class LiveCamera(ShimCamera):
-    """A camera whose images are drawn while it runs, each `latency_s` before its time stamp.
+    """A camera whose images are rendered while it runs, each `latency_s` before its time stamp.
 
-    What is not drawn in time is shown as it was in the beginning, without anything in it.
+    An image that is not rendered in time is shown empty, as at the beginning.
 
     Attributes:
-        drawn: how many images were in time.
+        drawn: number of images that were in time.
     """
 
     SLOTS = 8
@@ -155,9 +155,9 @@ class LiveCamera(ShimCamera):
         """Write the file.
 
         Args:
-            draw: the image of a time of CLOCK_MONOTONIC.
+            draw: returns the image at a time of CLOCK_MONOTONIC.
             latency_s: shorter than SLOTS / 2 frames.
-            settled_s: so long after its time an image is drawn, when all is known that belongs to that time.
+            settled_s: delay from an image's time to its rendering, by which all data of that time are known.
         """
         super().__init__(file, [blank] * self.SLOTS, fps=fps, fourcc="YUYV")
         self._blank, self._draw, self._fps = _encoded(blank, "YUYV"), draw, fps
