@@ -116,7 +116,7 @@ def explain(
 
 
 def useful(explanation: Explanation, blocks: Blocks, tell: Callable[[str], None]) -> Explanation:
-    """Drop causes that do not reduce the error on data not used in the fit."""
+    """Drop causes that do not reduce the error on data not used in the fit, or whose values cannot be."""
     fit = explanation.fit
     if explanation.unknown or fit.is_exact:
         return explanation
@@ -124,9 +124,11 @@ def useful(explanation: Explanation, blocks: Blocks, tell: Callable[[str], None]
         markers, error = is_marker(fit), _missed(fit, blocks)
         fewer = [fit.without(cause) for cause in fit.causes]
         losses = [float((_missed(one, blocks) - error)[markers].sum()) for one in fewer]
-        least = int(np.argmin(losses))
-        if losses[least] > 0.0:
+        # Negative backlash or compliance is no cause, whatever it gains.
+        kept = [loss > 0.0 and cause.is_possible for loss, cause in zip(losses, fit.causes, strict=True)]
+        if all(kept):
             break
+        least = min((k for k, is_kept in enumerate(kept) if not is_kept), key=losses.__getitem__)
         tell(f"dropped {describe(fit.causes[least])}: no gain on data not used in the fit")
         fit = fewer[least]
     return replace(explanation, fit=fit)

@@ -333,6 +333,7 @@ class Search:
             counted = self._counted(fit, cause)
             least = NAMED + self.doubt(beside.itself)
             lost = beside.is_lost_for(least if counted == 1.0 else _rise(least, beside.itself.dof, counted))
+            lost = lost or not cause.is_possible
             if lost or (remembers(cause) and self.agreed(beside.without, beside.itself) < NAMED):
                 self._tell(f"dropped {describe(cause)}")
                 return beside.without, True
