@@ -1,8 +1,8 @@
-"""How large the ball is, learnt while it is followed, and what a size that does not fit says of a fix.
+"""Track the apparent size of the ball and use it to judge each fix.
 
-What pulls a centre, fingertips over the limb or an edge of the ball's hue along it, makes the ball seem smaller or
-larger by as much, and may do so in both eyes alike. Then neither the rows nor the two sizes contradict each other; but
-the size contradicts the one that the ball had a moment ago.
+Fingertips over the outline, or a nearby edge of the ball's hue, shift a measured centre and make the ball seem
+smaller or larger by the same amount. Both eyes may be affected alike, so that neither the rows nor the two sizes
+contradict each other. The size then still contradicts that of the previous fixes.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from bodyschema.interfaces.records import FloatArray, Reason
 
 from .triangulate import Location, triangulate
 
-# How well somebody measures a ball (1-sigma, relative), and what calibration leaves of a size at one place and another.
+# Relative 1-sigma of a ball's radius measured by hand, and of the size from one place to another after calibration.
 RADIUS_SIGMA, _TOLERANCE = 0.03, 0.004
-# So many fixes are remembered.
+# Number of fixes that are remembered.
 _MEMORY = 31
-# A size that is off by no more sigmas than this says nothing.
+# A size error of fewer sigmas is ignored.
 _FREE_SIGMAS = 1.5
-# Where the size of so many fixes is known, what is off by more than these is something else: sigmas, and relative.
+# After this many fixes a size that differs by more sigmas, and by more than this share, is another object.
 _FEWEST, _MOST_SIGMAS, _MOST_OFF = 5, 4.0, 0.06
 
 
@@ -31,16 +31,16 @@ class BallSize:
     """The ball's radius as a share of the configured one."""
 
     def __init__(self, calibration: StereoCalibration) -> None:
-        """Nothing is known yet but the configured radius."""
+        """Start with the configured radius."""
         self._calibration = calibration
         self._shares: deque[tuple[float, float]] = deque(maxlen=_MEMORY)
 
     def forget(self) -> None:
-        """Know no more than at first."""
+        """Forget the learned radius."""
         self._shares.clear()
 
     def contradicts(self, found: Location) -> Reason | None:
-        """SIZE_MISMATCH where something of another size than the ball of the last fixes was found."""
+        """Return SIZE_MISMATCH if the size differs too much from that of the previous fixes."""
         if len(self._shares) < _FEWEST:
             return None
         off, sigma = self._off(found)
@@ -48,9 +48,9 @@ class BallSize:
         return Reason.SIZE_MISMATCH if is_other else None
 
     def doubted(self, found: Location) -> Location:
-        """`found` with each centre as unsure as its size is off, beyond what noise explains."""
+        """Return `found` with each centre's covariance inflated by its size error, beyond what noise explains."""
         off, sigma = self._off(found)
-        # [px²], in both directions: nothing tells from where the centre is pulled.
+        # [px²], in both directions: the direction of the shift is unknown.
         excess = np.maximum(0.0, off**2 - (_FREE_SIGMAS * sigma) ** 2) * found.radii_px**2
         if not excess.any():
             return found
@@ -58,20 +58,20 @@ class BallSize:
         return found if pulled is None else replace(found, cov=found.cov + pulled[1])
 
     def learn(self, found: Location) -> None:
-        """Take the size of a fix into account."""
+        """Update the radius with the size of a fix."""
         self._shares.append((float(found.sizes.mean()), float(np.sqrt(_variances(found).mean()))))
 
     def _off(self, found: Location) -> tuple[FloatArray, FloatArray]:
-        """By how much each eye's size is off, relative, shape (2,), and the 1-sigma of that."""
+        """Return each eye's relative size error, shape (2,), and its 1-sigma."""
         share, share_sigma = self._known()
         return found.sizes / share - 1.0, np.sqrt(_variances(found) + share_sigma**2)
 
     def _known(self) -> tuple[float, float]:
-        """The share and its 1-sigma."""
+        """Return the estimated share and its 1-sigma."""
         if not self._shares:
             return 1.0, RADIUS_SIGMA
         shares, sigmas = np.array(self._shares).T
-        # The median, as some of the fixes may have been pulled themselves.
+        # The median is robust to fixes whose centre was shifted.
         order = np.argsort(shares)
         weights = sigmas[order] ** -2
         median = shares[order][np.searchsorted(np.cumsum(weights), 0.5 * weights.sum())]
@@ -80,5 +80,5 @@ class BallSize:
 
 
 def _variances(found: Location) -> FloatArray:
-    """Of each eye's size by itself, shape (2,): what its radius and its depth leave unsure."""
+    """Return the variance of each eye's size, shape (2,), from its radius and its depth."""
     return found.size_sigmas**2 + found.cov[2, 2] / found.x[2] ** 2 + _TOLERANCE**2

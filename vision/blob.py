@@ -1,4 +1,4 @@
-"""Patches of the marker's colour, and the ball among them."""
+"""Detection of patches of the marker's colour, and of the ball among them."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from .config import VisionConfig
 from .outline import Outline, fit_outline, refine_outline
 from .sphere import Pinhole
 
-# A patch that fills less of its enclosing circle is not the image of a ball.
+# A patch that fills a smaller share of its enclosing circle is not a ball.
 _LEAST_FILL = 0.45
-# Below this a patch may be the ball together with something of similar hue behind it.
+# Below this share a patch may be the ball joined with a background of similar hue.
 _WHOLE_DISC_FILL = 0.8
-# Parts of the strongest colour that tell the ball from what is behind it.
+# Shares of the strongest colour that separate the ball from its background.
 _STRONG_SHARES = (0.5, 0.7)
-# Parts with the same box whose fill differs by less are the same patch.
+# Parts with the same box are one patch if their fill differs by less.
 _SAME_FILL = 0.02
-# A part of the ball or of a brick has an edge on some sides only; on the others its surroundings are as colourful.
+# Part of a ball or a brick has an edge on some sides only; on the others its surroundings are as colourful.
 _MOST_UNEVEN = 0.3
-# Where more of the outline than this leaves the ellipse, something covers the ball.
+# The ball is occluded if a larger share of its outline leaves the ellipse.
 _MOST_OFF = 0.15
-# A pixel is over-exposed from here [grey levels]; a ball with more than this share of them cannot be measured.
+# Grey level of an over-exposed pixel, and the largest share of such pixels on a ball that can be measured.
 _WHITE, _MOST_WHITE = 250, 0.35
-# Centre of a patch that could not be measured: 1-sigma as a part of its radius.
+# 1-sigma of the centre of a patch that could not be measured, as a share of its radius.
 _ROUGH_SIGMA = 0.1
-# A patch at the border is a ball that reaches out of view where so many points of its outline are on a circle, up to
-# this part of the radius.
+# A patch at the border is a partly visible ball if this many outline points lie on a circle, within this share of the
+# radius.
 _LEAST_ARC_POINTS, _ROUND = 8, 0.1
-# Pixels around a patch that the outline may reach into.
+# Margin around a patch for its outline [px].
 _APRON_PX = 12
 
 
 @dataclass(frozen=True, slots=True)
 class Region:
-    """A rectangle of pixels; the last column and row belong to the outside."""
+    """A rectangle of pixels; the last column and row are excluded."""
 
     left: int
     top: int
@@ -48,11 +48,11 @@ class Region:
     bottom: int
 
     def crop(self, image: ImageArray) -> ImageArray:
-        """The part of `image` (height, width, ...) in this rectangle; a view."""
+        """Return a view of this rectangle of `image` (height, width, ...)."""
         return image[self.top : self.bottom, self.left : self.right]
 
     def grown(self, by: int, within: tuple[int, int]) -> Region:
-        """Larger by `by` pixels on each side, cut at an image of (width, height)."""
+        """Return the rectangle enlarged by `by` pixels on each side, clipped to an image of (width, height)."""
         return Region(
             max(self.left - by, 0),
             max(self.top - by, 0),
@@ -78,7 +78,7 @@ class Patch:
 
     @property
     def is_whole(self) -> bool:
-        """Whether it may be a ball by itself, without something of similar hue behind it."""
+        """True if the patch may be a ball alone, without a background of similar hue."""
         return self.fill >= _WHOLE_DISC_FILL
 
 
@@ -91,8 +91,8 @@ class Disc:
         radius_px: radius of the circle of the same area [px].
         cov_px: covariance of the centre, shape (2, 2) [px²].
         radius_sigma_px: 1-sigma of the radius [px].
-        level: how bright the marker's colour is on it [grey levels].
-        unrest: how far its limb leaves the ellipse, in variances of its samples; 0 where that was not looked at.
+        level: mean amount of the marker's colour on it [grey levels].
+        unrest: roughness of its contour: deviation from the ellipse in variances of its samples; 0 if not computed.
     """
 
     centre_px: FloatArray
@@ -103,14 +103,16 @@ class Disc:
     unrest: float = 0.0
 
     def is_same_as(self, other: Disc) -> bool:
-        """Whether two discs, of overlapping patches, show the same ball."""
+        """Return True if two discs from overlapping patches show the same ball."""
         return float(np.linalg.norm(self.centre_px - other.centre_px)) < max(self.radius_px, other.radius_px)
 
 
 def find_patches(
     image: ImageArray, region: Region, gate: Gate, config: VisionConfig, least_radius_px: float = 0.0
 ) -> list[Patch]:
-    """Patches of the marker's colour in `region` of a BGR image, the most disc-like first; of discs this large."""
+    """Return patches of the marker's colour in `region` of a BGR image, at least this large, the most disc-like
+    first.
+    """
     pixels = region.crop(image)
     least_pixels = max(config.min_pixels, round(_LEAST_FILL * math.pi * least_radius_px**2))
     patches = _patches(gate.mask(pixels), region, least_pixels, config)
@@ -124,8 +126,10 @@ def find_patches(
 
 
 def patch_at(image: ImageArray, centre_px: FloatArray, radius_px: float, gate: Gate) -> Patch | None:
-    """What of a circle in a BGR image has the marker's colour, as a patch of that circle; None when that is too little
-    for a ball."""
+    """Return the part of a circle in a BGR image that has the marker's colour, as a patch of that circle.
+
+    None if it is too small a part for a ball.
+    """
     height, width = image.shape[:2]
     low, high = np.rint(centre_px - radius_px).astype(int), np.rint(centre_px + radius_px).astype(int) + 1
     low, high = np.clip(low, 0, (width, height)), np.clip(high, 0, (width, height))
@@ -140,7 +144,7 @@ def patch_at(image: ImageArray, centre_px: FloatArray, radius_px: float, gate: G
 
 
 def measure(image: ImageArray, patch: Patch, eye: Pinhole, gate: Gate, config: VisionConfig) -> Disc | Reason:
-    """The ball's image at `patch`, or why it is none."""
+    """Measure the ball's image at `patch`, or return the reason why it cannot be measured."""
     height, width = image.shape[:2]
     if not _clear_of_border(patch.box, config.border_margin_px, (width, height)):
         return Reason.AT_BORDER
@@ -160,14 +164,15 @@ def measure(image: ImageArray, patch: Patch, eye: Pinhole, gate: Gate, config: V
     reach = outline.radius_px + config.border_margin_px
     if (centre_px - reach < 0).any() or (centre_px + reach > (width - 1, height - 1)).any():
         return Reason.AT_BORDER
-    # Of all the ball: the patch may be its brighter part.
+    # Over the whole ball: the patch may be only its brighter part.
     level = _level(image, Region(0, 0, width, height), centre_px, outline.radius_px, gate)
     return Disc(centre_px, outline.radius_px, outline.cov_px, outline.radius_sigma_px, level, outline.unrest)
 
 
 def roughly(image: ImageArray, patch: Patch, gate: Gate) -> Disc | None:
-    """The ball that a patch may be though it could not be measured, or that reaches out of view; None when it is not
-    round."""
+    """Return a rough disc for a patch that could not be measured or that is partly out of view; None if it is not
+    round.
+    """
     circle = (patch.centre_px, patch.radius_px) if patch.is_whole else _cut_circle(image, patch, gate)
     if circle is None:
         return None
@@ -178,7 +183,7 @@ def roughly(image: ImageArray, patch: Patch, gate: Gate) -> Disc | None:
 
 
 def _cut_circle(image: ImageArray, patch: Patch, gate: Gate) -> tuple[FloatArray, float] | None:
-    """Centre (2,) and radius [px] of a round patch that the image's border cuts; None for others."""
+    """Return centre (2,) and radius [px] of a round patch cut by the image border; None for others."""
     height, width = image.shape[:2]
     if _clear_of_border(patch.box, 1, (width, height)):
         return None
@@ -206,7 +211,7 @@ def _is_whole(outline: Outline, config: VisionConfig) -> bool:
 
 
 def _level(image: ImageArray, box: Region, centre_px: FloatArray, radius_px: float, gate: Gate) -> float:
-    """Mean amount of the marker's colour in what a patch's box has of the square inside the disc."""
+    """Return the mean amount of the marker's colour in the square inside the disc, clipped to the patch's box."""
     first, last = (np.rint(centre_px + side * 0.6 * radius_px).astype(int) for side in (-1, 1))
     first = np.clip(first, (box.left, box.top), (box.right - 1, box.bottom - 1))
     last = np.clip(last, first, (box.right - 1, box.bottom - 1))
@@ -214,7 +219,7 @@ def _level(image: ImageArray, box: Region, centre_px: FloatArray, radius_px: flo
 
 
 def _washed_out(image: ImageArray, patch: Patch) -> bool:
-    """Whether much of the ball is white in all channels: neither its colour nor its shading can be told there."""
+    """Return True if much of the ball is white in all channels, so that neither colour nor shading is usable."""
     pixels = patch.box.crop(image)
     return float(np.mean(pixels.min(axis=2) >= _WHITE)) > _MOST_WHITE * np.pi / 4
 
@@ -258,11 +263,13 @@ def _patch(mask: ImageArray, stats: np.ndarray, region: Region) -> Patch | None:
 def _brighter_parts(
     image: ImageArray, patch: Patch, gate: Gate, least_pixels: int, config: VisionConfig
 ) -> list[Patch]:
-    """What is left of a patch when only pixels with much of its strongest colour count: the ball before brick."""
+    """Return the parts of a patch that keep much of its strongest colour: the ball in front of a brick wall, for
+    example.
+    """
     pixels = patch.box.crop(image)
     amount = gate.amount(pixels)
     own = gate.mask(pixels) > 0
-    # The ball may be a small part of the patch: the level that half of the least ball reaches.
+    # The ball may be a small part of the patch: use the level that half of the smallest ball reaches.
     strongest = float(np.sort(amount[own])[-config.min_pixels // 2])
     return [
         part

@@ -1,4 +1,4 @@
-"""What has the marker's colour: a mask by hue, and the amount of that colour in each pixel."""
+"""Colour gates: a mask of the marker's colour, and the amount of that colour in each pixel."""
 
 from __future__ import annotations
 
@@ -30,11 +30,13 @@ class Gate(Protocol):
         ...
 
     def mask(self, image: ImageArray) -> ImageArray:
-        """255 where a BGR image (height, width, 3) may show the marker, else 0; shape (height, width)."""
+        """Return 255 where a BGR image (height, width, 3) may show the marker, else 0; shape (height, width)."""
         ...
 
     def amount(self, image: ImageArray | Float32Array) -> Float32Array:
-        """How much of the marker's light each pixel of a BGR image (..., 3) has, shape (...), in grey levels."""
+        """Return the amount of the marker's light in each pixel of a BGR image (..., 3), shape (...), in grey
+        levels.
+        """
         ...
 
     def follow(self, pixels: ImageArray) -> None:
@@ -42,7 +44,7 @@ class Gate(Protocol):
         ...
 
     def reset(self) -> None:
-        """Forget what was learnt."""
+        """Forget the learned colour."""
         ...
 
 
@@ -78,7 +80,7 @@ class ColourGate:
         )
 
     def reset(self) -> None:
-        """Begin again with the band of the configuration."""
+        """Restore the band of the configuration."""
         self._use(self._first)
 
     def _use(self, band: HueBand) -> None:
@@ -87,7 +89,7 @@ class ColourGate:
         self._weights_bgr = _chroma_weights(band.hue_deg)
 
     def mask(self, image: ImageArray) -> ImageArray:
-        """255 where a BGR image (height, width, 3) has the colour, else 0; shape (height, width)."""
+        """Return 255 where a BGR image (height, width, 3) has the colour, else 0; shape (height, width)."""
         hsv = cv2.cvtColor(image, cv2.COLOR_BGR2HSV)
         mask = cv2.inRange(hsv, *self._ranges[0])
         for lower, upper in self._ranges[1:]:
@@ -95,7 +97,7 @@ class ColourGate:
         return cast(ImageArray, mask)
 
     def amount(self, image: ImageArray | Float32Array) -> Float32Array:
-        """How much of the colour each pixel of a BGR image (..., 3) has, shape (...), in grey levels.
+        """Return the amount of the colour in each pixel of a BGR image (..., 3), shape (...), in grey levels.
 
         A linear function of the channels that is 0 for all greys: white highlights and grey backgrounds add
         nothing, and a pixel that the marker covers by half has half of it.
@@ -114,7 +116,7 @@ class BrightGate:
         self._first = self._lowest = 255.0 * min_brightness
 
     def mask(self, image: ImageArray) -> ImageArray:
-        """255 where a BGR image (height, width, 3) is bright, else 0; shape (height, width)."""
+        """Return 255 where a BGR image (height, width, 3) is bright, else 0; shape (height, width)."""
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         return cast(ImageArray, cv2.threshold(grey, self._lowest, 255, cv2.THRESH_BINARY)[1])
 
@@ -124,16 +126,16 @@ class BrightGate:
         self._lowest = _followed(self._lowest, _ROOM * seen, self._first)
 
     def reset(self) -> None:
-        """Begin again with the configured brightness."""
+        """Restore the configured brightness."""
         self._lowest = self._first
 
     def amount(self, image: ImageArray | Float32Array) -> Float32Array:
-        """The brightness of each pixel of a BGR image (..., 3), shape (...), in grey levels."""
+        """Return the brightness of each pixel of a BGR image (..., 3), shape (...), in grey levels."""
         return image.astype(np.float32, copy=False) @ np.full(3, 1 / 3, np.float32)
 
 
 def gate_of(config: VisionConfig) -> Gate:
-    """What tells the ball that `config` describes."""
+    """Create the gate for the ball that `config` describes."""
     return BrightGate(config.min_brightness) if config.marker == "bright_ball" else ColourGate(config.band)
 
 
@@ -143,7 +145,9 @@ def _followed(limit: float, wanted: float, first: float) -> float:
 
 
 def _hsv_ranges(band: HueBand) -> list[tuple[ImageArray, ImageArray]]:
-    """Inclusive (lower, upper) bounds of OpenCV's HSV with hue 0..179; two of them where the band goes over red."""
+    """Return inclusive (lower, upper) bounds of OpenCV's HSV with hue 0..179; two pairs if the band wraps around
+    red.
+    """
     low = round((band.hue_deg - band.half_width_deg) / 2)
     high = round((band.hue_deg + band.half_width_deg) / 2)
     if low < 0:

@@ -88,7 +88,7 @@ def colour_of_the_moving(images: Iterable[ImageArray]) -> HueBand:
 
 
 def read_images(files: Sequence[Path]) -> list[ImageArray]:
-    """BGR images of `files`; ColourUnlearnt for one that is no image or has another size than the first."""
+    """Return the BGR images of `files`; raise ColourUnlearnt for one that is unreadable or differs in size."""
     images: list[ImageArray] = []
     for file in files:
         image = read_image(file)
@@ -101,7 +101,7 @@ def read_images(files: Sequence[Path]) -> list[ImageArray]:
 
 
 def colour_table(band: HueBand) -> str:
-    """The table [vision.colour] of robot.toml."""
+    """Return the table [vision.colour] of robot.toml."""
     return (
         "[vision.colour]\n"
         f"hue_deg = {band.hue_deg:.1f}\n"
@@ -135,7 +135,7 @@ def _apart_deg(hue_deg: NDArray[np.floating], other_deg: float) -> FloatArray:
 
 
 def _band(pixels: ImageArray) -> HueBand:
-    """The band around the pixels' hues (n, 3 of HSV), with room for other light."""
+    """Return the band around the pixels' hues (n, 3 of HSV), with room for other light."""
     middle = _mean_hue_deg(pixels)
     reach = float(np.quantile(_apart_deg(pixels[:, 0] * 2.0, middle), 1.0 - 2 * _SHARE)) + _MARGIN_DEG
     saturation, value = (float(np.quantile(pixels[:, channel], 2 * _SHARE)) / 255.0 for channel in (1, 2))

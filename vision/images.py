@@ -12,7 +12,7 @@ from bodyschema.interfaces.records import ImageArray, StereoFrame
 
 
 def check_images(frame: StereoFrame, calibration: StereoCalibration) -> None:
-    """SourceError: the images are not uint8 BGR of the calibration's size."""
+    """Raise SourceError if the images are not uint8 BGR of the calibration's size."""
     width, height = calibration.image_size_px
     if len(frame.images) != len(calibration.eyes_m):
         raise SourceError(
@@ -35,7 +35,7 @@ def _described(image: ImageArray) -> str:
 
 
 def check_calibration(calibration: StereoCalibration) -> None:
-    """ConfigError: the calibration describes no stereo pair, nor one camera."""
+    """Raise ConfigError if the calibration describes neither a stereo pair nor one camera."""
     width, height = calibration.image_size_px
     if not (math.isfinite(calibration.focal_px) and calibration.focal_px > 0):
         raise ConfigError(f"[camera] focal_px is {calibration.focal_px}", remedy="It has to be a number above 0")

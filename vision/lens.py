@@ -42,7 +42,7 @@ class Lens:
 
     @classmethod
     def from_vector(cls, model: Model, values: ArrayLike) -> Lens:
-        """The lens with these values, in the order of `vector`."""
+        """Create the lens with these values, in the order of `vector`."""
         fx, fy, cx, cy, *distortion = np.asarray(values, dtype=np.float64).tolist()
         return cls(model, (fx, fy), (cx, cy), tuple(distortion))
 
@@ -58,7 +58,7 @@ class Lens:
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
     def project(self, x: FloatArray) -> FloatArray:
-        """Image coordinates (n, 2) [px] of points (n, 3) in the eye's frame: x right, y down, z forward."""
+        """Project points (n, 3) in the eye's frame (x right, y down, z forward) to image coordinates (n, 2) [px]."""
         return self.project_posed(x, np.zeros(3), np.zeros(3))[0]
 
     def project_posed(
@@ -84,7 +84,7 @@ class Lens:
         return px.reshape(-1, 2), J[:, 8:14], J[:, :8]
 
     def directions(self, px: FloatArray) -> FloatArray:
-        """Directions (n, 2) as (x/z, y/z) of what is seen at (n, 2) [px], by Newton's method."""
+        """Return directions (n, 2) as (x/z, y/z) of image points (n, 2) [px], by Newton's method."""
         px = np.reshape(np.asarray(px, dtype=np.float64), (-1, 2))
         flat = (px - np.array(self.principal_point_px)) / np.array(self.focal_px)
         if self.model == "fisheye":
@@ -93,7 +93,7 @@ class Lens:
         return self._undistorted(flat, px)
 
     def _angle(self, seen: FloatArray) -> FloatArray:
-        """Angle off the axis [rad] of what is seen this far from the principal point, in focal lengths."""
+        """Return the angle off the axis [rad] for a distance from the principal point in focal lengths."""
         # Kannala & Brandt 2006, eq. (6)
         powers = np.array([3, 5, 7, 9])
         k = np.array(self.distortion)

@@ -1,4 +1,4 @@
-"""Which disc in the left eye and which in the right are the marker."""
+"""Matching of the marker's discs in the left and the right eye."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class StereoMatcher:
         self._calibration, self._config = calibration, config
 
     def match(self, left: Sequence[Disc], right: Sequence[Disc]) -> Location | Reason:
-        """The one pair that fits, or why there is none; both sequences hold at least one disc."""
+        """Return the one pair that fits, or the reason for none; both sequences hold at least one disc."""
         outcomes = [self._check(one, other) for one, other in product(left, right)]
         found = _without_reflections([outcome for outcome in outcomes if isinstance(outcome, Location)])
         if len(found) == 1:
@@ -45,7 +45,7 @@ class StereoMatcher:
         return Reason.SIZE_MISMATCH if Reason.SIZE_MISMATCH in outcomes else Reason.EPIPOLAR
 
     def doubt(self, found: Location, left: Sequence[Disc], right: Sequence[Disc]) -> Reason | None:
-        """Why the pair `found` may not be the marker.
+        """Return the reason why the pair `found` may not be the marker, or None.
 
         Another pair, of discs measured or rough, may be it too, or `found` may be a mirrored copy of that one.
         """
@@ -126,7 +126,7 @@ def _alike(one: Disc, other: Disc) -> bool:
 
 
 def _without_reflections(found: list[Location]) -> list[Location]:
-    """All but the dimmer, farther copies that a mirror or a window makes of the nearest and brightest one."""
+    """Return the locations without the dimmer, farther copies that a mirror or window makes of the brightest one."""
     if len(found) < 2:
         return found
     first = max(found, key=lambda one: one.level)

@@ -8,7 +8,7 @@ from bodyschema.interfaces.records import FloatArray
 
 
 def inverse_of_normal(normal: FloatArray, least_determinant: float) -> FloatArray | None:
-    """Inverse of a normal matrix (k, k); None where its determinant, relative to its trace to the k, is less."""
+    """Invert a normal matrix (k, k); None if its determinant, relative to its trace to the power k, is smaller."""
     if len(normal) != 3:
         if np.linalg.det(normal) < least_determinant * np.trace(normal) ** len(normal):
             return None

@@ -16,7 +16,7 @@ from .colour import Float32Array, Gate
 
 
 def rays_round(radius_px: float) -> FloatArray:
-    """Rays about a pixel apart on the outline, as rows (cos, sin, 1) of their angles, shape (n, 3).
+    """Return rays about a pixel apart on the outline, as rows (cos, sin, 1) of their angles, shape (n, 3).
 
     These are the derivatives of a circle's points along the rays by its centre and its radius, too.
     """
@@ -32,7 +32,7 @@ def _rays(count: int) -> FloatArray:
 def sample(
     image: Float32Array, centre_px: FloatArray, rays: FloatArray, radii: FloatArray, shape: FloatArray
 ) -> Float32Array:
-    """`image` on every ray (rows) and at every radius (columns) of the ellipse's own polar coordinates."""
+    """Sample `image` on every ray (rows) and at every radius (columns) of the ellipse's own polar coordinates."""
     directions = rays[:, :2] @ shape
     at = (centre_px + directions[:, None, :] * radii[:, None]).astype(np.float32)
     samples = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -40,7 +40,7 @@ def sample(
 
 
 def ball_colour(inside: Float32Array, gate: Gate) -> FloatArray | None:
-    """The ball's colour (3,) per unit of its amount; the median leaves highlights out."""
+    """Return the ball's colour (3,) per unit of its amount; the median excludes highlights."""
     samples = inside.reshape(-1, 3)
     amount = gate.amount(samples)
     coloured = amount > 1.0
@@ -52,7 +52,7 @@ def ball_colour(inside: Float32Array, gate: Gate) -> FloatArray | None:
 
 
 def mean_of_three(values: NDArray[np.floating]) -> FloatArray:
-    """Mean over three neighbours along the closed first axis."""
+    """Return the mean over three neighbours along the closed first axis."""
     wrapped = np.empty((len(values) + 2, *values.shape[1:]))
     wrapped[0], wrapped[1:-1], wrapped[-1] = values[-1], values, values[0]
     sums = wrapped[:-2] + wrapped[1:-1]
@@ -62,6 +62,6 @@ def mean_of_three(values: NDArray[np.floating]) -> FloatArray:
 
 
 def median(values: NDArray[np.floating]) -> float:
-    """The upper median; NumPy's own costs ten times as much for the few values here."""
+    """Return the upper median; NumPy's own costs ten times as much for the few values here."""
     middle = len(values) // 2
     return float(np.partition(values, middle)[middle])

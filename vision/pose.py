@@ -1,4 +1,4 @@
-"""The most likely pose of a rigid body whose points one eye or two see."""
+"""Maximum-likelihood pose of a rigid body whose points are seen by one eye or two."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class PoseEstimator:
         self._own_roots = [self._root(sighting) for sighting in self._sightings]
 
     def refine(self, rotation: FloatArray, x: FloatArray) -> Pose | None:
-        """The pose of the least squares near a first one; None where the body is not before the eyes.
+        """Return the least-squares pose near a first one; None if the body is not in front of the eyes.
 
         Levenberg-Marquardt on the turn about the origin of the body and the origin's place.
         """
@@ -93,7 +93,7 @@ class PoseEstimator:
         return self._result(rotation, x, *now)
 
     def scale(self, pose: Pose) -> tuple[float, float]:
-        """By how much the body seems larger than told, as a part of its size, and the 1-sigma of that.
+        """Return the relative size error of the body against its nominal size, and its 1-sigma.
 
         One more Gauss-Newton step with the size free: the eyes' distance against the printed size.
         """
@@ -109,27 +109,27 @@ class PoseEstimator:
         return float((cov @ full.T @ residuals)[6]), math.sqrt(cov[6, 6])
 
     def _moved(self, eye: Sighting, pose: Pose) -> FloatArray:
-        """What the pixels of an eye do when the body grows (k, 2)."""
+        """Return the derivative of an eye's pixels by the body's size (k, 2)."""
         arms = eye.points @ pose.rotation.T
         return (projection_slopes(self._calibration.focal_px, arms + self._in_eye(pose.x, eye)) @ arms[..., None])[
             ..., 0
         ]
 
     def _all_of(self, right: bool) -> Sighting:
-        """What one eye sees of all points."""
+        """Return one eye's sighting of all points."""
         seen = [sighting for sighting in self._sightings if sighting.right == right]
         points, pixels = np.concatenate([s.points for s in seen]), np.concatenate([s.pixels for s in seen])
         return Sighting(points, pixels, np.asarray(block_diag(*(s.cov_px for s in seen))), right)
 
     def _root(self, sighting: Sighting) -> FloatArray:
-        """What makes residuals independent and of sigma 1."""
+        """Return the matrix that makes residuals independent and of sigma 1."""
         return whitening(sighting.cov_px, self._calibration.pixel_sigma)
 
     def _in_eye(self, x: FloatArray, sighting: Sighting) -> FloatArray:
         return x - np.array([self._calibration.baseline_m, 0.0, 0.0]) if sighting.right else x
 
     def _linearised(self, rotation: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-        """Residuals and their derivative by turn and place, in units of sigma."""
+        """Return the residuals and their derivative by turn and place, in units of sigma."""
         residuals, jacobians = [], []
         for eye, root in zip(self._eyes, self._roots, strict=True):
             arms = eye.points @ rotation.T
@@ -157,7 +157,7 @@ class PoseEstimator:
 
 
 def projection_slopes(focal_px: float, points: FloatArray) -> FloatArray:
-    """Derivative (k, 2, 3) [px/m] of the pixels of points (k, 3) in an eye's frame."""
+    """Return the derivative (k, 2, 3) [px/m] of the pixels of points (k, 3) in an eye's frame."""
     rows = np.zeros((len(points), 2, 3))
     scale = focal_px / points[:, 2]
     rows[:, 0, 0] = rows[:, 1, 1] = scale
@@ -166,7 +166,7 @@ def projection_slopes(focal_px: float, points: FloatArray) -> FloatArray:
 
 
 def whitening(cov_px: FloatArray, pixel_sigma: float) -> FloatArray:
-    """What makes the residuals of an eye's pixels, u and v by turns, independent and of sigma 1.
+    """Return the matrix that makes an eye's pixel residuals, u and v in turn, independent and of sigma 1.
 
     Args:
         cov_px: their own covariance (2k, 2k) [px²].
@@ -178,7 +178,7 @@ def whitening(cov_px: FloatArray, pixel_sigma: float) -> FloatArray:
 
 
 def turned(arms: FloatArray) -> FloatArray:
-    """What a turn ω does to arms (k, 3): matrices (k, 3, 3) with ω × arm = −[arm]× ω."""
+    """Return matrices (k, 3, 3) with ω × arm = −[arm]× ω for arms (k, 3) under a small turn ω."""
     matrices = np.zeros((len(arms), 3, 3))
     x, y, z = arms.T
     matrices[:, 0, 1], matrices[:, 0, 2] = z, -y
@@ -188,7 +188,7 @@ def turned(arms: FloatArray) -> FloatArray:
 
 
 def mirrored(rotation: FloatArray, x: FloatArray) -> FloatArray:
-    """The other rotation (3, 3) under which a small plane at x (3,) with this one looks nearly the same.
+    """Return the other rotation (3, 3) under which a small plane at x (3,) looks nearly the same.
 
     A plane's image without perspective does not tell towards which side it is tilted: half a turn about the line of
     sight and half a turn about the plane's own normal.
@@ -199,7 +199,7 @@ def mirrored(rotation: FloatArray, x: FloatArray) -> FloatArray:
 
 
 def fitted_motion(body: FloatArray, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rotation (3, 3) and origin (3,) that take points of the body (k, 3) to where they are seen (k, 3).
+    """Return rotation (3, 3) and origin (3,) that take points of the body (k, 3) to their observed places (k, 3).
 
     Kabsch 1976.
     """

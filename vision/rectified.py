@@ -83,17 +83,17 @@ class Rectification:
         )
 
     def points(self, px: FloatArray, eye: int) -> FloatArray:
-        """Where what an eye (0 left, 1 right) sees at (n, 2) [px] is in its rectified image, shape (n, 2) [px]."""
+        """Return the rectified image points (n, 2) [px] of an eye's (0 left, 1 right) points (n, 2) [px]."""
         calibration = self.calibration
         return calibration.focal_px * self.directions(px, eye) + np.array(calibration.principal_point_px)
 
     def directions(self, px: FloatArray, eye: int) -> FloatArray:
-        """The same as directions (x/z, y/z), shape (n, 2)."""
+        """Return the rectified directions (x/z, y/z) of an eye's image points, shape (n, 2)."""
         lens, R = self.eyes[eye]
         return _turned(lens.directions(px), R)
 
     def maps(self, eye: int) -> tuple[ImageArray, ImageArray]:
-        """OpenCV's fixed-point maps that rectify the images of an eye (0 left, 1 right)."""
+        """Return OpenCV's fixed-point maps that rectify the images of an eye (0 left, 1 right)."""
         lens, R = self.eyes[eye]
         calibration = self.calibration
         width, height = calibration.image_size_px
@@ -105,14 +105,14 @@ class Rectification:
         return cv2.convertMaps(x, y, cv2.CV_16SC2)  # pyright: ignore
 
     def _common_view(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper limits (x/z, y/z) of the largest upright rectangle that all eyes' images fill."""
+        """Return the limits (x/z, y/z) of the largest upright rectangle that all eyes' images fill."""
         views = [_filled(lens, R, self.rig.image_size_px) for lens, R in self.eyes]
         low = np.max([view[0] for view in views], axis=0)
         return low, np.min([view[1] for view in views], axis=0)
 
 
 def _filled(lens: Lens, R: FloatArray, size_px: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-    """Limits (x/z, y/z) of an upright rectangle that one eye's image fills."""
+    """Return the limits (x/z, y/z) of an upright rectangle that one eye's image fills."""
     width, height = size_px
     along = np.linspace(0.0, 1.0, _BORDER_POINTS)
     ends = np.zeros_like(along)
@@ -170,7 +170,7 @@ class RectifiedCamera:
         self._eyes.__exit__(kind, error, trace)
 
     def read(self, timeout_s: float) -> StereoFrame | None:
-        """The next frame, rectified; None when none came within `timeout_s`."""
+        """Return the next frame, rectified; None if none came within `timeout_s`."""
         if not self._open:
             raise SourceError("the camera is not open")
         frame = self._eyes.read(timeout_s)

@@ -1,4 +1,4 @@
-"""What a calibration tells of two cameras, or of one alone."""
+"""Calibration of two cameras, or of one."""
 
 from __future__ import annotations
 
@@ -113,14 +113,14 @@ class StereoRig:
         return float(np.sqrt(along @ self.covariance[-3:, -3:] @ along))
 
     def with_vector(self, vector: FloatArray) -> StereoRig:
-        """The rig with other parameters, all else the same."""
+        """Return the rig with other parameters, all else the same."""
         left, right, rotation, translation = split(self.model, vector)
         return StereoRig(
             left, right, rotation, translation, self.image_size_px, self.serials, self.covariance, self.made
         )
 
     def require(self, image_size_px: tuple[int, int], serials: tuple[str, ...]) -> None:
-        """OtherCameras when these cameras are not the calibrated ones. A serial that is not known fits all."""
+        """Raise OtherCameras if these cameras are not the calibrated ones. An unknown serial fits all."""
         _require_size(image_size_px, self.image_size_px)
         if len(serials) != len(self.serials):
             raise OtherCameras(
@@ -182,7 +182,7 @@ class OneEyeRig:
         return np.sqrt(np.diag(self.covariance))
 
     def require(self, image_size_px: tuple[int, int], serials: tuple[str, ...]) -> None:
-        """OtherCameras when this camera is not the calibrated one. A serial that is not known fits all."""
+        """Raise OtherCameras if this camera is not the calibrated one. An unknown serial fits all."""
         _require_size(image_size_px, self.image_size_px)
         if len(serials) != 1:
             raise OtherCameras(
@@ -200,7 +200,7 @@ Rig = StereoRig | OneEyeRig
 
 
 def _require_size(image_size_px: tuple[int, int], calibrated_px: tuple[int, int]) -> None:
-    """OtherCameras when the images are of another size than those that were calibrated with."""
+    """Raise OtherCameras if the images differ in size from those of the calibration."""
     if image_size_px != calibrated_px:
         is_, was = ("x".join(map(str, size)) for size in (image_size_px, calibrated_px))
         raise OtherCameras(
@@ -214,18 +214,18 @@ def _lens_names(model: Model) -> tuple[str, ...]:
 
 
 def parameter_names(model: Model) -> tuple[str, ...]:
-    """Names of the parameters of a rig of two eyes whose lenses are of this model."""
+    """Return the parameter names of a rig of two eyes with lenses of this model."""
     lens = _lens_names(model)
     return (*(f"left.{name}" for name in lens), *(f"right.{name}" for name in lens), *_POSE_NAMES)
 
 
 def lens_of_one(model: Model, vector: FloatArray) -> Lens | None:
-    """The lens, where a vector is of all parameters of one camera alone."""
+    """Return the lens if the vector has the parameters of a single camera, else None."""
     return Lens.from_vector(model, vector) if len(vector) == len(_lens_names(model)) else None
 
 
 def split(model: Model, vector: FloatArray) -> tuple[Lens, Lens, FloatArray, FloatArray]:
-    """Left lens, right lens, rotation vector [rad] and translation [m] of a vector of all parameters."""
+    """Split a vector of all parameters into left lens, right lens, rotation vector [rad] and translation [m]."""
     n = 4 + len(DISTORTION_NAMES[model])
     left, right = Lens.from_vector(model, vector[:n]), Lens.from_vector(model, vector[n : 2 * n])
     return left, right, vector[2 * n : 2 * n + 3], vector[2 * n + 3 :]

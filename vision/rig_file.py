@@ -79,7 +79,7 @@ class _FileOfOne(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def read_rig(file: Path) -> Rig:
-    """The calibration in `file`, of two cameras or of one.
+    """Read the calibration in `file`, of two cameras or of one.
 
     Raises:
         ConfigError: it cannot be read, is damaged or is another kind of file; names the line.
@@ -97,7 +97,7 @@ def read_rig(file: Path) -> Rig:
 
 
 def write_rig(rig: Rig, file: Path) -> None:
-    """Write the calibration; what stood there is replaced at once, or not at all.
+    """Write the calibration, replacing the file atomically.
 
     Raises:
         ConfigError: the folder cannot be written to.
@@ -198,7 +198,7 @@ def _checked(found: _File | _FileOfOne, file: Path, text: str) -> Rig:
 
 
 def _covariance(uncertainty: _Uncertainty) -> FloatArray:
-    """Sigmas and correlation as one matrix; ValueError when they are none."""
+    """Return the covariance from sigmas and correlation; raise ValueError if they are invalid."""
     n = len(uncertainty.sigma)
     if len(uncertainty.correlation) != n or any(len(row) != n for row in uncertainty.correlation):
         raise ValueError(f"not {n} rows of {n} numbers")

@@ -45,7 +45,9 @@ class Pinhole:
     principal_point_px: tuple[float, float]
 
     def outline(self, x_eye: FloatArray, radius_m: float) -> Ellipse | None:
-        """The outline of a sphere around `x_eye` (3,) [m] in this eye's frame; None when it is not before the eye."""
+        """Return the outline of a sphere around `x_eye` (3,) [m] in this eye's frame; None if it is not in front of
+        the eye.
+        """
         distance = float(np.linalg.norm(x_eye))
         if not (x_eye[2] > 0 and distance > radius_m):
             return None
@@ -61,7 +63,7 @@ class Pinhole:
         return Ellipse(centre, math.sqrt(major * minor), _stretch(away, math.sqrt(major / minor)))
 
     def distance_over_radius(self, centre_px: FloatArray, radius_px: float) -> float:
-        """How many sphere radii away a sphere is whose outline has this centre and radius (rough: one fixed point)."""
+        """Return the approximate distance, in sphere radii, of a sphere whose outline has this centre and radius."""
         tan_theta = float(np.linalg.norm(centre_px - self.principal_point_px)) / self.focal_px
         # For small γ the ellipse has the area π f² sin²γ / cos³θ.
         cos_theta = 1.0 / math.hypot(1.0, tan_theta)
@@ -69,7 +71,7 @@ class Pinhole:
         return 1.0 / min(sin_gamma, 0.9)
 
     def sphere_centre(self, centre_px: FloatArray, distance_over_radius: float) -> FloatArray:
-        """The image (2,) [px] of the centre of a sphere whose outline has its centre at `centre_px` (2,) [px].
+        """Return the image (2,) [px] of a sphere's centre whose outline is centred at `centre_px` (2,) [px].
 
         Args:
             distance_over_radius: distance of the sphere's centre from the eye in units of its radius.
@@ -86,7 +88,7 @@ class Pinhole:
         return np.array(self.principal_point_px) + offset * (tan_theta / tan_ellipse)
 
     def shape(self, centre_px: FloatArray) -> FloatArray:
-        """The shape (2, 2) of the outline of a small sphere seen at `centre_px` (2,) [px]."""
+        """Return the shape (2, 2) of the outline of a small sphere seen at `centre_px` (2,) [px]."""
         offset = centre_px - np.array(self.principal_point_px)
         tan_theta = float(np.linalg.norm(offset)) / self.focal_px
         return _stretch(_unit(offset), (1.0 + tan_theta**2) ** 0.25)

@@ -1,4 +1,4 @@
-"""What the uncertainty of a calibration makes of what is computed with it."""
+"""Propagation of a calibration's covariance to results computed with it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _STEP = 1e-3  # of a parameter's sigma
 
 
 def covariance_of(rig: StereoRig, figures: Callable[[StereoRig], FloatArray]) -> FloatArray:
-    """Covariance (m, m) of the figures (m,) that a function makes of a rig, to first order."""
+    """Return the covariance (m, m) of figures (m,) computed from a rig, to first order."""
     vector, sigma = rig.vector, rig.sigma
     slopes = []
     for k, step in enumerate(_STEP * sigma):

@@ -1,4 +1,4 @@
-"""The marker as a rigid body: where on it which tag is."""
+"""The marker as a rigid body: positions of the tags on it."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ class TagBody:
 
     @classmethod
     def single(cls, config: TagConfig) -> TagBody:
-        """One tag, whose frame is the body's."""
+        """Create a body from one tag, whose frame is the body's."""
         return cls({config.id: config.side_m * TAG_CORNERS})
 
     @classmethod
     def cluster(cls, config: ClusterConfig, tag: TagConfig) -> TagBody:
-        """The tags of a cluster.
+        """Create a body from the tags of a cluster.
 
         Raises:
             ConfigError: it has none, or the same one twice.

@@ -1,4 +1,4 @@
-"""The tags that there are."""
+"""Dictionaries of tags."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ DICTIONARIES: dict[Dictionary, int] = {
 
 
 def tags_of(name: Dictionary) -> Any:
-    """OpenCV's dictionary of that name."""
+    """Return the OpenCV dictionary with that name."""
     return cv2.aruco.getPredefinedDictionary(DICTIONARIES[name])
 
 
 def require_tag(name: Dictionary, id: int) -> None:
-    """ConfigError where the dictionary has no tag of that number."""
+    """Raise ConfigError if the dictionary has no tag with that number."""
     most = len(tags_of(name).bytesList)
     if not 0 <= id < most:
         raise ConfigError(f"there is no tag {id} in {name}", remedy=f"Its numbers go from 0 to {most - 1}")
 
 
 def tag_modules(name: Dictionary, id: int) -> FloatArray:
-    """A tag's modules with its black border, rows from the top, shape (8, 8), 1 white and 0 black.
+    """Return a tag's modules with its black border, rows from the top, shape (8, 8), 1 white and 0 black.
 
     Raises:
         ConfigError: there is no such tag.

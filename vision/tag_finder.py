@@ -1,4 +1,4 @@
-"""Finds tags in one image, and measures their corners."""
+"""Detection of tags in one image, with their corners."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Seen = dict[int, TagImage | Reason]
 
 
 class TagFinder:
-    """Finds the tags of some numbers."""
+    """Detector of the tags with the given numbers."""
 
     def __init__(self, config: TagConfig, ids: Collection[int]) -> None:
         """Prepare OpenCV's detector of the dictionary."""
@@ -33,7 +33,7 @@ class TagFinder:
         self._detector = cv2.aruco.ArucoDetector(tags_of(config.dictionary), parameters)
 
     def find(self, grey: ImageArray, region: Region | None = None) -> Seen:
-        """The tags in a region (left, top, right, bottom) of one eye's grey image, or why they are none."""
+        """Find the tags in a region (left, top, right, bottom) of a grey image; a refused tag has its reason."""
         tags: Seen = {}
         for id, rough in self.squares(grey, region):
             if id in self._ids:
@@ -41,7 +41,7 @@ class TagFinder:
         return tags
 
     def squares(self, grey: ImageArray, region: Region | None = None) -> list[tuple[int, FloatArray]]:
-        """Numbers and rough corners (4, 2) [px] of all tags of the dictionary in a region."""
+        """Return numbers and rough corners (4, 2) [px] of all tags of the dictionary in a region."""
         x0, y0, x1, y1 = region or (0, 0, grey.shape[1], grey.shape[0])
         corners, ids, _ = self._detector.detectMarkers(np.ascontiguousarray(grey[y0:y1, x0:x1]))
         rough = [np.asarray(quad, dtype=np.float64).reshape(4, 2) + np.array([x0, y0]) for quad in corners]
@@ -49,5 +49,5 @@ class TagFinder:
 
 
 def _numbers(ids: object) -> list[int]:
-    """The tags' numbers as OpenCV tells them: an array (n, 1), or None."""
+    """Return the tag numbers from OpenCV's array (n, 1) or None."""
     return [] if ids is None else [int(id) for id in np.ravel(np.asarray(ids))]

@@ -71,7 +71,7 @@ class TagTracker:
         self._last: tuple[float, list[FloatArray], FloatArray] | None = None
 
     def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
-        """The marker in `frame`, in the left optical frame, or why there is none.
+        """Return the marker in `frame`, in the left optical frame, or the reason for a miss.
 
         Raises:
             SourceError: the images are not uint8 BGR of the calibration's size.
@@ -120,7 +120,7 @@ class TagTracker:
         return pose
 
     def _agreeing(self, left: dict[int, TagImage], right: dict[int, TagImage]) -> list[dict[int, TagImage]] | Reason:
-        """What both eyes see without the tags whose rows differ."""
+        """Return both eyes' tags without those whose rows differ."""
         both = sorted(left.keys() & right.keys())
         if not both:
             return Reason.OCCLUDED
@@ -130,7 +130,7 @@ class TagTracker:
         return [{id: tag for id, tag in eye.items() if id not in apart} for eye in (left, right)]
 
     def _rows_agree(self, left: TagImage, right: TagImage) -> bool:
-        """Whether the rows of a tag's corners differ by no more than noise, and its disparity is positive."""
+        """Return True if the rows of a tag's corners differ by no more than noise, and its disparity is positive."""
         apart = left.corners_px - right.corners_px
         rows = np.arange(1, 8, 2)
         cov = (left.cov_px + right.cov_px)[np.ix_(rows, rows)]
@@ -139,7 +139,7 @@ class TagTracker:
         return abs(float(apart[:, 1].mean())) <= allowed and bool((apart[:, 0] > 0.0).all())
 
     def _pose(self, t: float, seen: list[dict[int, TagImage]]) -> Pose | Reason:
-        """The one likely pose; a tag that contradicts the others is left out once."""
+        """Return the one likely pose; a tag that contradicts the others is left out once."""
         found = self._likely(t, seen)
         if isinstance(found, Pose) or found is not Reason.REPROJECTION or len(_ids(seen)) < 3:
             return found
@@ -180,7 +180,7 @@ class TagTracker:
         return Pose(best.rotation, best.x, best.cov * unexplained, best.squares, best.by_sighting)
 
     def _minima(self, estimator: PoseEstimator, seen: list[dict[int, TagImage]]) -> list[Pose]:
-        """The different poses that squares are least at, the most likely first."""
+        """Return the distinct local minima of the squares, the most likely first."""
         poses: list[Pose] = []
         for rotation, x in self._starts(seen):
             for turn in (rotation, self._mirrored(rotation, x, seen)):
@@ -190,7 +190,7 @@ class TagTracker:
         return sorted(poses, key=lambda pose: pose.squares)
 
     def _stayed(self, t: float, poses: Sequence[Pose]) -> Pose | None:
-        """Of two poses the one that the marker is in if it has not turned over since the last frame."""
+        """Return the pose, of two, that is consistent with the last frame; None if that is unclear."""
         if self._last is None or not 0 < t - self._last[0] <= _LONGEST_PAUSE_S:
             return None
         turned = [float(Rotation.from_matrix(self._last[2].T @ pose.rotation).magnitude()) for pose in poses]
@@ -198,7 +198,7 @@ class TagTracker:
         return poses[nearest] if turned[nearest] < _STAYED * _apart(poses[0], poses[1]) else None
 
     def _starts(self, seen: list[dict[int, TagImage]]) -> list[tuple[FloatArray, FloatArray]]:
-        """A first pose from all corners that all eyes see."""
+        """Return a first pose from the corners that all eyes see."""
         if not self.calibration.is_stereo:
             ids = list(seen[0])
             corners = np.concatenate([self.body.corners[id] for id in ids])
@@ -234,12 +234,12 @@ class TagTracker:
 
 
 def _ids(seen: Iterable[dict[int, TagImage]]) -> set[int]:
-    """The numbers that any eye sees."""
+    """Return the tag numbers seen by any eye."""
     return set[int]().union(*seen)
 
 
 def _why(eyes: Iterable[Seen]) -> Reason:
-    """Why eyes without a measured tag have none: of what was refused there, the most telling reason."""
+    """Return the most informative reason for eyes without a measured tag."""
     reasons = {reason for eye in eyes for reason in eye.values()}
     return next((reason for reason in _TELLING if reason in reasons), Reason.NO_MARKER)
 

@@ -11,14 +11,16 @@ from bodyschema.interfaces.records import MarkerFix, MarkerMiss, StereoFrame
 
 
 class MarkerTracker(Protocol):
-    """Finds the marker in stereo images, frame by frame."""
+    """Interface of a tracker that finds the marker in stereo images, frame by frame."""
 
     def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
-        """The marker in `frame`, in the left optical frame, or why there is none; SourceError for unfit images."""
+        """Return the marker in `frame`, in the left optical frame, or the reason for a miss; SourceError for unfit
+        images.
+        """
         ...
 
     def forget(self) -> None:
-        """What was seen so far says nothing of the next frame."""
+        """Forget all earlier frames."""
         ...
 
 
@@ -39,7 +41,8 @@ class TrackedCamera:
         self._camera.__exit__(kind, error, trace)
 
     def read(self, timeout_s: float) -> MarkerFix | MarkerMiss | None:
-        """The marker in the next frame, or why it was not found; None when no frame came within `timeout_s` [s].
+        """Return the marker in the next frame, or the reason for a miss; None if no frame came within `timeout_s`
+        [s].
 
         Raises:
             SourceEnded: there will be no more.

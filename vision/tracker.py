@@ -1,4 +1,4 @@
-"""From a stereo frame to a marker fix, or the reason why there is none."""
+"""Tracker of a coloured ball in stereo frames: a marker fix, or the reason for a miss."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class _Expected:
     radius_px: float
 
     def fits(self, disc: Disc | Patch) -> bool:
-        """Whether a disc is the marker as far as one eye can tell."""
+        """Return True if a disc agrees with the prediction in this eye."""
         apart_px = max(float(np.linalg.norm(disc.centre_px - self.centre_px)), abs(disc.radius_px - self.radius_px))
         return apart_px < _AS_EXPECTED * self.radius_px
 
@@ -128,7 +128,7 @@ class StereoTracker:
         self._fixes = 0
 
     def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
-        """The marker in `frame`, in the left optical frame, or why there is none.
+        """Return the marker in `frame`, in the left optical frame, or the reason for a miss.
 
         Raises:
             SourceError: the images are not uint8 BGR of the calibration's size.
@@ -163,7 +163,7 @@ class StereoTracker:
         self._size.forget()
 
     def _look(self, frame: StereoFrame, in_left: _Expected | None, in_right: _Expected | None) -> Location | Reason:
-        """The marker where it is expected, else anywhere in view."""
+        """Return the marker near its prediction, else anywhere in view."""
         left_image, right_image = frame.images
         left, left_rough = self._discs(left_image, in_left)
         if left is Reason.NO_MARKER:
@@ -187,7 +187,7 @@ class StereoTracker:
         return answer
 
     def _rivalry(self, frame: StereoFrame, found: Location, left: list[Disc], right: list[Disc]) -> Reason | None:
-        """Why something else in view, measured or not, may be the marker instead."""
+        """Return the reason why something else in view, measured or not, may be the marker instead."""
         reason = self._matcher.doubt(found, left, right)
         if reason is not None:
             return reason
@@ -233,7 +233,7 @@ class StereoTracker:
         return discs or reason or Reason.NO_MARKER, rough
 
     def _where_expected(self, image: ImageArray, expected: _Expected) -> Disc | None:
-        """The marker, if it can be measured from the circle on that it was expected to be."""
+        """Return the marker if it can be measured from its predicted circle."""
         patch = patch_at(image, expected.centre_px, expected.radius_px, self._gate)
         outcome = None if patch is None else measure(image, patch, self._eye, self._gate, self.config)
         return outcome if isinstance(outcome, Disc) and expected.fits(outcome) else None
@@ -257,7 +257,7 @@ class StereoTracker:
         return Region(*low.tolist(), *high.tolist()) if (high > low).all() else None
 
     def _doubt(self, t: float, found: Location) -> Reason | None:
-        """Why what was found in the images cannot be the marker that was seen a moment ago."""
+        """Return the reason why the detection contradicts the recent track, or None."""
         last = self._last
         if last is None or not 0 <= t - last.t <= _LONGEST_MEMORY_S:
             return self._doubt_without_track(t, found)
@@ -275,7 +275,7 @@ class StereoTracker:
         return reason
 
     def _refused_again(self, t: float, found: Location) -> Reason | None:
-        """Why it was refused a moment ago, if this is the same thing: time alone brings it no nearer to the marker."""
+        """Return the reason of a recent refusal if this is the same object, else None."""
         refused = self._refused
         if refused is None or not 0 <= t - refused.t <= _LONGEST_PAUSE_S:
             return None
@@ -283,7 +283,7 @@ class StereoTracker:
         return refused.reason if alike and self._within_reach(found.x, refused.x, t - refused.t) else None
 
     def _within_reach(self, x: FloatArray, from_x: FloatArray, seconds: float) -> bool:
-        """Whether a thing may have gone from one place (3,) [m] to another in that time."""
+        """Return True if an object can have moved from one place (3,) [m] to another in that time."""
         reach_m = _JUMP_RADII * self.config.radius_m + self.config.max_speed_m_s * min(seconds, _FAIR_PAUSE_S)
         return float(np.linalg.norm(x - from_x)) <= reach_m
 

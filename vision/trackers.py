@@ -15,7 +15,7 @@ from .tracker import StereoTracker
 
 
 def tracker_of(calibration: StereoCalibration, config: VisionConfig) -> MarkerTracker:
-    """A tracker for rectified images of `calibration`, of two eyes or one.
+    """Create a tracker for rectified images of `calibration`, of two eyes or one.
 
     Raises:
         ConfigError: that describes no cameras, or the marker cannot be.

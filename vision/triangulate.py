@@ -1,4 +1,4 @@
-"""From two image points of a rectified pair to a point with covariance."""
+"""Triangulation of two image points of a rectified pair, with covariance."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Location:
 def triangulate(
     calibration: StereoCalibration, centres_px: FloatArray, variances_px: FloatArray
 ) -> tuple[FloatArray, FloatArray] | None:
-    """The point seen at `centres_px` (ul, vl, ur, vr) [px] with `variances_px` (4,) [px²].
+    """Triangulate the point seen at `centres_px` (ul, vl, ur, vr) [px] with `variances_px` (4,) [px²].
 
     Returns:
         The most likely point (3,) [m] in the left optical frame and its covariance (3, 3) [m²], to first order;

@@ -1,4 +1,4 @@
-"""Points from both eyes' own images, and how sure the calibration leaves them."""
+"""Triangulation from both eyes' unrectified images."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .rig import StereoRig
 
 
 def triangulated(rig: StereoRig, left_px: FloatArray, right_px: FloatArray) -> FloatArray:
-    """Points (n, 3) [m] in the left camera's own frame of what is seen at (n, 2) [px] by each eye.
+    """Return points (n, 3) [m] in the left camera's own frame, seen at (n, 2) [px] by each eye.
 
     The middle of the shortest line between both rays.
     """

@@ -49,7 +49,7 @@ class Waves:
 
 
 def waves(residual: FloatArray, radius_px: float, first: int = 2) -> Waves:
-    """The waves in the residuals (n,) of an outline's points, evenly spread around it; 0 where there is none.
+    """Return the waves in the residuals (n,) of an outline's points, evenly spread around it; 0 if there are none.
 
     `first` is the slowest wave that the fit left in.
     """

@@ -1,4 +1,4 @@
-"""The calibration board: what is on it, its page, and where it is in an image."""
+"""The calibration board: its pattern, its printable page, and its detection in images."""
 
 from .board import Board
 from .detector import OTHER_BOARD, BoardDetector, Corners, NotFound

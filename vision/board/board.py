@@ -1,4 +1,4 @@
-"""A flat board of known squares."""
+"""The calibration board: a flat board of known squares."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ _DICTIONARY = re.compile(r"(?:[4-7]X[4-7]_(?:50|100|250|1000)|ARUCO_ORIGINAL|APR
 
 @dataclass(frozen=True)
 class Board:
-    """Squares of a chessboard, with an ArUco marker in each white one where the pattern is `charuco`.
+    """A chessboard, with an ArUco marker in each white square if the pattern is `charuco`.
 
-    The board's frame: origin in the outer corner of the upper left square, which is black, x along the rows to the
-    right, y down, z into the board.
+    Board frame: origin at the outer corner of the upper left square, which is black; x to the right along the rows,
+    y down, z into the board.
 
     Attributes:
         columns, rows: number of squares.
         square_m: side of a square [m].
         marker_m: side of a marker's black frame [m]; None: 0.75 of a square.
-        dictionary: name of the markers' dictionary as OpenCV has it, without DICT_; None: the smallest one of 4×4 bits.
-        pattern: `chessboard` has no markers: the whole of it has to be in view.
+        dictionary: OpenCV name of the markers' dictionary without DICT_; None: the smallest of 4×4 bits.
+        pattern: a `chessboard` has no markers, so all of it must be in view.
 
     Raises:
-        ConfigError: such a board there is not.
+        ConfigError: the board is not possible.
     """
 
     columns: int = 8
@@ -78,7 +78,7 @@ class Board:
 
     @property
     def dictionary_name(self) -> str:
-        """Name of the dictionary as OpenCV has it, without DICT_."""
+        """OpenCV name of the dictionary, without DICT_."""
         if self.dictionary is not None:
             return self.dictionary
         needed = len(self.marker_squares)
@@ -86,45 +86,45 @@ class Board:
 
     @cached_property
     def marker_squares(self) -> list[tuple[int, int]]:
-        """Column and row of the white squares, in the order of the markers' numbers."""
+        """Column and row of the white squares, in the order of the marker numbers."""
         return [(c, r) for r in range(self.rows) for c in range(self.columns) if (c + r) % 2 == 1]
 
     @cached_property
     def corners_m(self) -> FloatArray:
-        """Where four squares meet, in the order of the corners' numbers, shape (n, 3) [m], z = 0."""
+        """Inner corners, where four squares meet, in the order of their numbers, shape (n, 3) [m], z = 0."""
         c, r = np.meshgrid(np.arange(1, self.columns), np.arange(1, self.rows))
         return np.asarray(self.square_m * np.stack([c.ravel(), r.ravel(), np.zeros(c.size)], axis=1), dtype=np.float64)
 
     @property
     def name(self) -> str:
-        """What it is, in words."""
+        """Description of the board for people."""
         squares = f"{self.columns}x{self.rows} squares of {1e3 * self.square_m:g} mm"
         return f"{squares}, {self.dictionary_name}" if self.pattern == "charuco" else f"{squares}, plain"
 
     def opencv(self) -> Any:
-        """The same board as OpenCV's."""
+        """Return the board as an OpenCV object."""
         return cv2.aruco.CharucoBoard(
             (self.columns, self.rows), self.square_m, self.marker_side_m, dictionary(self.dictionary_name)
         )
 
 
 def smallest_size(markers: int) -> int:
-    """Of the smallest dictionary with so many markers; the largest one's where none has."""
+    """Return the size of the smallest dictionary with enough markers, or of the largest if there is none."""
     return next((size for size in SIZES if size >= markers), SIZES[-1])
 
 
 def dictionary(name: str) -> Any:
-    """OpenCV's dictionary of that name, without DICT_."""
+    """Return the OpenCV dictionary with that name, without DICT_."""
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
 
 
 def marker_count(name: str) -> int:
-    """How many markers a dictionary has."""
+    """Return the number of markers in a dictionary."""
     return len(dictionary(name).bytesList)
 
 
 def marker_bits(board: Board, number: int) -> FloatArray:
-    """The cells of a marker with its black frame of one cell, shape (cells, cells), 1 white and 0 black."""
+    """Return the cells of a marker with its black frame of one cell, shape (cells, cells), 1 white and 0 black."""
     cells = int(dictionary(board.dictionary_name).markerSize) + 2
     image = cv2.aruco.generateImageMarker(dictionary(board.dictionary_name), number, cells)
     return np.asarray(image > 127, dtype=np.float64)

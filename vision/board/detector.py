@@ -1,4 +1,4 @@
-"""Finds a board's corners in an image, or says why there are none."""
+"""Detection of a board's corners in an image, with the reason if there are none."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from .squares import squares_seen
 
 IntArray = NDArray[np.int64]
 Why = Literal["dark", "over_exposed", "blurred", "other_dictionary", "other_pattern", "other_squares", "not_found"]
-# The board itself is not the one that is looked for.
+# Reasons that mean that another board is in view.
 OTHER_BOARD: tuple[Why, ...] = ("other_dictionary", "other_pattern", "other_squares")
 
 _LEAST_CORNERS = 6
 _LEAST_MARKERS = 3
-# A corner's place is known to a small part of its edges' width; from here on it gets too large a part.
+# Corner accuracy is a small share of the edge width; with more blur that share is too large.
 _MOST_BLUR_PX = 2.5
 _FAMILIES = ("4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "APRILTAG_36h11", "ARUCO_ORIGINAL")
 
@@ -50,11 +50,11 @@ class Corners:
 
 @dataclass(frozen=True)
 class NotFound:
-    """Why an image shows no usable board.
+    """Reason why an image shows no usable board.
 
     Attributes:
         why: the kind of reason.
-        text: in words, with what to do.
+        text: message with a remedy.
     """
 
     why: Why
@@ -62,16 +62,16 @@ class NotFound:
 
 
 class BoardDetector:
-    """Finds one board."""
+    """Detector of one board."""
 
     def __init__(self, board: Board) -> None:
-        """Prepare OpenCV's detector of this board."""
+        """Create OpenCV's detector for this board."""
         self.board = board
         self._charuco = None if board.pattern == "chessboard" else cv2.aruco.CharucoDetector(board.opencv())
         self._other_family: str | None = None
 
     def find(self, image: ImageArray) -> Corners | NotFound:
-        """The board's corners in `image`, shape (height, width, 3) BGR or (height, width)."""
+        """Find the board's corners in `image`, shape (height, width, 3) BGR or (height, width)."""
         grey = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
         found = self._plain(grey) if self._charuco is None else self._marked(grey)
         if isinstance(found, NotFound):
@@ -127,9 +127,9 @@ class BoardDetector:
         return Corners(np.arange(len(self.board.corners_m)), corners.reshape(-1, 2))
 
     def _other_dictionary(self, grey: ImageArray, wanted: str | None) -> str | None:
-        """The family of markers that are in the image in the place of those wanted, if any are.
+        """Return the family of other markers in the image, if there are any.
 
-        That of an earlier image is looked for first: a search for all families takes five times as long.
+        The family found in an earlier image is tried first: a search for all families takes five times as long.
         """
         bits = "" if wanted is None else wanted.split("_")[0]
         families = [name for name in _FAMILIES if name.split("_")[0] != bits or "APRILTAG" in name]
@@ -144,16 +144,16 @@ class BoardDetector:
 
 
 def _markers(grey: ImageArray, family: str) -> list[int]:
-    """Numbers of the markers of a family."""
+    """Return the numbers of the markers of a family."""
     detector: Any = cv2.aruco.ArucoDetector(dictionary(family))
     numbers: Sequence[int] | None = detector.detectMarkers(grey)[1]
     return [] if numbers is None else np.ravel(numbers).tolist()
 
 
 def _in_order(grey: ImageArray, grid: FloatArray, board: Board) -> FloatArray:
-    """The corners (rows, columns, 2) turned so that the square up and left of the first one is black.
+    """Return the corners (rows, columns, 2), turned so that the square up and left of the first one is black.
 
-    Where that cannot tell which way up the board is, the first corner is the one nearer to the image's upper left.
+    If the pattern is ambiguous, the first corner is the one nearer to the image's upper left.
     """
     a, b = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     if a[0] * b[1] - a[1] * b[0] < 0:  # a mirrored order

@@ -1,4 +1,4 @@
-"""What is wrong with an image in which nothing was found."""
+"""Checks of brightness and focus for an image in which no board was found."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _MOST_EDGE_PX = 2.7
 
 
 def image_fault(grey: ImageArray) -> tuple[Literal["dark", "over_exposed", "blurred"], str] | None:
-    """Kind and words of what is wrong with the whole image (height, width); None when nothing is."""
+    """Return kind and message of what is wrong with the whole image (height, width); None if nothing is."""
     if np.quantile(grey, 0.99) < _DARK_LEVEL:
         return "dark", "the image is black. Take the lens cap off; longer exposure, more light"
     white = float(np.mean(grey >= _WHITE_LEVEL))

@@ -1,4 +1,4 @@
-"""The board's page."""
+"""Printable page of the calibration board."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from .board import Board, marker_bits
 
 
 def page(board: Board, paper: str = "A4") -> Page:
-    """The board on a sheet, upright or across, whichever leaves more room.
+    """Lay out the board on a sheet, in portrait or landscape, whichever leaves more room.
 
     Raises:
-        ConfigError: no such paper, or the board does not fit on it.
+        ConfigError: the paper is unknown, or the board does not fit on it.
     """
     width, height = (1e3 * side for side in board.size_m)
     made = drawn_page((width, height), paper, board.name, [*_squares(board), *_markers(board)])

@@ -1,13 +1,13 @@
-"""Corners of a board with markers, to hundredths of a pixel.
+"""Refinement of a marker board's corners to hundredths of a pixel.
 
-At a corner two edges cross. Every gradient on them is at right angles to the line to the corner, which gives the corner
-as a least-squares solution (Förstner & Gülch 1987; OpenCV's cornerSubPix). What disturbs that are the markers' edges.
-So the pixels are chosen in the board's own directions: a cross of two strips along the edges, which markers leave
-white. A square window has to be so small, where squares are seen aslant, that half of the edges are lost.
+At a corner two edges cross. Every gradient on them is perpendicular to the line to the corner, which gives the corner
+as a least-squares solution (Förstner & Gülch 1987; OpenCV's cornerSubPix). The edges of the markers disturb this. The
+pixels are therefore chosen along the board's own directions: a cross of two strips along the edges, which markers
+leave white. In oblique views a square window would have to be so small that half of the edges are lost.
 
-A lens bends the edges. Both arms of an edge leave the corner to the same side then, and a straight cross would be
-drawn there: through a fisheye all corners of a board off the axis by some 0.03 px the same way. How edges bend is told
-by the neighbours: the second differences of their places.
+A lens bends the edges. Both arms of an edge then leave the corner to the same side, and a straight cross is biased:
+through a fisheye by some 0.03 px in the same direction for all corners off the axis. The bend of the edges is
+estimated from the second differences of the neighbouring corners.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from .board import Board
 
 IntArray = NDArray[np.int64]
 
-_REACH = 0.35  # of a square: how far along the edges
-_NEIGHBOURS = 1.6  # squares: what tells the board's directions at a corner
-_BENDING_STEPS = 2  # squares to each side: what tells how the edges at a corner bend
+_REACH = 0.35  # of a square: length along the edges
+_NEIGHBOURS = 1.6  # squares: neighbourhood for the board's directions at a corner
+_BENDING_STEPS = 2  # squares to each side: neighbourhood for the bend of the edges
 _ITERATIONS = 8
 _CONVERGED_PX = 1e-3
 _MOST_MOVED = 0.2  # of a square
 _LEAST_STRIP_PX = 1.0
-_BLURRED_PX = 1.5  # beside an edge: what gradients mix in
+_BLURRED_PX = 1.5  # width of an edge, where gradients mix
 _BORDER_PX = 2.0
 _MOST_REACH_PX = 40
 _MOST_CONDITION = 1e4
 
 
 def refined(grey: ImageArray, board: Board, numbers: IntArray, px: FloatArray) -> tuple[IntArray, FloatArray]:
-    """The corners, moved to where their edges cross; those are left out of which this cannot be told.
+    """Move the corners to where their edges cross, and drop those that cannot be determined.
 
     Args:
         grey: the image, shape (height, width).
-        numbers, px: the corners roughly, shapes (n,) and (n, 2).
+        numbers, px: rough corners, shapes (n,) and (n, 2).
     """
     levels = np.asarray(grey, dtype=np.float64)
     both = [cv2.Scharr(levels, cv2.CV_64F, *axis) for axis in ((1, 0), (0, 1))]
@@ -58,9 +58,9 @@ def refined(grey: ImageArray, board: Board, numbers: IntArray, px: FloatArray) -
 
 
 def _frames(board: Board, numbers: IntArray, px: FloatArray) -> FloatArray:
-    """What one square to the right and one down are in pixels at each corner, as columns, shape (n, 2, 2).
+    """Return the image of one square to the right and one down at each corner, as columns, shape (n, 2, 2) [px].
 
-    Not a number where nothing tells.
+    NaN where it cannot be determined.
     """
     places = board.corners_m[numbers, :2] / board.square_m
     H, _ = cv2.findHomography(places, px, 0)
@@ -81,13 +81,13 @@ def _frames(board: Board, numbers: IntArray, px: FloatArray) -> FloatArray:
 
 
 def _bends(board: Board, numbers: IntArray, px: FloatArray) -> FloatArray:
-    """How far the edges across and down bend away from their tangents one square from each corner, as columns.
+    """Return how far the edges across and down deviate from their tangents one square from each corner, as columns.
 
     Shape (n, 2, 2) [px]; 0 where fewer than three corners of an edge are known.
     """
     steps = np.arange(-_BENDING_STEPS, _BENDING_STEPS + 1)
     powers = np.stack([np.ones(len(steps)), steps, steps**2], axis=-1)
-    # With a margin, so that neighbours beyond the board are unknown corners.
+    # A margin makes neighbours beyond the board unknown corners.
     places = np.rint(board.corners_m[numbers, :2] / board.square_m).astype(int) + _BENDING_STEPS
     grid = np.full((board.columns + 2 * _BENDING_STEPS, board.rows + 2 * _BENDING_STEPS, 2), np.nan)
     grid[places[:, 0], places[:, 1]] = px
@@ -100,7 +100,7 @@ def _bends(board: Board, numbers: IntArray, px: FloatArray) -> FloatArray:
         told = known.sum(axis=1) >= 3
         weighed = powers * known[told, :, None]
         normal = np.einsum("nki,kj->nij", weighed, powers)
-        # From the corner itself: small numbers lose no digits.
+        # Relative to the corner itself, to keep the digits.
         moments = np.einsum("nki,nkj->nij", weighed, np.nan_to_num(seen[told] - px[told, None]))
         bends[told, :, axis] = np.linalg.solve(normal, moments)[:, 2]
     return bends
@@ -109,9 +109,9 @@ def _bends(board: Board, numbers: IntArray, px: FloatArray) -> FloatArray:
 def _crossings(
     slopes: FloatArray, start: FloatArray, frames: FloatArray, bends: FloatArray, board: Board
 ) -> FloatArray:
-    """Where the edges cross near `start`, shape (n, 2) [px]; not a number where nothing tells."""
+    """Return where the edges cross near `start`, shape (n, 2) [px]; NaN where it cannot be determined."""
     into_squares = np.linalg.inv(frames)
-    # What is left white of a square beside its marker.
+    # Width of the white strip between a square's edge and its marker.
     strip = 0.5 * (1.0 - board.marker_side_m / board.square_m)
     squares_a_px = np.linalg.norm(into_squares, axis=2)
     strip_px = strip / squares_a_px
@@ -130,9 +130,9 @@ def _crossings(
         weights = _cross(np.abs(squares), half_widths[:, None])
         weighed = g * weights[..., None]
         G = np.einsum("nki,nkj->nij", weighed, g)
-        # Edges of one direction alone tell no crossing.
+        # Edges of a single direction determine no crossing.
         told = np.linalg.cond(G) < _MOST_CONDITION
-        # The tangent where an edge has bent away by b passes the corner at -b.
+        # The tangent of an edge that has deviated by b passes the corner at -b.
         tangents = p + np.einsum("nij,nkj->nki", bends, squares**2)
         h = np.einsum("nki,nk->ni", weighed, np.einsum("nki,nki->nk", g, tangents))
         step = np.full_like(at, np.nan)
@@ -144,7 +144,9 @@ def _crossings(
 
 
 def _cross(squares: FloatArray, half_widths: FloatArray) -> FloatArray:
-    """Weights of places (..., 2) [squares from the corner]: of a strip along each edge, fading at its end and sides."""
+    """Return weights for places (..., 2) [squares from the corner]: a strip along each edge, fading at its end and
+    sides.
+    """
     fade = np.clip((_REACH - squares) / 0.12, 0.0, 1.0)
     within = np.clip((half_widths - squares) / (0.4 * half_widths), 0.0, 1.0)
     return np.maximum(within[..., 1] * fade[..., 0], within[..., 0] * fade[..., 1])

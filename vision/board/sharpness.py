@@ -1,4 +1,4 @@
-"""How wide edges are: blur as the 1-sigma of the Gaussian that would have made them."""
+"""Blur of edges, as the 1-sigma of the equivalent Gaussian."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from bodyschema.interfaces.records import FloatArray, ImageArray
 
 from .board import Board
 
-_ALONG = 0.3  # of a square: where edges are looked at, away from corner and marker
+_ALONG = 0.3  # of a square: where edges are sampled, away from corner and marker
 _STEEPEST = 0.999
 
 
 def blur_px(grey: ImageArray, board: Board, numbers: NDArray[np.int64], px: FloatArray) -> float:
-    """1-sigma of the blur [px] across the edges between neighbouring corners, in the blurrier of their two directions.
+    """Return the 1-sigma of the blur [px] of the edges between neighbouring corners, in the blurrier direction.
 
     Args:
         grey: the image, shape (height, width).
-        numbers, px: the corners that were found, shapes (n,) and (n, 2).
+        numbers, px: the detected corners, shapes (n,) and (n, 2).
     """
     return max(_across(grey, numbers, px, board, step) for step in (1, board.columns - 1))
 
@@ -46,9 +46,10 @@ def _across(grey: ImageArray, numbers: NDArray[np.int64], px: FloatArray, board:
 
 
 def sharpest_edge_px(grey: FloatArray) -> float:
-    """1-sigma of the blur [px] of the sharpest edges in an image (height, width); it need not show a board.
+    """Return the 1-sigma of the blur [px] of the sharpest edges in an image (height, width), with or without a
+    board.
 
-    That of the direction in which they are least sharp: motion blurs along its own alone.
+    The direction of the largest blur counts: motion blurs along its own direction only.
     """
     smooth = cv2.GaussianBlur(grey, (0, 0), 1.0)
     right, down = smooth[1:-1, 2:] - smooth[1:-1, :-2], smooth[2:, 1:-1] - smooth[:-2, 1:-1]
@@ -59,7 +60,7 @@ def sharpest_edge_px(grey: FloatArray) -> float:
 
 
 def _sigma(steepness: float) -> float:
-    """Of the Gaussian that leaves this share of a step's height between -1 px and +1 px."""
+    """Return the sigma of the Gaussian that leaves this share of a step's height between -1 px and +1 px."""
     return float(1.0 / ndtri(0.5 + 0.5 * np.clip(steepness, 1e-3, 0.999)))
 
 
@@ -70,7 +71,7 @@ def _sampled(grey: ImageArray, at: FloatArray) -> FloatArray:
 
 
 def _levels(grey: ImageArray, px: FloatArray) -> tuple[float, float]:
-    """Black and white of the board."""
+    """Return the black and white levels of the board."""
     low = np.clip(np.floor(px.min(axis=0)).astype(int), 0, None)
     high = np.ceil(px.max(axis=0)).astype(int) + 1
     dark, bright = np.quantile(grey[low[1] : high[1], low[0] : high[0]], [0.1, 0.9])

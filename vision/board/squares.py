@@ -1,4 +1,4 @@
-"""How many squares the board in the image has: markers are numbered row by row, so their places tell."""
+"""Number of squares of the board in an image, from the marker numbers, which run row by row."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from bodyschema.interfaces.records import FloatArray
 from .board import Board
 
 _MOST = 24
-# Of a marker's side: how far its corners may be from where a plane seen in perspective through a lens has them.
+# of a marker's side: allowed deviation of its corners from a perspective image of a plane, for lens distortion
 _FITTING = 0.25
 
 
 def squares_seen(numbers: Sequence[int], corners_px: Sequence[FloatArray], board: Board) -> str | None:
-    """None where the markers fit the board; else the squares, as in 10x7, of the smallest board they fit.
+    """Return None if the markers fit the board; else the squares, such as 10x7, of the smallest board they fit.
 
-    Where they fit no board at all, it is what the board has.
+    If they fit no board, return the squares of `board`.
 
     Args:
-        numbers: the markers' numbers.
+        numbers: marker numbers.
         corners_px: their corners, shape (4, 2) each, clockwise from the upper left.
     """
     seen = np.stack(corners_px)
@@ -37,14 +37,14 @@ def squares_seen(numbers: Sequence[int], corners_px: Sequence[FloatArray], board
 
 
 def _place(number: int, columns: int) -> tuple[int, int]:
-    """Column and row of a marker's square. Two rows have as many markers as one has squares."""
+    """Return column and row of a marker's square. Two rows have as many markers as one has squares."""
     pair, rest = divmod(number, columns)
     upper = columns // 2
     return (2 * rest + 1, 2 * pair) if rest < upper else (2 * (rest - upper), 2 * pair + 1)
 
 
 def _misfit(numbers: Sequence[int], seen_px: FloatArray, columns: int, board: Board) -> float:
-    """Median distance of the markers' corners from the best perspective image of such a board, in marker sides."""
+    """Return the median distance of the marker corners from the best perspective image of a board, in marker sides."""
     share = board.marker_side_m / board.square_m
     square = 0.5 + 0.5 * share * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     model = np.concatenate([np.array(_place(number, columns)) + square for number in numbers])

@@ -1,1 +1,1 @@
-"""Two cameras' lenses and their places against each other, from images of a board."""
+"""Calibration of two cameras' lenses and relative pose from images of a board."""

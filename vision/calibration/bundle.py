@@ -1,4 +1,4 @@
-"""The joint least-squares problem of both eyes: lenses, the right eye's place, and the board's pose in every view."""
+"""Joint least-squares problem of both eyes: lenses, the right eye's pose, and the board's pose in every view."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bodyschema.vision.rig import CalibrationError, lens_of_one, split
 from .view import EYES, Eye, View
 
 _ITERATIONS = 60
-_CONVERGED = 1e-9  # share of the sum of squares that a step has to gain
+_CONVERGED = 1e-9  # smallest relative decrease of the sum of squares for another step
 _FIRST_DAMPING = 1e-4
 _MOST_DAMPING = 1e12
 _POSE = 6
@@ -31,8 +31,8 @@ class Bundle:
         vector: the rig's parameters, as `StereoRig.vector` has them.
         poses: the board's pose in the left eye's frame for each view, as rotation vector [rad] and position [m],
             shape (views, 6).
-        residuals: of each view, seen minus expected, shape (corners, 2) [px], the left eye's before the right one's.
-        weights: of each view's corners, shape (corners,), of `corner_weights`; 0 where it was left out.
+        residuals: per view, measured minus predicted, shape (corners, 2) [px], the left eye's before the right one's.
+        weights: per view and corner, shape (corners,), of `corner_weights`; 0 for rejected corners.
         normal: the normal matrix of `vector` with the poses eliminated, for residuals of 1 px.
     """
 
@@ -45,21 +45,21 @@ class Bundle:
 
     @property
     def kept(self) -> tuple[FloatArray, ...]:
-        """The residuals of each view without the corners that were left out."""
+        """Residuals of each view without the rejected corners."""
         return tuple(each[w > 0.0] for each, w in zip(self.residuals, self.weights, strict=True))
 
     @property
     def freedom(self) -> int:
-        """Image coordinates less unknowns."""
+        """Degrees of freedom: image coordinates minus unknowns."""
         return sum(each.size for each in self.kept) - len(self.vector) - self.poses.size
 
     @property
     def sigma_px(self) -> float:
-        """1-sigma of an image coordinate, as the residuals tell it: the RMS over all views [px]."""
+        """1-sigma of an image coordinate: the RMS residual over all views [px]."""
         return float(np.sqrt(sum(np.sum(each**2) for each in self.kept) / max(self.freedom, 1)))
 
     def view_rms_px(self) -> FloatArray:
-        """RMS residual per image coordinate of each view [px]."""
+        """Return the RMS residual per image coordinate of each view [px]."""
         return np.array([np.sqrt(np.mean(each**2)) for each in self.kept])
 
 
@@ -71,7 +71,7 @@ def solve(
     poses: FloatArray,
     weights: Sequence[FloatArray] | None = None,
 ) -> Bundle:
-    """The least-squares solution from a start, by Levenberg and Marquardt's method.
+    """Solve the least-squares problem from a start by the Levenberg-Marquardt method.
 
     Args:
         corners_m: the board's corners, shape (n, 3) [m].
@@ -107,11 +107,11 @@ def solve(
 def view_residuals(
     view: View, corners_m: FloatArray, model: Model, vector: FloatArray, start: FloatArray, weights: FloatArray
 ) -> FloatArray:
-    """What is left of a view with the board's best pose in it for a rig that is held fixed, shape (corners, 2) [px].
+    """Return a view's residuals for a fixed rig, with the best-fitting board pose, shape (corners, 2) [px].
 
     Args:
         start: the pose to start from, shape (6,).
-        weights: of the corners, shape (corners,).
+        weights: corner weights, shape (corners,).
     """
     pose = start[None]
     linear = _linearised([view], corners_m, model, vector, pose, [weights])
@@ -135,10 +135,12 @@ def view_residuals(
 def eye_of(
     eye: Eye, model: Model, vector: FloatArray, pose: FloatArray
 ) -> tuple[Lens, FloatArray, FloatArray, tuple[FloatArray, ...]]:
-    """Lens of an eye, the board's pose in its frame, and how that pose depends on the rig's and on the left eye's.
+    """Return an eye's lens, the board's pose in its frame, and the Jacobians of that pose.
+
+    The Jacobians are with respect to the right eye's pose and to the board's pose in the left eye's frame.
 
     Args:
-        pose: the board's in the left eye's frame, shape (6,).
+        pose: the board's pose in the left eye's frame, shape (6,).
     """
     alone = lens_of_one(model, vector)
     if alone is not None:
@@ -157,9 +159,9 @@ def eye_of(
 def seen_with_slopes(
     view: View, corners_m: FloatArray, model: Model, vector: FloatArray, pose: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Residuals (corners, 2) [px] of a view, and how what is expected depends on the rig and on the board's pose.
+    """Return a view's residuals (corners, 2) [px] and the Jacobians of the prediction by rig and by board pose.
 
-    The slopes have two rows a corner, u and v: shapes (2 corners, p) and (2 corners, 6).
+    The Jacobians have two rows a corner, u and v: shapes (2 corners, p) and (2 corners, 6).
     """
     p = len(vector)
     n = p if lens_of_one(model, vector) is not None else (p - _POSE) // 2
@@ -196,7 +198,7 @@ class _Linear:
         return _weighted(self.residuals, self.weights)
 
     def reduced(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Normal matrix and gradient of the rig with the poses eliminated, and the poses' normal matrices."""
+        """Return normal matrix and gradient of the rig with the poses eliminated, and the poses' normal matrices."""
         poses = self.pose_normals + damping * self.pose_normals * np.eye(_POSE)
         weighed = np.linalg.solve(poses, np.transpose(self.mixed, (0, 2, 1)))
         normal = self.normal + damping * np.diag(np.diag(self.normal))
@@ -205,7 +207,7 @@ class _Linear:
         return normal, gradient, poses
 
     def step(self, damping: float) -> tuple[FloatArray, FloatArray] | None:
-        """The next step of rig and poses; None where the equations have no solution."""
+        """Return the next step of rig and poses; None if the equations have no solution."""
         try:
             normal, gradient, poses = self.reduced(damping)
             scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
@@ -217,7 +219,7 @@ class _Linear:
 
 
 def _weighted(residuals: Sequence[FloatArray], weights: Sequence[FloatArray]) -> float:
-    """Weighted sum of squared residuals [px²]."""
+    """Return the weighted sum of squared residuals [px²]."""
     return float(sum(np.sum(w[:, None] * each**2) for each, w in zip(residuals, weights, strict=True)))
 
 

@@ -1,4 +1,4 @@
-"""The calibration of two cameras, or of one, from views of a board."""
+"""Calibration of two cameras, or of one, from views of a board."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ _REWEIGHTED = 3
 
 @dataclass(frozen=True)
 class Asked:
-    """What a calibration is made for.
+    """Request for a calibration.
 
     Attributes:
         image_size_px, serials: of the eyes.
         date: ISO 8601 in UTC.
-        model: the lenses' model; `auto` takes fisheye where it foretells views better.
-        scale_sigma: 1-sigma of the board's size, as a share of it.
-        baseline_m: the baseline as measured by hand, to check against [m].
+        model: lens model; `auto` takes fisheye if it predicts held-out views better.
+        scale_sigma: relative 1-sigma of the board's size.
+        baseline_m: baseline measured by hand, for a check [m].
     """
 
     image_size_px: tuple[int, int]
@@ -52,7 +52,7 @@ class Asked:
 
     @property
     def eyes(self) -> tuple[Eye, ...]:
-        """Which eyes look."""
+        """The eyes in use."""
         return EYES if len(self.serials) > 1 else ONE_EYE
 
 
@@ -67,7 +67,7 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Fitted:
-    """One lens model fitted to the views that fit it."""
+    """One lens model, fitted to the views that agree with it."""
 
     views: tuple[View, ...]
     left_out: tuple[LeftOut, ...]
@@ -77,13 +77,13 @@ class Fitted:
 
 @dataclass(frozen=True)
 class Calibrated:
-    """A calibration with what it was made of.
+    """A calibration with the data it was made from.
 
     Attributes:
         rig: the calibration.
-        fitted: the model that was chosen.
-        rivals_px: held-out error of each model that was tried [px].
-        coverage: what the views cover.
+        fitted: the selected model.
+        rivals_px: held-out error of each candidate model [px].
+        coverage: image coverage of the views.
     """
 
     rig: Rig
@@ -96,10 +96,10 @@ class Calibrated:
 def calibrate(
     views: Sequence[View], board: Board, asked: Asked, tell: Callable[[str], None] = lambda _: None
 ) -> Calibrated:
-    """Lenses and places of two cameras, or the lens of one.
+    """Calibrate the lenses and poses of two cameras, or the lens of one.
 
     Raises:
-        CalibrationError: it is not good enough, and why.
+        CalibrationError: the result is not good enough; the message says why.
     """
     coverage = Coverage.of(views, board, asked.image_size_px, asked.eyes)
     if reasons := lacking(coverage):
@@ -128,7 +128,7 @@ def _fits(
     models: Sequence[Model],
     tell: Callable[[str], None],
 ) -> dict[Model, Fitted]:
-    """What fits of the models; CalibrationError with the first one's reason when none does."""
+    """Fit each model and return those that fit; raise the first model's CalibrationError if none does."""
     fits: dict[Model, Fitted] = {}
     refusals: list[CalibrationError] = []
     for model in models:
@@ -149,7 +149,7 @@ def fit(
     model: Model,
     eyes: tuple[Eye, ...] = EYES,
 ) -> Fitted:
-    """One model's fit; views that do not fit the others are left out, the worst first.
+    """Fit one lens model; views that do not fit the others are left out, the worst first.
 
     Raises:
         CalibrationError: the eyes are misplaced, the views do not determine the lenses, or too many are outliers.
@@ -176,7 +176,7 @@ def fit(
 
 
 def _weighed(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> Bundle:
-    """The fit in which each image's corners count as exactly as they were found."""
+    """Refit with weights that follow the accuracy of each image's corners."""
     for _ in range(_REWEIGHTED):
         weights = corner_weights(views, corners_m, bundle)
         bundle = solve(views, corners_m, bundle.model, bundle.vector, bundle.poses, weights)
@@ -184,7 +184,7 @@ def _weighed(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> Bu
 
 
 def _chosen(fits: dict[Model, Fitted]) -> Model:
-    """Pinhole, unless fisheye foretells views better that both have fitted."""
+    """Select pinhole, unless fisheye predicts the views shared by both fits better."""
     if len(fits) == 1:
         return next(iter(fits))
     shared = {view.name for view in fits["pinhole"].views} & {view.name for view in fits["fisheye"].views}
@@ -198,7 +198,7 @@ def _of(fitted: Fitted, names: set[str]) -> HeldOut:
 
 
 def _outlier(rms_px: FloatArray) -> int | None:
-    """The view farthest from the usual, if it is too far."""
+    """Return the index of the view farthest from the median, if it is an outlier."""
     usual = float(np.median(rms_px))
     spread = 1.4826 * float(np.median(np.abs(rms_px - usual)))
     worst = int(np.argmax(rms_px))
@@ -231,7 +231,7 @@ def _rig(fitted: Fitted, board: Board, asked: Asked) -> Rig:
     if alone is not None:
         return OneEyeRig(alone, asked.image_size_px, (asked.serials[0],), unsure_by, made)
     left, right, rotation, translation = split(bundle.model, bundle.vector)
-    # A board of another size makes all lengths as much longer, and nothing else.
+    # An error of the board's size scales all lengths, and nothing else.
     unsure_by[-3:, -3:] += asked.scale_sigma**2 * np.outer(translation, translation)
     serials = asked.serials[0], asked.serials[1]
     return StereoRig(left, right, rotation, translation, asked.image_size_px, serials, unsure_by, made)

@@ -1,4 +1,4 @@
-"""Whether a calibration still holds, from one look at the board."""
+"""Check of a calibration from one view of the board."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from .view import View
 
 _LEAST_CORNERS = 8
 _SIGMAS = 4.0
-# What focus, warmth and a bent sheet of paper may do, besides what the covariance knows of.
+# Drift allowed for focus, temperature and a bent board, beyond the covariance.
 _FREE_ROWS_PX = 0.15
 _FREE_SQUARE = 0.002
 _STEP_PX = 1e-3
-# Images that are exchanged or upside down are told by rows that agree so much better when they are put right, and by
-# squares that are then right to this share.
+# Exchanged or upside-down images are recognised if correcting them reduces the row differences to this share, with
+# square sizes right within this share.
 _MISPLACED_ROWS, _MISPLACED_SIZE = 0.1, 0.03
 
 
 @dataclass(frozen=True)
 class Check:
-    """What one look tells.
+    """Result of a check with one view.
 
     Attributes:
-        corners: how many both eyes saw.
+        corners: number of corners seen by both eyes.
         epipolar_px: RMS difference of the rows at which the two rectified images show a corner [px].
-        rows_px, rows_sigma_px: mean of the differences, and what calibration and noise leave unsure of it [px].
-        roll_deg, roll_sigma_deg: how far one eye is turned about its line of sight, as the differences tell [deg].
-        square_m, square_sigma_m: the board's square as it is measured [m].
-        nominal_m: the board's square as it is [m].
-        wrong: what does not hold any more; empty when the calibration holds.
+        rows_px, rows_sigma_px: mean of the differences, and its 1-sigma from calibration and noise [px].
+        roll_deg, roll_sigma_deg: rotation of one eye about its line of sight, from the differences [deg].
+        square_m, square_sigma_m: measured side of the board's squares [m].
+        nominal_m: true side of the board's squares [m].
+        wrong: messages for what no longer holds; empty if the calibration holds.
     """
 
     corners: int
@@ -54,12 +54,12 @@ class Check:
 
     @property
     def holds(self) -> bool:
-        """Whether the calibration still holds."""
+        """True if the calibration still holds."""
         return not self.wrong
 
 
 def check(rig: StereoRig, view: View, board: Board) -> Check:
-    """One look at the board with a calibration.
+    """Check a calibration with one view of the board.
 
     Raises:
         CalibrationError: one of the eyes does not see enough of the board.
@@ -73,7 +73,7 @@ def check(rig: StereoRig, view: View, board: Board) -> Check:
     model = board.corners_m[numbers]
     covariance = covariance_of(rig, lambda other: _figures(other, left, right, model))
     covariance = covariance + rig.made.held_out_px**2 * _noise(rig, left, right, model)
-    # From focal lengths, radians and shares to what a person reads.
+    # From focal lengths, radians and shares to display units.
     focal = Rectification(rig).calibration.focal_px
     units = np.array([focal, np.degrees(1.0), board.square_m])
     found = units * _figures(rig, left, right, model)
@@ -99,19 +99,21 @@ def _shared(view: View) -> tuple[np.ndarray, FloatArray, FloatArray]:
 
 
 def _rows(rig: StereoRig, left: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """By how much lower the right rectified image shows each corner, and where along the row, in focal lengths."""
+    """Return the right image's row minus the left one's for each corner, and the position along the row [focal
+    lengths].
+    """
     rectification = Rectification(rig)
     here, there = rectification.directions(left, 0), rectification.directions(right, 1)
     return there[:, 1] - here[:, 1], there[:, 0]
 
 
 def _rows_apart(rig: StereoRig, left: FloatArray, right: FloatArray) -> float:
-    """RMS difference of the rows, in focal lengths."""
+    """Return the RMS difference of the rows, in focal lengths."""
     return float(np.sqrt(np.mean(_rows(rig, left, right)[0] ** 2)))
 
 
 def _misplaced(rig: StereoRig, left: FloatArray, right: FloatArray, model: FloatArray) -> str | None:
-    """What is said where the calibration would hold for images exchanged or turned upside down, else None."""
+    """Return a message if the calibration would hold for images exchanged or turned upside down, else None."""
     turned_left, turned_right = (np.array(rig.image_size_px) - 1.0 - px for px in (left, right))
     placed = (
         ("left and right are exchanged: exchange the cameras, or their names where they are configured", right, left),
@@ -128,7 +130,7 @@ def _misplaced(rig: StereoRig, left: FloatArray, right: FloatArray, model: Float
 
 
 def _figures(rig: StereoRig, left: FloatArray, right: FloatArray, model: FloatArray) -> FloatArray:
-    """Mean difference of the rows, their slope along the rows [rad], and the board's size as measured, to its own."""
+    """Return the mean row difference, its slope along the rows [rad], and the ratio of measured to true board size."""
     rows, at = _rows(rig, left, right)
     along = at - at.mean()
     seen, true = pdist(triangulated(rig, left, right)), pdist(model)
@@ -136,7 +138,7 @@ def _figures(rig: StereoRig, left: FloatArray, right: FloatArray, model: FloatAr
 
 
 def _noise(rig: StereoRig, left: FloatArray, right: FloatArray, model: FloatArray) -> FloatArray:
-    """Covariance of the figures for noise of 1 px in every image coordinate."""
+    """Return the covariance of the figures for noise of 1 px in every image coordinate."""
     px = np.concatenate([left, right])
     slopes = []
     for place in np.ndindex(px.shape):

@@ -1,4 +1,4 @@
-"""Views of the board, and gathering them from images."""
+"""Views of the board, gathered from images."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from .images import ImagePair, require_equal_sizes
 from .view import EYES, ONE_EYE, Eye, View, image_of
 
 _MOST_NAMES = 4
-# So many pairs that show another board, and none the one looked for, say enough; progress is told after so many.
+# Number of pairs after which another board is certain, and interval of progress messages.
 _SURE_PAIRS, _TOLD_PAIRS = 3, 10
 _NUMBERS = re.compile(r"\d+(\.\d+)?")
 
 
 class Detector(Protocol):
-    """Finds one board; see `bodyschema.vision.board.BoardDetector`."""
+    """Interface of a board detector; see `bodyschema.vision.board.BoardDetector`."""
 
     def find(self, image: ImageArray) -> Corners | NotFound: ...
 
 
 @dataclass(frozen=True)
 class Unusable:
-    """An image without a usable board, and why."""
+    """An image without a usable board, and the reason."""
 
     name: str
     eye: Eye
@@ -39,11 +39,11 @@ class Unusable:
 
 @dataclass
 class Gathered:
-    """Views, the images they are from, and what could not be used.
+    """Views, their images, and the images that could not be used.
 
     Attributes:
         image_size_px: of each eye; (0, 0) before the first image.
-        eyes: which eyes look.
+        eyes: the eyes in use.
     """
 
     board: Board
@@ -54,20 +54,20 @@ class Gathered:
     eyes: tuple[Eye, ...] = EYES
 
     def coverage(self) -> Coverage:
-        """What the views cover."""
+        """Return the image coverage of the views."""
         return Coverage.of(self.views, self.board, self.image_size_px, self.eyes)
 
     def add(self, view: View, images: ImagePair) -> None:
-        """Take a view."""
+        """Add a view."""
         self.views.append(view)
         self.images[images.name] = images
 
 
 def gathered(pairs: Iterable[ImagePair], board: Board, tell: Callable[[str], None] = lambda _: None) -> Gathered:
-    """All views in images; where the first ones show another board, the others are not looked at.
+    """Gather all views from images; stop early if the first images show another board.
 
     Args:
-        tell: is told how far it is, and which images cannot be used, and why: one line a reason and eye.
+        tell: receives progress, and one line for each reason and eye with the images that cannot be used.
 
     Raises:
         CalibrationError: the two eyes' images are of different sizes.
@@ -90,7 +90,7 @@ def gathered(pairs: Iterable[ImagePair], board: Board, tell: Callable[[str], Non
 
 
 def summarised(unusable: Sequence[Unusable], eyes: Sequence[Eye] = EYES) -> list[str]:
-    """Which images cannot be used, and why: one line for each eye and reason, numbers in it apart."""
+    """Return one line for each eye and reason with the unusable images; reasons that differ in numbers only are one."""
     alike: dict[tuple[Eye, str], list[Unusable]] = {}
     for each in unusable:
         alike.setdefault((each.eye, _kind(each)), []).append(each)
@@ -116,12 +116,12 @@ def _usual(texts: Sequence[str]) -> str:
 
 
 def eyes_of(pair: ImagePair) -> tuple[Eye, ...]:
-    """Which eyes' images a pair has."""
+    """Return the eyes for which a pair has images."""
     return ONE_EYE if pair.right is None else EYES
 
 
 def looked_at(pair: ImagePair, detector: Detector) -> tuple[View, tuple[Unusable, ...]]:
-    """The board's corners in a pair of images, and why an eye has none.
+    """Find the board's corners in a pair of images, with the reason for each eye without corners.
 
     Raises:
         CalibrationError: the two eyes' images are of different sizes.
@@ -139,7 +139,7 @@ def looked_at(pair: ImagePair, detector: Detector) -> tuple[View, tuple[Unusable
 
 
 def require_both(found: Gathered) -> None:
-    """CalibrationError where an eye sees no usable board in any image, with the reason that most of its images have."""
+    """Raise CalibrationError with the most frequent reason if an eye sees no usable board in any image."""
     if not found.views and not found.unusable:
         raise CalibrationError("there are no images")
     blind: list[Eye] = [eye for eye in found.eyes if all(view.eye(eye) is None for view in found.views)]

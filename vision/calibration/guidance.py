@@ -1,4 +1,4 @@
-"""Which views are there, and which is wanted next."""
+"""Coverage of the views so far, and advice on the next view."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from .view import EYES, Eye, View, all_px, image_of, seen_by
 
 GRID = (3, 3)
 _ROWS, _COLUMNS = ("upper", "middle", "lower"), ("left", "middle", "right")
-# Before anything is calibrated a webcam's usual focal length is taken, as a share of the image's width.
+# Share of the image's width: focal length of a typical webcam, used before calibration.
 _USUAL_FOCAL = 0.9
 CORNERS_A_CELL = 8
 _TILT_DEG = 15.0
 TILTED_EACH_WAY = 2
-_NEAR, _FAR = 0.55, 0.40  # the board's extent as a share of the image's
+_NEAR, _FAR = 0.55, 0.40  # extent of the board as a share of the image
 WANTED_VIEWS = 20
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """What the views have covered.
+    """Coverage of the image, of tilts and of distances by the views.
 
     Attributes:
-        whole_views: views that all eyes saw.
+        whole_views: number of views seen by all eyes.
         cells: corners in each cell of a 3×3 grid, for each eye, shape (eyes, 3, 3).
-        tilts_deg: of the board in each whole view about the image's upright and level axes, shape (n, 2), roughly:
-            right edge away and lower edge away are positive.
-        extents: of the board in each whole view, as a share of the image.
-        eyes: which eyes look.
+        tilts_deg: rough tilt of the board in each whole view about the image's vertical and horizontal axes, shape
+            (n, 2); right edge away and lower edge away are positive.
+        extents: extent of the board in each whole view, as a share of the image.
+        eyes: the eyes in use.
     """
 
     whole_views: int
@@ -50,7 +50,7 @@ class Coverage:
     def of(
         cls, views: Sequence[View], board: Board, image_size_px: tuple[int, int], eyes: tuple[Eye, ...] = EYES
     ) -> Coverage:
-        """What these views cover."""
+        """Return the coverage of these views."""
         whole = [view for view in views if view.is_seen_by(eyes)]
         left = seen_by(whole, "left")
         tilts = [rough_tilt_deg(corners, board, image_size_px) for corners in left]
@@ -59,27 +59,27 @@ class Coverage:
         return cls(len(whole), cells, np.reshape(tilts, (-1, 2)), np.array(extents), eyes)
 
     def covered(self, eye: Eye) -> NDArray[np.bool_]:
-        """Which cells of an eye's image have enough corners, shape (3, 3)."""
+        """Return the cells of an eye's image that have enough corners, shape (3, 3)."""
         return self.cells[self.eyes.index(eye)] >= CORNERS_A_CELL
 
     @property
     def largest_tilts_deg(self) -> FloatArray:
-        """Of each whole view, shape (n,)."""
+        """Total tilt of each whole view [deg], shape (n,)."""
         return np.hypot(self.tilts_deg[:, 0], self.tilts_deg[:, 1])
 
     def missing(self) -> list[str]:
-        """What to show next, the most useful first; empty when nothing is missing."""
+        """Return advice on the next views, the most useful first; empty if nothing is missing."""
         return [*self._tilts_missing(), *self._cells_missing(), *self._distances_missing(), *self._views_missing()]
 
     @property
     def progress(self) -> float:
-        """How much of what is wanted is there, 0 to 1."""
+        """Share of the wanted coverage that is reached, 0 to 1."""
         wanted = len(self.tilted()) + len(self.eyes) * GRID[0] * GRID[1] + 2 + WANTED_VIEWS
         lacking = len(self._tilts_missing()) + len(self._cells_missing()) + len(self._distances_missing())
         return 1.0 - (lacking + max(WANTED_VIEWS - self.whole_views, 0)) / wanted
 
     def tilted(self) -> dict[str, int]:
-        """How many views have each edge of the board farther away than the opposite one."""
+        """Return the number of views in which each edge of the board is farther away than the opposite one."""
         about_upright, about_level = self.tilts_deg[:, 0], self.tilts_deg[:, 1]
         ways = {
             "right": about_upright > _TILT_DEG,
@@ -91,12 +91,12 @@ class Coverage:
 
     @property
     def has_near(self) -> bool:
-        """Whether a view has the board near."""
+        """True if a view shows the board near."""
         return bool(np.any(self.extents > _NEAR))
 
     @property
     def has_far(self) -> bool:
-        """Whether a view has it far away."""
+        """True if a view shows the board far away."""
         return bool(np.any(self.extents < _FAR))
 
     def _tilts_missing(self) -> list[str]:
@@ -127,12 +127,12 @@ class Coverage:
 
 
 def cell_name(row: int, column: int) -> str:
-    """As in "upper left"."""
+    """Return the name of a grid cell, such as "upper left"."""
     return "middle" if (row, column) == (1, 1) else f"{_ROWS[row]} {_COLUMNS[column]}"
 
 
 def cell_counts(px: FloatArray, image_size_px: tuple[int, int]) -> NDArray[np.int64]:
-    """How many image points (n, 2) lie in each cell of the grid, rows first."""
+    """Count the image points (n, 2) in each cell of the grid, rows first."""
     rows = np.clip(px[:, 1] / image_size_px[1] * GRID[0], 0, GRID[0] - 1).astype(int)
     columns = np.clip(px[:, 0] / image_size_px[0] * GRID[1], 0, GRID[1] - 1).astype(int)
     counts = np.zeros(GRID, dtype=np.int64)
@@ -141,15 +141,15 @@ def cell_counts(px: FloatArray, image_size_px: tuple[int, int]) -> NDArray[np.in
 
 
 def extent(corners: Corners, image_size_px: tuple[int, int]) -> float:
-    """How much of the image the corners span: the larger of both directions."""
+    """Return the share of the image that the corners span: the larger of both directions."""
     return float(np.max(np.ptp(corners.px, axis=0) / np.array(image_size_px)))
 
 
 def rough_tilt_deg(corners: Corners, board: Board, image_size_px: tuple[int, int]) -> tuple[float, float]:
-    """How far the board is turned out of the image plane, as `Coverage` has it.
+    """Return the board's tilt out of the image plane, as in `Coverage`.
 
-    Not out of the plane square to the line of sight: parallel to the image plane a board is seen without perspective
-    wherever it is, and tells nothing of the focal length.
+    The image plane is the reference, not the plane perpendicular to the line of sight: a board parallel to the image
+    plane shows no perspective anywhere in the image, and does not determine the focal length.
     """
     width, height = image_size_px
     focal = _USUAL_FOCAL * width

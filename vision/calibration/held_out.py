@@ -1,4 +1,4 @@
-"""How well a calibration foretells views that it was not made of."""
+"""Held-out error of a calibration, by cross-validation over views."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _POSE_FREEDOM = 6
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Errors of each view when it was not fitted, its pose apart.
+    """Errors of each view when it was held out, except for its own pose.
 
     Attributes:
         squares: sum of squared residuals of each view [px²].
-        freedom: image coordinates of each less those that its pose takes.
+        freedom: image coordinates of each view minus those its pose takes.
     """
 
     squares: FloatArray
@@ -36,20 +36,20 @@ class HeldOut:
 
     @property
     def view_rms_px(self) -> FloatArray:
-        """The same of each view."""
+        """RMS error per image coordinate of each view [px]."""
         return np.sqrt(self.squares / self.freedom)
 
     def is_better_than(self, other: HeldOut) -> bool:
-        """Whether views are foretold better than by `other`, in the logarithm by more than twice its standard error."""
+        """Return True if the mean log error is lower than that of `other` by more than twice its standard error."""
         gain = np.log(other.squares / self.squares)
         return float(gain.mean()) > 2.0 * float(gain.std(ddof=1)) / np.sqrt(len(gain))
 
 
 def held_out(views: Sequence[View], corners_m: FloatArray, whole: Bundle) -> HeldOut:
-    """Cross-validation by views: a tenth of them is left out in turn and then foretold.
+    """Cross-validate by views: hold out a tenth of them in turn and predict them.
 
     Args:
-        whole: the fit of all views, from which each part's fit starts. Corners that it left out do not count here.
+        whole: the fit of all views, from which each part's fit starts. Corners rejected there do not count here.
     """
     groups = np.arange(len(views)) % min(_FOLDS, len(views))
     squares = np.zeros(len(views))

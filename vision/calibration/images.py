@@ -1,4 +1,4 @@
-"""Pairs of images in files, or those of one camera: which belong together, and reading them."""
+"""Pairs of image files, or those of one camera: match them by name, read and write them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _WILDCARD = re.compile(r"(\*|\?|\[[^\]]*\])")
 
 @dataclass(frozen=True)
 class PairFiles:
-    """The files of one view: the same one twice where it shows both eyes side by side, one of one camera alone."""
+    """Files of one view: the same file twice for side-by-side images, one file for a single camera."""
 
     name: str
     left: Path
@@ -30,7 +30,7 @@ class PairFiles:
 
 @dataclass(frozen=True, eq=False)
 class ImagePair:
-    """Both eyes' images of one instant, or that of one camera alone, shape (height, width, 3) BGR each."""
+    """Both eyes' images of one instant, or that of a single camera, shape (height, width, 3) BGR each."""
 
     name: str
     left: ImageArray
@@ -38,30 +38,29 @@ class ImagePair:
 
     @property
     def images(self) -> tuple[ImageArray, ...]:
-        """One for each eye, the left one's first."""
+        """One image for each eye, the left one first."""
         return (self.left,) if self.right is None else (self.left, self.right)
 
     @property
     def size_px(self) -> tuple[int, int]:
-        """Width and height of each."""
+        """Width and height of each image."""
         return self.left.shape[1], self.left.shape[0]
 
 
 def pair_files(
     folder: Path, left: str | None, right: str | None, *, side_by_side: bool, one: bool = False
 ) -> list[PairFiles]:
-    """Which files of a folder belong together, in the order of their names.
+    """Match the files of a folder into pairs, sorted by name.
 
-    Without patterns, left and right are told apart by `left`, `right`, `l` or `r` in the names of files or of their
-    folders; what else the names have is the view's. Numbers in names count as numbers.
+    Without patterns, left and right are recognised by `left`, `right`, `l` or `r` in the names of files or of their
+    folders; the rest of the name identifies the view. Numbers in names sort as numbers.
 
     Args:
-        left, right: patterns of the eyes' files, as in left*.png; equal texts for the star
-            belong together.
-        one: whether all images are of one camera alone.
+        left, right: patterns of the eyes' files, such as left*.png; files with equal text for the star belong together.
+        one: True if all images are of a single camera.
 
     Raises:
-        CalibrationError: there is no such folder, or it has no pairs.
+        CalibrationError: the folder does not exist, or has no pairs.
     """
     if not folder.is_dir():
         raise CalibrationError(f"{folder}: there is no such folder")
@@ -83,7 +82,7 @@ def pair_files(
 
 
 def read_pairs(pairs: list[PairFiles], *, side_by_side: bool) -> Iterator[ImagePair]:
-    """The images, one pair after the other.
+    """Yield the images, one pair after the other.
 
     Raises:
         CalibrationError: a file is no image, or the sizes differ.
@@ -106,7 +105,7 @@ def read_pairs(pairs: list[PairFiles], *, side_by_side: bool) -> Iterator[ImageP
 
 
 def require_equal_sizes(name: str, left: ImageArray, right: ImageArray) -> None:
-    """CalibrationError where the two eyes' images are of different sizes."""
+    """Raise CalibrationError if the two eyes' images are of different sizes."""
     if left.shape[:2] != right.shape[:2]:
         sizes = [_size((image.shape[1], image.shape[0])) for image in (left, right)]
         raise CalibrationError(
@@ -123,7 +122,7 @@ def _images(folder: Path, pattern: str) -> list[Path]:
 
 
 def _varied(file: Path, pattern: str) -> str:
-    """What a file's name has in the place of the stars and other wildcards of its pattern."""
+    """Return the text of a file's name that matches the wildcards of its pattern."""
     parts = _WILDCARD.split(Path(pattern).name)
     words = {"*": "(.*)", "?": "(.)"}
     wild = "".join(words.get(part, f"({part})") if k % 2 else re.escape(part) for k, part in enumerate(parts))
@@ -151,7 +150,7 @@ def _matched(left: dict[str, Path], right: dict[str, Path]) -> list[PairFiles]:
 
 
 def _in_order(file: Path) -> tuple[list[tuple[float, str]], str]:
-    """Files are in the order of their names, numbers in them as numbers."""
+    """Return a sort key by name, with numbers as numbers."""
     parts = _NUMBER.split(file.as_posix())
     return [(float(part), "") if k % 2 else (0.0, part) for k, part in enumerate(parts)], file.as_posix()
 
@@ -164,10 +163,10 @@ def _read(file: Path) -> ImageArray:
 
 
 def write_pair(pair: ImagePair, folder: Path, number: int) -> None:
-    """Write a pair as left01.png and right01.png, as `pair_files` reads them, or the image of one camera alone.
+    """Write a pair as left01.png and right01.png, as `pair_files` reads them, or the image of a single camera.
 
     Raises:
-        CalibrationError: it cannot be written.
+        CalibrationError: a file cannot be written.
     """
     names = ("left", "right") if len(pair.images) > 1 else ("image",)
     for name, image in zip(names, pair.images, strict=True):

@@ -1,4 +1,4 @@
-"""What each corner does to a joint fit, and how sure its rig is by that."""
+"""Influence of each corner on a joint fit, and the rig's covariance from it."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ _LEAST_FREE = 0.2
 
 @dataclass(frozen=True)
 class Influence:
-    """Of one view's corners, the left eye's before the right one's.
+    """Influence of one view's corners, the left eye's before the right one's.
 
     Attributes:
-        residual: seen minus expected, shape (corners, 2) [px].
-        scores: how each coordinate pulls the rig, its pose adapted, shape (2 corners, p).
-        by_pose: how what is expected depends on the board's pose, shape (2 corners, 6).
-        free: the share of its variance that the fit leaves each corner, shape (corners,).
+        residual: measured minus predicted, shape (corners, 2) [px].
+        scores: pull of each coordinate on the rig, with its pose adapted, shape (2 corners, p).
+        by_pose: Jacobian of the prediction by the board's pose, shape (2 corners, 6).
+        free: share of its variance that the fit leaves each corner, shape (corners,).
     """
 
     residual: FloatArray
@@ -33,7 +33,7 @@ class Influence:
 
 
 def influences(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> Iterator[Influence]:
-    """Of each view that was fitted."""
+    """Yield the influence of each fitted view."""
     rig = _inverse(bundle.normal)
     for view, pose, weights in zip(views, bundle.poses, bundle.weights, strict=True):
         residual, J, K = seen_with_slopes(view, corners_m, bundle.model, bundle.vector, pose)
@@ -47,10 +47,10 @@ def influences(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> 
 
 
 def covariance(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> FloatArray:
-    """Of the rig's parameters, shape (p, p), whatever the noise of each corner is.
+    """Return the covariance of the rig's parameters, shape (p, p), without assuming equal noise of all corners.
 
     Each corner's own residuals stand for its variance (HC3 of MacKinnon & White 1985), so that corners with much noise
-    and much influence, as those at a fisheye's border, count as much as they do.
+    and much influence, such as those at a fisheye's border, are weighted correctly.
     """
     middle = np.zeros_like(bundle.normal)
     for each in influences(views, corners_m, bundle):

@@ -1,4 +1,4 @@
-"""Views of the board from cameras that send images now: taken by themselves when the board is still and new."""
+"""Views of the board from live cameras, taken automatically when the board is still and in a new pose."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from .images import ImagePair
 from .view import EYES, Eye, View, all_px
 
 _STILL_PX = 1.0  # between two frames; the median of all corners
-# What makes a view another one: how far its corners are from theirs, as a share of the image's width, or the tilt.
+# A view is new if its corners differ by this share of the image's width from all others, or its tilt by this angle.
 _NEW_SHARE, _NEW_TILT_DEG = 0.06, 10.0
 
 
 class Outcome(StrEnum):
-    """What became of a pair of images."""
+    """Outcome of a pair of images."""
 
     TAKEN = "taken"
     MOVING = "moving"
@@ -33,13 +33,13 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True)
 class Look:
-    """One pair of images.
+    """Result for one pair of images.
 
     Attributes:
-        outcome: what became of it: taken as a view, the board moved, it is where it was in a view that was taken, or an
-            eye does not see it and the other one shows nothing new.
+        outcome: taken as a view; the board moved; a similar view was taken before; or an eye does not see the board and
+            the other one shows nothing new.
         view: the corners in it.
-        unusable: the eyes that do not see the board, and why.
+        unusable: the eyes that do not see the board, with the reason.
         pair: the images.
     """
 
@@ -50,18 +50,19 @@ class Look:
 
 
 class LiveViews:
-    """Looks at one pair of images after the other.
+    """Selection of views from a stream of image pairs.
 
-    A view is taken when both eyes see the board, it has been still for two frames, and no view like it was taken. One
-    eye's is taken alone where it shows the board in a part of the image in which it was not yet.
+    A view is taken when both eyes see the board, it has been still for two frames, and no similar view was taken. A
+    view
+    of a single eye is taken if it shows the board in a part of the image that is not covered yet.
 
     Attributes:
-        found: the views that were taken, and their images.
-        coverage: what they cover.
+        found: the views taken, and their images.
+        coverage: image coverage of these views.
     """
 
     def __init__(self, board: Board, detector: Detector | None = None, eyes: tuple[Eye, ...] = EYES) -> None:
-        """Nothing was seen yet."""
+        """Start without views."""
         self.found = Gathered(board, eyes=eyes)
         self.coverage = self.found.coverage()
         self._detector = BoardDetector(board) if detector is None else detector
@@ -69,7 +70,7 @@ class LiveViews:
         self._before: View | None = None
 
     def look(self, frame: StereoFrame) -> Look:
-        """Look at the next pair, and take it where it is of use.
+        """Examine the next pair, and take it if it is useful.
 
         Raises:
             CalibrationError: the two eyes' images are of different sizes.
@@ -86,7 +87,7 @@ class LiveViews:
         return Look(outcome, view, unusable, pair)
 
     def forget(self) -> None:
-        """The next pair does not follow the last one: cameras were away."""
+        """Forget the last pair, after the cameras were disconnected."""
         self._before = None
 
     def _outcome(self, view: View) -> Outcome:
@@ -101,7 +102,7 @@ class LiveViews:
         return Outcome.TAKEN
 
     def _fills(self, view: View, eye: Eye) -> bool:
-        """Whether an eye sees the board in a part of its image in which it was not yet."""
+        """Return True if an eye sees the board in a part of its image that is not covered yet."""
         shown = cell_counts(all_px([view], eye), self.found.image_size_px) >= CORNERS_A_CELL
         return bool((shown & ~self.coverage.covered(eye)).any())
 
@@ -118,7 +119,7 @@ class LiveViews:
 
 
 def _apart_px(one: View, other: View, eye: Eye) -> float:
-    """Median distance of the corners that both views have; infinite where they have none."""
+    """Return the median distance of the corners in both views; infinite if there are none."""
     a, b = one.eye(eye), other.eye(eye)
     if a is None or b is None:
         return np.inf

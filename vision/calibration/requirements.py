@@ -1,4 +1,4 @@
-"""When views or a calibration are not good enough, and why."""
+"""Requirements on views and on a calibration, with messages for those not met."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _MOST_HAND_ERROR_M = 0.0015
 
 
 def lacking(coverage: Coverage) -> list[str]:
-    """What is wrong with the views, before anything is made of them."""
+    """Return messages for what the views lack, before a fit."""
     reasons = []
     who = "both eyes saw" if len(coverage.eyes) > 1 else "the camera saw"
     if coverage.whole_views < LEAST_VIEWS:
@@ -47,7 +47,7 @@ def lacking(coverage: Coverage) -> list[str]:
 
 
 def misplaced(R_right_left: FloatArray, translation_m: FloatArray) -> str | None:
-    """What is wrong with where the eyes are: exchanged, upside down, one above the other; None when nothing is.
+    """Return a message if the eyes are exchanged, upside down or one above the other, else None.
 
     Args:
         R_right_left, translation_m: a point x of the left eye's frame is at R x + t in the right one's.
@@ -73,7 +73,7 @@ def misplaced(R_right_left: FloatArray, translation_m: FloatArray) -> str | None
 
 
 def unsure(rig: Rig) -> list[str]:
-    """What of a calibration is not determined well enough."""
+    """Return messages for the parameters that are not determined well enough."""
     reasons = []
     width = rig.image_size_px[0]
     if rig.made.held_out_px > _MOST_HELD_OUT * width:
@@ -106,7 +106,7 @@ def unsure(rig: Rig) -> list[str]:
 
 
 def contradicts(rig: StereoRig, baseline_m: float) -> str | None:
-    """What to say where the baseline that was measured by hand is not the calibrated one; None where it is."""
+    """Return a message if the baseline measured by hand contradicts the calibrated one, else None."""
     allowed = np.hypot(3.0 * rig.baseline_sigma_m, _MOST_HAND_ERROR_M)
     ratio = baseline_m / rig.baseline_m
     if abs(baseline_m - rig.baseline_m) <= allowed:
@@ -119,5 +119,5 @@ def contradicts(rig: StereoRig, baseline_m: float) -> str | None:
 
 
 def together(reasons: Sequence[str]) -> str:
-    """The reasons as one message."""
+    """Join the reasons into one message."""
     return reasons[0] if len(reasons) == 1 else "".join(f"\n- {reason}" for reason in reasons)

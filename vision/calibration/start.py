@@ -1,4 +1,4 @@
-"""Where the joint fit begins: each eye by itself, then the right eye's place from all views of both."""
+"""Initial values for the joint fit: each eye by itself, then the right eye's pose from all views of both."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bodyschema.vision.rig import CalibrationError
 
 from .view import EYES, Eye, View, seen_by
 
-# Of the image's width: the focal lengths that a fisheye lens is tried with.
+# of the image's width: candidate focal lengths of a fisheye lens
 _FISHEYE_FOCALS = (0.25, 0.35, 0.5, 0.7, 1.0)
 _LEAST_CORNERS = 6
 
@@ -27,7 +27,7 @@ def start(
     model: Model,
     eyes: Sequence[Eye] = EYES,
 ) -> tuple[FloatArray, FloatArray]:
-    """The rig's parameters and the board's pose in the left eye's frame in each view, shape (views, 6).
+    """Return initial rig parameters and board poses in the left eye's frame, shape (views, 6).
 
     Raises:
         CalibrationError: no two views were seen by both eyes, or OpenCV finds no lens.
@@ -50,7 +50,7 @@ def start(
 
 
 def pose_of(seen: Corners, corners_m: FloatArray, lens: Lens) -> FloatArray:
-    """The board's pose in an eye's frame: rotation vector [rad] and position [m], shape (6,)."""
+    """Return the board's pose in an eye's frame: rotation vector [rad] and position [m], shape (6,)."""
     model = corners_m[seen.numbers]
     directions = lens.directions(seen.px)
     _, rotations, translations, _ = cv2.solvePnPGeneric(
@@ -93,7 +93,7 @@ def _lens(seen: Sequence[Corners], corners_m: FloatArray, size_px: tuple[int, in
 def _fisheye(
     seen: Sequence[Corners], corners_m: FloatArray, size_px: tuple[int, int], share: float
 ) -> tuple[Lens, float]:
-    """An undistorted fisheye lens of a focal length, and how far corners are from where it has them [px]."""
+    """Return an undistorted fisheye lens of a focal length, and the median residual of its corners [px]."""
     focal = share * size_px[0]
     centre = (0.5 * (size_px[0] - 1), 0.5 * (size_px[1] - 1))
     lens = Lens("fisheye", (focal, focal), centre, (0.0,) * len(DISTORTION_NAMES["fisheye"]))
@@ -111,7 +111,7 @@ def _fisheye(
 
 
 def _between(left: Sequence[FloatArray | None], right: Sequence[FloatArray | None]) -> tuple[Rotation, FloatArray]:
-    """The left eye's pose in the right one's frame: what most views agree on."""
+    """Return the left eye's pose in the right one's frame, as a median over the views."""
     turns, places = [], []
     for a, b in zip(left, right, strict=True):
         if a is None or b is None:
@@ -126,7 +126,7 @@ def _between(left: Sequence[FloatArray | None], right: Sequence[FloatArray | Non
 
 
 def _through(right: FloatArray | None, rotation: Rotation, translation: FloatArray) -> FloatArray:
-    """The board's pose in the left eye's frame, of that in the right one's."""
+    """Return the board's pose in the left eye's frame from that in the right one's."""
     if right is None:
         raise CalibrationError("a view that neither eye saw")
     turn = rotation.inv() * Rotation.from_rotvec(right[:3])

@@ -1,9 +1,10 @@
-"""How much each corner counts in the joint fit.
+"""Weights of the corners in the joint fit.
 
-Corners are found to 0.01 px where squares are large, and to 0.1 px where they are small or seen aslant: far off, and
-through a fisheye towards the border, which is where its lens is learnt from. Taken as equal, the good ones count too
-little. So the variance of a corner is taken from the residuals of those whose squares
-are as wide, times what its own image's residuals are larger or smaller.
+Corners are found to 0.01 px where squares are large, and to 0.1 px where they are small or seen obliquely: far away,
+and
+towards the border of a fisheye image, which determines its lens. With equal weights, the accurate corners would count
+too little. The variance of a corner is therefore estimated from the residuals of corners whose squares are as wide,
+multiplied by the relative level of its own image's residuals.
 """
 
 from __future__ import annotations
@@ -22,25 +23,25 @@ from .bundle import Bundle
 from .influence import influences
 from .view import View
 
-_FARTHEST = 5.0  # 1-sigmas: farther off, a corner was mistaken for something else
-_MOST_MISTAKEN = 0.2  # of an image's corners
-_GROUP = 60  # corners whose squares are as wide
-_SHARED = 6.0  # corners that the usual spread counts for, against an image's own
+_FARTHEST = 5.0  # 1-sigmas: a corner farther off is an outlier
+_MOST_MISTAKEN = 0.2  # of an image's corners: largest share of outliers
+_GROUP = 60  # corners with squares of similar width
+_SHARED = 6.0  # prior weight of the usual variance, in corners, against an image's own
 _ROUNDS = 3
-# Of a squared distance in the plane, by twice the variance of a coordinate: the median of an exponential distribution.
+# A squared distance in the plane over twice the coordinate variance is exponential; this is the median.
 _MEDIAN = np.log(2.0)
 
 
 @dataclass(frozen=True)
 class _Spread:
-    """Of all corners: their variance as their own residuals tell it [px²], how wide squares are there, their images."""
+    """Spread of all corners: variance from their own residuals [px²], width of their squares, and their image."""
 
     own: FloatArray
     width: FloatArray
     image: NDArray[np.int64]
 
     def usual(self, share: FloatArray, kept: NDArray[np.bool_], *, robust: bool) -> FloatArray:
-        """The variance of corners whose squares are as wide, of what is left when an image's share is taken out."""
+        """Return the variance of corners by the width of their squares, with the share of each image taken out."""
         order = np.flatnonzero(kept)[np.argsort(self.width[kept], kind="stable")]
         groups = np.array_split(order, max(len(order) // _GROUP, 1))
         left = self.own / share
@@ -50,13 +51,13 @@ class _Spread:
         return np.exp(np.interp(np.log(self.width), middle, np.log(np.maximum(falling, 1e-12))))
 
     def shares(self, usual: FloatArray, kept: NDArray[np.bool_]) -> FloatArray:
-        """By how much each image's corners vary more than the usual, for each corner."""
+        """Return the variance of each corner's image relative to the usual one."""
         among = kept.astype(np.float64)
         count, total = np.bincount(self.image, among), np.bincount(self.image, among * self.own / usual)
         return ((total + _SHARED) / (count + _SHARED))[self.image]
 
     def fitting(self, usual: FloatArray) -> NDArray[np.bool_]:
-        """Which corners were not mistaken for something else."""
+        """Return which corners are not outliers."""
         fits = np.ones(len(self.own), dtype=bool)
         for number in range(int(self.image.max()) + 1):
             mine = np.flatnonzero(self.image == number)
@@ -67,7 +68,7 @@ class _Spread:
 
 
 def corner_weights(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> tuple[FloatArray, ...]:
-    """The weight of each view's corners after a fit, the left eye's before the right one's; 0 for what was mistaken.
+    """Return the weights of each view's corners after a fit, the left eye's before the right one's; 0 for outliers.
 
     The mean over all corners is 1, so that weighted residuals remain pixels.
     """
@@ -87,7 +88,7 @@ def _spread(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> _Sp
     own, width, image = [], [], []
     for k, (view, pose, each) in enumerate(zip(views, bundle.poses, influences(views, corners_m, bundle), strict=True)):
         own.append(0.5 * np.sum(each.residual**2, axis=1) / each.free)
-        # Pixels that a step along the board's axes takes, and so how wide a square is across its narrower direction.
+        # Pixels per step along the board's axes, and from them the width of a square in its narrower direction.
         steps = each.by_pose[:, 3:].reshape(-1, 2, 3) @ Rotation.from_rotvec(pose[:3]).as_matrix()[:, :2]
         width.append(1.0 / np.linalg.norm(np.linalg.inv(steps), axis=2).max(axis=1))
         left = 0 if view.left is None else len(view.left)

@@ -1,4 +1,4 @@
-"""What the tracker sees and makes of it, drawn into the images."""
+"""Annotated camera images that show what the tracker sees."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .annotate_tags import TagDrawing, TagSight, outline
 GREEN, YELLOW, RED, BLACK = (80, 220, 80), (0, 220, 255), (110, 110, 255), (0, 0, 0)
 FONT, LETTERS, LINE_PX = cv2.FONT_HERSHEY_SIMPLEX, 0.5, 18
 SUBPIXEL_BITS = 4
-MAGNIFIED = 10  # the difference of the rows, which is a fraction of a pixel
+MAGNIFIED = 10  # the row difference is a fraction of a pixel
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,8 +28,8 @@ class Sight:
     """One patch of the marker's colour in one eye.
 
     Attributes:
-        centre_px, radius_px: of the disc; roughly of the patch where it is none.
-        reason: why it is no disc, or None.
+        centre_px, radius_px: of the disc, or roughly of the patch if it is no disc.
+        reason: reason why it is no disc, or None.
     """
 
     centre_px: tuple[float, float]
@@ -38,7 +38,7 @@ class Sight:
 
 
 class Annotator:
-    """Draws frames of one camera."""
+    """Annotator for the frames of one camera."""
 
     def __init__(self, calibration: StereoCalibration, config: VisionConfig) -> None:
         self._calibration, self._config = calibration, config
@@ -50,7 +50,7 @@ class Annotator:
         self._whole = Region(0, 0, width, height)
 
     def sights(self, image: ImageArray) -> list[Sight]:
-        """Everything that looks like the ball in one eye's image, the marker or not; nothing where it is tags."""
+        """Return everything that looks like the ball in one eye's image, marker or not; empty for tags."""
         if not self._is_ball:
             return []
         found = []
@@ -63,7 +63,7 @@ class Annotator:
         return found
 
     def drawn(self, frame: StereoFrame, seen: MarkerFix | MarkerMiss) -> ImageArray:
-        """All images side by side (height, eyes width, 3), with what was seen in them."""
+        """Return all images side by side (height, eyes width, 3), with annotations."""
         eyes = [np.ascontiguousarray(image).copy() for image in frame.images]
         sights = [self.sights(image) for image in frame.images]
         if self._tags is not None:
@@ -74,7 +74,7 @@ class Annotator:
             for sight in sights[place]:
                 self._draw_sight(eye, sight)
             if isinstance(seen, MarkerMiss) and len(eyes) > 1:
-                for sight in sights[1 - place]:  # where the other eye's discs should be in this one
+                for sight in sights[1 - place]:  # expected rows of the other eye's discs
                     if sight.reason is None:
                         _row(eye, sight.centre_px[1], YELLOW)
         if isinstance(seen, MarkerFix):
@@ -93,7 +93,7 @@ class Annotator:
             _write(image, WORDS[sight.reason], at, RED)
 
     def _draw_fix(self, eyes: list[ImageArray], fix: MarkerFix) -> None:
-        """The marker as it would be seen at the fix, and its row in the other eye."""
+        """Draw the marker projected from the fix, and its row in the other eye."""
         radius_px = self._calibration.focal_px * self._config.radius_m / float(fix.x[2]) if self._is_ball else 0.0
         if not self._calibration.is_stereo:
             u, v = self._calibration.project(fix.x)[:2].tolist()
@@ -108,7 +108,7 @@ class Annotator:
                 _circle(image, own, radius_px, GREEN)
             cv2.drawMarker(image, (round(own[0]), round(own[1])), GREEN, cv2.MARKER_CROSS, 9)
             _row(image, other, YELLOW)
-            # Where the other eye's row is, the distance magnified so that it can be seen.
+            # The distance to the other eye's row, magnified to be visible.
             end = own[1] + MAGNIFIED * (other - own[1])
             at = round(own[0] + 2 * radius_px) + 6
             cv2.line(image, (at, round(own[1])), (at, round(end)), RED, 2)
@@ -123,7 +123,7 @@ class Annotator:
 
 
 def _draw_tag(image: ImageArray, tag: TagSight) -> None:
-    """A tag's outline and number: yellow where it is measured, red where it is not, with the reason."""
+    """Draw a tag's outline and number: yellow if it is measured, red with the reason if not."""
     why = WORDS[tag.reason] if tag.reason is not None else ""
     why = why if tag.is_wanted else "not the marker's"
     colour = RED if why else YELLOW
@@ -149,7 +149,7 @@ def _row(image: ImageArray, v_px: float, colour: tuple[int, int, int]) -> None:
 
 
 def _write(image: ImageArray, text: str, at: tuple[int, int], colour: tuple[int, int, int]) -> None:
-    """Letters on a ground of their own."""
+    """Write text on a filled background."""
     (width, height), _ = cv2.getTextSize(text, FONT, LETTERS, 1)
     x, y = max(at[0], 2), max(at[1], height + 2)
     cv2.rectangle(image, (x - 2, y - height - 3), (x + width + 2, y + 4), BLACK, -1)

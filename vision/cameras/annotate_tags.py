@@ -1,4 +1,4 @@
-"""Tags drawn into the images: those that are seen, and those of the marker where a fix has it."""
+"""Tags drawn into camera images: the detected ones, and the marker's as predicted from a fix."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class TagSight:
     """A tag in one eye's image.
 
     Attributes:
-        corners_px: (4, 2), roughly where it was refused.
-        reason: why it is not measured, or None. is_wanted: whether the marker has it.
+        corners_px: shape (4, 2), rough if it was refused.
+        reason: reason why it is not measured, or None. is_wanted: True if it belongs to the marker.
     """
 
     id: int
@@ -37,7 +37,7 @@ class TagSight:
 
 
 class TagDrawing:
-    """Of the tags that [vision] looks for, and of others of their dictionary."""
+    """Drawing of the tags that [vision] names, and of others of their dictionary."""
 
     def __init__(self, calibration: StereoCalibration, config: VisionConfig) -> None:
         self._calibration, self._config = calibration, config.tag
@@ -46,7 +46,7 @@ class TagDrawing:
         self._finder = TagFinder(config.tag, range(len(tags_of(config.tag.dictionary).bytesList)))
 
     def sights(self, image: ImageArray) -> Iterator[TagSight]:
-        """All tags of the dictionary in one eye's image."""
+        """Yield all tags of the dictionary in one eye's image."""
         grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
         for id, rough in self._finder.squares(grey):
             found = measure_tag(grey, id, rough, self._config)
@@ -54,7 +54,7 @@ class TagDrawing:
             yield TagSight(id, corners, reason, id in self._body.corners)
 
     def draw_fix(self, eyes: list[ImageArray], fix: MarkerFix, colour: tuple[int, int, int]) -> None:
-        """Outlines of the marker's tags that face the left eye, and the marker's axes."""
+        """Draw the outlines of the marker's tags that face the left eye, and the marker's axes."""
         if fix.R is None:
             return
         turn = Rotation.from_quat(fix.R).as_matrix()
@@ -69,13 +69,13 @@ class TagDrawing:
                 cv2.line(image, _fixed(px[0]), _fixed(end), shade, 2, cv2.LINE_AA, SUBPIXEL_BITS)
 
     def _seen(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Where the left eye and a right one see points (n, 3), (n, 2) each [px]."""
+        """Project points (n, 3) into the left and a right eye, shape (n, 2) each [px]."""
         px = self._calibration.project(x)
         return px[:, :2], px[:, 2:]
 
 
 def outline(image: ImageArray, px: FloatArray, colour: tuple[int, int, int]) -> None:
-    """A closed line through points (n, 2)."""
+    """Draw a closed line through points (n, 2)."""
     points = [np.round(px * 2**SUBPIXEL_BITS).astype(np.int32)]
     cv2.polylines(image, points, True, colour, 2, cv2.LINE_AA, SUBPIXEL_BITS)
 

@@ -1,4 +1,4 @@
-"""A camera in a thread of its own: the newest image, never a queue of old ones."""
+"""Camera thread that hands on the newest image and keeps no queue."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ log = logging.getLogger(__name__)
 
 
 class Capture:
-    """Reads a device as fast as it sends, and hands each image on.
+    """Thread that reads a device as fast as it sends and hands each image on.
 
     Attributes:
-        look: what its images say of the camera.
-        failure: why it does not read any more, or None.
+        look: statistics of the camera from its images.
+        failure: error that ended the thread, or None.
     """
 
     def __init__(
         self, device: CameraDevice, fps: float, take: Callable[[Shot], None], wake: Callable[[], None]
     ) -> None:
-        """Nothing is opened yet.
+        """Create the thread's state without opening the device.
 
         Args:
-            fps: what is expected.
-            take: given each image, in the thread.
+            fps: expected frame rate [1/s].
+            take: called with each image, in the thread.
             wake: called in the thread when it ends.
         """
         self._device, self._fps, self._take, self._wake = device, fps, take, wake

@@ -18,23 +18,23 @@ NonNegative = Annotated[float, Meta(ge=0)]
 Side = Annotated[int, Meta(ge=16, le=LARGEST_SIDE_PX)]
 
 LAYOUTS = ("one", "two", "side_by_side", "images", "videos")
-# Of a camera whose latency nobody has measured [s]: exposure, readout and transfer of a webcam.
+# Latency uncertainty of an uncalibrated camera [s]: exposure, readout and transfer of a webcam.
 UNKNOWN_LATENCY_SIGMA_S = 0.015
 ENUMERATED = re.compile(r"\d+|/dev/video\d+")
 
 
 class UvcSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What a camera is told when it is opened; it is asked afterwards what it took.
+    """Settings written to a camera when it is opened, and read back afterwards.
 
     Attributes:
         image_size_px: width and height of each eye's image.
         fps: frames per second.
-        fourcc: how images come over the wire: MJPG (compressed) or YUYV (about five times as much).
-        buffers: of the kernel. A camera that loses every second frame with 1 needs 2.
-        exposure_s: exposure time; without it the camera chooses, and the ball's brightness wanders.
-        gain: in the camera's units, as `v4l2-ctl -l` shows them; without it as it is.
+        fourcc: transfer format: MJPG (compressed) or YUYV (about five times as much).
+        buffers: kernel buffers. A camera that loses every second frame with 1 needs 2.
+        exposure_s: exposure time; without it the camera chooses, and the ball's brightness drifts.
+        gain: in the camera's units, as `v4l2-ctl -l` shows them; without it unchanged.
         white_balance_k: colour temperature [K]; without it the camera chooses.
-        focus: in the camera's units; without it as it is. A lens that refocuses changes the calibration.
+        focus: in the camera's units; without it unchanged. A lens that refocuses changes the calibration.
     """
 
     image_size_px: tuple[Side, Side]
@@ -48,21 +48,21 @@ class UvcSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class OneConfig(UvcSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [vision.cameras.one]: one camera alone.
+    """The table [vision.cameras.one]: a single camera.
 
     Attributes:
-        device: as /dev/v4l/by-id or by-path names it.
+        device: its name in /dev/v4l/by-id or by-path.
     """
 
     device: str
 
 
 class TwoConfig(UvcSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [vision.cameras.two]: a camera for each eye, neither waiting for the other.
+    """The table [vision.cameras.two]: one free-running camera for each eye.
 
     Attributes:
-        left, right: the devices, as /dev/v4l/by-id or by-path name them.
-        max_apart_s: images taken further apart make no pair; 0.6 of a frame's time without it.
+        left, right: the devices, by their names in /dev/v4l/by-id or by-path.
+        max_apart_s: largest time difference of a pair; 0.6 of the frame time without it.
     """
 
     left: str
@@ -71,25 +71,25 @@ class TwoConfig(UvcSettings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     @property
     def longest_apart_s(self) -> float:
-        """`max_apart_s`, or what follows from `fps`: free-running cameras are up to half a frame apart."""
+        """`max_apart_s`, or its default from `fps`: free-running cameras are up to half a frame apart."""
         return self.max_apart_s or 0.6 / self.fps
 
 
 class SideBySideConfig(UvcSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [vision.cameras.side_by_side]: one camera whose image has both eyes', the left one at its left."""
+    """The table [vision.cameras.side_by_side]: one camera with both eyes in its image, the left one on the left."""
 
     device: str
 
 
 class ImagesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [vision.cameras.images]: image files in the place of cameras, in the order of their names.
+    """The table [vision.cameras.images]: image files instead of cameras, sorted by name.
 
     Attributes:
-        left, right: patterns relative to robot.toml, as in "left/*.png"; of one camera alone `left` only.
+        left, right: patterns relative to robot.toml, such as "left/*.png"; only `left` for a single camera.
         times: a text file with the time of each pair [s], one a line; or
-        name_ticks_per_s: the last number in each name is its time, so many to the second (1e9: nanoseconds); or
-        fps: the time between two follows from it.
-        speed: 1 as they were taken, 2 twice as fast, 0 as fast as they are read.
+        name_ticks_per_s: the last number in each name is its time, in ticks of this rate (1e9: nanoseconds); or
+        fps: gives the time between two.
+        speed: 1 as recorded, 2 twice as fast, 0 as fast as they are read.
     """
 
     left: str
@@ -101,14 +101,14 @@ class ImagesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 class VideosConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [vision.cameras.videos]: films in the place of cameras.
+    """The table [vision.cameras.videos]: video files instead of cameras.
 
     Attributes:
-        left, right: a file for each eye, relative to robot.toml; of one camera alone `left` only; or
-        side_by_side: one with both eyes' images in each frame, the left one at its left.
-        times: a text file with the time of each frame [s], one a line; without it, it follows from
-        fps: and without that from the rate that the file names.
-        speed: 1 as it was taken, 2 twice as fast, 0 as fast as it is read.
+        left, right: a file for each eye, relative to robot.toml; only `left` for a single camera; or
+        side_by_side: one file with both eyes' images in each frame, the left one on the left.
+        times: a text file with the time of each frame [s], one a line; without it the times follow from
+        fps: and without that from the rate in the file.
+        speed: 1 as recorded, 2 twice as fast, 0 as fast as it is read.
     """
 
     left: str | None = None
@@ -120,12 +120,12 @@ class VideosConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [vision.cameras]: where images come from. Exactly one of the five layouts.
+    """The table [vision.cameras]: source of the images. Exactly one of the five layouts is given.
 
     Attributes:
         calibration: the file that `bodyschema calibrate cameras` wrote, relative to robot.toml. Without it the
-            images are taken as rectified already, as [camera] describes.
-        latency_s: from the middle of the exposure to the time stamp; `bodyschema calibrate latency` measures it.
+            images are assumed to be rectified, as [camera] describes.
+        latency_s: time from mid-exposure to the time stamp [s]; `bodyschema calibrate latency` measures it.
         latency_sigma_s: its 1-sigma; without it 15 ms for devices, 0 for files.
     """
 
@@ -140,7 +140,7 @@ class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     @property
     def layout(self) -> OneConfig | TwoConfig | SideBySideConfig | ImagesConfig | VideosConfig:
-        """The one that is given; call `check` first."""
+        """The layout that is given; call `check` first."""
         found = self.one or self.two or self.side_by_side or self.images or self.videos
         if found is None:
             raise ConfigError("[vision.cameras] names no cameras")
@@ -148,7 +148,7 @@ class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     @property
     def devices(self) -> dict[str, str]:
-        """The devices by what they are called; none where images come from files."""
+        """Devices by display name; empty if images come from files."""
         match self.layout:
             case OneConfig() as one:
                 return {"camera": one.device}
@@ -160,7 +160,7 @@ class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     @property
     def eyes(self) -> int:
-        """How many eyes look: 1 or 2."""
+        """Number of eyes: 1 or 2."""
         match self.layout:
             case OneConfig():
                 return 1
@@ -176,7 +176,7 @@ class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         return UNKNOWN_LATENCY_SIGMA_S if self.devices else 0.0
 
     def check(self, file: Path, text: str) -> None:
-        """ConfigError when there is not exactly one layout, or it is not complete."""
+        """Raise ConfigError if there is not exactly one layout, or if it is incomplete."""
         given = [name for name in LAYOUTS if getattr(self, name) is not None]
 
         def refuse(what: str, remedy: str, *keys: str) -> None:

@@ -1,4 +1,4 @@
-"""What a camera is told, and what it says that it took."""
+"""Settings of a camera: write them, and report what it did not accept."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ROUNDING = 0.05  # cameras round to their own steps
 
 
 class VideoCapture(Protocol):
-    """What is used of cv2.VideoCapture."""
+    """Subset of cv2.VideoCapture in use."""
 
     def isOpened(self) -> bool: ...
     def set(self, propId: int, value: float, /) -> bool: ...
@@ -31,7 +31,7 @@ class VideoCapture(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class _Control:
-    """One setting: its key, the switch of its automatic with the value for off, property, value, unit of the key."""
+    """One setting: key, automatic mode as (property, value for off), property, value, and the key's unit."""
 
     key: str
     automatic: tuple[int, float] | None
@@ -41,20 +41,20 @@ class _Control:
 
 
 def raw_size_px(settings: UvcSettings) -> tuple[int, int]:
-    """Width and height of the image that the device sends."""
+    """Return width and height of the image that the device sends."""
     width, height = settings.image_size_px
     return (2 * width, height) if isinstance(settings, SideBySideConfig) else (width, height)
 
 
 def apply(capture: VideoCapture, settings: UvcSettings, name: str) -> list[str]:
-    """Tell the camera `settings`; what it did not take, in sentences.
+    """Apply `settings` to the camera and return a message for each that it did not accept.
 
     Raises:
-        SourceError: it sends images of another size, for which no calibration holds.
+        SourceError: the camera sends images of another size, for which the calibration does not hold.
     """
     width, height = raw_size_px(settings)
     capture.set(cv2.CAP_PROP_BUFFERSIZE, settings.buffers)
-    # The format first: it decides which sizes there are, and these which rates.
+    # The format comes first: it determines the available sizes, and these the rates.
     capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*settings.fourcc))
     capture.set(cv2.CAP_PROP_FRAME_WIDTH, width)
     capture.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
@@ -69,7 +69,7 @@ def apply(capture: VideoCapture, settings: UvcSettings, name: str) -> list[str]:
 
 
 def sends_jpeg(capture: VideoCapture) -> bool:
-    """Whether images come compressed."""
+    """Return True if images arrive compressed."""
     return _fourcc(capture) == "MJPG"
 
 
@@ -119,5 +119,5 @@ def _control_complaints(capture: VideoCapture, settings: UvcSettings, name: str)
 
 
 def left_to_the_camera(settings: UvcSettings) -> list[str]:
-    """The settings that nobody fixed."""
+    """Return the settings left to the camera's own control."""
     return [control.key for control in _controls(settings) if control.value is None]

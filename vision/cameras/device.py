@@ -1,4 +1,4 @@
-"""One camera on V4L2, as OpenCV opens it."""
+"""One V4L2 camera, opened with OpenCV."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from .shot import Shot
 from .stamps import Stamps
 
 JPEG_END = b"\xff\xd9"
-PADDING_BYTES = 64  # that some cameras leave after the end
-# How long a read may wait for a frame before it gives up [s]; OpenCV's own is 10, and closing has to wait for it.
+PADDING_BYTES = 64  # that some cameras append
+# Timeout of a read [s]; OpenCV's default is 10, and closing has to wait for it.
 SELECT_TIMEOUT = ("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "1")
 
 OpenCapture = Callable[[str], VideoCapture]
 
 
 def open_v4l2(device: str) -> VideoCapture:
-    """The device in OpenCV's V4L2 backend; others do not hand on the kernel's time stamps."""
+    """Open the device in OpenCV's V4L2 backend, the only one that passes on the kernel's time stamps."""
     os.environ.setdefault(*SELECT_TIMEOUT)
     return cv2.VideoCapture(device, cv2.CAP_V4L2)
 
 
 class CameraDevice:
-    """A camera that is opened, set, read back and then read frame by frame, by one thread.
+    """A camera that is opened, set up, read back and then read frame by frame, by one thread.
 
     Attributes:
-        name: what messages call it.
-        complaints: what it did not take of its settings.
-        damaged: how many images came with their end missing.
+        name: display name for messages.
+        complaints: messages for settings that it did not accept.
+        damaged: number of truncated images.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class CameraDevice:
         try:
             self.complaints = apply(capture, self._settings, self.name)
             self._is_jpeg = sends_jpeg(capture)
-            if self._is_jpeg:  # decoded here, so that a torn image is seen
+            if self._is_jpeg:  # decoded here, to detect truncated images
                 capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
         except BaseException:
             capture.release()
@@ -87,10 +87,10 @@ class CameraDevice:
             self._capture = None
 
     def read(self) -> Shot | None:
-        """The next image; None for one that cannot be used. Waits for it about a second at most.
+        """Return the next image, or None if it cannot be used. Waits for at most about a second.
 
         Raises:
-            SourceLost: none came.
+            SourceLost: no image came.
         """
         capture = self._capture
         if capture is None:
@@ -114,7 +114,7 @@ class CameraDevice:
         return Shot(t, self.stamps.sigma_s, image)
 
     def _decoded(self, raw: np.ndarray) -> ImageArray | None:
-        """The image; None where a part of it is missing."""
+        """Decode an image; return None if a part of it is missing."""
         data = raw.reshape(-1)
         if self._is_jpeg and JPEG_END not in data[-PADDING_BYTES:].tobytes():
             return None

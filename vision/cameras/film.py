@@ -1,4 +1,4 @@
-"""Images of one eye or two that were taken before, played."""
+"""Playback of recorded images of one eye or two."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from .look import of_image
 
 
 class Roll(Protocol):
-    """Images of one eye or two in order."""
+    """Recorded images of one eye or two, in order."""
 
     @property
     def t(self) -> FloatArray:
-        """Their times [s], strictly increasing, shape (n,)."""
+        """Times [s], strictly increasing, shape (n,)."""
         ...
 
     @property
     def t_sigma(self) -> FloatArray:
-        """How far apart the two eyes' images were taken [s], shape (n,)."""
+        """Time between the two eyes' images [s], shape (n,)."""
         ...
 
     @property
@@ -37,25 +37,25 @@ class Roll(Protocol):
     def serials(self) -> tuple[str, ...]: ...
 
     def open(self, place: int) -> None:
-        """Be ready to give the pair at `place`."""
+        """Prepare to read the pair at `place`."""
         ...
 
     def close(self) -> None: ...
 
     def next(self) -> tuple[ImageArray, ...]:
-        """The next pair; SourceError where it cannot be read."""
+        """Return the next pair; raise SourceError if it cannot be read."""
         ...
 
 
 class Film:
-    """`StereoEyes` of a roll. What was read is not read again after closing and opening.
+    """`StereoEyes` that plays recorded images. Closing and reopening continues after the last image read.
 
-    At a speed above 0 the times are the clock's, the first pair is due when the film is opened, and pairs that
-    nobody asked for in time are skipped, as a camera's are. At speed 0 they are the roll's own, one follows the other
-    as fast as it is read, and none is skipped.
+    At a speed above 0 the times are the clock's, the first pair is due when the film is opened, and pairs not read in
+    time are skipped, as with a camera. At speed 0 the times are those of the recording, pairs follow each other as fast
+    as they are read, and none is skipped.
 
     Attributes:
-        dropped: pairs that were skipped.
+        dropped: number of skipped pairs.
     """
 
     def __init__(
@@ -68,11 +68,11 @@ class Film:
         sigma_s: float = 0.0,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """Nothing is opened yet.
+        """Prepare the playback without opening files.
 
         Args:
-            roll: makes the roll, at the first opening; ConfigError or SourceError where files are missing or wrong.
-            latency_s, sigma_s: taken off the times [s], and 1-sigma added to their own.
+            roll: creates the roll when it is first needed; ConfigError or SourceError where files are missing or wrong.
+            latency_s, sigma_s: subtracted from the times [s], and 1-sigma added to theirs.
         """
         self._make, self._clock, self._sleep = roll, clock, sleep
         self._speed, self._latency_s, self._sigma_s = speed, latency_s, sigma_s
@@ -89,12 +89,12 @@ class Film:
 
     @property
     def serials(self) -> tuple[str, ...]:
-        """The files of each eye."""
+        """Files of each eye."""
         return self._made.serials
 
     @property
     def health(self) -> tuple[str, ...]:
-        """What is wrong with the light in the last pair; all else that is wrong with files is an error."""
+        """Exposure problems of the last pair; all other problems with files are errors."""
         names = ("left eye", "right eye") if len(self._shown) > 1 else ("camera",)
         light = (of_image(image, name) for name, image in zip(names, self._shown, strict=False))
         return tuple(text for text in light if text is not None)
@@ -121,10 +121,10 @@ class Film:
             self._made.close()
 
     def read(self, timeout_s: float) -> StereoFrame | None:
-        """The next pair of images; None when none was due within `timeout_s`.
+        """Return the next pair of images, or None if none was due within `timeout_s`.
 
         Raises:
-            SourceEnded: there will be no more.
+            SourceEnded: there are no more images.
         """
         if not self._is_open:
             raise SourceError("the images are not open")
@@ -151,7 +151,7 @@ class Film:
         return wait_s <= timeout_s
 
     def _caught_up(self, images: tuple[ImageArray, ...]) -> tuple[ImageArray, ...]:
-        """The newest pair that is due."""
+        """Return the newest pair that is due."""
         now = self._clock.now()
         while self._next + 1 < len(self._made.t) and self._due_s(self._next + 1) <= now:
             self._next += 1
@@ -161,10 +161,10 @@ class Film:
 
 
 def read_times(file: Path, count: int) -> FloatArray:
-    """The times in a text file [s], the first number of each line; # begins a comment.
+    """Read the times in a text file [s], the first number of each line; # begins a comment.
 
     Raises:
-        ConfigError: it cannot be read, has not `count` times, or they do not increase.
+        ConfigError: the file cannot be read, does not have `count` times, or they do not increase.
     """
     try:
         lines = [line.split("#")[0].replace(",", " ").split() for line in read_at_most(file).decode().splitlines()]
@@ -178,7 +178,7 @@ def read_times(file: Path, count: int) -> FloatArray:
 
 
 def checked_times(times: FloatArray, file: Path) -> FloatArray:
-    """`times`; ConfigError naming the first that is not later than the one before."""
+    """Return `times`; raise ConfigError with the first that is not later than the one before."""
     wrong = np.flatnonzero(~(np.diff(times) > 0))
     if len(wrong) or not np.isfinite(times).all():
         place = int(wrong[0]) + 2 if len(wrong) else int(np.argmin(np.isfinite(times))) + 1

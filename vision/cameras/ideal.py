@@ -1,4 +1,4 @@
-"""Eyes whose images are rectified already."""
+"""Cameras whose images are already rectified."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from bodyschema.interfaces.records import StereoFrame
 
 
 class IdealCamera:
-    """A `StereoCamera` of eyes that [camera] describes as they are: ideal pinholes side by side, or one alone."""
+    """A `StereoCamera` of eyes that [camera] describes: ideal pinholes side by side, or a single one."""
 
     def __init__(self, eyes: StereoEyes, calibration: StereoCalibration) -> None:
         self._eyes, self._calibration = eyes, calibration
 
     @property
     def calibration(self) -> StereoCalibration:
-        """The calibration the images belong to."""
+        """The calibration of the images."""
         return self._calibration
 
     def __enter__(self) -> Self:
@@ -46,7 +46,7 @@ class IdealCamera:
         self._eyes.__exit__(kind, error, trace)
 
     def read(self, timeout_s: float) -> StereoFrame | None:
-        """The next frame; None when none came within `timeout_s`. Raises as the eyes do."""
+        """Return the next frame, or None if none came within `timeout_s`. Raises as the eyes do."""
         return self._eyes.read(timeout_s)
 
 

@@ -1,4 +1,4 @@
-"""Image files in the place of cameras."""
+"""Image files instead of cameras."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
 class ImageRoll:
-    """The images that a pattern for each eye names, in the order of their names: numbers in them count as numbers.
+    """The images that match a pattern for each eye, sorted by name; numbers in names sort as numbers.
 
     Attributes:
-        t: times [s] (n,). t_sigma: between the two eyes' [s] (n,).
+        t: times [s] (n,). t_sigma: time between the two eyes' images [s] (n,).
         image_size_px: of each eye's image. serials: folder and pattern of each eye.
     """
 
     def __init__(self, config: ImagesConfig, folder: Path) -> None:
-        """Look at the names, and at the first pair.
+        """Read the names and the first pair.
 
         Raises:
-            ConfigError: no files are there, not as many of each eye, or without the times that are asked for.
-            SourceError: a file is no image, or the two eyes' have not one size.
+            ConfigError: there are no files, not as many of each eye, or the requested times are missing.
+            SourceError: a file is no image, or the two eyes' images differ in size.
         """
         patterns = (config.left,) if config.right is None else (config.left, config.right)
         self._eyes = [_files(folder, pattern) for pattern in patterns]
@@ -65,14 +65,14 @@ class ImageRoll:
         return frozen_array(np.arange(count) / (config.fps or 1.0)), together
 
     def open(self, place: int) -> None:
-        """Be ready to give the pair at `place`."""
+        """Prepare to read the pair at `place`."""
         self._next = place
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Do nothing: no file is held open."""
 
     def next(self) -> tuple[ImageArray, ...]:
-        """The next image of each eye; SourceError where a file is none, or of another size."""
+        """Return the next image of each eye; raise SourceError if a file is no image, or of another size."""
         files = [each[self._next] for each in self._eyes]
         images = tuple(_image(file) for file in files)
         for file, image in zip(files, images, strict=True):
@@ -92,13 +92,13 @@ def _files(folder: Path, pattern: str) -> list[Path]:
 
 
 def _natural(name: str) -> list[tuple[int, float, str]]:
-    """A key by which img_2 comes before img_10."""
+    """Return a sort key that puts img_2 before img_10."""
     words = re.split(r"(\d+(?:\.\d+)?)", name)
     return [(0, float(word), "") if NUMBER.fullmatch(word) else (1, 0.0, word) for word in words if word]
 
 
 def _ticks(file: Path, since: int) -> float:
-    """The last number in a name, less `since`: taken off here, so that nanoseconds since 1970 keep their digits."""
+    """Return the last number in a name minus `since`, as integers, so that nanoseconds since 1970 keep their digits."""
     numbers = NUMBER.findall(file.stem)
     if not numbers:
         remedy = "Give fps or times in the place of name_ticks_per_s"

@@ -112,7 +112,7 @@ class LiveEyes:
         self._opened.close()
 
     def read(self, timeout_s: float) -> StereoFrame | None:
-        """The newest pair of images; None when none came within `timeout_s`.
+        """Return the newest pair of images; None if none came within `timeout_s`.
 
         Raises:
             SourceLost: a camera went away.
@@ -130,7 +130,7 @@ class LiveEyes:
         return Capture(device, self._layout.fps, partial(self._take, eye), self._wake)
 
     def _await_first(self) -> None:
-        """SourceLost when a camera that could be opened sends nothing."""
+        """Raise SourceLost if an opened camera sends nothing."""
         with self._changed:
             self._changed.wait_for(lambda: not self._missing() or self._failed() is not None, FIRST_IMAGE_S)
         if (failure := self._failed()) is not None:
@@ -143,7 +143,7 @@ class LiveEyes:
             )
 
     def _missing(self) -> list[Capture]:
-        """The cameras that have sent nothing yet."""
+        """Return the cameras that have sent nothing yet."""
         return [capture for capture in self._captures if capture.look.frames == 0]
 
     def _failed(self) -> SourceError | None:

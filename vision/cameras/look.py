@@ -20,7 +20,7 @@ WHITE, MOST_WHITE = 250, 0.25
 
 
 def of_image(image: ImageArray, name: str) -> str | None:
-    """What is wrong with the light in an image, or None."""
+    """Return what is wrong with the light in an image, or None."""
     levels = image[::STEP_PX, ::STEP_PX]
     if np.quantile(levels, BLACK_QUANTILE) < BLACK:
         return f"the {name}'s image is black: is the lens cap on? Else more light, or a longer exposure_s"

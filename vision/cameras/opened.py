@@ -18,7 +18,7 @@ from .videos import VideoRoll
 def eyes_of(
     config: CamerasConfig, folder: Path, clock: Clock, open_capture: OpenCapture = open_v4l2
 ) -> LiveEyes | Film:
-    """The configured cameras or files as `StereoEyes`, not opened yet.
+    """Create the configured cameras or files as `StereoEyes`, not opened yet.
 
     Args:
         folder: of robot.toml; files are named relative to it.

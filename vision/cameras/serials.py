@@ -13,7 +13,7 @@ IMAGES = "-video-index0"
 
 
 def serial_of(device: str, root: Path = ROOT) -> str:
-    """The serial number of a camera, by sysfs; without one the name that it has under by-id, or was given."""
+    """Return a camera's serial number from sysfs; without one, its name under by-id or as given."""
     node = Path(os.path.realpath(device)).name
     try:
         serial = (root / USB_SERIAL.format(node)).read_text(encoding="utf-8", errors="replace").strip()
@@ -23,7 +23,7 @@ def serial_of(device: str, root: Path = ROOT) -> str:
 
 
 def connected(root: Path = ROOT) -> list[str]:
-    """The cameras on this machine, by the name that stays: by-id, and by-path where two share that."""
+    """Return the cameras on this machine by their persistent names: by-id, or by-path if two share that."""
     named: dict[str, str] = {}
     for folder in (BY_PATH, BY_ID):  # the better name last
         for link in sorted((root / folder).glob(f"*{IMAGES}")):

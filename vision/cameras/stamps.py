@@ -35,7 +35,7 @@ class Stamps:
         return KERNEL_SIGMA_S if self.source == "kernel" else ARRIVAL_SIGMA_S
 
     def stamp(self, kernel_s: float, arrival_s: float) -> float | None:
-        """The time of a frame [s]; None for the first ones, and for one whose stamp is not to be believed.
+        """Return the time of a frame [s]; None for the first ones, and for one with an implausible stamp.
 
         Args:
             kernel_s: what the driver said. arrival_s: when the frame was handed over. Both [s], monotonic.

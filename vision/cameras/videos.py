@@ -59,7 +59,7 @@ class VideoRoll:
         return frozen_array(np.arange(count) / fps)
 
     def open(self, place: int) -> None:
-        """Be ready to give the pair at `place`."""
+        """Prepare to read the pair at `place`."""
         self._captures = [cv2.VideoCapture(str(file)) for file in self._files]
         for _ in range(place):  # seeking is not exact in every film
             for capture in self._captures:
@@ -72,7 +72,7 @@ class VideoRoll:
         self._captures = []
 
     def next(self) -> tuple[ImageArray, ...]:
-        """The next image of each eye; SourceError where the film is damaged."""
+        """Return the next image of each eye; raise SourceError if the film is damaged."""
         images: list[ImageArray] = []
         for file, capture in zip(self._files, self._captures, strict=True):
             is_there, image = capture.read()
@@ -86,7 +86,7 @@ class VideoRoll:
 
 
 def _measured(file: Path) -> tuple[tuple[int, int], int, float]:
-    """Size of the frames, how many can be read, and how many there are to the second."""
+    """Return the size of the frames, the number that can be read, and their rate [1/s]."""
     if not file.is_file():
         raise ConfigError("there is no such film", file=file, remedy="Files are named relative to robot.toml")
     capture = cv2.VideoCapture(str(file))

@@ -45,7 +45,9 @@ class WatchedCamera:
         self._camera.__exit__(kind, error, trace)
 
     def read(self, timeout_s: float) -> ImageArray | None:
-        """The next picture (height, eyes width, 3), None when none came in `timeout_s`. Raises as the camera does."""
+        """Return the next annotated picture (height, eyes width, 3); None if none came in time. Raises as the camera
+        does.
+        """
         frame = self._camera.read(timeout_s)
         if frame is None:
             return None
@@ -92,7 +94,7 @@ class PlainEyes:
         self._eyes.__exit__(kind, error, trace)
 
     def read(self, timeout_s: float) -> ImageArray | None:
-        """The next picture (height, eyes width, 3); None when none came within `timeout_s`. Raises as the eyes do."""
+        """Return the next picture (height, eyes width, 3); None if none came in time. Raises as the eyes do."""
         frame = self._eyes.read(timeout_s)
         if frame is None:
             return None
@@ -106,5 +108,5 @@ class PlainEyes:
 
 
 def joined(frame: StereoFrame) -> ImageArray:
-    """All eyes' images side by side."""
+    """Join all eyes' images side by side."""
     return np.hstack(frame.images)

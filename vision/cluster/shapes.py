@@ -123,7 +123,7 @@ def _folded(name: str, first: Face, links: Sequence[tuple[Cell, Cell, float]]) -
 
 
 def rpy_of(rotation: FloatArray) -> tuple[float, float, float]:
-    """Roll, pitch and yaw [rad] of a rotation (3, 3), URDF convention."""
+    """Return roll, pitch and yaw [rad] of a rotation (3, 3), URDF convention."""
     with warnings.catch_warnings():
         # At a pitch of 90° roll and yaw turn about one axis: any split is right.
         warnings.filterwarnings("ignore", "Gimbal lock", UserWarning)

@@ -8,7 +8,7 @@ from bodyschema.vision.tag_config import Dictionary, PlacedTag, Vector
 
 
 def cluster_tables(dictionary: Dictionary, side_m: float, tags: Sequence[PlacedTag], notes: Sequence[str] = ()) -> str:
-    """The tables [vision], [vision.tag] and [[vision.cluster.tags]].
+    """Return the tables [vision], [vision.tag] and [[vision.cluster.tags]].
 
     Args:
         notes: what is said of each tag, behind its number.
@@ -24,7 +24,7 @@ def cluster_tables(dictionary: Dictionary, side_m: float, tags: Sequence[PlacedT
 
 
 def tag_tables(dictionary: Dictionary, side_m: float, id: int) -> str:
-    """The tables [vision] and [vision.tag] of a single tag."""
+    """Return the tables [vision] and [vision.tag] of a single tag."""
     return "\n".join(["[vision]", 'marker = "tag"', "", *_tag_table(dictionary, side_m), f"id = {id}"]) + "\n"
 
 

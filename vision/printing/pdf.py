@@ -8,7 +8,7 @@ POINT_MM = 25.4 / 72.0
 
 
 def pdf(page: Page) -> bytes:
-    """The file's bytes."""
+    """Return the bytes of the file."""
     width, height = (side / POINT_MM for side in page.size_mm)
     drawn = [*(_rectangle(each, page) for each in page.rectangles), "f", *(_text(each, page) for each in page.texts)]
     stream = "\n".join(["0 g", *drawn]).encode("latin-1")

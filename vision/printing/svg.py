@@ -8,7 +8,7 @@ from .sheet import Page, Text
 
 
 def svg(page: Page) -> bytes:
-    """The file's bytes."""
+    """Return the bytes of the file."""
     width, height = page.size_mm
     black = "".join(
         f'<rect x="{r.x_mm:.4f}" y="{r.y_mm:.4f}" width="{r.width_mm:.4f}" height="{r.height_mm:.4f}"/>\n'

@@ -1,4 +1,4 @@
-"""report.html: a calibration to look at, in one file that needs no network."""
+"""Calibration report: report.html, a single file that needs no network."""
 
 from .page import page
 

@@ -1,4 +1,4 @@
-"""The page."""
+"""HTML page of a camera calibration report."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from bodyschema.vision.rectified import Rectification
 from bodyschema.vision.rig import StereoRig
 
 _NORMAL_95 = 1.96
-_ARROW_SHARE = 0.04  # of the image's width: the arrow of a residual that is larger than 95 % of them
+_ARROW_SHARE = 0.04  # of the image's width: arrow length for the 95 % quantile of the residuals
 
 
 def page(found: Calibrated, gathered: Gathered) -> str:
-    """report.html of a calibration and the images that it was made of."""
+    """Return report.html for a calibration and the images it was made from."""
     rig = found.rig
     style = files("bodyschema.vision.calibration.report").joinpath("page.css").read_text(encoding="utf-8")
     head = (
@@ -61,7 +61,7 @@ def _baseline(found: Calibrated) -> Iterator[tuple[str, str]]:
 
 
 def _eyes(found: Calibrated, serials: Sequence[str]) -> list[tuple[str, str]]:
-    """What each eye is called, and its device; the only one has no name."""
+    """Return name and device of each eye; a single eye has no name."""
     return list(zip(found.coverage.eyes if len(serials) > 1 else ("",), serials, strict=True))
 
 
@@ -161,5 +161,5 @@ def _size(found: Calibrated) -> tuple[int, int]:
 
 
 def _round(value: float) -> float:
-    """To one digit."""
+    """Round to one digit."""
     return float(f"{value:.0e}")

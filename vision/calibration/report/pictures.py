@@ -1,4 +1,4 @@
-"""The report's pictures: images with their corners, and plots over the image's area."""
+"""Pictures of the report: images with their corners, and plots over the image area."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _FIRST = (30, 60, 240)
 
 
 def photograph(image: ImageArray, corners: Corners | None, alt: str) -> str:
-    """An image, made small, with the corners that were found; the first one red, so that a turned board is seen."""
+    """Return a small image with the detected corners; the first one is red, to reveal a rotated board."""
     scale = min(1.0, _WIDTH_PX / image.shape[1])
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     if small.ndim == 2:
@@ -33,7 +33,7 @@ def photograph(image: ImageArray, corners: Corners | None, alt: str) -> str:
 
 
 def coverage(px: FloatArray, covered: np.ndarray, size_px: tuple[int, int], eye: Eye) -> str:
-    """All corners over an eye's image; cells that have too few are red."""
+    """Plot all corners over an eye's image; cells with too few are red."""
     width, height = size_px
     cells = [
         f'<rect class="empty" x="{c * width / GRID[1]:.1f}" y="{r * height / GRID[0]:.1f}" '
@@ -46,7 +46,7 @@ def coverage(px: FloatArray, covered: np.ndarray, size_px: tuple[int, int], eye:
 
 
 def residuals(px: FloatArray, off_px: FloatArray, stretch: float, size_px: tuple[int, int], eye: Eye) -> str:
-    """An arrow from where each corner should be, `stretch` times as long as it is."""
+    """Plot the residuals as arrows from the predicted corners, magnified by `stretch`."""
     path = "".join(
         f"M{u:.1f} {v:.1f}l{du:.1f} {dv:.1f}" for (u, v), (du, dv) in zip(px - off_px, stretch * off_px, strict=True)
     )
