@@ -76,7 +76,8 @@ def _tolerances(diagnosis: Diagnosis) -> Tolerances:
 
 
 def _verdict(diagnosis: Diagnosis, causes: tuple[Cause, ...]) -> Verdict:
-    if diagnosis.left.is_there:
+    # A search that ends at its limit has described the error and not explained it.
+    if diagnosis.left.is_there or diagnosis.ended_early:
         return "unexplained"
     if not causes:
         return "nothing_found"

@@ -26,6 +26,11 @@ def test_a_search_that_ended_at_its_longest_is_told(small) -> None:
     assert "there may be more of them" in conclusion(ended).limitations[-1]
 
 
+def test_a_search_that_ended_at_its_limit_explains_nothing(small) -> None:
+    assert conclusion(small).verdict == "explained"
+    assert conclusion(dataclasses.replace(small, ended_early=True)).verdict == "unexplained"
+
+
 def test_what_is_rejected_though_chance_hardly_brings_it_about_has_a_word_why(small) -> None:
     rest = dataclasses.replace(small, extended=small.aligned, standings=())
     rows = {(row.effect, row.where): row for row in conclusion(rest).rejected}
