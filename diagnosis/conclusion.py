@@ -44,11 +44,14 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
     rms = _rms_mm(diagnosis)
     verdict = _verdict(diagnosis, causes)
     gain = Gain(percent, interval)
+    timed = diagnosis.aligned.observations.motion.t is not None
     # A tracker or a scanner has no intrinsics in robot.toml.
     seen_by = "instrument" if diagnosis.aligned.simulation.robot.calibration is None else "camera"
     return DiagnosisFile(
         verdict=verdict,
-        sentence=sentence(verdict, causes, rms, gain, _named_mm(diagnosis), _tolerated_mm(diagnosis), seen_by),
+        sentence=sentence(
+            verdict, causes, rms, gain, _named_mm(diagnosis), _tolerated_mm(diagnosis), seen_by, timed=timed
+        ),
         pairs=Pairs(len(diagnosis.markers), len(diagnosis.markers), diagnosis.outliers),
         rms_mm=rms,
         mean_mm=_mean_mm(diagnosis),

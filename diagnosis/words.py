@@ -27,7 +27,13 @@ SURE = 0.9
 
 
 def finding(
-    name: str, where: str | None, source: str | None, numbers: dict[str, float], seen_by: str = "camera"
+    name: str,
+    where: str | None,
+    source: str | None,
+    numbers: dict[str, float],
+    seen_by: str = "camera",
+    *,
+    timed: bool = True,
 ) -> str:
     """Return one cause as a clause: what is wrong, where, by how much.
 
@@ -48,7 +54,7 @@ def finding(
     shift = f"{1e3 * size('x_m', 'y_m', 'z_m'):.3g} mm"
     turn = f"{size('rx_rad', 'ry_rad', 'rz_rad') * _DEG:.2g}°"
     moved = " and ".join(said for said, end in ((shift, "_m"), (turn, "_rad")) if any(n.endswith(end) for n in numbers))
-    when = f" at t = {numbers['t0']:.1f}" if "t0" in numbers else ""
+    when = f" at {'t =' if timed else 'row'} {numbers['t0']:.1f}" if "t0" in numbers else ""
     match name:
         case "joint_offset":
             return f"the zero of {at} is off by {turned('offset')}"
@@ -125,6 +131,8 @@ def sentence(
     named_mm: float | None = None,
     tolerated_mm: float | None = None,
     seen_by: str = "camera",
+    *,
+    timed: bool = True,
 ) -> str:
     """Return the verdict in one or two short sentences.
 
@@ -142,7 +150,7 @@ def sentence(
         told = "What is measured differs from the simulation in a way that none of the known effects explains"
         return told if named_mm is None else f"{told}; a smooth model of it explains {_share(gain)} ({figures})"
     largest = sorted(causes, key=lambda cause: -cause.share_of_gain_percent)
-    told = [finding(c.effect, c.where, c.source, told_values(c), seen_by) for c in largest[:_TOLD]]
+    told = [finding(c.effect, c.where, c.source, told_values(c), seen_by, timed=timed) for c in largest[:_TOLD]]
     head = told[0][0].upper() + told[0][1:]
     if more := len(largest) - len(told):
         head += f"; {', '.join(told[1:])}; {more} smaller cause{'s' * (more > 1)}"

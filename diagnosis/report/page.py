@@ -24,7 +24,7 @@ from .spread import arrows, histogram
 
 _STYLE = (Path(__file__).parent / "page.css").read_text(encoding="utf-8")
 _VERDICTS: dict[Verdict, tuple[str, str]] = {
-    "explained": ("Explained", "Every part of the error that is not noise has a cause with a name."),
+    "explained": ("Explained", "Apart from noise and small errors everywhere, the whole error has named causes."),
     "nothing_found": ("Nothing found", "What is left of the error is noise: there is nothing to correct."),
     "undecided": (
         "Undecided",
@@ -82,10 +82,11 @@ def page(diagnosis: Diagnosis, file: DiagnosisFile, remedies: Sequence[str], abo
 
 def _head(file: DiagnosisFile, about: About) -> str:
     name, meaning = _VERDICTS[file.verdict]
+    found, _, figures = file.sentence.rstrip(".").partition(". ")
     return (
         f'<header><p class="of">{escape(about.robot)} · {escape(about.recording)} · {file.pairs.total:,} pairs</p>'
-        f'<h1><span class="verdict {file.verdict}">{name}</span> {escape(file.sentence.rstrip("."))}.</h1>'
-        f"<p>{meaning}</p>{_unexplained(file)}</header>"
+        f'<h1><span class="verdict {file.verdict}">{name}</span> {escape(found)}.</h1>'
+        f"<p>{escape(figures)}{'. ' if figures else ''}{meaning}</p>{_unexplained(file)}</header>"
     )
 
 
@@ -144,7 +145,7 @@ def _causes(residuals: Residuals, file: DiagnosisFile, remedies: Sequence[str]) 
 def _cause(
     residuals: Residuals, cause: Cause, effect: Effect | None, remedy: str, seen_by: str, *, opened: bool
 ) -> str:
-    said = finding(cause.effect, cause.where, cause.source, told_values(cause), seen_by)
+    said = finding(cause.effect, cause.where, cause.source, told_values(cause), seen_by, timed=residuals.timed)
     plots = [outlier_panel(residuals)] if effect is None else evidence_panels(residuals, effect)
     state = " open" if opened else ""
     return (
