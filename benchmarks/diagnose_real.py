@@ -27,7 +27,7 @@ from bodyschema.interfaces.records import FloatArray
 from kbmaps.arrays import BoolArray
 
 SETS = ("ur5_laser", "wam_laser", "ur10_laser_a", "ur10_laser_b", "panda_eyeinhand")
-# What is asked of a set [mm].
+# Required held-out residual of each set [mm].
 ASKED = {"ur5_laser": "mean ≤ 0.090", "wam_laser": "RMS ≤ 1.5"}
 ONE_DAY, ANOTHER_DAY = "ur10_laser_a", "ur10_laser_b"
 ASKED_LATER = "RMS < 0.44, aim 0.33"
@@ -83,7 +83,7 @@ def row(name: str, diagnosis: Diagnosis, dealt: Diagnosis, seconds: float) -> st
 
 
 def taken_along(earlier: Diagnosis, arm: Arm, later: Diagnosis) -> str:
-    """What the effects found on one day leave of another day's recording, and what the best geometry does."""
+    """Report the held-out residual of one day's effects on another day's recording, and that of the best geometry."""
     simulation = arm.simulation.with_effects(earlier.causes)
     taken = held_out_mm(aligned(Observations.of(arm.recording, simulation), simulation), later.markers)
     geometry = held_out_mm(later.geometry, later.markers)

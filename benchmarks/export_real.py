@@ -41,7 +41,7 @@ def corrected(file: Path, q: FloatArray) -> FloatArray:
 
 
 def rms_mm(distances: FloatArray) -> float:
-    """Of distances (n,) [m]."""
+    """Return the RMS [mm] of distances (n,) [m]."""
     return float(1e3 * np.sqrt(np.square(distances).mean()))
 
 

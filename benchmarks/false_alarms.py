@@ -33,14 +33,14 @@ QUIET, LONGEST = (20, 120), 600
 
 
 def inverse_statistics(joints: int, sigma: float, seed: int, draws: int) -> list[float]:
-    """1 / R at the alarm for changes of one arm; 0 where there is none in time."""
+    """Return 1 / R at the alarm for changes of one arm; 0 where no alarm comes in time."""
     rng = np.random.default_rng([seed, joints, round(1e4 * sigma), 17])
     arm = rough_arm(joints, rng, TOLERANCES)
     known = walk(joints, KNOWN, rng)
     belief = reference(arm, known, arm.measured(known, sigma, rng), noise_of(sigma, KNOWN)).belief
     found: list[float] = []
     for _ in range(draws):
-        # A belief that is true: what the arm is like is drawn from it, and positions are linear in that.
+        # A correct belief: the arm's parameters are sampled from it, and positions are linear in them.
         detector = ChangeDetector(belief, SharedNoise(np.ones(1), 1.0), sigma, 1.0)
         q = walk(joints, QUIET[1] + LONGEST, rng)
         _, jacobian = belief.parameters.linearised(belief.mean, q)
@@ -52,7 +52,7 @@ def inverse_statistics(joints: int, sigma: float, seed: int, draws: int) -> list
 
 
 def drawn_change(detector: ChangeDetector, size: int, sigma: float, rng: np.random.Generator) -> FloatArray:
-    """A change of the parameters (size,), as the detector supposes."""
+    """Sample a change of the parameters (size,) from the detector's prior."""
     kind = detector.kinds[int(rng.choice(len(detector.kinds), p=[each.share for each in detector.kinds]))]
     change = np.zeros(size)
     change[kind.columns] = sigma * rng.choice(SIZES) * rng.normal(size=len(kind.columns)) * kind.units
@@ -70,7 +70,7 @@ def log_statistic(detector: ChangeDetector, q: FloatArray, errors: FloatArray, s
 
 
 def noise_of(sigma: float, pairs: int) -> FloatArray:
-    """Covariances of so many pairs (pairs, 3, 3)."""
+    """Return the covariances of the pairs (pairs, 3, 3)."""
     return np.broadcast_to(sigma**2 * np.eye(3), (pairs, 3, 3))
 
 

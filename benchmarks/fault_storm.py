@@ -52,7 +52,7 @@ TELL_EVERY_S = 30.0
 
 
 def swing(phase: float) -> Callable[[float], float]:
-    """A joint moved by hand."""
+    """Return the motion of a joint moved by hand, an angle [rad] by time [s]."""
     return lambda t: 1.2 * math.sin(0.7 * t + phase)
 
 
@@ -80,7 +80,7 @@ def _port(device: Device, clock: VirtualClock, rng: Random, baud: int = 1_000_00
 
 
 def names(count: int) -> list[str]:
-    """The joints' names."""
+    """Return the names of the joints."""
     return [f"joint{k}" for k in range(1, count + 1)]
 
 

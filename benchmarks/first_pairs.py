@@ -37,7 +37,7 @@ FRAMES = {"known": (True, True), "pose unknown": (False, True), "pose and marker
 KNOWN_STAGES, STAGES, TOOL_STAGES = (0, 1, 2, 5, 12, 20, 40, 100, 300), (12, 20, 40, 100, 300), (3, 10, 40)
 LIMIT, REACH, STEP = np.radians(90.0), np.radians(60.0), np.radians(2.0)
 POSES = 300
-# How far what is not known is from what is drawn: far enough that no tolerance could hold it.
+# Distance of unknown poses from the nominal ones: far beyond any tolerance.
 POSE_RAD, POSE_M, MARKER_M, TOOL_M = 0.5, 0.3, 0.1, 0.25
 
 
@@ -54,7 +54,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What was answered at one stage.
+    """Predictions at one stage.
 
     Attributes:
         error: mean distance to the truth [m].
@@ -83,7 +83,7 @@ def guided(joints: int, count: int, rng: np.random.Generator) -> FloatArray:
 
 
 def elsewhere(built: RigidChain, frame: str, rng: np.random.Generator) -> RigidChain:
-    """The arm with what is not known of its frame anywhere."""
+    """Return the arm with a random tool or camera pose where `frame` leaves them unknown."""
     pose_known, marker_known = FRAMES[frame]
     if not marker_known:
         built = built.with_tool(MARKER_M * rng.normal(size=3))

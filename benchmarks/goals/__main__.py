@@ -46,7 +46,7 @@ def main() -> None:
 
 
 def measure(chosen: Sequence[Row], results: Results, most_seeds: int | None, deadline: float) -> None:
-    """Runs what is missing, row after row, until the deadline on the monotonic clock [s]."""
+    """Run the missing studies, row after row, until the deadline on the monotonic clock [s]."""
     for row in chosen:
         for study in row.studies:
             try:

@@ -93,7 +93,7 @@ def _rigid_from_nothing(pairs: int, reach_deg: float, seed: int) -> Values:
 
 
 def _rigid_rough(joints: int, pairs: int, seed: int) -> Values:
-    """The rigid chain on the train's task: random links, rough drawing."""
+    """Run the rigid chain on the tensor train's task: random links, rough nominal model."""
     rng = np.random.default_rng(seed)
     parameters = ChainParameters(random_chain(joints, rng))
     change = parameters.standard_deviations(ROUGH) * rng.normal(size=parameters.size)

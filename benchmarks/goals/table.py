@@ -37,7 +37,7 @@ def _standing(cells: Sequence[Cell]) -> str:
 
 
 def _goal(cell: Cell) -> str:
-    """The goal, and the number alone where the bound has raised it."""
+    """Format the goal; if the bound has raised it, append the original goal."""
     text = cell.goal.text()
     return text if cell.goal == cell.figure.goal else f"{text} ({cell.figure.goal.text()})"
 
