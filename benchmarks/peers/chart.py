@@ -17,7 +17,7 @@ _NARROW_DECADES = 1.6
 
 @dataclass(frozen=True)
 class Style:
-    """How a line looks wherever it appears: its colour, dashes and weight."""
+    """Appearance of a line: its colour, dashes and weight."""
 
     colour: str
     dashes: str = ""

@@ -1,4 +1,4 @@
-"""How time and memory grow with the joints and with the pairs, beside what theory says."""
+"""Growth of time and memory with the joints and with the pairs, compared with theory."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ SERIES = (
 
 
 def measure(known: Sequence[Growth], deadline: Callable[[], bool]) -> list[Growth]:
-    """What is known and what is missing of it, one entry a size; stops early when `deadline()` says so."""
+    """Return the known entries and measure the missing ones, one per size; stop early once `deadline()` is true."""
     entries = list(known)
     measured = {(entry.what, entry.competitor, entry.size) for entry in known}
     for series in SERIES:

@@ -13,7 +13,7 @@ from benchmarks.peers.results import Cell, Results, cell
 from benchmarks.peers.tasks import Task
 
 _OURS = ("#e4572e", "#f0a202", "#2a9d5c", "#1f8fe0", "#8e5bd6", "#d6409f", "#12a5a5", "#b5651d", "#5a7d00", "#c1121f")
-# Peers are told apart by what is written on their lines: one grey for other learners, ink for calibration.
+# Peers are distinguished by the labels on their lines: one grey for other learners, ink for calibration.
 _LEARNT, _CALIBRATED = "#929aa5", "var(--ink)"
 _DASHES = ("6 3", "2 3", "8 3 2 3", "12 3")
 # So many of ours, and of each group of peers, have their names at their lines' ends.
@@ -43,7 +43,7 @@ def _group(competitor: Competitor) -> str:
 
 
 def write_page(path: Path, results: Results, tasks: Sequence[Task], competitors: Sequence[Competitor]) -> None:
-    """The page for all that has been measured, task by task."""
+    """Write the page of all results, task by task."""
     looks = styles(competitors)
     shown = [task for task in tasks if any(key[0] == task.key for key in results.outcomes)]
     body = [
@@ -75,7 +75,7 @@ def counts_of(task: Task, results: Results) -> list[int]:
 
 
 def goal(task: Task, results: Results, pairs: int, test: str) -> float | None:
-    """The figure to reach [m], or 1.15 times the bound if that is larger."""
+    """Return the target error [m], or 1.15 times the bound if that is larger; None without a target."""
     bound = results.bound(task.key, pairs, test)
     figure = task.goals.get(pairs)
     if figure is None or (test == "drawn alike" and "extrapolated" in tests_of(task, results)):

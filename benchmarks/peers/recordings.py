@@ -20,7 +20,7 @@ _MOST_HELD_OUT = 500
 class Splits:
     """Random splits of a recording: some pairs to learn, the others held out.
 
-    Where the instrument stood and the reflector sat is fitted to the pairs first, for all competitors alike.
+    The poses of the instrument and the reflector are fitted to the pairs first, for all competitors.
     """
 
     recording: Recording

@@ -1,4 +1,4 @@
-"""What was measured, kept in a JSON file that later runs add to."""
+"""Measured results, kept in a JSON file that later runs extend."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Results:
 
     @classmethod
     def load(cls, path: Path) -> Results:
-        """The results in a file; none yet if it does not exist."""
+        """Load the results of a file; return empty results if it does not exist."""
         if not path.exists():
             return cls()
         content = json.loads(path.read_text())
@@ -94,7 +94,7 @@ class Results:
         os.replace(written, path)
 
     def forget(self, competitors: set[str]) -> None:
-        """Drops what was measured of some competitors, to measure them again."""
+        """Drop the results of some competitors, to measure them again."""
         self.outcomes = {
             key: outcome for key, outcome in self.outcomes.items() if outcome.competitor not in competitors
         }
@@ -150,7 +150,7 @@ def cell(outcomes: list[Outcome], test: str) -> Cell:
 
 
 def machine() -> dict[str, str]:
-    """Where a run takes place."""
+    """Describe the machine of a run."""
     model = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.exists():

@@ -34,7 +34,7 @@ class BodySchema:
 
     @classmethod
     def drawn(cls, chain: RigidChain) -> BodySchema:
-        """A drawing in this form: axes and links as they stand with all joints at zero."""
+        """Convert a nominal model: axes and links with all joints at zero."""
         transform = np.eye(4)
         axes, points = [], [np.zeros(3)]
         for fixed, axis in zip(chain.fixed[:-1], chain.axes, strict=True):
@@ -47,7 +47,7 @@ class BodySchema:
 
     @classmethod
     def random(cls, problem: Problem) -> BodySchema:
-        """A random arm about as large as the cloud of positions and with its centre where theirs is."""
+        """Draw a random arm about as large as the cloud of positions, with the same centre."""
         size = float(np.linalg.norm(problem.x - problem.x.mean(axis=0), axis=1).mean())
         axes = problem.rng.normal(size=(problem.joints, 3))
         axes /= np.linalg.norm(axes, axis=1, keepdims=True)

@@ -37,7 +37,7 @@ class Grid:
         return math.prod(self.nodes)
 
     def poses(self) -> FloatArray:
-        """The grid's poses (size, d) [rad], last joint fastest."""
+        """Return the grid's poses (size, d) [rad], last joint fastest."""
         scaled = np.array(list(product(*(chebyshev(count) for count in self.nodes))))
         return self.low + 0.5 * (scaled + 1.0) * (self.high - self.low)
 
