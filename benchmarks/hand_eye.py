@@ -38,7 +38,7 @@ KNOWN_ARM = ChainTolerances(
     axes=EXACT, points=EXACT, zeros=EXACT, tool=ANYWHERE, base_rotation=ANYWHERE, base_translation=ANYWHERE
 )
 METHODS = ("TSAI", "PARK", "HORAUD", "ANDREFF", "DANIILIDIS")
-# What OpenCV 4 is asked, by another interpreter: lists of rotations and places in, each method's answer out.
+# Script run by the OpenCV 4 interpreter: lists of rotations and translations in, each method's result out.
 ASKED = """
 import cv2, json, sys
 import numpy as np
@@ -50,7 +50,7 @@ for name in sys.argv[1:]:
 
 
 def wrist_camera() -> RobotDescription:
-    """The desk arm with a camera on its gripper and a marker that stands in the world."""
+    """Load the desk arm with a camera on its gripper and a marker fixed in the world."""
     tables, text = read_toml(ROBOT)
     turned = {"joints": tables["robot"]["joints"][::-1], "marker_link": "base_link", "marker_xyz": [0.0, 0.0, 0.0]}
     robot = tables["robot"] | turned | {"marker_known": False}
@@ -65,7 +65,7 @@ def transform(turn: Rotation, shift: FloatArray) -> FloatArray:
 
 
 def seen(T_camera_tag: FloatArray, rng: np.random.Generator) -> Pose | None:
-    """The tag's pose as its noisy corners tell it; None where the image does not tell which way it is tilted."""
+    """Estimate the tag's pose from its noisy corners; None if its tilt is ambiguous (a mirrored pose fits as well)."""
     x = CORNERS @ T_camera_tag[:3, :3].T + T_camera_tag[:3, 3]
     px = CAMERA.project(x)[:, :2] + CORNER_PX * rng.standard_normal((4, 2))
     estimator = PoseEstimator(CAMERA, [Sighting(CORNERS, px, CORNER_PX**2 * np.eye(8), right=False)])
@@ -85,7 +85,7 @@ def views(
     T_world_tag = None
     while len(q) < count:
         angles = rng.uniform(robot.lower, robot.upper)
-        # The nominal chain goes from the gripper, where the camera is drawn, to the world.
+        # The nominal chain goes from the gripper, where the camera nominally sits, to the world.
         T_gripper_world = robot.chain.poses(angles[None])[0]
         if T_world_tag is None:
             # The tag stands before the camera of the first view.
@@ -116,7 +116,7 @@ def learnt(
     learner = RigidLearner(placed.chain, KNOWN_ARM)
     learner.learn(q, x, cov=cov)
     report = learner.report()
-    # The camera is drawn in the gripper's own frame.
+    # The nominal camera pose is the gripper's own frame.
     left = np.linalg.inv(T_gripper_camera) @ np.linalg.inv(placed.T_measured_nominal)
     truth = np.concatenate([Rotation.from_matrix(left[:3, :3]).as_rotvec(), left[:3, 3]])
     low, high = (

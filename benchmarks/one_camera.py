@@ -89,7 +89,7 @@ class Arm:
 
 
 def image(eyes: StereoEyes, number: int, x: FloatArray, rotation: FloatArray) -> ImageArray:
-    """What the camera takes of the tag at x (3,) [m], turned so (3, 3)."""
+    """Render the camera image of the tag at x (3,) [m] with rotation (3, 3)."""
     width, height = CAMERA.image_size_px
     total = np.zeros((height, width, 3))
     for again in range(PAINTINGS):
@@ -101,7 +101,10 @@ def image(eyes: StereoEyes, number: int, x: FloatArray, rotation: FloatArray) ->
 
 
 def measured(arm: Arm, q: FloatArray, seed: int) -> tuple[list[MarkerFix], FloatArray, int]:
-    """Fixes of postures q, each looked at alone; which they are of; how many are turned over."""
+    """Return fixes of postures q (n, d) [rad], the postures they belong to, and the number of mirrored poses.
+
+    Each posture is tracked from a single image.
+    """
     eyes, fixes, kept, flipped = StereoEyes(EmptyWorld(), CAMERA, LOOK, seed), [], [], 0
     for number, pose in enumerate(arm.true.poses(q)):
         rotation = pose[:3, :3] @ arm.turn
@@ -140,7 +143,7 @@ def bound(arm: Arm, q: FloatArray, fixes: list[MarkerFix], test: FloatArray, *, 
 
 
 def frames_a_second(seed: int) -> tuple[float, float]:
-    """Of one core: followed through a film, and searched for in whole images."""
+    """Return the frame rates [1/s] on one core: tracking through a film, and searching whole images."""
     eyes, rng = StereoEyes(EmptyWorld(), CAMERA, LOOK, seed), np.random.default_rng(seed)
     film = []
     for k in range(60):

@@ -57,7 +57,7 @@ class StandInSampler:
         self.stored = 0
 
     def history(self, request: Request) -> bytes:
-        """As the sampler answers `pairs`."""
+        """Answer `pairs` like the sampler."""
         begin = int(request.parameters["from"])
         page = self._pairs[begin - 1 : min(self.stored, begin - 1 + PAGE)]
         return encode(PairsReply(STORE, self.stored, page), request.encoding)
@@ -81,7 +81,7 @@ def walk(rng: np.random.Generator, count: int, low: FloatArray, high: FloatArray
 
 
 def ask(robot_file: Path) -> None:
-    """The asking process: prints the latencies [s] as JSON when its time is over."""
+    """Query the learner until the phase ends, then print the latencies [s] as JSON (runs in its own process)."""
     config = Config.load(robot_file)
     rng = np.random.default_rng(2)
     low, high = np.maximum(config.robot.lower, -1.2), np.minimum(config.robot.upper, 1.2)
@@ -123,13 +123,13 @@ def running_learner(robot_file: Path, endpoint: str) -> Iterator[None]:
 
 
 def learner_status(config: Config) -> LearnerStatus:
-    """What the learner says of itself."""
+    """Return the learner's status."""
     with client(config.tables.zenoh.learner) as bus:
         return decode(bus.ask_one(Keys(config.robot.name).status("learner")), LearnerStatus)
 
 
 def write_robot(folder: Path) -> Path:
-    """The shipped model with ports and a state directory of its own."""
+    """Write the shipped model with its own ports and state directory; return its robot.toml."""
     model = model_file("upper_body")
     for file in model.parent.glob("*.urdf"):
         (folder / file.name).write_bytes(file.read_bytes())
@@ -140,7 +140,7 @@ def write_robot(folder: Path) -> Path:
 
 
 def free_port() -> int:
-    """A port that nobody listens on now."""
+    """Return a free TCP port."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]

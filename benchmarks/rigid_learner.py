@@ -230,7 +230,7 @@ class GuidedFit:
 
 
 def guided_fits(drawing: str, seed: int) -> list[GuidedFit]:
-    """A marker moved by about 250 mm, met on a path in steps of 1 to 3 degrees: after each of `STAGES`."""
+    """Fit an arm with a marker moved by about 250 mm along a path in steps of 1 to 3 degrees, at each of `STAGES`."""
     tolerances, rng = DRAWINGS[drawing], np.random.default_rng(seed)
     arm = rough_arm(7, rng, tolerances)
     q = guided_path(STAGES[-1], rng).q

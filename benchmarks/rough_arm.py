@@ -38,9 +38,9 @@ class RoughArm:
 
 
 def rough_arm(joints: int, rng: np.random.Generator, tolerances: ChainTolerances = ROUGH) -> RoughArm:
-    """The humanoid arm without its last joints; the drawing errs as the tolerances say.
+    """Return the humanoid arm without its last joints, with a nominal model that errs within `tolerances`.
 
-    The drawing itself is no textbook arm: every link is turned by 0.02 rad and shifted by 5 mm (standard deviations of
+    The nominal arm is not ideal either: every link is rotated by 0.02 rad and shifted by 5 mm (standard deviations of
     each component), so that no two axes meet.
     """
     ideal = nominal_chain()

@@ -59,14 +59,14 @@ class FromMemory(Generic[T]):
         return None
 
     def read(self, timeout_s: float) -> T:  # noqa: ARG002
-        """The next item; SourceEnded after the last."""
+        """Return the next item; raise SourceEnded after the last."""
         for item in self._rest:
             return item
         raise SourceEnded("all frames are through")
 
 
 def record(config: Config, frames: int) -> tuple[list[StereoFrame], list[JointReading]]:
-    """What cameras and encoders of the simulated robot give while it is guided."""
+    """Record camera frames and encoder readings of the simulated robot while it is guided."""
     seen: list[StereoFrame] = []
     readings: list[JointReading] = []
     with SimWorld(config.robot, config.tables.sim) as world, world.joints as joints, world.camera as camera:
