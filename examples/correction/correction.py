@@ -9,7 +9,7 @@ import sys
 
 
 class Correction:
-    """What an arm makes of its readings, as bodyschema found it."""
+    """True joint angles and marker pose of an arm from its readings, with the effects that bodyschema found."""
 
     def __init__(self, text):
         file = json.loads(text)
@@ -23,7 +23,7 @@ class Correction:
         self.gravity = file["gravity_m_s2"]
 
     def read(self, q, pace=1.0):
-        """True joint angles, and the marker's pose (3 rows of 4) in the measurement frame, at the next readings.
+        """Return true joint angles, and the marker's pose (3 rows of 4) in the measurement frame, at the next readings.
 
         pace: time since the last readings, as a multiple of the usual one; None after an interruption.
         """
@@ -42,7 +42,7 @@ class Correction:
         return angles, product(back, marker)
 
     def error(self, effect, q, pace):
-        """What an effect adds to the reading of its joint."""
+        """Return the error that an effect adds to the reading of its joint."""
         kind, values, state, reading = effect["effect"], effect["values"], effect["state"], q[effect["joint"]]
         if kind == "joint_offset":
             return values[0]

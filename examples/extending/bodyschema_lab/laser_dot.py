@@ -27,7 +27,7 @@ class LaserDot:
         """Nothing is kept from frame to frame."""
 
     def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
-        """The dot in both eyes, or why there is none."""
+        """Locate the dot with both cameras, or return the reason for a miss."""
         right = None if frame.right is None else self._centre(frame.right)
         left = self._centre(frame.left)
         if left is None or right is None:
