@@ -41,7 +41,7 @@ from kbmaps.arrays import FloatArray
 SIGMA_M = 0.003
 SHARED = 0.9
 REGION_DEG = 5.0
-# As the daemon's settings have them.
+# Same values as in the daemon's settings.
 TOLERANCES = ChainTolerances(
     axes=np.radians(3.0),
     points=0.015,

@@ -1,9 +1,9 @@
-"""How long the readers of correction.json take for one reading of a 6-joint arm with 5 effects.
+"""Time that the readers of correction.json take for one reading of a 6-joint arm with 5 effects.
 
     python -m benchmarks.correction
 
-Without joints that give, and with two of them: their load is weighed three times a reading. Needs g++ for C++ and node
-for JavaScript; what is not there is left out.
+Measured without compliant joints and with two, whose load is computed three times a reading. Needs g++ for C++ and node
+for JavaScript; missing ones are skipped.
 """
 
 from __future__ import annotations

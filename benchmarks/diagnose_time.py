@@ -1,4 +1,4 @@
-"""What a diagnosis costs: `python -m benchmarks.diagnose_time [--pairs 1600] [--times 10] [--causes 1 2 3 5]`.
+"""Cost of a diagnosis: `python -m benchmarks.diagnose_time [--pairs 1600] [--times 10] [--causes 1 2 3 5]`.
 
 The shipped upper body's arm, six joints and the eyes, walks; effects of the table are put into its simulation, pixel
 noise and whole ticks are added. All hypotheses are tried. Each case runs in a process of its own: seconds are the

@@ -1,4 +1,4 @@
-"""How exactly noise-free samples give a random chain back: `python -m benchmarks.exactness [--seeds N]`.
+"""Error of a random chain recovered from noise-free samples: `python -m benchmarks.exactness [--seeds N]`.
 
 The paper: 3^d samples determine the chain, wherever they lie. In float64 a smaller cluster costs digits outside it.
 Errors are the largest of 500 configurations within +-80 degrees [m], median (and worst) over the seeds.

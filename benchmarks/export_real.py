@@ -1,10 +1,10 @@
-"""Exported models on measured data that they were not diagnosed from: does MuJoCo gain what `diagnose` promised?
+"""Compare the gain of exported models in MuJoCo with the prediction of `diagnose`, on held-out measurements.
 
     python -m benchmarks.export_real --data $DATA
 
 Of each recording three tenths are held out, in blocks. The rest is diagnosed, and exported as MJCF and correction.json.
 MuJoCo and examples/correction/correction.py then predict the held-out rows from their readings. *Before* is the robot
-as described, placed by the rows that were diagnosed. A gain is to lie in the interval that diagnosis.json states.
+as described, placed by the rows that were diagnosed. The gain should lie in the interval stated in diagnosis.json.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""False alarms where the model's claims are true: `python -m benchmarks.false_alarms [--arms N] [--draws N]`.
+"""False alarm rate when the model's uncertainty is correct: `python -m benchmarks.false_alarms [--arms N] [--draws N]`.
 
-Waiting for alarms that come once in 75,000 pairs would take too long. But where a change is drawn as the detector
-supposes it to be (kind, size, direction, any first pair t), the pairs have the density R_n over those without a change,
+Waiting for alarms that come once in 75,000 pairs would take too long. But if a change is sampled from the
+detector's prior (kind, size, direction, any first pair t), the pairs have the density R_n over those without a change,
 R_n being the statistic itself, summed over t (Wald's likelihood identity). So without a change an alarm comes once in
 
     1 / E[1 / R_alarm]

@@ -1,7 +1,7 @@
-"""How many wrong readings the drivers believe when answers are lost, late, corrupt, cut, swapped, in garbage.
+"""Wrong readings that the drivers accept when answers are lost, late, corrupt, cut, swapped or amid garbage.
 
-Virtual time, so millions of transactions in minutes. Type: python -m benchmarks.fault_storm --transactions 10_000_000
-How many readings of six servos come in a second when answers are lost: python -m benchmarks.fault_storm --rates
+Virtual time: millions of transactions take minutes. Run: python -m benchmarks.fault_storm --transactions 10_000_000
+Readings per second of six servos when answers are lost: python -m benchmarks.fault_storm --rates
 Servos that repeat their answer before the last: python -m benchmarks.fault_storm --stale 2 --transactions 36_000
 """
 

@@ -1,10 +1,10 @@
-"""Errors and claims of the learner while pairs are few: `python -m benchmarks.first_pairs [--seeds N] [--only PART]`.
+"""Errors and uncertainty of the learner with few pairs: `python -m benchmarks.first_pairs [--seeds N] [--only PART]`.
 
-Arms of four, six and seven joints, guided along a path. Their drawings err by half, once and twice the learner's
-tolerances; the frame is known, or the camera's pose is not, or the marker's place neither. Each seed draws one of the
-noises of 0.3, 3 and 10 mm and one of the drawings' errors. After the last stage the tool is changed, and told. Of each
-stage: mean distance to the truth, and the mean length of the claimed sigma [mm], the share of coordinates within one
-and 1.96 sigma [%], and how often which model answered. "near" are poses within three degrees a joint of the path,
+Arms of four, six and seven joints, guided along a path. Their nominal models err by half, once and twice the
+learner's tolerances. The frame is known, or the camera's pose is unknown, or also the marker's position. Each seed
+draws one of the noises of 0.3, 3 and 10 mm and one of the nominal errors. After the last stage comes an announced tool
+change. Printed per stage: mean distance to the truth, mean length of the claimed sigma [mm], share of coordinates
+within one and 1.96 sigma [%], and how often each model answered. "near" are poses within three degrees a joint of the path,
 "anywhere" those within the limits of 90 degrees.
 """
 

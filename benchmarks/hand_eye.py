@@ -1,7 +1,7 @@
-"""Where a camera sits on the flange, from a tag that stands in the world: this learner beside OpenCV's five methods.
+"""Hand-eye calibration of a wrist camera from a tag fixed in the world, compared with OpenCV's five methods.
 
 Run `python -m benchmarks.hand_eye [--seeds N] [--views N] [--opencv4 PYTHON]`. OpenCV 5 has no `calibrateHandEye` in
-Python: PYTHON is an interpreter with OpenCV 4, without which this learner is alone. The arm is the desk arm, exact and
+Python: PYTHON is an interpreter with OpenCV 4, without which only this learner runs. The arm is the desk arm, exact and
 with exact encoders, as OpenCV's methods take it to be; its camera sits near the gripper and sees a tag of 50 mm from
 0.3 to 0.8 m. Its corners have noise of 0.05 px. All methods get the same views; errors are those of T_flange_camera,
 RMS over the seeds.

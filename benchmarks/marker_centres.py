@@ -1,9 +1,9 @@
-"""How exactly the marker's centre is found, beside OpenCV's detectors: `python benchmarks/marker_centres.py`.
+"""Accuracy of the marker's centre, compared with OpenCV's detectors: `python benchmarks/marker_centres.py`.
 
 Balls of 5 to 40 px radius, drawn at random by the tests' ray tracer, with a webcam's noise (light and sensor). Each
 rival gets the same part of the image and the same mask of colours, and the correction for the sphere's ellipse with
 the true distance. Then the error in space at 1 m against the Cramér-Rao bound, from the derivative of the rendered
-pixels by the ball's place: of all other things the bound knows everything.
+pixels by the ball's position; the bound takes all else as known.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ def information(x: FloatArray, look: Look, pictures: list[FloatArray], calibrati
 
         middle = light(x)
         slopes = [(light(x + step) - light(x - step)) / (2 * step.sum()) for step in steps]
-        # Pixels that are over-exposed tell nothing.
+        # Over-exposed pixels carry no information.
         weight = np.where(middle < 254.5, 1.0 / (look.noise_sd**2 + look.shot * middle + 1 / 12), 0.0)
         total += np.array([[np.sum(weight * one * other) for other in slopes] for one in slopes])
     return total

@@ -1,12 +1,12 @@
-"""What one camera makes of a tag on the tool: fixes, their claims, the arm learnt from them, and frames a second.
+"""One camera and a tag on the tool: fixes, their claimed uncertainty, the arm learnt from them, and frame rates.
 
 Run `python -m benchmarks.one_camera [--seeds N] [--pairs N]`. A desk arm of four joints is rendered as one camera of
 640×480 pixels and f = 600 px sees it, with 2 grey levels of noise; the tag of 50 mm on its tool is 0.5 to 0.7 m away
-and turned by up to 50° from the line of sight. The drawing is wrong by 1° an axis, 5 mm a point, 2° a zero and 20 mm at
-the tool. Encoders are exact: what is left is what the corners leave.
+and turned by up to 50° from the line of sight. The nominal model is wrong by 1° an axis, 5 mm a point, 2° a joint
+offset and 20 mm at the tool. Encoders are exact, so the remaining error comes from the corners.
 
-The bound is that of Cramér and Rao for a chain with the drawing's tolerances as its prior, from the corners' claimed
-covariances: positions alone, and with the orientations too.
+The bound is that of Cramér and Rao for a chain with the nominal model's tolerances as its prior, from the corners'
+claimed covariances: positions alone, and with the orientations too.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""How long a `predict` answer takes over loopback TCP at d = 7, while the learner learns, replays and solves.
+"""Latency of `predict` over loopback TCP at d = 7, while the learner learns, replays and solves.
 
-Three processes as in real use: the learner, somebody who asks 250 times a second, and this one, which stands in for
+Three processes as in real use: the learner, a client that asks 250 times a second, and this one, which stands in for
 the sampler: it has 3,000 pairs in its history and publishes 30 more a second. Run: python benchmarks/predict_latency.py
 """
 

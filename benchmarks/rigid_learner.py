@@ -1,9 +1,9 @@
-"""What the rigid chain learners reach: `python -m benchmarks.rigid_learner [--seeds N]`.
+"""Accuracy of the rigid chain learners: `python -m benchmarks.rigid_learner [--seeds N]`.
 
 The arm is a humanoid's, its marker seen by a camera on the head; d joints, configurations uniform within +-80 degrees,
-10 mm of noise on each coordinate, drawing wrong by 3 degrees an axis, 15 mm a point and 30 mm at the marker (each
+10 mm of noise on each coordinate, nominal model wrong by 3 degrees an axis, 15 mm a point and 30 mm at the marker (each
 component) unless said. Errors are mean distances to the noise-free truth, in mm, means over the seeds. `bound` is what
-the posterior of the right model with the right prior leaves. The noise is not told to the learner.
+the posterior of the right model with the right prior leaves. The learner does not know the noise.
 """
 
 from __future__ import annotations

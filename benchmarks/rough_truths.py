@@ -92,7 +92,7 @@ class SaggingArm:
             torques, axes = self._torques(frames), self._axes(frames)
             about = np.einsum("nki,nki->nk", torques, axes)[..., None] * axes
             turn = self._compliance[:, None] * (about + self._across * (torques - about))
-            # As a rotation vector in the frame of the joint before it moves.
+            # A rotation vector in the frame of the joint before it moves.
             yielded = np.einsum("nkji,nkj->nki", frames[:, :-1, :3, :3], turn)
             frames = self._frames(q, yielded)
         return frames[:, -1, :3, 3]

@@ -1,4 +1,4 @@
-"""What learning and predicting cost at seven joints, NumPy beside compiled: `python -m benchmarks.speed`.
+"""Cost of learning and predicting at seven joints, NumPy and compiled: `python -m benchmarks.speed`.
 
 Input checks and basis functions are included, except for padasip's FilterNLMS, one filter a coordinate, which is handed
 its 2187 features ready-made. numba takes part where it is installed. All rivals take turns in this one process, so

@@ -1,4 +1,4 @@
-"""What a tensor train learns from how many pairs: `python -m benchmarks.tensor_train [--seeds N] [--only PART]`.
+"""Accuracy of a tensor train by number of pairs: `python -m benchmarks.tensor_train [--seeds N] [--only PART]`.
 
 Parts: exact, noisy, prior, cluster, bent, outliers, stream, cost. "Rough prior": every link turned by 3 degrees and
 shifted by 15 mm and the marker by 30 mm, standard deviations of each component; "mild": 2 degrees, 10 mm, 30 mm.

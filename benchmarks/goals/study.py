@@ -15,7 +15,7 @@ Values = Mapping[str, float]
 
 
 class NotHereError(Exception):
-    """Something that a study needs is not there; the message says what to do."""
+    """Something that a study needs is missing; the message gives the remedy."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Least-squares calibration with scipy, and the nominal model as it is.
 
-The method of calibration toolboxes (FIGAROH; Hollerbach, Khalil and Gautier 2008): small placement errors of every
-joint frame, reduced to the identifiable ones by a pivoted QR of the regressor, then Levenberg-Marquardt without a prior.
+Method of calibration toolboxes (FIGAROH; Hollerbach, Khalil and Gautier 2008): small placement errors of every joint
+frame, reduced to the identifiable ones by a pivoted QR of the regressor, then Levenberg-Marquardt without a prior.
 """
 
 from __future__ import annotations
