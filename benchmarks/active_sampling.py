@@ -113,7 +113,7 @@ class Trial:
         return next_poses(posterior, region, candidates, count, limits=limits)
 
     def stretch(self, start: FloatArray) -> FloatArray:
-        """Poses on the way to a pose, at least `STRETCH` steps away: to any, or to the best."""
+        """Return poses towards a target at least `STRETCH` steps away: a random target, or the best."""
         goals = self.arm.angles(GOALS, self._range_deg, self._rng)
         away = goals - start
         lengths = np.linalg.norm(away, axis=1)
@@ -126,7 +126,7 @@ class Trial:
 
 
 def curve(setup: Setup, seed: int, way: str, last: int) -> dict[int, float]:
-    """Mean error [m] by number of pairs."""
+    """Return the mean error [m] by number of pairs."""
     trial = Trial(setup, seed, way)
     errors = {trial.pairs: trial.error()}
     while trial.pairs < last:

@@ -57,7 +57,7 @@ def _same(values: FloatArray) -> FloatArray:
 
 
 def _sag(arm: RoughArm, rng: np.random.Generator) -> Bend:
-    """Springs in the joints: each gives way in proportion to the torque of a weight at the marker."""
+    """Return joint springs that yield in proportion to the torque of a weight at the marker."""
     chain = arm.parameters.chain(arm.change)
 
     def torques(q: FloatArray) -> FloatArray:

@@ -47,7 +47,7 @@ def main() -> None:
 
 
 def row(lenses: str, rigs: list[Figures]) -> str:
-    """One line of the table."""
+    """Return one line of the table."""
     z = np.abs(np.concatenate([each.z for each in rigs]))
     off_mm = np.array([each.baseline_mm for each in rigs])
     in_sigmas = off_mm / [each.baseline_sigma_mm for each in rigs]

@@ -43,8 +43,7 @@ from kbmaps import ChainBelief, ChainParameters, ChainTolerances, Explanation, l
 from kbmaps.changes.mixture import log_ratios
 from kbmaps.robust import OUTLIER_SIGMAS
 
-# After half as many pairs as the chain knows, on which it is tried out, the change comes within so many, and is to be
-# noticed within so many.
+# Pairs that the chain knows (half as many more validate it), range of pairs until the change, and pairs to notice it.
 KNOWN, CHANGED_WITHIN, LONGEST = 1000, (20, 80), 600
 STEPS_DEG = (1.0, 3.0)
 TOLERANCES = ChainTolerances(
@@ -109,7 +108,7 @@ class Outcome:
 
 
 def walk(joints: int, count: int, rng: np.random.Generator) -> FloatArray:
-    """Straight ways between random waypoints in steps of 1 to 3 degrees, shape (count, joints)."""
+    """Return straight ways between random waypoints in steps of 1 to 3 degrees, shape (count, joints)."""
     q, goal = [np.zeros(joints)], rng.uniform(-REACH, REACH, joints)
     while len(q) < count:
         step = math.radians(rng.uniform(*STEPS_DEG))
@@ -299,14 +298,14 @@ def quiet(kind: str, joints: int, sigma: float, seed: int, pairs: int) -> int:
 
 
 def seen_in_stereo(x: FloatArray, sigma: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Positions (n, 3) [m] with noise, and its covariances (n, 3, 3) [m²]: sigma across the view, more along it."""
+    """Return noisy positions (n, 3) [m] and covariances (n, 3, 3) [m²]: sigma across the view, more along it."""
     view = x / np.linalg.norm(x, axis=1)[:, None]
     noise = sigma * (rng.normal(size=x.shape) + DEPTH * rng.normal(size=(len(x), 1)) * view)
     return x + noise, sigma**2 * (np.eye(3) + DEPTH**2 * view[:, :, None] * view[:, None, :])
 
 
 def row(case: Case, found: list[Outcome]) -> str:
-    """One line of the table."""
+    """Return one line of the table."""
     kept = [each for each in found if not each.early]
     delays, *told = (
         np.array([getattr(each, name) for each in kept])

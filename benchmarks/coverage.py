@@ -183,7 +183,7 @@ def run(task: Task, entry: Entry, seed: int) -> Outcome:
 
 
 def refit(model: Model) -> None:
-    """Lets a model that fits now and then fit to all that it has been given."""
+    """Refit a tensor train to all its pairs; other models are left unchanged."""
     if isinstance(model, TensorLearner):
         model.refit()
 

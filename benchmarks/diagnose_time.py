@@ -128,7 +128,7 @@ def cost(pairs: int, causes: int, seed: int) -> Cost:
 
 
 def in_own_process(pairs: int, causes: int, seed: int) -> Cost:
-    """`cost`, with a peak of memory that is its own."""
+    """Run `cost` in its own process, so that its memory peak is separate."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         return pool.submit(cost, pairs, causes, seed).result()
 

@@ -23,7 +23,7 @@ TEST_ROWS = 500
 
 
 def errors(joints: int, cluster_deg: float, times: int, seed: int) -> FloatArray:
-    """Distances (500,) [m] within +-80 degrees after so many times 3^d pairs from a cluster."""
+    """Return distances (500,) [m] within +-80 degrees after a multiple of 3^d pairs from a cluster."""
     rng = np.random.default_rng(seed)
     chain, prior = random_chain(joints, rng), random_chain(joints, rng)
     cluster, reach = (np.full(joints, np.radians(deg)) for deg in (cluster_deg, REACH_DEG))

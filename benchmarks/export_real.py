@@ -34,7 +34,7 @@ DRAWS = 2000
 
 
 def corrected(file: Path, q: FloatArray) -> FloatArray:
-    """Positions (n, 3) [m] by the Python reader of correction.json."""
+    """Return positions (n, 3) [m] by the Python reader of correction.json."""
     sys.path.insert(0, str(READERS))
     reader = importlib.import_module("correction").Correction(file.read_text(encoding="utf-8"))
     return np.array([reader.read(row)[1][3::4] for row in q.tolist()])
@@ -46,7 +46,7 @@ def rms_mm(distances: FloatArray) -> float:
 
 
 def gain(before: FloatArray, after: FloatArray, blocks: NDArray[np.int64]) -> str:
-    """By how much the RMS falls [%], with the 95 % interval over resampled blocks of rows."""
+    """Return the decrease of the RMS [%], with the 95 % interval over resampled blocks of rows."""
     numbers, rng = np.unique(blocks), np.random.default_rng(0)
     sums = np.array([[np.square(d[blocks == b]).sum() for d in (before, after)] for b in numbers])
     drawn = sums[rng.integers(len(numbers), size=(DRAWS, len(numbers)))].sum(axis=1)
@@ -55,7 +55,7 @@ def gain(before: FloatArray, after: FloatArray, blocks: NDArray[np.int64]) -> st
 
 
 def row(folder: Path) -> str:
-    """One row of the table."""
+    """Return one row of the table."""
     simulation = load_simulation(folder / "robot.toml")
     recording = Recording.read(folder / "measured.csv", simulation.robot.joints)
     tenth = np.arange(len(recording)) * TENTHS // len(recording)

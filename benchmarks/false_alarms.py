@@ -60,7 +60,7 @@ def drawn_change(detector: ChangeDetector, size: int, sigma: float, rng: np.rand
 
 
 def log_statistic(detector: ChangeDetector, q: FloatArray, errors: FloatArray, sigma: float, first: int) -> float:
-    """log R when it first is beyond the limit after pair `first`; infinite if it is not."""
+    """Return log R when it first exceeds the limit after pair `first`; infinite if it never does."""
     covariance = noise_of(sigma, 1)
     for k in range(min(first + LONGEST, len(q))):
         detector.add(q[k : k + 1], errors[k : k + 1], covariance)

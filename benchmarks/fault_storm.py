@@ -85,7 +85,7 @@ def names(count: int) -> list[str]:
 
 
 def dynamixel(clock: VirtualClock, rng: Random, count: int, model: str, *, is_fast: bool) -> Rig:
-    """Dynamixel servos."""
+    """Return a rig of Dynamixel servos."""
     ids = range(1, count + 1)
     chain = Chain(Servo(BY_NAME[model], k, swing(k), return_delay_s=0.0, booted_s=0.1 * k) for k in ids)
     port = _port(chain, clock, rng)
@@ -98,7 +98,7 @@ def dynamixel(clock: VirtualClock, rng: Random, count: int, model: str, *, is_fa
 
 
 def feetech(clock: VirtualClock, rng: Random, count: int, model: str) -> Rig:
-    """Feetech servos."""
+    """Return a rig of Feetech servos."""
     servos = (FeetechServo(FEETECH_MODELS[model], k, swing(k), return_delay_s=0.0) for k in range(1, count + 1))
     chain = FeetechChain(servos)
     port = _port(chain, clock, rng)
@@ -111,7 +111,7 @@ def feetech(clock: VirtualClock, rng: Random, count: int, model: str) -> Rig:
 
 
 def lines(clock: VirtualClock, rng: Random, count: int) -> Rig:
-    """Own encoders."""
+    """Return a rig of custom encoders."""
     encoders = {name: (4096, swing(k)) for k, name in enumerate(names(count), 1)}
     board = EncoderBoard(encoders, begun_s=clock.now(), drift=1e-4)
     port = _port(board, clock, rng, LINE_BAUD)

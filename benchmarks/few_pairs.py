@@ -74,7 +74,7 @@ def pseudo_inverse(joints: int, q: FloatArray, x: FloatArray) -> KBMap:
 
 
 def evidence(prior: RigidChain | None, joints: int, q: FloatArray, x: FloatArray) -> Model | KBMap:
-    """Through the kernel while pairs are few, else through the control points."""
+    """Fit through the kernel while pairs are few, else through the control points."""
     if len(q) <= MOST_KERNEL_PAIRS:
         return taught(KernelLearner(bases(joints), prior), q, x)
     learner = ExactLearner(nothing(joints) if prior is None else prior.to_kbmap(bases(joints)))

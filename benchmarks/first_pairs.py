@@ -4,8 +4,8 @@ Arms of four, six and seven joints, guided along a path. Their nominal models er
 learner's tolerances. The frame is known, or the camera's pose is unknown, or also the marker's position. Each seed
 draws one of the noises of 0.3, 3 and 10 mm and one of the nominal errors. After the last stage comes an announced tool
 change. Printed per stage: mean distance to the truth, mean length of the claimed sigma [mm], share of coordinates
-within one and 1.96 sigma [%], and how often each model answered. "near" are poses within three degrees a joint of the path,
-"anywhere" those within the limits of 90 degrees.
+within one and 1.96 sigma [%], and how often each model answered. "near" are poses within three degrees a joint of the
+path, "anywhere" those within the limits of 90 degrees.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Outcome:
 
 
 def guided(joints: int, count: int, rng: np.random.Generator) -> FloatArray:
-    """Straight ways between random waypoints in steps of 2 degrees, shape (count, joints)."""
+    """Return straight ways between random waypoints in steps of 2 degrees, shape (count, joints)."""
     q, goal = [np.zeros(joints)], rng.uniform(-REACH, REACH, joints)
     while len(q) < count:
         if np.linalg.norm(goal - q[-1]) < STEP:
@@ -151,7 +151,7 @@ def looked(
 
 
 def cases(seeds: int, first: int, only: str, joints: tuple[int, ...]) -> Iterator[Case]:
-    """Noises and drawings in turn, so that nine seeds have each of both once."""
+    """Yield the cases; nine seeds cover each combination of noise and nominal error once."""
     for frame in FRAMES:
         for d in joints:
             for seed in range(first, first + seeds):

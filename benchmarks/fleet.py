@@ -225,7 +225,7 @@ def _publish(walks: list[Walk], publish: list, rate: float, seconds: float) -> i
 
 
 def _await_answers(ends: list[str], names: list[str]) -> None:
-    """Until every robot's learner answers: they come up one after the other."""
+    """Wait until every robot's learner answers; they start one after the other."""
     deadline = time.monotonic() + LIMIT_S
     for place, end in enumerate(ends):
         waiting = names[place :: len(ends)]

@@ -78,7 +78,7 @@ def record_walk(seed: int) -> Walk:
 
 
 def nlms(mu0: float, replays: int) -> Learner:
-    """Online steps, each followed by replays of random earlier pairs."""
+    """Return a learner of online steps, each followed by replays of random earlier pairs."""
 
     def learn(start: KBMap, q: FloatArray, x: FloatArray) -> KBMap:
         rng = np.random.default_rng(0)

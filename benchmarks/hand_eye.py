@@ -79,7 +79,7 @@ def seen(T_camera_tag: FloatArray, rng: np.random.Generator) -> Pose | None:
 def views(
     robot: RobotDescription, T_gripper_camera: FloatArray, count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, list[Pose], FloatArray]:
-    """Joint angles (n, d), what is seen there, and the gripper's poses in the world (n, 4, 4)."""
+    """Return joint angles (n, d), the tag poses seen there, and the gripper's poses in the world (n, 4, 4)."""
     T_camera_gripper = np.linalg.inv(T_gripper_camera)
     q, poses, grippers = [], [], []
     T_world_tag = None
@@ -109,7 +109,7 @@ def views(
 def learnt(
     nominal: RigidChain, q: FloatArray, poses: list[Pose], T_gripper_camera: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """T_gripper_camera (4, 4), and which of its six numbers (6,) are within their 95 % intervals of the true ones."""
+    """Return T_gripper_camera (4, 4), and True (6,) for each of its numbers whose 95 % interval covers the truth."""
     x, cov = np.array([pose.x for pose in poses]), np.array([pose.cov[3:, 3:] for pose in poses])
     turns = np.array([pose.rotation for pose in poses])
     placed = align(nominal, q, x, pose_known=False, marker_known=False, turns=turns)
@@ -128,7 +128,7 @@ def learnt(
 
 
 def of_opencv(python: Path, grippers: FloatArray, poses: list[Pose]) -> dict[str, FloatArray]:
-    """T_gripper_camera (4, 4) by each of OpenCV's methods."""
+    """Return T_gripper_camera (4, 4) by each of OpenCV's methods."""
     views = [grippers[:, :3, :3], grippers[:, :3, 3], *(np.array(part) for part in zip(*_parts(poses), strict=True))]
     told = json.dumps([each.tolist() for each in views])
     command = [str(python), "-c", ASKED, *METHODS]

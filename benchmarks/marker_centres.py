@@ -45,14 +45,14 @@ Detector = Callable[[ImageArray, ImageArray, float], FloatArray | None]
 
 
 def by_contour(image: ImageArray, mask: ImageArray, radius_px: float) -> FloatArray | None:  # noqa: ARG001
-    """cv2.fitEllipse on the longest contour of the mask."""
+    """Locate the ball by cv2.fitEllipse on the longest contour of the mask."""
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     longest = max(contours, key=len, default=None)
     return None if longest is None or len(longest) < 5 else np.array(cv2.fitEllipse(longest)[0])
 
 
 def by_circles(image: ImageArray, mask: ImageArray, radius_px: float) -> FloatArray | None:  # noqa: ARG001
-    """cv2.HoughCircles on the brightness of the colour, told the radius to a quarter."""
+    """Locate the ball by cv2.HoughCircles on the brightness of the colour, given the radius to a quarter."""
     amount = np.clip(GATE.amount(image), 0, 255).astype(np.uint8)
     low, high = int(0.75 * radius_px), int(np.ceil(1.25 * radius_px))
     found = cv2.HoughCircles(
@@ -66,7 +66,7 @@ def by_circles(image: ImageArray, mask: ImageArray, radius_px: float) -> FloatAr
 
 
 def by_blob(image: ImageArray, mask: ImageArray, radius_px: float) -> FloatArray | None:  # noqa: ARG001
-    """cv2.SimpleBlobDetector on the brightness of the colour, told the area to a factor of two."""
+    """Locate the ball by cv2.SimpleBlobDetector on the brightness of the colour, given the area to a factor of two."""
     settings = cv2.SimpleBlobDetector.Params()
     settings.filterByColor, settings.blobColor = True, 255
     settings.filterByArea, settings.minArea, settings.maxArea = True, 1.5 * radius_px**2, 6.3 * radius_px**2
@@ -131,7 +131,7 @@ def compare_centres(name: str, look: Look, frames: int, seed: int) -> None:
 
 
 def information(x: FloatArray, look: Look, pictures: list[FloatArray], calibration: StereoCalibration) -> FloatArray:
-    """Fisher's information (3, 3) [1/m²] of the ball's place in the noisy pixels of both eyes."""
+    """Return the Fisher information (3, 3) [1/m²] of the ball's position in the noisy pixels of both cameras."""
     total = np.zeros((3, 3))
     fine = replace(look, samples=16)
     # Large beside the rays' spacing, small beside the blur: 0.2 px.

@@ -61,7 +61,7 @@ def _paint_brick(picture: FloatArray, centre_px: FloatArray, radius_px: float) -
 
 
 def tracked(calibration: StereoCalibration, frames: list[StereoFrame], *, forget: bool) -> tuple[list[float], int]:
-    """CPU times [s] of all frames but the first, and how many were fixes."""
+    """Return CPU times [s] of all frames but the first, and how many were fixes."""
     tracker = StereoTracker(calibration)
     tracker.track(frames[0])
     seconds: list[float] = []

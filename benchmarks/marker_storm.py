@@ -83,7 +83,7 @@ def draw_scene(rng: np.random.Generator, kind: str) -> Scene:
 def _paint_own_hue(
     rng: np.random.Generator, pictures: tuple[FloatArray, FloatArray], start: FloatArray, look: Look
 ) -> None:
-    """Boxes of the ball's hue in both pictures, paler and darker, beside the ball and behind it."""
+    """Paint boxes of the ball's hue in both images, paler and darker, beside the ball and behind it."""
     for _ in range(3):
         shade = float(rng.uniform(0.5, 1.0))
         rgb = tuple(shade * (level + float(rng.uniform(0.0, 0.15))) for level in look.ball_rgb)
@@ -109,7 +109,7 @@ def is_in_full_view(x: FloatArray) -> bool:
 
 
 def shoot(scene: Scene, number: int, rng: np.random.Generator) -> tuple[StereoFrame, FloatArray, bool]:
-    """Frame `number` of a scene, the ball's place (3,) [m], and whether the ball is in the picture at all."""
+    """Return frame `number` of a scene, the ball's position (3,) [m], and True if the ball is in the image."""
     x = scene.start + number * scene.step
     shown = not (scene.kind == "hidden" and 4 <= number < 8)
     look = scene.look

@@ -80,7 +80,7 @@ class Arm:
         return seen & (-(facing * x).sum(axis=1) / distance > np.cos(MOST_OBLIQUE))
 
     def postures(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """Postures (count, d) in which the camera sees the tag."""
+        """Return postures (count, d) in which the camera sees the tag."""
         found = np.zeros((0, len(self.lower)))
         while len(found) < count:
             q = rng.uniform(self.lower, self.upper, (4000, len(self.lower)))
@@ -119,7 +119,7 @@ def measured(arm: Arm, q: FloatArray, seed: int) -> tuple[list[MarkerFix], Float
 
 
 def bound(arm: Arm, q: FloatArray, fixes: list[MarkerFix], test: FloatArray, *, oriented: bool) -> float:
-    """RMS distance [m] that no unbiased learner of these pairs falls below on average."""
+    """Return the RMS distance [m] that no unbiased learner of these pairs falls below on average."""
     parameters = ChainParameters(arm.true)
     spread = parameters.standard_deviations(DRAWN)
     columns = np.flatnonzero(spread > 0.0)

@@ -63,13 +63,13 @@ class StandInSampler:
         return encode(PairsReply(STORE, self.stored, page), request.encoding)
 
     def next(self) -> bytes:
-        """Store one more pair; it as it is published."""
+        """Store one more pair and return it as published."""
         self.stored += 1
         return encode(self._pairs[self.stored - 1])
 
 
 def walk(rng: np.random.Generator, count: int, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Joint angles (count, d) [rad]: straight ways between random waypoints in steps of 2 degrees."""
+    """Return joint angles (count, d) [rad]: straight ways between random waypoints in steps of 2 degrees."""
     step, q = np.radians(STEP_DEG), [(low + high) / 2]
     goal = rng.uniform(low, high)
     while len(q) < count:
@@ -98,7 +98,7 @@ def ask(robot_file: Path) -> None:
 
 
 def asked(robot_file: Path) -> FloatArray:
-    """Latencies [ms] that another process measures."""
+    """Return the latencies [ms] measured by another process."""
     command = [sys.executable, __file__, "--ask", str(robot_file)]
     done = subprocess.run(command, check=True, capture_output=True, timeout=PHASE_S + 60.0)
     return 1e3 * np.array(json.loads(done.stdout))
@@ -106,7 +106,7 @@ def asked(robot_file: Path) -> FloatArray:
 
 @contextmanager
 def running_learner(robot_file: Path, endpoint: str) -> Iterator[None]:
-    """`bodyschema learner`, from when it answers to the end of the with statement."""
+    """Run `bodyschema learner`, from its first answer to the end of the with statement."""
     command = module_command("bodyschema", "learner", "--robot", str(robot_file))
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
     try:
@@ -147,7 +147,7 @@ def free_port() -> int:
 
 
 def measure(robot_file: Path) -> tuple[FloatArray, FloatArray]:
-    """Latencies [ms] of an idle learner, and of one that learns."""
+    """Return latencies [ms] of an idle learner, and of one that learns."""
     config = Config.load(robot_file)
     keys, endpoints = Keys(config.robot.name), config.tables.zenoh
     sampler = StandInSampler(config, STORED_PAIRS + int(PAIRS_PER_S * (PHASE_S + 60.0)))

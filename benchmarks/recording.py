@@ -46,6 +46,6 @@ class Recording:
         return cls(robot.chain, table[:, : robot.chain.joints], table[:, -3:])
 
     def split(self, pairs: int, seed: int) -> tuple[IntArray, IntArray]:
-        """Rows to learn, so many, and all others, in a random order."""
+        """Split rows at random into those to learn and all others."""
         order = np.random.default_rng(seed).permutation(len(self))
         return order[:pairs], order[pairs:]

@@ -184,7 +184,7 @@ class ExactCost:
 
 
 def exact_costs(kbmap: KBMap, rng: np.random.Generator) -> tuple[list[ExactCost], float]:
-    """At each of `STAGES`, and the most memory [MB] of learning and solving the pairs of the last."""
+    """Return the costs at each of `STAGES`, and the peak memory [MB] of learning and solving the pairs of the last."""
     learner, costs = ExactLearner(kbmap), list[ExactCost]()
     q, x = np.empty((0, JOINTS)), np.empty((0, 3))
     for total in STAGES:
@@ -218,7 +218,7 @@ def exact_learner(kbmap: KBMap, rng: np.random.Generator) -> None:
 
 
 def solve_ms(learner: ExactLearner, precision: float | Literal["evidence"] | None) -> float:
-    """Median of three solves."""
+    """Return the median of three solves."""
     times: list[float] = []
     for _ in range(3):
         begin = time.thread_time()

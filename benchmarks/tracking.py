@@ -107,7 +107,7 @@ def sample(config: Config, sources: Sources) -> str:
 
 
 def timed(rivals: dict[str, Callable[[], str]], rounds: int) -> dict[str, tuple[list[float], str]]:
-    """Seconds of each round, and what the last one said; each round runs every rival, so all meet the same load."""
+    """Return the seconds of each round, and the last result; each round runs every rival under the same load."""
     results: dict[str, tuple[list[float], str]] = {name: ([], "") for name in rivals}
     for _ in range(rounds):
         for name, run in rivals.items():
@@ -160,7 +160,7 @@ def _endpoint() -> str:
 
 
 def _keep_to_one_core() -> None:
-    """All threads from now on share one core."""
+    """Restrict all threads to one core from now on."""
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     cv2.setNumThreads(1)
 

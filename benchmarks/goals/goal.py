@@ -38,7 +38,7 @@ class Goal:
         return f"{number(self.low)} to {number(self.high)}{unit}"
 
     def with_bound(self, bound: Measured | None) -> Goal:
-        """1.15 times the bound where that is more."""
+        """Return the goal, raised to 1.15 times the bound where that is more."""
         return self if bound is None else Goal(self.low, max(self.high, BOUND_FACTOR * bound.value), self.unit)
 
 
@@ -132,7 +132,7 @@ def judged(figure: Figure, results: Mapping[str, Sequence[Values]]) -> Cell:
 
 
 def number(value: float) -> str:
-    """Three digits; infinity is "never"."""
+    """Format with three digits; infinity is "never"."""
     if math.isinf(value):
         return "never"
     if value != 0.0 and abs(value) < 1e-3:

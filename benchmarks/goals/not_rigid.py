@@ -85,7 +85,7 @@ def _ladder_row() -> Row:
 
 
 def _split(data: Path | None, pairs: int | None, seed: int) -> Values:
-    """Held-out mean errors of a random split; None learns four fifths of the rows."""
+    """Return held-out mean errors of a random split; None learns four fifths of the rows."""
     if data is None:
         raise NotHereError(f"no folder with recordings is given (--data FOLDER or {DATA_VARIABLE})")
     folder = data / _RECORDING

@@ -14,7 +14,7 @@ HEADER = "| what | goal | measured | bound | seeds | |\n| --- | --- | --- | --- 
 
 
 def table(rows: Iterable[Row], results: Mapping[str, Sequence[Values]]) -> str:
-    """All rows: each with its name and what it is about, and a line for each figure."""
+    """Format all rows: each with its name and subject, and a line for each figure."""
     return "\n".join([HEADER, *(line for row in rows for line in _lines(row, results))])
 
 

@@ -56,7 +56,7 @@ class _Arm:
         return _Arm(RoughArm(self.arm.parameters, change), self.sigma, self.learning, self.rng)
 
     def teach(self, q: FloatArray) -> Iterable[int]:
-        """Learns pairs, all background work done after each; yields how many."""
+        """Learn pairs, with all background work done after each; yield their number."""
         cov = frozen_array(self.sigma**2 * np.eye(3))
         first = self.learning.counters.last_seq + 1
         for k, (row, x) in enumerate(zip(q, self.arm.measured(q, self.sigma, self.rng), strict=True)):

@@ -38,7 +38,7 @@ def bounds(trial: Trial) -> dict[str, float]:
 
 
 def _information(arm: RoughArm, q: FloatArray, std: FloatArray, sigma: float) -> FloatArray:
-    """Precision of the parameters in units of their prior's standard deviations, from pairs at q."""
+    """Return the precision of the parameters in units of their prior's standard deviations, from pairs at q."""
     _, jacobian = arm.parameters.linearised(arm.change, q)
     design = (jacobian * std).reshape(3 * len(q), -1) / sigma
     return design.T @ design

@@ -68,14 +68,14 @@ def measure(known: Sequence[Growth], deadline: Callable[[], bool]) -> list[Growt
 
 
 def _shape(series: Series, size: int) -> tuple[int, int]:
-    """Joints and pairs."""
+    """Return the numbers of joints and pairs."""
     if series.what == "pairs":
         return _JOINTS_BY_PAIRS, size
     return size, _PAIRS_FULL_MAP if series.competitor == "nlms" else _PAIRS_A_JOINT * size
 
 
 def _cost(series: Series, size: int) -> tuple[float, float]:
-    """CPU time to learn [s], best of several, and the most memory that it holds at once [MiB]."""
+    """Return the best CPU time to learn [s], and the peak memory [MiB]."""
     problem = _problem(*_shape(series, size))
     learn = BY_KEY[series.competitor].learn
     best = math.inf

@@ -14,7 +14,7 @@ _LABELS = {"joints": "joints d", "pairs": "pairs n"}
 
 
 def growth_section(results: Results, competitors: Sequence[Competitor], looks: dict[str, Style]) -> str:
-    """Charts of time and memory against joints and pairs; nothing where they were not measured."""
+    """Return charts of time and memory against joints and pairs; nothing where they were not measured."""
     if not results.growth:
         return ""
     titles = {competitor.key: competitor.title for competitor in competitors}

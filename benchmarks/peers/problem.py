@@ -19,7 +19,7 @@ class Fitted(Protocol):
     """Something that has learnt."""
 
     def predict(self, q: FloatArray, /) -> FloatArray:
-        """Positions (n, 3) [m] at q (n, d) [rad]."""
+        """Return positions (n, 3) [m] at q (n, d) [rad]."""
         ...
 
 
@@ -59,7 +59,7 @@ class Problem:
         return len(self.q)
 
     def scaled(self, q: FloatArray) -> FloatArray:
-        """Angles with the working range as -1 .. 1."""
+        """Return angles with the working range as -1 .. 1."""
         return (2.0 * q - self.low - self.high) / (self.high - self.low)
 
 

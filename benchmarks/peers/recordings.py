@@ -46,7 +46,7 @@ class Splits:
 
 
 def recorded_tasks(data: Path | None) -> list[Task]:
-    """One task a recording below `data`; none without."""
+    """Return one task per recording below `data`; none without `data`."""
     folders = [] if data is None else sorted(path.parent for path in data.glob("*/robot.toml"))
     return [
         Task(

@@ -82,7 +82,7 @@ class Results:
         )
 
     def save(self, path: Path) -> None:
-        """Written beside and moved into place, so that a killed run leaves the file of before."""
+        """Write a temporary file and move it into place, so that a killed run leaves the previous file."""
         content = {
             "runs": self.runs,
             "bounds": [[*key, value] for key, value in self.bounds.items()],
@@ -105,7 +105,7 @@ class Results:
         return [outcome for outcome in self.outcomes.values() if outcome.key[:3] == wanted]
 
     def bound(self, task: str, pairs: int, test: str) -> float | None:
-        """Mean of the bound [m] over the seeds."""
+        """Return the mean of the bound [m] over the seeds."""
         values = [value for key, value in self.bounds.items() if (key[0], key[1], key[3]) == (task, pairs, test)]
         return float(np.mean(values)) if values else None
 
@@ -130,7 +130,7 @@ class Cell:
 
 
 def cell(outcomes: list[Outcome], test: str) -> Cell:
-    """Summary of the outcomes for one test."""
+    """Return the summary of the outcomes for one test."""
     good = [outcome for outcome in outcomes if outcome.status == "ok" and test in outcome.errors]
     failed = sum(outcome.status == "failed" for outcome in outcomes)
     reasons = [outcome.reason for outcome in outcomes if outcome.reason]

@@ -52,7 +52,7 @@ class Job:
 
 
 def jobs(plan: Plan) -> Iterator[Job]:
-    """Every task at few pairs first, then the next seed; sizes that cost more come once the cheap ones are done."""
+    """Yield every task at few pairs first, then the next seed; costlier sizes come after the cheap ones."""
     counts = sorted({n for task in plan.tasks for n in task.counts if plan.fewest_pairs <= n <= plan.most_pairs})
     for cheap in (True, False):
         for seed in range(plan.seeds):
@@ -131,7 +131,7 @@ def _own(problem: Problem, seed: int) -> Problem:
 
 
 def _tested(fitted: Fitted, trial: Trial) -> tuple[dict[str, float], float]:
-    """Mean error of each test [m], and the processor's best time a row [µs], once warm."""
+    """Return the mean error of each test [m], and the processor's best time a row [µs], once warm."""
     errors: dict[str, float] = {}
     rates: list[float] = []
     for name, (q, x) in trial.tests.items():

@@ -181,7 +181,7 @@ BENT: dict[str, tuple[str, Setting]] = {
 
 
 def simulated_tasks() -> list[Task]:
-    """All tasks that need no recording."""
+    """Return all tasks that need no recording."""
     tasks = [
         Task(
             f"nothing{d}",

@@ -58,7 +58,7 @@ class Arm:
         return len(self.axes)
 
     def frames(self, joint_angles: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Rotations (d+1, n, 3, 3) and origins (d+1, n, 3) after F_0 .. F_d, for the joints' true angles (n, d)."""
+        """Return rotations (d+1, n, 3, 3) and origins (d+1, n, 3) after F_0 .. F_d, for true joint angles (n, d)."""
         rotation = np.broadcast_to(self.fixed[0, :3, :3], (len(joint_angles), 3, 3))
         origin = np.broadcast_to(self.fixed[0, :3, 3], (len(joint_angles), 3))
         rotations, origins = [rotation], [origin]
@@ -135,7 +135,7 @@ class Sag:
         return bent
 
     def torques(self, arm: Arm, joint_angles: FloatArray) -> FloatArray:
-        """Gravity's torque (n, d - first) [N m] about each joint that carries the arm."""
+        """Return gravity's torque (n, d - first) [N m] about each joint that carries the arm."""
         torso = Arm(np.concatenate([np.eye(4)[None], arm.fixed[self.first + 1 :]]), arm.axes[self.first :])
         rotations, origins = torso.frames(joint_angles[:, self.first :])
         torques = np.zeros((len(joint_angles), torso.joints))

@@ -33,7 +33,7 @@ class Placements:
         return self.linearised(self.change, q)[0]
 
     def linearised(self, change: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Positions (n, 3) and their derivatives (n, 3, 6 d + 6) by the change, (turn, shift) frame by frame."""
+        """Return positions (n, 3) and their derivatives (n, 3, 6 d + 6) by the change, (turn, shift) frame by frame."""
         motions = change.reshape(-1, 6)
         rotation, origin = np.broadcast_to(np.eye(3), (len(q), 3, 3)), np.zeros((len(q), 3))
         rotations: list[FloatArray] = []

@@ -63,7 +63,7 @@ class BodySchema:
         return x
 
     def learn(self, q: FloatArray, x: FloatArray, order: IntArray, rates: FloatArray) -> None:
-        """One step for each pair of an order, of q (n, d) and x (n, 3), at its rate."""
+        """Take one step for each pair of an order, of q (n, d) and x (n, 3), at its rate."""
         step = _Stepper(self)
         cosines, sines = np.cos(q)[..., None], np.sin(q)[..., None]
         for index, rate in zip(order.tolist(), rates.tolist(), strict=True):
@@ -84,7 +84,7 @@ class _Stepper:
         self.products = [(self.before[k], self.turns[k], self.before[k + 1]) for k in range(joints)]
 
     def __call__(self, cosine: FloatArray, sine: FloatArray, x: FloatArray, rate: float) -> None:
-        """One step for cosines and sines (d, 1) of a pair's angles and its position x (3,)."""
+        """Take one step for cosines and sines (d, 1) of a pair's angles and its position x (3,)."""
         axes, links, before = self.axes, self.links, self.before
         versine = 1.0 - cosine
         # Rodrigues: R = a aᵀ (1 − cos q) + sin q [a]× + cos q 1
@@ -113,7 +113,7 @@ class _Stepper:
 
 
 def rotations(axes: FloatArray, angles: FloatArray) -> FloatArray:
-    """Rotations (k, 3, 3) by angles (k,) about unit axes (k, 3), or all about one (3,)."""
+    """Return rotations (k, 3, 3) by angles (k,) about unit axes (k, 3), or all about one (3,)."""
     outer = axes[..., :, None] * axes[..., None, :]
     cosine, sine = np.cos(angles)[:, None, None], np.sin(angles)[:, None, None]
     return cosine * np.eye(3) + (1.0 - cosine) * outer + sine * cross_matrix(axes)

@@ -75,7 +75,7 @@ class LWPR:
         self._upper = np.triu(np.ones((inputs, inputs)))
 
     def learn(self, x: FloatArray, y: FloatArray) -> None:
-        """One pair: x (d,) and y (outputs,)."""
+        """Learn one pair: x (d,) and y (outputs,)."""
         activation = self._activations(x)
         closest = np.zeros(self.outputs)
         np.maximum.at(closest, self._output[: self.fields], activation)
@@ -114,7 +114,7 @@ class LWPR:
         return out
 
     def _activations(self, x: FloatArray) -> FloatArray:
-        """Activations (..., fields) at x (d,) or (n, 1, d)."""
+        """Return activations (..., fields) at x (d,) or (n, 1, d)."""
         off = x - self._centre[: self.fields]
         distances = self.settings.first_metric * np.einsum("...i,...i->...", off, off)
         if len(self._moved):
@@ -148,7 +148,7 @@ class LWPR:
         return named
 
     def _update(self, at: IntArray, w: FloatArray, x: FloatArray, y: FloatArray) -> None:
-        """Recursive sums of the local models (table 3 of the paper), then the metric."""
+        """Update the recursive sums of the local models (table 3 of the paper), then the metric."""
         columns = self._table.take(at, axis=0).T.copy()
         field = self._named(columns)
         keep, settings = field["forgetting"].copy(), self.settings
@@ -268,7 +268,7 @@ class LWPR:
 
 
 def _dots(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Inner products (k,) of columns (m, k)."""
+    """Return inner products (k,) of columns (m, k)."""
     return np.add.reduce(first * second, axis=0)
 
 
