@@ -76,7 +76,7 @@ def mend_links(folder: Path) -> None:
 
 
 def compile_kernels(root: Path, library: Path) -> str:
-    """Compiles the sources into the library; what went wrong, or nothing."""
+    """Compile the sources into the library; return what went wrong, or nothing."""
     library.unlink(missing_ok=True)
     compiler = shlex.split(os.environ.get("CC") or sysconfig.get_config_var("CC") or "cc")
     include = sysconfig.get_path("include")

@@ -38,7 +38,7 @@ def stored(session: zenoh.Session, prefix: str, first: int) -> dict:
 
 
 def follow(session: zenoh.Session, prefix: str, first: int) -> Iterator[dict]:
-    """Every pair of one store from `first` on, once and in order, without end."""
+    """Yield every pair of one store from `first` on, once and in order, without end."""
     heard: queue.SimpleQueue[dict] = queue.SimpleQueue()
     # Subscribed before history is asked: what comes meanwhile comes both ways, and is taken once.
     subscriber = session.declare_subscriber(

@@ -69,7 +69,7 @@ class Correction:
         raise ValueError(f"unknown effect {kind}")
 
     def frames(self, angles):
-        """Frames of all joints in the root link's; the last is that link's own."""
+        """Return frames of all joints in the root link's; the last is that link's own."""
         frames = [(1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)] * (len(angles) + 1)
         for k, parent, slides, pose in self.chain:
             a, b, c, x, d, e, f, y, g, h, i, z = product(frames[parent], pose)
@@ -83,7 +83,7 @@ class Correction:
         return frames
 
     def torques(self, frames):
-        """Gravity's torque about each joint, or force along it."""
+        """Return gravity's torque about each joint, or force along it."""
         mass, mx, my = ([0.0] * len(frames) for _ in range(3))
         torques = [0.0] * (len(frames) - 1)
         for k, parent, slides, _ in reversed(self.chain):
@@ -99,7 +99,7 @@ class Correction:
 
 
 def product(P, Q):
-    """One pose after another."""
+    """Return the product of two poses."""
     a, b, c, x, d, e, f, y, g, h, i, z = P
     A, B, C, X, D, E, F, Y, G, H, J, Z = Q
     return (
