@@ -1,4 +1,4 @@
-"""Builds the compiled kernels of kbmaps where there is a C compiler, and does without them where there is none.
+"""Build the compiled kernels of kbmaps if there is a C compiler, else a pure Python wheel.
 
 BODYSCHEMA_PURE=1 in the environment leaves them out, for a wheel that installs anywhere. CC and CFLAGS are honoured.
 """
@@ -28,7 +28,7 @@ class KernelBuildHook(BuildHookInterface):
     """Adds the shared library to wheels; editable installs get it beside the sources. Mends links that came as text."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Compiles, or says why not and leaves the wheel pure Python."""
+        """Compile the kernels, or report why not and leave the wheel pure Python."""
         mend_links(Path(self.root, PACKAGE))
         if os.environ.get("BODYSCHEMA_PURE", "") not in ("", "0"):
             return
@@ -50,12 +50,12 @@ class KernelBuildHook(BuildHookInterface):
             build_data["force_include"][str(library)] = LIBRARY
 
     def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:  # noqa: ARG002
-        """Removes what was needed only until the wheel was written."""
+        """Remove the temporary files of the wheel build."""
         if self._directory is not None:
             self._directory.cleanup()
 
     def clean(self, versions: list[str]) -> None:  # noqa: ARG002
-        """Removes the library of an editable install."""
+        """Remove the library of an editable install."""
         Path(self.root, LIBRARY).unlink(missing_ok=True)
 
     _directory: tempfile.TemporaryDirectory[str] | None = None
@@ -76,7 +76,7 @@ def mend_links(folder: Path) -> None:
 
 
 def compile_kernels(root: Path, library: Path) -> str:
-    """Compiles the sources into the library; what went wrong, or nothing."""
+    """Compile the sources into the library; return what went wrong, or nothing."""
     library.unlink(missing_ok=True)
     compiler = shlex.split(os.environ.get("CC") or sysconfig.get_config_var("CC") or "cc")
     include = sysconfig.get_path("include")

@@ -46,7 +46,7 @@ BOOTSTRAPS = 1000
 
 @dataclass(frozen=True)
 class Setup:
-    """Where pairs may be taken.
+    """A range of poses from which pairs may be taken.
 
     Attributes:
         name: what is printed.
@@ -113,7 +113,7 @@ class Trial:
         return next_poses(posterior, region, candidates, count, limits=limits)
 
     def stretch(self, start: FloatArray) -> FloatArray:
-        """Poses on the way to a pose, at least `STRETCH` steps away: to any, or to the best."""
+        """Return poses towards a target at least `STRETCH` steps away: a random target, or the best."""
         goals = self.arm.angles(GOALS, self._range_deg, self._rng)
         away = goals - start
         lengths = np.linalg.norm(away, axis=1)
@@ -126,7 +126,7 @@ class Trial:
 
 
 def curve(setup: Setup, seed: int, way: str, last: int) -> dict[int, float]:
-    """Mean error [m] by number of pairs."""
+    """Return the mean error [m] by number of pairs."""
     trial = Trial(setup, seed, way)
     errors = {trial.pairs: trial.error()}
     while trial.pairs < last:
@@ -141,7 +141,7 @@ def curve(setup: Setup, seed: int, way: str, last: int) -> dict[int, float]:
 
 
 def walk_curve(seed: int, way: str, last: int) -> dict[int, float]:
-    """The same where the arm has to walk: stretches of 20 steps of 2 degrees."""
+    """Return the mean error [m] by number of pairs for an arm that moves in stretches of 20 steps of 2 degrees."""
     trial = Trial(Setup(WALK), seed, way)
     at = np.zeros(7)
     errors: dict[int, float] = {}
@@ -153,9 +153,9 @@ def walk_curve(seed: int, way: str, last: int) -> dict[int, float]:
 
 
 def pairs_to_reach(level: float, pairs: FloatArray, errors: FloatArray) -> float:
-    """Where a curve of mean errors first falls to a level, between its points by a straight line in logarithms.
+    """Return the number of pairs at which a curve of mean errors first falls to a level, interpolated log-log.
 
-    The last of them where it does not fall so far: the pairs needed are at least as many.
+    If the curve never falls that far, return its last number of pairs, which is then a lower bound.
     """
     falling = np.minimum.accumulate(errors)
     return float(np.exp(np.interp(-np.log(level), -np.log(falling), np.log(np.maximum(pairs, 0.5)))))
@@ -178,13 +178,13 @@ class Curves:
         return cls(np.array(list(curves[0]), dtype=np.float64), np.array([list(one.values()) for one in curves]))
 
     def at(self, pairs: float, rows: NDArray[np.intp] | None = None) -> float:
-        """The mean error at a number of pairs, between those of the grid by a straight line in logarithms."""
+        """Return the mean error at a number of pairs, interpolated log-log on the grid."""
         means = np.log(self.errors[slice(None) if rows is None else rows].mean(axis=0))
         return float(np.exp(np.interp(np.log(pairs), np.log(np.maximum(self.pairs, 0.5)), means)))
 
 
 def share_of_pairs(pairs: float, chosen: Curves, random: Curves) -> tuple[float, FloatArray]:
-    """The pairs chosen over the random ones that lead to the same mean error; the same for resampled seeds."""
+    """Return the ratio of chosen to random pairs at equal mean error, and the same ratios for resampled seeds."""
     seeds = len(random.errors)
     resamples = np.random.default_rng(0).integers(0, seeds, (BOOTSTRAPS, seeds))
     ratios = [

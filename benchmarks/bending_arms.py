@@ -24,7 +24,7 @@ from bodyschema.daemon.learning import DirectSolver, Learning, NominalModel
 
 
 def stream(truth: str, seed: int, pairs: int, sigma: float, every: int) -> tuple[int, Counter[str]]:
-    """Changes that were found along one walk, and how often each model answered."""
+    """Return the number of changes detected along one walk, and how often each model answered."""
     rng = np.random.default_rng([seed, 7])
     arm = rough_arm(JOINTS, rng, TOLERANCES)
     positions = TRUTHS[truth](arm, rng)

@@ -37,9 +37,12 @@ class BentArm(RoughArm):
 
 
 def bent(arm: RoughArm, kind: str, rng: np.random.Generator) -> RoughArm:
-    """The arm, rigid or bent: "sag" (up to 1 degree a joint under the marker's weight), "eccentric" (encoders off by
-    1 degree · sin), "gain" (gears off by 1 %), "affine" (camera off by 2 % a component) or "radial" (2 %, 0.6 m from
-    the optical axis)."""
+    """Return the arm, rigid or with one non-rigid effect.
+
+    The kinds are "sag" (up to 1 degree a joint under the marker's weight), "eccentric" (encoders off by
+    1 degree · sin), "gain" (gears off by 1 %), "affine" (camera off by 2 % a component) and "radial" (2 %, 0.6 m from
+    the optical axis).
+    """
     if kind == RIGID:
         return arm
     makers = {"sag": _sag, "eccentric": _eccentric, "gain": _gain}
@@ -54,7 +57,7 @@ def _same(values: FloatArray) -> FloatArray:
 
 
 def _sag(arm: RoughArm, rng: np.random.Generator) -> Bend:
-    """Springs in the joints: each gives way in proportion to the torque of a weight at the marker."""
+    """Return joint springs that yield in proportion to the torque of a weight at the marker."""
     chain = arm.parameters.chain(arm.change)
 
     def torques(q: FloatArray) -> FloatArray:

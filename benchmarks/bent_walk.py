@@ -41,7 +41,7 @@ from kbmaps.arrays import FloatArray
 SIGMA_M = 0.003
 SHARED = 0.9
 REGION_DEG = 5.0
-# As the daemon's settings have them.
+# Same values as in the daemon's settings.
 TOLERANCES = ChainTolerances(
     axes=np.radians(3.0),
     points=0.015,
@@ -54,7 +54,7 @@ Predict = Callable[[FloatArray], Estimate]
 
 
 def noise(pairs: int, rng: np.random.Generator, share: float) -> FloatArray:
-    """Noise (n, 3) [m] of SIGMA_M; `share` is the correlation of neighbours."""
+    """Return noise (n, 3) [m] of SIGMA_M; `share` is the correlation of neighbours."""
     fresh = rng.normal(size=(pairs, 3))
     series = np.empty_like(fresh)
     series[0] = fresh[0]
@@ -95,7 +95,7 @@ LEARNERS = {"rigid": rigid, "exact": exact, "residual": residual}
 
 
 def run(truth: str, learners: list[str], pairs: int, seed: int, share: float) -> list[list[float]]:
-    """For each learner: error and coverage within 1 and 2 sigma in the region and later, and the CPU time [s]."""
+    """Return for each learner: error and coverage within 1 and 2 sigma in the region and later, and CPU time [s]."""
     rng = np.random.default_rng(seed)
     arm = rough_arm(JOINTS, rng, ROUGH)
     positions = TRUTHS[truth](arm, rng)

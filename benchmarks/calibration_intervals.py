@@ -1,8 +1,8 @@
-"""How often a calibration's intervals cover: `python benchmarks/calibration_intervals.py [--rigs N] [--first SEED]`.
+"""Coverage of a calibration's intervals: `python benchmarks/calibration_intervals.py [--rigs N] [--first SEED]`.
 
 Rigs of two webcams drawn at random, one half with fisheye lenses, are calibrated from 20 rendered pairs of a board,
 with the lens model that they have; a normal distribution has 68 % of the parameters within one claimed sigma, 95 %
-within two. No rig is left out; one that is refused is printed. Ctrl-C ends early, with the table.
+within two. No rig is skipped; refused ones are printed. Ctrl-C ends early, with the table.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def main() -> None:
 
 
 def row(lenses: str, rigs: list[Figures]) -> str:
-    """One line of the table."""
+    """Return one line of the table."""
     z = np.abs(np.concatenate([each.z for each in rigs]))
     off_mm = np.array([each.baseline_mm for each in rigs])
     in_sigmas = off_mm / [each.baseline_sigma_mm for each in rigs]

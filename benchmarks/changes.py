@@ -43,8 +43,7 @@ from kbmaps import ChainBelief, ChainParameters, ChainTolerances, Explanation, l
 from kbmaps.changes.mixture import log_ratios
 from kbmaps.robust import OUTLIER_SIGMAS
 
-# After half as many pairs as the chain knows, on which it is tried out, the change comes within so many, and is to be
-# noticed within so many.
+# Pairs that the chain knows (half as many more validate it), range of pairs until the change, and pairs to notice it.
 KNOWN, CHANGED_WITHIN, LONGEST = 1000, (20, 80), 600
 STEPS_DEG = (1.0, 3.0)
 TOLERANCES = ChainTolerances(
@@ -58,13 +57,13 @@ TOLERANCES = ChainTolerances(
 VERDICTS = RIGHT, UNDECIDED, WRONG = "right", "undecided", "wrong"
 IN_TIME, NAMED_AFTER = 30, (30, 100, 300)
 PAIRS_BETWEEN_FALSE_ALARMS = 50_000
-# Of a quiet walk: a new chain is fitted so often, to so many of the last pairs.
+# On a walk without a change: pairs between two fits of the chain, and the number of latest pairs it is fitted to.
 REFIT, FITTED = 500, 2000
 OUTLIERS, OUTLIER_M = 0.01, 0.3
 # An arm that is no chain: by how much, at most, in how many waves over a turn.
 BENT_M, WAVES = 0.004, 2.0
 RIGID, BENT, TICKS = "rigid", "not rigid", "ticks"
-# What an arm's encoders tell apart [rad], and how much worse a stereo camera is along its view.
+# Encoder resolution [rad], and the factor by which a stereo camera is less precise along its view.
 TICK_RAD, DEPTH = 2.0 * math.pi / 4096, 8.0
 
 
@@ -98,7 +97,7 @@ CASES = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """One seed: delays [pairs], infinite where it was not noticed, and what it was called after so many pairs."""
+    """One seed: delays [pairs], infinite where undetected, and the verdicts after each number of pairs."""
 
     delay: float
     optimal: float
@@ -109,7 +108,7 @@ class Outcome:
 
 
 def walk(joints: int, count: int, rng: np.random.Generator) -> FloatArray:
-    """Straight ways between random waypoints in steps of 1 to 3 degrees, shape (count, joints)."""
+    """Return straight ways between random waypoints in steps of 1 to 3 degrees, shape (count, joints)."""
     q, goal = [np.zeros(joints)], rng.uniform(-REACH, REACH, joints)
     while len(q) < count:
         step = math.radians(rng.uniform(*STEPS_DEG))
@@ -123,7 +122,10 @@ def walk(joints: int, count: int, rng: np.random.Generator) -> FloatArray:
 def changed(
     arm: RoughArm, case: Case, q: FloatArray, rng: np.random.Generator
 ) -> tuple[RoughArm, FloatArray, int | None]:
-    """The arm after a change, the change of its parameters, and the joint whose zero it is; q (n, d) come after it."""
+    """Return the changed arm, the change of its parameters, and the joint whose offset changed (None for other kinds).
+
+    q (n, d) [rad] are the poses after the change.
+    """
     parameters, joint = arm.parameters, None
     theta = np.zeros(parameters.size)
     if case.kind == "tool":
@@ -147,7 +149,7 @@ def direction(rng: np.random.Generator) -> FloatArray:
 
 
 def reference(arm: RoughArm, q: FloatArray, x: FloatArray, covs: FloatArray) -> Reference:
-    """The chain of pairs q (n, d) [rad], x (n, 3) [m] and their covariances (n, 3, 3) [m²]."""
+    """Fit the reference chain to pairs q (n, d) [rad], x (n, 3) [m] with covariances (n, 3, 3) [m²]."""
     belief = fitted_belief(ChainBelief.from_tolerances(ChainParameters(arm.drawing), TOLERANCES), q, x)
     bases = learning_bases(np.full(q.shape[1], -np.pi), np.full(q.shape[1], np.pi), [False] * q.shape[1])
     kbmap = belief.chain.to_kbmap(bases)
@@ -158,7 +160,7 @@ def reference(arm: RoughArm, q: FloatArray, x: FloatArray, covs: FloatArray) -> 
 
 
 def cusum_threshold(information: float) -> float:
-    """What a CUSUM of Gaussian log likelihood ratios may reach (Siegmund 1985, section 2.6).
+    """Return the alarm threshold of a CUSUM of Gaussian log likelihood ratios (Siegmund 1985, section 2.6).
 
     Args:
         information: mean log likelihood ratio of a pair after the change.
@@ -172,7 +174,7 @@ def cusum_threshold(information: float) -> float:
 
 
 def sum_threshold(information: float) -> float:
-    """What the log of a sum of likelihood ratios over onsets may reach (Pollak 1987), for the same alarms."""
+    """Return the threshold of the log of summed likelihood ratios over onsets (Pollak 1987), at the same alarm rate."""
     return math.log(PAIRS_BETWEEN_FALSE_ALARMS) - 0.583 * math.sqrt(2.0 * information)
 
 
@@ -218,7 +220,10 @@ def outcome(case: Case, joints: int, sigma: float, seed: int, known_pairs: int) 
 
 
 def verdict(found: list[Explanation], case: Case, joint: int | None) -> str:
-    """What the learner would call it. A zero that no motion tells from the tool or the camera is right for these."""
+    """Judge the learner's verdict on the change: right, wrong or undecided.
+
+    A joint offset that is not identifiable apart from the tool or the camera counts as right for these.
+    """
     kinds = [KindOfChange(each.kind.name, each.kind.joint, each.probability) for each in found]
     record = msgspec.structs.replace(ChangeRecord.told(0), kinds=kinds)
     if record.named is None:
@@ -228,10 +233,10 @@ def verdict(found: list[Explanation], case: Case, joint: int | None) -> str:
 
 
 def statistics_if_told(watch: Watch, theta: FloatArray, case: Case, joint: int | None) -> tuple[float, float]:
-    """By the watch's own model, logs of what those have who are told of the change beforehand.
+    """Return log statistics of detectors that know the change beforehand, computed with the watch's own model.
 
-    The greatest likelihood ratio over the onsets, told the change; the sum of these ratios over the onsets, told its
-    kind and size, but not its direction.
+    The first is the greatest likelihood ratio over the onsets, given the change. The second is the sum of these ratios
+    over the onsets, given its kind and size but not its direction.
     """
     detector, place = watch.detector, 0
     if detector is None:
@@ -264,7 +269,7 @@ def pair_of(number: int, q: FloatArray, x: FloatArray, cov: FloatArray) -> Pair:
 
 
 def quiet(kind: str, joints: int, sigma: float, seed: int, pairs: int) -> int:
-    """False alarms along a walk where nothing changes; after one the watch begins anew."""
+    """Count false alarms along a walk without a change; the watch restarts after each."""
     rng = np.random.default_rng([seed, joints, round(1e4 * sigma), (RIGID, BENT, TICKS).index(kind), 99])
     arm = rough_arm(joints, rng, TOLERANCES)
     q = walk(joints, KNOWN + pairs, rng)
@@ -293,14 +298,14 @@ def quiet(kind: str, joints: int, sigma: float, seed: int, pairs: int) -> int:
 
 
 def seen_in_stereo(x: FloatArray, sigma: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Positions (n, 3) [m] with noise, and its covariances (n, 3, 3) [m²]: sigma across the view, more along it."""
+    """Return noisy positions (n, 3) [m] and covariances (n, 3, 3) [m²]: sigma across the view, more along it."""
     view = x / np.linalg.norm(x, axis=1)[:, None]
     noise = sigma * (rng.normal(size=x.shape) + DEPTH * rng.normal(size=(len(x), 1)) * view)
     return x + noise, sigma**2 * (np.eye(3) + DEPTH**2 * view[:, :, None] * view[:, None, :])
 
 
 def row(case: Case, found: list[Outcome]) -> str:
-    """One line of the table."""
+    """Return one line of the table."""
     kept = [each for each in found if not each.early]
     delays, *told = (
         np.array([getattr(each, name) for each in kept])

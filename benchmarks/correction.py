@@ -1,9 +1,9 @@
-"""How long the readers of correction.json take for one reading of a 6-joint arm with 5 effects.
+"""Time that the readers of correction.json take for one reading of a 6-joint arm with 5 effects.
 
     python -m benchmarks.correction
 
-Without joints that give, and with two of them: their load is weighed three times a reading. Needs g++ for C++ and node
-for JavaScript; what is not there is left out.
+Measured without compliant joints and with two, whose load is computed three times a reading. Needs g++ for C++ and node
+for JavaScript; missing ones are skipped.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ int main(int, char** argv) {
 
 
 def six_joints(folder: Path) -> RobotDescription:
-    """An arm of six links of 0.2 m and 2 kg."""
+    """Write and load an arm of six links of 0.2 m and 2 kg."""
     inertia = '<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/>'
     mass = f'<inertial><origin xyz="0 0 0.1"/><mass value="2"/>{inertia}</inertial>'
     links = "".join(f'<link name="link{k}">{mass}</link>' for k in range(7))
@@ -103,7 +103,7 @@ def six_joints(folder: Path) -> RobotDescription:
 
 
 def commands(folder: Path) -> dict[str, list[str]]:
-    """How to run each reader's loop."""
+    """Return the command that runs each reader's loop."""
     (folder / "loop.py").write_text(IN_PYTHON.format(readers=str(READERS), repeats=REPEATS))
     found = {"Python": [sys.executable, str(folder / "loop.py")]}
     if node := shutil.which("node"):

@@ -1,4 +1,4 @@
-"""How often the truth lies within what the models claim: `python -m benchmarks.coverage [--seeds N]`.
+"""Coverage of the models' predictive uncertainty: `python -m benchmarks.coverage [--seeds N]`.
 
 Per task and model: the share of coordinates of the true position, at poses that were not learnt, within 1 and within
 1.96 of the claimed sigma of the prediction (mean over the seeds, with its standard error), and the mean error. Goal:
@@ -47,14 +47,14 @@ BENT_GOAL = (0.60, 0.85)
 
 @dataclass(frozen=True)
 class Task:
-    """What is learnt and where it is asked.
+    """Training data and test poses of one case.
 
     Attributes:
         joints: 6 or 7.
         pairs: how many.
-        told: whether the noise is told.
+        told: whether the learner knows the noise.
         reach_deg: half the range of independent poses; 0 for a guided path.
-        around_deg: the middle of that range is drawn within this.
+        around_deg: half the range of the random centre of those poses.
         test_deg: half the range of the test poses.
         bend: as in `bent`.
         outliers: share of the pairs that are off by 200 mm.
@@ -104,7 +104,7 @@ def tasks() -> list[Task]:
 
 @dataclass(frozen=True)
 class Entry:
-    """A model under test: how it is made of a drawing, and how it is told of a marker that was moved, if it can be."""
+    """A model under test: its constructor from a nominal model, and its tool-change call, if it has one."""
 
     make: Callable[[RoughArm, Task], Model]
     new_tool: Callable[[Model], None] | None = None
@@ -183,7 +183,7 @@ def run(task: Task, entry: Entry, seed: int) -> Outcome:
 
 
 def refit(model: Model) -> None:
-    """Lets a model that fits now and then fit to all that it has been given."""
+    """Refit a tensor train to all its pairs; other models are left unchanged."""
     if isinstance(model, TensorLearner):
         model.refit()
 

@@ -27,7 +27,7 @@ from bodyschema.interfaces.records import FloatArray
 from kbmaps.arrays import BoolArray
 
 SETS = ("ur5_laser", "wam_laser", "ur10_laser_a", "ur10_laser_b", "panda_eyeinhand")
-# What is asked of a set [mm].
+# Required held-out residual of each set [mm].
 ASKED = {"ur5_laser": "mean ≤ 0.090", "wam_laser": "RMS ≤ 1.5"}
 ONE_DAY, ANOTHER_DAY = "ur10_laser_a", "ur10_laser_b"
 ASKED_LATER = "RMS < 0.44, aim 0.33"
@@ -42,20 +42,20 @@ class Arm:
 
     @classmethod
     def load(cls, folder: Path, every: int) -> Arm:
-        """Every so many rows of the set."""
+        """Load every `every`-th row of the set."""
         simulation = load_simulation(folder / "robot.toml")
         whole = Recording.read(folder / "measured.csv", simulation.robot.joints)
         return cls(simulation, whole.rows(np.arange(0, len(whole), every)))
 
 
 def at_random(rows: int, seed: int) -> Blocks:
-    """Rows that are dealt to folds one by one, wherever they are."""
+    """Assign rows to folds one by one, at random."""
     blocks = Blocks.cut(rows)
     return Blocks(np.random.default_rng(seed).permutation(blocks.of_row), blocks.count)
 
 
 def distances_mm(diagnosis: Diagnosis) -> FloatArray:
-    """Errors (n,) of the extended simulation on rows that were not fitted, those left out that are not the marker."""
+    """Return errors (n,) [mm] of the extended simulation on held-out rows, without fixes that are not the marker."""
     return 1e3 * diagnosis.held_out["extended"][diagnosis.markers]
 
 
@@ -64,12 +64,12 @@ def rms(distances: FloatArray) -> float:
 
 
 def held_out_mm(fit: Fit, kept: BoolArray) -> float:
-    """RMS of a fit on blocks that it was not fitted to, of the rows that are kept."""
+    """Return the RMS [mm] of a fit over held-out blocks, on the rows that are kept."""
     return 1e3 * rms(np.linalg.norm(held_out_errors(fit, Blocks.cut(len(kept))), axis=1)[kept])
 
 
 def row(name: str, diagnosis: Diagnosis, dealt: Diagnosis, seconds: float) -> str:
-    """One line of the table, from diagnoses with rows held out by blocks and at random."""
+    """Return one line of the table, from diagnoses with rows held out by blocks and at random."""
     file = conclusion(diagnosis)
     n, blocks, scattered = len(diagnosis.markers), distances_mm(diagnosis), distances_mm(dealt)
     other = [c for c in file.causes if c.effect not in ("link_geometry", "joint_offset", "outliers")]
@@ -83,7 +83,7 @@ def row(name: str, diagnosis: Diagnosis, dealt: Diagnosis, seconds: float) -> st
 
 
 def taken_along(earlier: Diagnosis, arm: Arm, later: Diagnosis) -> str:
-    """What the effects found on one day leave of another day's recording, and what the best geometry does."""
+    """Report the held-out residual of one day's effects on another day's recording, and that of the best geometry."""
     simulation = arm.simulation.with_effects(earlier.causes)
     taken = held_out_mm(aligned(Observations.of(arm.recording, simulation), simulation), later.markers)
     geometry = held_out_mm(later.geometry, later.markers)

@@ -1,4 +1,4 @@
-"""What a diagnosis costs: `python -m benchmarks.diagnose_time [--pairs 1600] [--times 10] [--causes 1 2 3 5]`.
+"""Cost of a diagnosis: `python -m benchmarks.diagnose_time [--pairs 1600] [--times 10] [--causes 1 2 3 5]`.
 
 The shipped upper body's arm, six joints and the eyes, walks; effects of the table are put into its simulation, pixel
 noise and whole ticks are added. All hypotheses are tried. Each case runs in a process of its own: seconds are the
@@ -49,13 +49,13 @@ HIDDEN: tuple[tuple[str, str | None, tuple[float, ...]], ...] = (
 INTERVAL_S, STEP_RAD, TICKS_A_TURN = 0.1, 0.04, 4096
 # A pose in which the ball is well in front of the eyes, and how far from it the walk goes [rad].
 CENTRE_RAD, SPREAD_RAD = (-0.9, 1.05, 0.8, 0.15, 0.9, 0.0), 0.5
-# Of the whole walk so many times as many rows are made as are wanted: the eyes do not see the rest.
+# The walk has this many times the wanted rows, because the cameras do not see all of them.
 SPARE, NEAREST_M, MARGIN_PX = 6, 0.2, 20.0
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What one diagnosis cost: seconds of the processor to find and to report, peak memory, and what was named."""
+    """Cost of one diagnosis: CPU seconds to find and to report, peak memory, and the causes named."""
 
     found_s: float
     told_s: float
@@ -68,7 +68,7 @@ class Cost:
 
 
 def arm() -> RobotDescription:
-    """The upper body's arm and its eyes, holding itself."""
+    """Load the arm and cameras of the upper body, held by its own motors."""
     tables, text = read_toml(model_file("upper_body"))
     tables["robot"] |= {"joints": list(JOINTS), "hold": "held"}
     tables["robot"]["held_at"] |= {"neck_pitch": 0.35}
@@ -76,7 +76,7 @@ def arm() -> RobotDescription:
 
 
 def walk(robot: RobotDescription, pairs: int, rng: np.random.Generator) -> Motion:
-    """Readings (n, d) [rad] in whole ticks that wander about a pose in front of the eyes, where these see the ball."""
+    """Return a random walk in front of the cameras: readings (n, d) [rad] in whole ticks, visible rows only."""
     centre, joints = np.array(CENTRE_RAD), len(robot.joints)
     q, at, heading = np.empty((SPARE * pairs, joints)), centre, np.zeros(joints)
     for row in range(len(q)):
@@ -92,7 +92,7 @@ def walk(robot: RobotDescription, pairs: int, rng: np.random.Generator) -> Motio
 
 
 def in_view(robot: RobotDescription, x: FloatArray) -> BoolArray:
-    """Which positions (n, 3) [m] the left eye sees, well inside its image."""
+    """Return True for each position (n, 3) [m] that lies well inside the left camera's image."""
     calibration = robot.calibration
     assert calibration is not None
     centre, size = np.array(calibration.principal_point_px), np.array(calibration.image_size_px)
@@ -102,7 +102,7 @@ def in_view(robot: RobotDescription, x: FloatArray) -> BoolArray:
 
 
 def recording(robot: RobotDescription, pairs: int, causes: int, seed: int) -> Recording:
-    """A walk as it is measured of the arm with the first `causes` of the hidden effects."""
+    """Simulate a measured walk of the arm with the first `causes` of the hidden effects."""
     rng = np.random.default_rng(seed)
     motion = walk(robot, pairs, rng)
     effects = tuple(Effect.at(robot, name, joint, None, values) for name, joint, values in HIDDEN[:causes])
@@ -128,7 +128,7 @@ def cost(pairs: int, causes: int, seed: int) -> Cost:
 
 
 def in_own_process(pairs: int, causes: int, seed: int) -> Cost:
-    """`cost`, with a peak of memory that is its own."""
+    """Run `cost` in its own process, so that its memory peak is separate."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         return pool.submit(cost, pairs, causes, seed).result()
 

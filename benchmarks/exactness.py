@@ -1,4 +1,4 @@
-"""How exactly noise-free samples give a random chain back: `python -m benchmarks.exactness [--seeds N]`.
+"""Error of a random chain recovered from noise-free samples: `python -m benchmarks.exactness [--seeds N]`.
 
 The paper: 3^d samples determine the chain, wherever they lie. In float64 a smaller cluster costs digits outside it.
 Errors are the largest of 500 configurations within +-80 degrees [m], median (and worst) over the seeds.
@@ -23,7 +23,7 @@ TEST_ROWS = 500
 
 
 def errors(joints: int, cluster_deg: float, times: int, seed: int) -> FloatArray:
-    """Distances (500,) [m] within +-80 degrees after so many times 3^d pairs from a cluster."""
+    """Return distances (500,) [m] within +-80 degrees after a multiple of 3^d pairs from a cluster."""
     rng = np.random.default_rng(seed)
     chain, prior = random_chain(joints, rng), random_chain(joints, rng)
     cluster, reach = (np.full(joints, np.radians(deg)) for deg in (cluster_deg, REACH_DEG))

@@ -1,10 +1,10 @@
-"""Exported models on measured data that they were not diagnosed from: does MuJoCo gain what `diagnose` promised?
+"""Compare the gain of exported models in MuJoCo with the prediction of `diagnose`, on held-out measurements.
 
     python -m benchmarks.export_real --data $DATA
 
 Of each recording three tenths are held out, in blocks. The rest is diagnosed, and exported as MJCF and correction.json.
 MuJoCo and examples/correction/correction.py then predict the held-out rows from their readings. *Before* is the robot
-as described, placed by the rows that were diagnosed. A gain is to lie in the interval that diagnosis.json states.
+as described, placed by the rows that were diagnosed. The gain should lie in the interval stated in diagnosis.json.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ DRAWS = 2000
 
 
 def corrected(file: Path, q: FloatArray) -> FloatArray:
-    """Positions (n, 3) [m] by the Python reader of correction.json."""
+    """Return positions (n, 3) [m] by the Python reader of correction.json."""
     sys.path.insert(0, str(READERS))
     reader = importlib.import_module("correction").Correction(file.read_text(encoding="utf-8"))
     return np.array([reader.read(row)[1][3::4] for row in q.tolist()])
 
 
 def rms_mm(distances: FloatArray) -> float:
-    """Of distances (n,) [m]."""
+    """Return the RMS [mm] of distances (n,) [m]."""
     return float(1e3 * np.sqrt(np.square(distances).mean()))
 
 
 def gain(before: FloatArray, after: FloatArray, blocks: NDArray[np.int64]) -> str:
-    """By how much the RMS falls [%], with the 95 % interval over resampled blocks of rows."""
+    """Return the decrease of the RMS [%], with the 95 % interval over resampled blocks of rows."""
     numbers, rng = np.unique(blocks), np.random.default_rng(0)
     sums = np.array([[np.square(d[blocks == b]).sum() for d in (before, after)] for b in numbers])
     drawn = sums[rng.integers(len(numbers), size=(DRAWS, len(numbers)))].sum(axis=1)
@@ -55,7 +55,7 @@ def gain(before: FloatArray, after: FloatArray, blocks: NDArray[np.int64]) -> st
 
 
 def row(folder: Path) -> str:
-    """One row of the table."""
+    """Return one row of the table."""
     simulation = load_simulation(folder / "robot.toml")
     recording = Recording.read(folder / "measured.csv", simulation.robot.joints)
     tenth = np.arange(len(recording)) * TENTHS // len(recording)

@@ -1,7 +1,7 @@
-"""False alarms where the model's claims are true: `python -m benchmarks.false_alarms [--arms N] [--draws N]`.
+"""False alarm rate when the model's uncertainty is correct: `python -m benchmarks.false_alarms [--arms N] [--draws N]`.
 
-Waiting for alarms that come once in 75,000 pairs would take too long. But where a change is drawn as the detector
-supposes it to be (kind, size, direction, any first pair t), the pairs have the density R_n over those without a change,
+Waiting for alarms that come once in 75,000 pairs would take too long. But if a change is sampled from the
+detector's prior (kind, size, direction, any first pair t), the pairs have the density R_n over those without a change,
 R_n being the statistic itself, summed over t (Wald's likelihood identity). So without a change an alarm comes once in
 
     1 / E[1 / R_alarm]
@@ -33,14 +33,14 @@ QUIET, LONGEST = (20, 120), 600
 
 
 def inverse_statistics(joints: int, sigma: float, seed: int, draws: int) -> list[float]:
-    """1 / R at the alarm for changes of one arm; 0 where there is none in time."""
+    """Return 1 / R at the alarm for changes of one arm; 0 where no alarm comes in time."""
     rng = np.random.default_rng([seed, joints, round(1e4 * sigma), 17])
     arm = rough_arm(joints, rng, TOLERANCES)
     known = walk(joints, KNOWN, rng)
     belief = reference(arm, known, arm.measured(known, sigma, rng), noise_of(sigma, KNOWN)).belief
     found: list[float] = []
     for _ in range(draws):
-        # A belief that is true: what the arm is like is drawn from it, and positions are linear in that.
+        # A correct belief: the arm's parameters are sampled from it, and positions are linear in them.
         detector = ChangeDetector(belief, SharedNoise(np.ones(1), 1.0), sigma, 1.0)
         q = walk(joints, QUIET[1] + LONGEST, rng)
         _, jacobian = belief.parameters.linearised(belief.mean, q)
@@ -52,7 +52,7 @@ def inverse_statistics(joints: int, sigma: float, seed: int, draws: int) -> list
 
 
 def drawn_change(detector: ChangeDetector, size: int, sigma: float, rng: np.random.Generator) -> FloatArray:
-    """A change of the parameters (size,), as the detector supposes."""
+    """Sample a change of the parameters (size,) from the detector's prior."""
     kind = detector.kinds[int(rng.choice(len(detector.kinds), p=[each.share for each in detector.kinds]))]
     change = np.zeros(size)
     change[kind.columns] = sigma * rng.choice(SIZES) * rng.normal(size=len(kind.columns)) * kind.units
@@ -60,7 +60,7 @@ def drawn_change(detector: ChangeDetector, size: int, sigma: float, rng: np.rand
 
 
 def log_statistic(detector: ChangeDetector, q: FloatArray, errors: FloatArray, sigma: float, first: int) -> float:
-    """log R when it first is beyond the limit after pair `first`; infinite if it is not."""
+    """Return log R when it first exceeds the limit after pair `first`; infinite if it never does."""
     covariance = noise_of(sigma, 1)
     for k in range(min(first + LONGEST, len(q))):
         detector.add(q[k : k + 1], errors[k : k + 1], covariance)
@@ -70,7 +70,7 @@ def log_statistic(detector: ChangeDetector, q: FloatArray, errors: FloatArray, s
 
 
 def noise_of(sigma: float, pairs: int) -> FloatArray:
-    """Covariances of so many pairs (pairs, 3, 3)."""
+    """Return the covariances of the pairs (pairs, 3, 3)."""
     return np.broadcast_to(sigma**2 * np.eye(3), (pairs, 3, 3))
 
 

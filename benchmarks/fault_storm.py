@@ -1,7 +1,7 @@
-"""How many wrong readings the drivers believe when answers are lost, late, corrupt, cut, swapped, in garbage.
+"""Wrong readings that the drivers accept when answers are lost, late, corrupt, cut, swapped or amid garbage.
 
-Virtual time, so millions of transactions in minutes. Type: python -m benchmarks.fault_storm --transactions 10_000_000
-How many readings of six servos come in a second when answers are lost: python -m benchmarks.fault_storm --rates
+Virtual time: millions of transactions take minutes. Run: python -m benchmarks.fault_storm --transactions 10_000_000
+Readings per second of six servos when answers are lost: python -m benchmarks.fault_storm --rates
 Servos that repeat their answer before the last: python -m benchmarks.fault_storm --stale 2 --transactions 36_000
 """
 
@@ -52,7 +52,7 @@ TELL_EVERY_S = 30.0
 
 
 def swing(phase: float) -> Callable[[float], float]:
-    """A joint moved by hand."""
+    """Return the motion of a joint moved by hand, an angle [rad] by time [s]."""
     return lambda t: 1.2 * math.sin(0.7 * t + phase)
 
 
@@ -80,12 +80,12 @@ def _port(device: Device, clock: VirtualClock, rng: Random, baud: int = 1_000_00
 
 
 def names(count: int) -> list[str]:
-    """The joints' names."""
+    """Return the names of the joints."""
     return [f"joint{k}" for k in range(1, count + 1)]
 
 
 def dynamixel(clock: VirtualClock, rng: Random, count: int, model: str, *, is_fast: bool) -> Rig:
-    """Dynamixel servos."""
+    """Return a rig of Dynamixel servos."""
     ids = range(1, count + 1)
     chain = Chain(Servo(BY_NAME[model], k, swing(k), return_delay_s=0.0, booted_s=0.1 * k) for k in ids)
     port = _port(chain, clock, rng)
@@ -98,7 +98,7 @@ def dynamixel(clock: VirtualClock, rng: Random, count: int, model: str, *, is_fa
 
 
 def feetech(clock: VirtualClock, rng: Random, count: int, model: str) -> Rig:
-    """Feetech servos."""
+    """Return a rig of Feetech servos."""
     servos = (FeetechServo(FEETECH_MODELS[model], k, swing(k), return_delay_s=0.0) for k in range(1, count + 1))
     chain = FeetechChain(servos)
     port = _port(chain, clock, rng)
@@ -111,7 +111,7 @@ def feetech(clock: VirtualClock, rng: Random, count: int, model: str) -> Rig:
 
 
 def lines(clock: VirtualClock, rng: Random, count: int) -> Rig:
-    """Own encoders."""
+    """Return a rig of custom encoders."""
     encoders = {name: (4096, swing(k)) for k, name in enumerate(names(count), 1)}
     board = EncoderBoard(encoders, begun_s=clock.now(), drift=1e-4)
     port = _port(board, clock, rng, LINE_BAUD)

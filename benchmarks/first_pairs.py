@@ -1,11 +1,11 @@
-"""Errors and claims of the learner while pairs are few: `python -m benchmarks.first_pairs [--seeds N] [--only PART]`.
+"""Errors and uncertainty of the learner with few pairs: `python -m benchmarks.first_pairs [--seeds N] [--only PART]`.
 
-Arms of four, six and seven joints, guided along a path. Their drawings err by half, once and twice the learner's
-tolerances; the frame is known, or the camera's pose is not, or the marker's place neither. Each seed draws one of the
-noises of 0.3, 3 and 10 mm and one of the drawings' errors. After the last stage the tool is changed, and told. Of each
-stage: mean distance to the truth, and the mean length of the claimed sigma [mm], the share of coordinates within one
-and 1.96 sigma [%], and how often which model answered. "near" are poses within three degrees a joint of the path,
-"anywhere" those within the limits of 90 degrees.
+Arms of four, six and seven joints, guided along a path. Their nominal models err by half, once and twice the
+learner's tolerances. The frame is known, or the camera's pose is unknown, or also the marker's position. Each seed
+draws one of the noises of 0.3, 3 and 10 mm and one of the nominal errors. After the last stage comes an announced tool
+change. Printed per stage: mean distance to the truth, mean length of the claimed sigma [mm], share of coordinates
+within one and 1.96 sigma [%], and how often each model answered. "near" are poses within three degrees a joint of the
+path, "anywhere" those within the limits of 90 degrees.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ FRAMES = {"known": (True, True), "pose unknown": (False, True), "pose and marker
 KNOWN_STAGES, STAGES, TOOL_STAGES = (0, 1, 2, 5, 12, 20, 40, 100, 300), (12, 20, 40, 100, 300), (3, 10, 40)
 LIMIT, REACH, STEP = np.radians(90.0), np.radians(60.0), np.radians(2.0)
 POSES = 300
-# How far what is not known is from what is drawn: far enough that no tolerance could hold it.
+# Distance of unknown poses from the nominal ones: far beyond any tolerance.
 POSE_RAD, POSE_M, MARKER_M, TOOL_M = 0.5, 0.3, 0.1, 0.25
 
 
@@ -54,7 +54,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What was answered at one stage.
+    """Predictions at one stage.
 
     Attributes:
         error: mean distance to the truth [m].
@@ -72,7 +72,7 @@ class Outcome:
 
 
 def guided(joints: int, count: int, rng: np.random.Generator) -> FloatArray:
-    """Straight ways between random waypoints in steps of 2 degrees, shape (count, joints)."""
+    """Return straight ways between random waypoints in steps of 2 degrees, shape (count, joints)."""
     q, goal = [np.zeros(joints)], rng.uniform(-REACH, REACH, joints)
     while len(q) < count:
         if np.linalg.norm(goal - q[-1]) < STEP:
@@ -83,7 +83,7 @@ def guided(joints: int, count: int, rng: np.random.Generator) -> FloatArray:
 
 
 def elsewhere(built: RigidChain, frame: str, rng: np.random.Generator) -> RigidChain:
-    """The arm with what is not known of its frame anywhere."""
+    """Return the arm with a random tool or camera pose where `frame` leaves them unknown."""
     pose_known, marker_known = FRAMES[frame]
     if not marker_known:
         built = built.with_tool(MARKER_M * rng.normal(size=3))
@@ -151,7 +151,7 @@ def looked(
 
 
 def cases(seeds: int, first: int, only: str, joints: tuple[int, ...]) -> Iterator[Case]:
-    """Noises and drawings in turn, so that nine seeds have each of both once."""
+    """Yield the cases; nine seeds cover each combination of noise and nominal error once."""
     for frame in FRAMES:
         for d in joints:
             for seed in range(first, first + seeds):

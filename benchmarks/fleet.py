@@ -45,12 +45,12 @@ STEP_RAD = 0.015
 LIMIT_S = 240.0
 ASK_EVERY_S = 0.1
 TICKS = os.sysconf("SC_CLK_TCK")
-# Whose processor time is told apart: threads by their names, and the solvers' processes.
+# Parts whose processor time is listed separately: threads by name, and the solver processes.
 PARTS: tuple[str, ...] = ("learn_pairs", "background", "others", "solver")
 
 
 def write_robot(folder: Path, name: str, sampler: str, learner: str) -> Path:
-    """Description of an arm of six joints that turn; the path of its robot.toml."""
+    """Write the description of an arm of six revolute joints; return the path of its robot.toml."""
     links = "".join(f'<link name="l{k}"/>' for k in range(JOINTS + 1))
     joints = "".join(
         f'<joint name="j{k}" type="revolute"><parent link="l{k}"/><child link="l{k + 1}"/>'
@@ -109,7 +109,7 @@ class Walk:
 
 @dataclass(frozen=True)
 class Usage:
-    """Of a process and its children: processor time [s] by `PARTS`, and memory [bytes]."""
+    """Processor time [s] by `PARTS` and memory [bytes] of a process and its children."""
 
     seconds: dict[str, float]
     memory: int
@@ -165,7 +165,7 @@ class Asker(threading.Thread):
 
 @dataclass(frozen=True)
 class Course:
-    """How pairs come: so many a second of each robot, for so long before and during the measurement."""
+    """Rate of pairs of each robot, and durations before and during the measurement."""
 
     rate: float
     warm_s: float
@@ -225,7 +225,7 @@ def _publish(walks: list[Walk], publish: list, rate: float, seconds: float) -> i
 
 
 def _await_answers(ends: list[str], names: list[str]) -> None:
-    """Until every robot's learner answers: they come up one after the other."""
+    """Wait until every robot's learner answers; they start one after the other."""
     deadline = time.monotonic() + LIMIT_S
     for place, end in enumerate(ends):
         waiting = names[place :: len(ends)]

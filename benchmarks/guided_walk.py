@@ -1,4 +1,4 @@
-"""What a learner can expect of a hand-guided recording: `python -m benchmarks.guided_walk [--seeds N] [--sweep]`.
+"""Accuracy of the learners on a hand-guided recording: `python -m benchmarks.guided_walk [--seeds N] [--sweep]`.
 
 Seven joints (two of the neck that carries the cameras, five of the arm). The nominal model is wrong by 2 degrees and
 10 mm a link and by 30 mm at the marker. 600 pairs with 3 mm noise along a smooth path, then another tool, 250 mm
@@ -44,7 +44,7 @@ SIGMA_M = 0.003
 TOOL_CHANGE_M = 0.25
 # Standard deviations a component, of vectors that measure about 2 degrees, 10 mm and 30 mm.
 AXIS_DEG, LINK_MM, TOOL_MM = 1.15, 5.8, 17.0
-# Wider than the nominal model is wrong: nobody knows by how much it is.
+# Wider than the nominal errors, which are unknown in practice.
 TOLERANCES = ChainTolerances(axes=np.radians(3.0), points=0.015, zeros=np.radians(3.0), tool=0.03)
 GOAL_MM, GOAL_AFTER_MM = 20.0, 30.0
 
@@ -78,7 +78,7 @@ def record_walk(seed: int) -> Walk:
 
 
 def nlms(mu0: float, replays: int) -> Learner:
-    """Online steps, each followed by replays of random earlier pairs."""
+    """Return a learner of online steps, each followed by replays of random earlier pairs."""
 
     def learn(start: KBMap, q: FloatArray, x: FloatArray) -> KBMap:
         rng = np.random.default_rng(0)
@@ -159,7 +159,7 @@ def score_walk(walk: Walk, bases: tuple[JointBasis, ...], scores: Scores, seed: 
 
 
 def print_claims(seeds: int, bases: tuple[JointBasis, ...]) -> None:
-    """Whether the error that the exact learner claims is the error it makes."""
+    """Print the claimed and the true error of the exact learner."""
     rows: dict[str, list[tuple[float, ...]]] = defaultdict(list)
     for seed in range(seeds):
         walk = record_walk(seed)

@@ -1,7 +1,7 @@
-"""Where a camera sits on the flange, from a tag that stands in the world: this learner beside OpenCV's five methods.
+"""Hand-eye calibration of a wrist camera from a tag fixed in the world, compared with OpenCV's five methods.
 
 Run `python -m benchmarks.hand_eye [--seeds N] [--views N] [--opencv4 PYTHON]`. OpenCV 5 has no `calibrateHandEye` in
-Python: PYTHON is an interpreter with OpenCV 4, without which this learner is alone. The arm is the desk arm, exact and
+Python: PYTHON is an interpreter with OpenCV 4, without which only this learner runs. The arm is the desk arm, exact and
 with exact encoders, as OpenCV's methods take it to be; its camera sits near the gripper and sees a tag of 50 mm from
 0.3 to 0.8 m. Its corners have noise of 0.05 px. All methods get the same views; errors are those of T_flange_camera,
 RMS over the seeds.
@@ -38,7 +38,7 @@ KNOWN_ARM = ChainTolerances(
     axes=EXACT, points=EXACT, zeros=EXACT, tool=ANYWHERE, base_rotation=ANYWHERE, base_translation=ANYWHERE
 )
 METHODS = ("TSAI", "PARK", "HORAUD", "ANDREFF", "DANIILIDIS")
-# What OpenCV 4 is asked, by another interpreter: lists of rotations and places in, each method's answer out.
+# Script run by the OpenCV 4 interpreter: lists of rotations and translations in, each method's result out.
 ASKED = """
 import cv2, json, sys
 import numpy as np
@@ -50,7 +50,7 @@ for name in sys.argv[1:]:
 
 
 def wrist_camera() -> RobotDescription:
-    """The desk arm with a camera on its gripper and a marker that stands in the world."""
+    """Load the desk arm with a camera on its gripper and a marker fixed in the world."""
     tables, text = read_toml(ROBOT)
     turned = {"joints": tables["robot"]["joints"][::-1], "marker_link": "base_link", "marker_xyz": [0.0, 0.0, 0.0]}
     robot = tables["robot"] | turned | {"marker_known": False}
@@ -65,7 +65,7 @@ def transform(turn: Rotation, shift: FloatArray) -> FloatArray:
 
 
 def seen(T_camera_tag: FloatArray, rng: np.random.Generator) -> Pose | None:
-    """The tag's pose as its noisy corners tell it; None where the image does not tell which way it is tilted."""
+    """Estimate the tag's pose from its noisy corners; None if its tilt is ambiguous (a mirrored pose fits as well)."""
     x = CORNERS @ T_camera_tag[:3, :3].T + T_camera_tag[:3, 3]
     px = CAMERA.project(x)[:, :2] + CORNER_PX * rng.standard_normal((4, 2))
     estimator = PoseEstimator(CAMERA, [Sighting(CORNERS, px, CORNER_PX**2 * np.eye(8), right=False)])
@@ -79,13 +79,13 @@ def seen(T_camera_tag: FloatArray, rng: np.random.Generator) -> Pose | None:
 def views(
     robot: RobotDescription, T_gripper_camera: FloatArray, count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, list[Pose], FloatArray]:
-    """Joint angles (n, d), what is seen there, and the gripper's poses in the world (n, 4, 4)."""
+    """Return joint angles (n, d), the tag poses seen there, and the gripper's poses in the world (n, 4, 4)."""
     T_camera_gripper = np.linalg.inv(T_gripper_camera)
     q, poses, grippers = [], [], []
     T_world_tag = None
     while len(q) < count:
         angles = rng.uniform(robot.lower, robot.upper)
-        # The nominal chain goes from the gripper, where the camera is drawn, to the world.
+        # The nominal chain goes from the gripper, where the camera nominally sits, to the world.
         T_gripper_world = robot.chain.poses(angles[None])[0]
         if T_world_tag is None:
             # The tag stands before the camera of the first view.
@@ -109,14 +109,14 @@ def views(
 def learnt(
     nominal: RigidChain, q: FloatArray, poses: list[Pose], T_gripper_camera: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """T_gripper_camera (4, 4), and which of its six numbers (6,) are within their 95 % intervals of the true ones."""
+    """Return T_gripper_camera (4, 4), and True (6,) for each of its numbers whose 95 % interval covers the truth."""
     x, cov = np.array([pose.x for pose in poses]), np.array([pose.cov[3:, 3:] for pose in poses])
     turns = np.array([pose.rotation for pose in poses])
     placed = align(nominal, q, x, pose_known=False, marker_known=False, turns=turns)
     learner = RigidLearner(placed.chain, KNOWN_ARM)
     learner.learn(q, x, cov=cov)
     report = learner.report()
-    # The camera is drawn in the gripper's own frame.
+    # The nominal camera pose is the gripper's own frame.
     left = np.linalg.inv(T_gripper_camera) @ np.linalg.inv(placed.T_measured_nominal)
     truth = np.concatenate([Rotation.from_matrix(left[:3, :3]).as_rotvec(), left[:3, 3]])
     low, high = (
@@ -128,7 +128,7 @@ def learnt(
 
 
 def of_opencv(python: Path, grippers: FloatArray, poses: list[Pose]) -> dict[str, FloatArray]:
-    """T_gripper_camera (4, 4) by each of OpenCV's methods."""
+    """Return T_gripper_camera (4, 4) by each of OpenCV's methods."""
     views = [grippers[:, :3, :3], grippers[:, :3, 3], *(np.array(part) for part in zip(*_parts(poses), strict=True))]
     told = json.dumps([each.tolist() for each in views])
     command = [str(python), "-c", ASKED, *METHODS]

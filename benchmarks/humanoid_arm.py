@@ -43,7 +43,7 @@ def built_chain(
     shift_mm: float = 10.0,
     tool_mm: float = 30.0,
 ) -> RigidChain:
-    """The arm as it was really built: every link turned and shifted a little, and the marker elsewhere.
+    """Return a random true arm: every link of the nominal one rotated and shifted a little, and the marker moved.
 
     axis_deg and shift_mm are standard deviations of each component, tool_mm of the marker's.
     """
@@ -63,7 +63,7 @@ class GuidedPath:
 
 
 def guided_path(pairs: int, rng: np.random.Generator, waypoint_deg: float = WAYPOINT_DEG) -> GuidedPath:
-    """A smooth path of the arm through random waypoints; the neck follows the arm with a gain and a lag."""
+    """Return a smooth path of the arm through random waypoints; the neck follows the arm with a gain and a lag."""
     # Waypoints are some 80 degrees apart in the joint space, a step covers 2: a quarter more than needed.
     waypoints = np.radians(rng.uniform(-waypoint_deg, waypoint_deg, (8 + pairs // 30, ARM_JOINTS)))
     spline = CubicSpline(np.arange(len(waypoints)), waypoints)

@@ -46,7 +46,7 @@ CASES = [
 
 
 def random_arm(rng: np.random.Generator, case: Case) -> tuple[KBMap, np.ndarray]:
-    """A random arm as a map of poses, and its half ranges."""
+    """Return a random arm as a pose map, and its half ranges (d,) [rad or m]."""
     d = len(case.kinds)
     slides = np.array([kind == "P" for kind in case.kinds])
     fixed = np.tile(np.eye(4), (d + 1, 1, 1))
@@ -59,7 +59,7 @@ def random_arm(rng: np.random.Generator, case: Case) -> tuple[KBMap, np.ndarray]
 
 
 def farthest(kbmap: KBMap, half: np.ndarray, rng: np.random.Generator) -> float:
-    """A distance [m] from the base that no configuration reaches: twice what the samples do, and more."""
+    """Return a distance [m] from the base that no configuration reaches: over twice the farthest sample."""
     reach = np.linalg.norm(kbmap.predict(rng.uniform(-half, half, (4000, len(half)))), axis=1).max()
     return 2.0 * float(reach) + BEYOND_M
 

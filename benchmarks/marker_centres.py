@@ -1,9 +1,9 @@
-"""How exactly the marker's centre is found, beside OpenCV's detectors: `python benchmarks/marker_centres.py`.
+"""Accuracy of the marker's centre, compared with OpenCV's detectors: `python benchmarks/marker_centres.py`.
 
 Balls of 5 to 40 px radius, drawn at random by the tests' ray tracer, with a webcam's noise (light and sensor). Each
 rival gets the same part of the image and the same mask of colours, and the correction for the sphere's ellipse with
 the true distance. Then the error in space at 1 m against the Cramér-Rao bound, from the derivative of the rendered
-pixels by the ball's place: of all other things the bound knows everything.
+pixels by the ball's position; the bound takes all else as known.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ Detector = Callable[[ImageArray, ImageArray, float], FloatArray | None]
 
 
 def by_contour(image: ImageArray, mask: ImageArray, radius_px: float) -> FloatArray | None:  # noqa: ARG001
-    """cv2.fitEllipse on the longest contour of the mask."""
+    """Locate the ball by cv2.fitEllipse on the longest contour of the mask."""
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     longest = max(contours, key=len, default=None)
     return None if longest is None or len(longest) < 5 else np.array(cv2.fitEllipse(longest)[0])
 
 
 def by_circles(image: ImageArray, mask: ImageArray, radius_px: float) -> FloatArray | None:  # noqa: ARG001
-    """cv2.HoughCircles on the brightness of the colour, told the radius to a quarter."""
+    """Locate the ball by cv2.HoughCircles on the brightness of the colour, given the radius to a quarter."""
     amount = np.clip(GATE.amount(image), 0, 255).astype(np.uint8)
     low, high = int(0.75 * radius_px), int(np.ceil(1.25 * radius_px))
     found = cv2.HoughCircles(
@@ -66,7 +66,7 @@ def by_circles(image: ImageArray, mask: ImageArray, radius_px: float) -> FloatAr
 
 
 def by_blob(image: ImageArray, mask: ImageArray, radius_px: float) -> FloatArray | None:  # noqa: ARG001
-    """cv2.SimpleBlobDetector on the brightness of the colour, told the area to a factor of two."""
+    """Locate the ball by cv2.SimpleBlobDetector on the brightness of the colour, given the area to a factor of two."""
     settings = cv2.SimpleBlobDetector.Params()
     settings.filterByColor, settings.blobColor = True, 255
     settings.filterByArea, settings.minArea, settings.maxArea = True, 1.5 * radius_px**2, 6.3 * radius_px**2
@@ -131,7 +131,7 @@ def compare_centres(name: str, look: Look, frames: int, seed: int) -> None:
 
 
 def information(x: FloatArray, look: Look, pictures: list[FloatArray], calibration: StereoCalibration) -> FloatArray:
-    """Fisher's information (3, 3) [1/m²] of the ball's place in the noisy pixels of both eyes."""
+    """Return the Fisher information (3, 3) [1/m²] of the ball's position in the noisy pixels of both cameras."""
     total = np.zeros((3, 3))
     fine = replace(look, samples=16)
     # Large beside the rays' spacing, small beside the blur: 0.2 px.
@@ -145,7 +145,7 @@ def information(x: FloatArray, look: Look, pictures: list[FloatArray], calibrati
 
         middle = light(x)
         slopes = [(light(x + step) - light(x - step)) / (2 * step.sum()) for step in steps]
-        # Pixels that are over-exposed tell nothing.
+        # Over-exposed pixels carry no information.
         weight = np.where(middle < 254.5, 1.0 / (look.noise_sd**2 + look.shot * middle + 1 / 12), 0.0)
         total += np.array([[np.sum(weight * one * other) for other in slopes] for one in slopes])
     return total

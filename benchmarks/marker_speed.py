@@ -34,7 +34,7 @@ BRICK_RGB = (0.55, 0.24, 0.17)
 
 
 def film(calibration: StereoCalibration, radius_px: float, pairs: int, *, beside_brick: bool) -> list[StereoFrame]:
-    """A ball on a small circle, 30 pairs a second."""
+    """Render a ball on a small circle, 30 pairs a second."""
     rng = np.random.default_rng((3, calibration.image_size_px[0], round(radius_px)))
     middle = np.array([0.05, 0.02, calibration.focal_px * RADIUS_M / radius_px])
     pictures = []
@@ -55,13 +55,13 @@ def film(calibration: StereoCalibration, radius_px: float, pairs: int, *, beside
 
 
 def _paint_brick(picture: FloatArray, centre_px: FloatArray, radius_px: float) -> None:
-    """A box whose edge the ball covers by a third of its radius."""
+    """Paint a box whose edge the ball covers by a third of its radius."""
     first = np.rint(centre_px + radius_px * np.array([0.7, -1.5])).astype(int)
     cv2.rectangle(picture, first.tolist(), (first + round(3 * radius_px)).tolist(), BRICK_RGB, -1)
 
 
 def tracked(calibration: StereoCalibration, frames: list[StereoFrame], *, forget: bool) -> tuple[list[float], int]:
-    """CPU times [s] of all frames but the first, and how many were fixes."""
+    """Return CPU times [s] of all frames but the first, and how many were fixes."""
     tracker = StereoTracker(calibration)
     tracker.track(frames[0])
     seconds: list[float] = []

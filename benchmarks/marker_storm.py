@@ -44,7 +44,7 @@ CONFIG = VisionConfig()
 
 @dataclass(frozen=True)
 class Scene:
-    """What is in view beside the ball, and how it moves: start (3,) [m] and step a frame (3,) [m]."""
+    """Contents of the view beside the ball, and the ball's motion: start (3,) [m] and step a frame (3,) [m]."""
 
     kind: str
     start: FloatArray
@@ -58,7 +58,7 @@ class Scene:
 
 
 def draw_scene(rng: np.random.Generator, kind: str) -> Scene:
-    """A scene of this kind; the second ball, if any, is well apart from the first in both images."""
+    """Draw a random scene of this kind; the second ball, if any, is well apart from the first in both images."""
     look = random_light(rng, Look(noise_sd=1.5, shot=0.03, exposure=float(rng.uniform(0.5, 1.1)), samples=4))
     start = place(SMALL, float(np.exp(rng.uniform(*np.log((7.0, 20.0))))), rng)
     step = rng.normal(0.0, 0.003, 3)
@@ -83,7 +83,7 @@ def draw_scene(rng: np.random.Generator, kind: str) -> Scene:
 def _paint_own_hue(
     rng: np.random.Generator, pictures: tuple[FloatArray, FloatArray], start: FloatArray, look: Look
 ) -> None:
-    """Boxes of the ball's hue in both pictures, paler and darker, beside the ball and behind it."""
+    """Paint boxes of the ball's hue in both images, paler and darker, beside the ball and behind it."""
     for _ in range(3):
         shade = float(rng.uniform(0.5, 1.0))
         rgb = tuple(shade * (level + float(rng.uniform(0.0, 0.15))) for level in look.ball_rgb)
@@ -96,7 +96,7 @@ def _paint_own_hue(
 
 
 def is_in_full_view(x: FloatArray) -> bool:
-    """Whether the ball around `x` (3,) [m] is clear of the borders of both images, by a pixel more than it has to."""
+    """Return True if the ball at `x` (3,) [m] clears the borders of both images, with a pixel to spare."""
     eye = Pinhole(SMALL.focal_px, SMALL.principal_point_px)
     margin_px = CONFIG.border_margin_px + 1.0
     for x_eye in in_eyes(x, SMALL):
@@ -109,7 +109,7 @@ def is_in_full_view(x: FloatArray) -> bool:
 
 
 def shoot(scene: Scene, number: int, rng: np.random.Generator) -> tuple[StereoFrame, FloatArray, bool]:
-    """Frame `number` of a scene, the ball's place (3,) [m], and whether the ball is in the picture at all."""
+    """Return frame `number` of a scene, the ball's position (3,) [m], and True if the ball is in the image."""
     x = scene.start + number * scene.step
     shown = not (scene.kind == "hidden" and 4 <= number < 8)
     look = scene.look
@@ -130,8 +130,11 @@ def shoot(scene: Scene, number: int, rng: np.random.Generator) -> tuple[StereoFr
 
 @dataclass
 class Count:
-    """What became of the frames of one kind: how many, fixes, wrong ones, those of other things, good balls, those
-    kept, reasons for none, and the errors (3,) of those kept in their claimed sigmas."""
+    """Results over the frames of one kind.
+
+    In order: frames, fixes, wrong fixes, fixes of other things, good balls, good balls kept, reasons for a miss, and
+    the errors (3,) of the kept ones in claimed sigmas.
+    """
 
     frames: int = 0
     fixes: int = 0
@@ -157,7 +160,7 @@ class Count:
 
 
 def is_wrong(answer: MarkerFix | MarkerMiss, x: FloatArray, *, shown: bool) -> bool:
-    """Whether there is a fix, but not where the ball is: `x` (3,) [m], if it is shown at all."""
+    """Return True for a fix away from the ball at `x` (3,) [m], or for any fix when no ball is shown."""
     if isinstance(answer, MarkerMiss):
         return False
     off = answer.x - x
@@ -165,7 +168,7 @@ def is_wrong(answer: MarkerFix | MarkerMiss, x: FloatArray, *, shown: bool) -> b
 
 
 def is_elsewhere(answer: MarkerFix | MarkerMiss, x: FloatArray, *, shown: bool) -> bool:
-    """Whether there is a fix of something else than the ball, which is at `x` (3,) [m], if it is shown at all."""
+    """Return True for a fix of something other than the ball at `x` (3,) [m], or for any fix when no ball is shown."""
     return isinstance(answer, MarkerFix) and (not shown or float(np.linalg.norm(answer.x - x)) > RADIUS_M)
 
 

@@ -1,12 +1,12 @@
-"""What one camera makes of a tag on the tool: fixes, their claims, the arm learnt from them, and frames a second.
+"""One camera and a tag on the tool: fixes, their claimed uncertainty, the arm learnt from them, and frame rates.
 
 Run `python -m benchmarks.one_camera [--seeds N] [--pairs N]`. A desk arm of four joints is rendered as one camera of
 640×480 pixels and f = 600 px sees it, with 2 grey levels of noise; the tag of 50 mm on its tool is 0.5 to 0.7 m away
-and turned by up to 50° from the line of sight. The drawing is wrong by 1° an axis, 5 mm a point, 2° a zero and 20 mm at
-the tool. Encoders are exact: what is left is what the corners leave.
+and turned by up to 50° from the line of sight. The nominal model is wrong by 1° an axis, 5 mm a point, 2° a joint
+offset and 20 mm at the tool. Encoders are exact, so the remaining error comes from the corners.
 
-The bound is that of Cramér and Rao for a chain with the drawing's tolerances as its prior, from the corners' claimed
-covariances: positions alone, and with the orientations too.
+The bound is that of Cramér and Rao for a chain with the nominal model's tolerances as its prior, from the corners'
+claimed covariances: positions alone, and with the orientations too.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class Arm:
         return seen & (-(facing * x).sum(axis=1) / distance > np.cos(MOST_OBLIQUE))
 
     def postures(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """Postures (count, d) in which the camera sees the tag."""
+        """Return postures (count, d) in which the camera sees the tag."""
         found = np.zeros((0, len(self.lower)))
         while len(found) < count:
             q = rng.uniform(self.lower, self.upper, (4000, len(self.lower)))
@@ -89,7 +89,7 @@ class Arm:
 
 
 def image(eyes: StereoEyes, number: int, x: FloatArray, rotation: FloatArray) -> ImageArray:
-    """What the camera takes of the tag at x (3,) [m], turned so (3, 3)."""
+    """Render the camera image of the tag at x (3,) [m] with rotation (3, 3)."""
     width, height = CAMERA.image_size_px
     total = np.zeros((height, width, 3))
     for again in range(PAINTINGS):
@@ -101,7 +101,10 @@ def image(eyes: StereoEyes, number: int, x: FloatArray, rotation: FloatArray) ->
 
 
 def measured(arm: Arm, q: FloatArray, seed: int) -> tuple[list[MarkerFix], FloatArray, int]:
-    """Fixes of postures q, each looked at alone; which they are of; how many are turned over."""
+    """Return fixes of postures q (n, d) [rad], the postures they belong to, and the number of mirrored poses.
+
+    Each posture is tracked from a single image.
+    """
     eyes, fixes, kept, flipped = StereoEyes(EmptyWorld(), CAMERA, LOOK, seed), [], [], 0
     for number, pose in enumerate(arm.true.poses(q)):
         rotation = pose[:3, :3] @ arm.turn
@@ -116,7 +119,7 @@ def measured(arm: Arm, q: FloatArray, seed: int) -> tuple[list[MarkerFix], Float
 
 
 def bound(arm: Arm, q: FloatArray, fixes: list[MarkerFix], test: FloatArray, *, oriented: bool) -> float:
-    """RMS distance [m] that no unbiased learner of these pairs falls below on average."""
+    """Return the RMS distance [m] that no unbiased learner of these pairs falls below on average."""
     parameters = ChainParameters(arm.true)
     spread = parameters.standard_deviations(DRAWN)
     columns = np.flatnonzero(spread > 0.0)
@@ -140,7 +143,7 @@ def bound(arm: Arm, q: FloatArray, fixes: list[MarkerFix], test: FloatArray, *, 
 
 
 def frames_a_second(seed: int) -> tuple[float, float]:
-    """Of one core: followed through a film, and searched for in whole images."""
+    """Return the frame rates [1/s] on one core: tracking through a film, and searching whole images."""
     eyes, rng = StereoEyes(EmptyWorld(), CAMERA, LOOK, seed), np.random.default_rng(seed)
     film = []
     for k in range(60):

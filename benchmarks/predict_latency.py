@@ -1,6 +1,6 @@
-"""How long a `predict` answer takes over loopback TCP at d = 7, while the learner learns, replays and solves.
+"""Latency of `predict` over loopback TCP at d = 7, while the learner learns, replays and solves.
 
-Three processes as in real use: the learner, somebody who asks 250 times a second, and this one, which stands in for
+Three processes as in real use: the learner, a client that asks 250 times a second, and this one, which stands in for
 the sampler: it has 3,000 pairs in its history and publishes 30 more a second. Run: python benchmarks/predict_latency.py
 """
 
@@ -57,19 +57,19 @@ class StandInSampler:
         self.stored = 0
 
     def history(self, request: Request) -> bytes:
-        """As the sampler answers `pairs`."""
+        """Answer `pairs` like the sampler."""
         begin = int(request.parameters["from"])
         page = self._pairs[begin - 1 : min(self.stored, begin - 1 + PAGE)]
         return encode(PairsReply(STORE, self.stored, page), request.encoding)
 
     def next(self) -> bytes:
-        """Store one more pair; it as it is published."""
+        """Store one more pair and return it as published."""
         self.stored += 1
         return encode(self._pairs[self.stored - 1])
 
 
 def walk(rng: np.random.Generator, count: int, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Joint angles (count, d) [rad]: straight ways between random waypoints in steps of 2 degrees."""
+    """Return joint angles (count, d) [rad]: straight ways between random waypoints in steps of 2 degrees."""
     step, q = np.radians(STEP_DEG), [(low + high) / 2]
     goal = rng.uniform(low, high)
     while len(q) < count:
@@ -81,7 +81,7 @@ def walk(rng: np.random.Generator, count: int, low: FloatArray, high: FloatArray
 
 
 def ask(robot_file: Path) -> None:
-    """The asking process: prints the latencies [s] as JSON when its time is over."""
+    """Query the learner until the phase ends, then print the latencies [s] as JSON (runs in its own process)."""
     config = Config.load(robot_file)
     rng = np.random.default_rng(2)
     low, high = np.maximum(config.robot.lower, -1.2), np.minimum(config.robot.upper, 1.2)
@@ -98,7 +98,7 @@ def ask(robot_file: Path) -> None:
 
 
 def asked(robot_file: Path) -> FloatArray:
-    """Latencies [ms] that another process measures."""
+    """Return the latencies [ms] measured by another process."""
     command = [sys.executable, __file__, "--ask", str(robot_file)]
     done = subprocess.run(command, check=True, capture_output=True, timeout=PHASE_S + 60.0)
     return 1e3 * np.array(json.loads(done.stdout))
@@ -106,7 +106,7 @@ def asked(robot_file: Path) -> FloatArray:
 
 @contextmanager
 def running_learner(robot_file: Path, endpoint: str) -> Iterator[None]:
-    """`bodyschema learner`, from when it answers to the end of the with statement."""
+    """Run `bodyschema learner`, from its first answer to the end of the with statement."""
     command = module_command("bodyschema", "learner", "--robot", str(robot_file))
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
     try:
@@ -123,13 +123,13 @@ def running_learner(robot_file: Path, endpoint: str) -> Iterator[None]:
 
 
 def learner_status(config: Config) -> LearnerStatus:
-    """What the learner says of itself."""
+    """Return the learner's status."""
     with client(config.tables.zenoh.learner) as bus:
         return decode(bus.ask_one(Keys(config.robot.name).status("learner")), LearnerStatus)
 
 
 def write_robot(folder: Path) -> Path:
-    """The shipped model with ports and a state directory of its own."""
+    """Write the shipped model with its own ports and state directory; return its robot.toml."""
     model = model_file("upper_body")
     for file in model.parent.glob("*.urdf"):
         (folder / file.name).write_bytes(file.read_bytes())
@@ -140,14 +140,14 @@ def write_robot(folder: Path) -> Path:
 
 
 def free_port() -> int:
-    """A port that nobody listens on now."""
+    """Return a free TCP port."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
 
 
 def measure(robot_file: Path) -> tuple[FloatArray, FloatArray]:
-    """Latencies [ms] of an idle learner, and of one that learns."""
+    """Return latencies [ms] of an idle learner, and of one that learns."""
     config = Config.load(robot_file)
     keys, endpoints = Keys(config.robot.name), config.tables.zenoh
     sampler = StandInSampler(config, STORED_PAIRS + int(PAIRS_PER_S * (PHASE_S + 60.0)))

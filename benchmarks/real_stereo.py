@@ -62,7 +62,7 @@ def rows(ours: Calibrated, theirs: dict[str, float]) -> list[tuple[str, str, str
 
 
 def opencv(views: list[View], size_px: tuple[int, int]) -> dict[str, float]:
-    """What cv2.calibrateCamera and then cv2.stereoCalibrate make of the views that both eyes saw."""
+    """Calibrate with cv2.calibrateCamera, then cv2.stereoCalibrate, from the views that both cameras saw."""
     eyes = [(view.left.px, view.right.px) for view in views if view.left is not None and view.right is not None]
     model = [BOARD.corners_m.astype(np.float32)] * len(eyes)
     left, right = ([px[eye].astype(np.float32) for px in eyes] for eye in range(2))

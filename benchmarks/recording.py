@@ -12,7 +12,7 @@ from bodyschema.interfaces.robot import RobotDescription
 from kbmaps import ChainTolerances, RigidChain
 from kbmaps.arrays import FloatArray, IntArray
 
-# How far a robot may be from its maker's drawing; where instrument and reflector are is not known at all.
+# Tolerances of a robot about its maker's nominal model; instrument and reflector poses are unknown.
 RECORDED = ChainTolerances(
     axes=math.radians(1.0),
     points=0.005,
@@ -46,6 +46,6 @@ class Recording:
         return cls(robot.chain, table[:, : robot.chain.joints], table[:, -3:])
 
     def split(self, pairs: int, seed: int) -> tuple[IntArray, IntArray]:
-        """Rows to learn, so many, and all others, in a random order."""
+        """Split rows at random into those to learn and all others."""
         order = np.random.default_rng(seed).permutation(len(self))
         return order[:pairs], order[pairs:]

@@ -1,9 +1,9 @@
-"""What the rigid chain learners reach: `python -m benchmarks.rigid_learner [--seeds N]`.
+"""Accuracy of the rigid chain learners: `python -m benchmarks.rigid_learner [--seeds N]`.
 
 The arm is a humanoid's, its marker seen by a camera on the head; d joints, configurations uniform within +-80 degrees,
-10 mm of noise on each coordinate, drawing wrong by 3 degrees an axis, 15 mm a point and 30 mm at the marker (each
+10 mm of noise on each coordinate, nominal model wrong by 3 degrees an axis, 15 mm a point and 30 mm at the marker (each
 component) unless said. Errors are mean distances to the noise-free truth, in mm, means over the seeds. `bound` is what
-the posterior of the right model with the right prior leaves. The noise is not told to the learner.
+the posterior of the right model with the right prior leaves. The learner does not know the noise.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def batch(arm: RoughArm, q: FloatArray, x: FloatArray) -> RigidLearner:
 
 
 def exact_from_drawing(pairs: int, seed: int) -> float:
-    """Error [mm] of noise-free pairs, d = 7."""
+    """Return the error [mm] of noise-free pairs, d = 7."""
     rng = np.random.default_rng(seed)
     arm = rough_arm(7, rng)
     q = arm.angles(pairs, 80, rng)
@@ -48,7 +48,7 @@ def exact_from_drawing(pairs: int, seed: int) -> float:
 
 
 def exact_from_nothing(pairs: int, reach_deg: float, seed: int) -> tuple[float, float]:
-    """Error over +-80 degrees [mm] of noise-free pairs within the reach, d = 7, and CPU time [s]."""
+    """Return the error over +-80 degrees [mm] of noise-free pairs within the reach, d = 7, and CPU time [s]."""
     rng = np.random.default_rng(seed)
     arm = rough_arm(7, rng)
     q = arm.angles(pairs, reach_deg, rng)
@@ -92,7 +92,7 @@ class NoisyFit:
 
 
 def noisy_fit(pairs: int, seed: int) -> NoisyFit:
-    """From the rough drawing, d = 6, sigma 10 mm."""
+    """Fit noisy pairs from the rough nominal model, d = 6, sigma 10 mm."""
     rng = np.random.default_rng(seed)
     arm = rough_arm(6, rng)
     q = arm.angles(pairs, 80, rng)
@@ -132,7 +132,7 @@ def noisy(seeds: int) -> None:
 
 
 def found_error(pairs: int, seed: int) -> float:
-    """Error [mm] from nothing, d = 6, sigma 10 mm, told to the search."""
+    """Return the error [mm] from nothing, d = 6, with a noise sigma of 10 mm known to the search."""
     rng = np.random.default_rng(seed)
     arm = rough_arm(6, rng)
     q = arm.angles(pairs, 80, rng)
@@ -150,7 +150,7 @@ def from_nothing(seeds: int) -> None:
 
 
 def local_fit(seed: int) -> tuple[float, float, float, float]:
-    """Error and bound [mm] over +-80 degrees of 300 pairs from a zone, shares within 1 and 1.96 sigma."""
+    """Return the error and bound [mm] over +-80 degrees of 300 pairs from a zone, shares within 1 and 1.96 sigma."""
     rng = np.random.default_rng(seed)
     arm = rough_arm(6, rng)
     q = arm.angles(300, 20, rng, centre_deg=rng.uniform(-60, 60, 6))
@@ -169,7 +169,7 @@ def local_zone(seeds: int) -> None:
 
 
 def spoilt_fit(pairs: int, seed: int) -> tuple[float, float]:
-    """Errors [mm] with 15 % of the pairs off by 200 mm, and of the same learner given the good ones alone."""
+    """Return errors [mm] with 15 % of the pairs off by 200 mm, and of the same learner on the good pairs alone."""
     rng = np.random.default_rng(seed)
     arm = rough_arm(6, rng)
     q = arm.angles(pairs, 80, rng)
@@ -189,7 +189,7 @@ def outliers(seeds: int) -> None:
 
 
 def new_tool_error(seed: int) -> float:
-    """Error [mm] 10 pairs after a tool change of 200 mm that was told, d = 6, sigma 5 mm, pair by pair."""
+    """Return the error [mm] 10 pairs after an announced tool change of 200 mm, d = 6, sigma 5 mm, pair by pair."""
     rng = np.random.default_rng(seed)
     arm = rough_arm(6, rng)
     learner = RecursiveRigidLearner(arm.drawing, ROUGH)
@@ -230,7 +230,7 @@ class GuidedFit:
 
 
 def guided_fits(drawing: str, seed: int) -> list[GuidedFit]:
-    """A marker moved by about 250 mm, met on a path in steps of 1 to 3 degrees: after each of `STAGES`."""
+    """Fit an arm with a marker moved by about 250 mm along a path in steps of 1 to 3 degrees, at each of `STAGES`."""
     tolerances, rng = DRAWINGS[drawing], np.random.default_rng(seed)
     arm = rough_arm(7, rng, tolerances)
     q = guided_path(STAGES[-1], rng).q

@@ -26,7 +26,7 @@ LEAD_S = 0.5  # the reader is at work before the first message
 
 
 def swing(phase: float) -> Callable[[float], float]:
-    """A joint moved by hand."""
+    """Return the motion of a joint moved by hand, an angle [rad] by time [s]."""
     return lambda t: 1.2 * math.sin(0.7 * t + phase)
 
 
@@ -46,7 +46,7 @@ def publish(rate_hz: float, count: int, ready: Event, done: Event) -> None:
 
 
 def measure(rate_hz: float, seconds: float) -> str:
-    """A line about reading at this rate for so long."""
+    """Read at `rate_hz` for `seconds`; return a line of results."""
     count = round(rate_hz * seconds)
     context = multiprocessing.get_context("spawn")
     ready, done = context.Event(), context.Event()
@@ -80,7 +80,7 @@ def measure(rate_hz: float, seconds: float) -> str:
 
 
 def _published(stamp_ns: int | None) -> float:
-    """When the bench stamped the message on this machine's monotonic clock, which it shares [s]."""
+    """Return the time [s] at which the benchmark stamped the message, on the shared monotonic clock."""
     assert stamp_ns is not None
     return (stamp_ns - Node({}, 1.0).stamp_ns(0.0)) * 1e-9
 

@@ -30,7 +30,7 @@ class RoughArm:
     def angles(
         self, n: int, reach_deg: float, rng: np.random.Generator, centre_deg: FloatArray | float = 0.0
     ) -> FloatArray:
-        """Random configurations (n, d) [rad], uniform within a reach of the centre."""
+        """Return random configurations (n, d) [rad], uniform within a reach of the centre."""
         return np.radians(centre_deg + rng.uniform(-reach_deg, reach_deg, (n, self.drawing.joints)))
 
     def measured(self, q: FloatArray, sigma: float, rng: np.random.Generator) -> FloatArray:
@@ -38,9 +38,9 @@ class RoughArm:
 
 
 def rough_arm(joints: int, rng: np.random.Generator, tolerances: ChainTolerances = ROUGH) -> RoughArm:
-    """The humanoid arm without its last joints; the drawing errs as the tolerances say.
+    """Return the humanoid arm without its last joints, with a nominal model that errs within `tolerances`.
 
-    The drawing itself is no textbook arm: every link is turned by 0.02 rad and shifted by 5 mm (standard deviations of
+    The nominal arm is not ideal either: every link is rotated by 0.02 rad and shifted by 5 mm (standard deviations of
     each component), so that no two axes meet.
     """
     ideal = nominal_chain()
@@ -61,7 +61,7 @@ def least_error(
     rng: np.random.Generator,
     tolerances: ChainTolerances = ROUGH,
 ) -> float:
-    """Mean error [m] at `test` of the posterior of the right model with the right prior, linearised at the truth."""
+    """Return the mean error [m] at `test` of the right model's posterior, with the right prior, linearised at truth."""
     std = arm.parameters.standard_deviations(tolerances)
     free = std > 0.0
     _, jacobian = arm.parameters.linearised(arm.change, q)

@@ -92,13 +92,13 @@ class SaggingArm:
             torques, axes = self._torques(frames), self._axes(frames)
             about = np.einsum("nki,nki->nk", torques, axes)[..., None] * axes
             turn = self._compliance[:, None] * (about + self._across * (torques - about))
-            # As a rotation vector in the frame of the joint before it moves.
+            # A rotation vector in the frame of the joint before it moves.
             yielded = np.einsum("nkji,nkj->nki", frames[:, :-1, :3, :3], turn)
             frames = self._frames(q, yielded)
         return frames[:, -1, :3, 3]
 
     def _frames(self, q: FloatArray, yielded: FloatArray) -> FloatArray:
-        """Frames of the joints and the marker (n, d+1, 4, 4) with each joint turned by a further rotation vector."""
+        """Return frames of joints and marker (n, d+1, 4, 4) with each joint turned by a further rotation vector."""
         pose = np.broadcast_to(self._chain.fixed[0], (len(q), 4, 4))
         frames = [pose]
         for k in range(JOINTS):
@@ -114,7 +114,7 @@ class SaggingArm:
         return np.einsum("nkij,kj->nki", frames[:, :-1, :3, :3], self._chain.axes)
 
     def _torques(self, frames: FloatArray) -> FloatArray:
-        """Torque vectors (n, d, 3) of all links beyond each joint, about its origin."""
+        """Return torque vectors (n, d, 3) of all links beyond each joint, about its origin."""
         origins, ends = frames[:, :-1, :3, 3], frames[:, 1:, :3, 3]
         beside = np.einsum("nkij,kj->nki", frames[:, 1:, :3, :3], self._beside)
         centres = origins + self._shares[:, None] * (ends - origins) + beside
@@ -199,7 +199,7 @@ MODELS = {"rigid": rigid, "train": train, "residual": residual, "ladder": ladder
 
 
 def run(truth: str, model: str, pairs: int, seed: int, told: bool) -> list[float]:
-    """Mean error and coverage within 1 and 2 sigma, near and wide, and the CPU time [s]."""
+    """Return the mean error and coverage within 1 and 2 sigma, near and wide, and the CPU time [s]."""
     rng = np.random.default_rng(seed)
     arm = rough_arm(JOINTS, rng, ROUGH)
     positions = TRUTHS[truth](arm, rng)

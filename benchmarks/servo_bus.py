@@ -39,12 +39,12 @@ Open = Callable[[str], ServoJoints]
 
 
 def swing(phase: float) -> Callable[[float], float]:
-    """A joint moved by hand."""
+    """Return the motion of a joint moved by hand, an angle [rad] by time [s]."""
     return lambda t: 1.2 * math.sin(0.7 * t + phase)
 
 
 def dynamixel(return_delay_s: float, *, is_fast: bool) -> tuple[Chain, Open]:
-    """A chain of Dynamixel servos, and the driver at a port."""
+    """Return a chain of Dynamixel servos, and a function that opens the driver at a port."""
     servos = [Servo(BY_NAME[MODEL], k, swing(k), return_delay_s=return_delay_s, booted_s=0.1234 * k) for k in IDS]
     entries = tuple(ServoConfig(name, k, MODEL) for name, k in zip(NAMES, IDS, strict=True))
 
@@ -73,7 +73,7 @@ def floating(return_delay_s: float) -> tuple[Chain, Open]:
 
 
 def feetech(return_delay_s: float, *, is_sync: bool) -> tuple[FeetechChain, Open]:
-    """A chain of Feetech servos, and the driver at a port."""
+    """Return a chain of Feetech servos, and a function that opens the driver at a port."""
     servos = [FeetechServo(FEETECH_MODELS[FEETECH_MODEL], k, swing(k), return_delay_s=return_delay_s) for k in IDS]
     entries = tuple(ServoConfig(name, k, FEETECH_MODEL) for name, k in zip(NAMES, IDS, strict=True))
 
@@ -85,7 +85,7 @@ def feetech(return_delay_s: float, *, is_sync: bool) -> tuple[FeetechChain, Open
 
 
 def measure(device: Device, samplings: dict[int, Sampling], driver: Open, seconds: float) -> str:
-    """A line about reading for so long."""
+    """Read for `seconds`; return a line of results."""
     off: list[float] = []
     with tempfile.TemporaryDirectory() as folder, PtyShell(device, Path(folder) / "bus") as shell:
         joints = driver(str(shell.link))

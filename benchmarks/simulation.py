@@ -26,7 +26,7 @@ LONG_TOOL = (0.23, 0.0, -0.37)
 def guide(
     robot: RobotDescription, calibration: StereoCalibration, config: SimConfig, seconds: float, tool: FloatArray
 ) -> tuple[FloatArray, float, float]:
-    """Readings (n, d) at the frames' times, the share of visible frames, and how many times real time it ran."""
+    """Return readings (n, d) at the frames' times, the share of visible frames, and the real-time factor."""
     truth = TrueRobot.draw(robot, config)
     q, readings, visible = np.zeros(len(robot.joints)), [], []
     spent = 0.0
@@ -66,7 +66,7 @@ def report_guiding(
 
 
 def report_frames(robot: RobotDescription, frames: int) -> None:
-    """Print stereo frames a second with the renderer's process beside the mechanics and nobody tracking."""
+    """Print stereo frames a second with the renderer's process beside the mechanics, without tracking."""
     with SimWorld(robot, SimConfig()) as world, world.joints, world.camera:
         world.camera.read(30.0)
         start, simulated = time.perf_counter(), world.now()

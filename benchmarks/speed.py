@@ -1,4 +1,4 @@
-"""What learning and predicting cost at seven joints, NumPy beside compiled: `python -m benchmarks.speed`.
+"""Cost of learning and predicting at seven joints, NumPy and compiled: `python -m benchmarks.speed`.
 
 Input checks and basis functions are included, except for padasip's FilterNLMS, one filter a coordinate, which is handed
 its 2187 features ready-made. numba takes part where it is installed. All rivals take turns in this one process, so
@@ -61,7 +61,7 @@ def start_map() -> KBMap:
 
 
 def kbmaps_calls(path: kernels.KernelPath, q: FloatArray, x: FloatArray) -> dict[str, Callable[[], object]]:
-    """The calls of `GOALS` on this path. All of them take one pair, but for those that say otherwise."""
+    """Return the calls of `GOALS` on this path; each takes one pair unless its name says otherwise."""
     with kernels.using(path):
         kbmap = start_map()
         learner, replayed = NLMS(kbmap), NLMS(kbmap)
@@ -91,7 +91,7 @@ def padasip_step(kbmap: KBMap, q: FloatArray, x: FloatArray) -> Callable[[], obj
 
 
 def numba_step(kbmap: KBMap, q: FloatArray, x: FloatArray) -> Callable[[], object]:
-    """The same step in numba, trusting its input; says how long it took to be there."""
+    """Return the same step in numba, without input checks; print the time to import and compile it."""
     begin = time.perf_counter()
     njit = importlib.import_module("numba").njit
     phases = np.array([basis.terms.phases for basis in kbmap.bases])
@@ -124,7 +124,7 @@ def numba_step(kbmap: KBMap, q: FloatArray, x: FloatArray) -> Callable[[], objec
 
 
 def online_costs(q: FloatArray, x: FloatArray, rounds: int = 40) -> dict[str, float]:
-    """Times [us] by name, those of `GOALS` with the path before it."""
+    """Return times [us] by name; those of `GOALS` are prefixed by their path."""
     rivals: dict[str, Callable[[], object]] = {}
     for path in kernels.available():
         rivals |= {f"{path} {name}": call for name, call in kbmaps_calls(path, q, x).items()}
@@ -168,7 +168,7 @@ def cell(value: float | None, width: int) -> str:
 
 @dataclass(frozen=True)
 class ExactCost:
-    """What the exact learner costs at so many pairs: learning [us a pair] and solves [ms].
+    """Cost of the exact learner at a number of pairs: learning [us a pair] and solves [ms].
 
     Attributes:
         ridge: with a given one.
@@ -184,7 +184,7 @@ class ExactCost:
 
 
 def exact_costs(kbmap: KBMap, rng: np.random.Generator) -> tuple[list[ExactCost], float]:
-    """At each of `STAGES`, and the most memory [MB] of learning and solving the pairs of the last."""
+    """Return the costs at each of `STAGES`, and the peak memory [MB] of learning and solving the pairs of the last."""
     learner, costs = ExactLearner(kbmap), list[ExactCost]()
     q, x = np.empty((0, JOINTS)), np.empty((0, 3))
     for total in STAGES:
@@ -218,7 +218,7 @@ def exact_learner(kbmap: KBMap, rng: np.random.Generator) -> None:
 
 
 def solve_ms(learner: ExactLearner, precision: float | Literal["evidence"] | None) -> float:
-    """Median of three solves."""
+    """Return the median of three solves."""
     times: list[float] = []
     for _ in range(3):
         begin = time.thread_time()
@@ -228,7 +228,7 @@ def solve_ms(learner: ExactLearner, precision: float | Literal["evidence"] | Non
 
 
 def stream_costs(path: kernels.KernelPath, rng: np.random.Generator) -> tuple[float, float]:
-    """What `RecursiveRigidLearner` costs a pair, its refits included [us]: over the first, with a full window."""
+    """Return the cost of `RecursiveRigidLearner` per pair, refits included [us]: first pairs, then a full window."""
     q, x = some_pairs(rng, STREAM)
     with kernels.using(path):
         learner = RecursiveRigidLearner(nominal_chain(), ROUGH, window=FULL_WINDOW)

@@ -1,4 +1,4 @@
-"""What a tensor train learns from how many pairs: `python -m benchmarks.tensor_train [--seeds N] [--only PART]`.
+"""Accuracy of a tensor train by number of pairs: `python -m benchmarks.tensor_train [--seeds N] [--only PART]`.
 
 Parts: exact, noisy, prior, cluster, bent, outliers, stream, cost. "Rough prior": every link turned by 3 degrees and
 shifted by 15 mm and the marker by 30 mm, standard deviations of each component; "mild": 2 degrees, 10 mm, 30 mm.
@@ -43,7 +43,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Task:
-    """What one fit is given.
+    """Input of one fit.
 
     Attributes:
         joints: 6 and 7 are the humanoid arm, built with an error; others random chains.
@@ -85,7 +85,7 @@ def true_chain(joints: int, rng: np.random.Generator) -> RigidChain:
 
 
 def bend_of(kind: str, joints: int, rng: np.random.Generator) -> Bend:
-    """What the joints really do at the measured values q (n, d)."""
+    """Return a function from measured values q (n, d) [rad] to true joint angles."""
     if kind == "eccentric":
         phase = rng.uniform(-np.pi, np.pi, joints)
         return lambda q: q + np.radians(1.0) * np.sin(q + phase)
@@ -196,7 +196,7 @@ def outliers(seeds: int) -> None:
 
 
 def stream(seeds: int) -> None:
-    """A walk of 2 degrees a joint and pair; the marker moves by 200 mm, and the stream's owner says so."""
+    """Learn a walk of 2 degrees a joint and pair, with an announced marker move of 200 mm; print errors and times."""
     names = ("after 600", "changed, 30", "changed, 100", "changed, 300")
     errors, times = np.zeros((seeds, len(names))), []
     for seed in range(seeds):
@@ -223,7 +223,7 @@ def stream(seeds: int) -> None:
 
 
 def walk(n: int, joints: int, rng: np.random.Generator) -> FloatArray:
-    """A path (n, joints) [rad] in steps of 2 degrees towards one random pose after the other within +-80 degrees."""
+    """Return a path (n, joints) [rad] between random poses within +-80 degrees, 2 degrees RMS a joint and step."""
     q, goal = np.zeros(joints), np.zeros(joints)
     path = np.empty((n, joints))
     for row in path:
@@ -247,7 +247,7 @@ def cost(seeds: int) -> None:
 
 
 def best_time(call: Callable[[], object], seeds: int, repeats: int = 50) -> float:
-    """The best mean time of one call [s] over several runs."""
+    """Return the best mean time of one call [s] over several runs."""
     times: list[float] = []
     for _ in range(max(seeds, 3)):
         start = time.perf_counter()

@@ -14,7 +14,7 @@ def interleaved_medians_us(
     calls: int = 200,
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, float]:
-    """Median over rounds of the mean time of a call [us]. Each round times every rival, so all meet the same load.
+    """Return the median over rounds of the mean time of a call [us]. Each round times every rival under the same load.
 
     Args:
         clock: [s]; time.thread_time leaves out what others have of the processor.

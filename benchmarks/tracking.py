@@ -59,14 +59,14 @@ class FromMemory(Generic[T]):
         return None
 
     def read(self, timeout_s: float) -> T:  # noqa: ARG002
-        """The next item; SourceEnded after the last."""
+        """Return the next item; raise SourceEnded after the last."""
         for item in self._rest:
             return item
         raise SourceEnded("all frames are through")
 
 
 def record(config: Config, frames: int) -> tuple[list[StereoFrame], list[JointReading]]:
-    """What cameras and encoders of the simulated robot give while it is guided."""
+    """Record camera frames and encoder readings of the simulated robot while it is guided."""
     seen: list[StereoFrame] = []
     readings: list[JointReading] = []
     with SimWorld(config.robot, config.tables.sim) as world, world.joints as joints, world.camera as camera:
@@ -107,7 +107,7 @@ def sample(config: Config, sources: Sources) -> str:
 
 
 def timed(rivals: dict[str, Callable[[], str]], rounds: int) -> dict[str, tuple[list[float], str]]:
-    """Seconds of each round, and what the last one said; each round runs every rival, so all meet the same load."""
+    """Return the seconds of each round, and the last result; each round runs every rival under the same load."""
     results: dict[str, tuple[list[float], str]] = {name: ([], "") for name in rivals}
     for _ in range(rounds):
         for name, run in rivals.items():
@@ -160,7 +160,7 @@ def _endpoint() -> str:
 
 
 def _keep_to_one_core() -> None:
-    """All threads from now on share one core."""
+    """Restrict all threads to one core from now on."""
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     cv2.setNumThreads(1)
 

@@ -1,4 +1,4 @@
-"""What MkDocs does not do by itself: files of the repository that the docs link to become pages of the site."""
+"""MkDocs hooks that turn repository files linked from the docs into pages of the site."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ def _targets(page: File) -> list[Path]:
 
 
 def _page_of(target: Path) -> str:
-    """Where in the site a file of the repository stands."""
+    """Return the path in the site of a file of the repository."""
     return f"files/{target.relative_to(ROOT).as_posix().rstrip('/')}.md"
 
 
 def _shown(target: Path) -> str:
-    """A file as it is; of a folder, the list of its files."""
+    """Return the page of a file, or for a folder the list of its files."""
     name = target.relative_to(ROOT).as_posix()
     if target.is_dir():
         inside = [file.relative_to(target).as_posix() for file in _shown_of(target)]
@@ -73,5 +73,5 @@ def _shown(target: Path) -> str:
 
 
 def _shown_of(folder: Path) -> list[Path]:
-    """The files of a folder, and of those in it, that can be read as text."""
+    """List the text files of a folder and its subfolders."""
     return sorted(file for file in folder.rglob("*") if file.suffix in {*LANGUAGES, ".urdf", ".md"})

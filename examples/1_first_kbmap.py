@@ -12,7 +12,7 @@ from kbmaps import ExactLearner, JointBasis, KBMap, RigidChain
 
 
 def three_joints() -> RigidChain:
-    """An arm that turns about z, y and x; it stands in for the robot, and nothing else knows its geometry."""
+    """Return an arm with axes z, y and x; it stands in for the robot, and only its positions are used."""
     fixed = np.tile(np.eye(4), (4, 1, 1))
     fixed[1:, :3, 3] = [[0.3, 0.0, 0.1], [0.0, 0.25, 0.0], [0.2, 0.0, 0.05]]
     axes = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])

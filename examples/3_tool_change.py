@@ -1,7 +1,7 @@
-"""Another tool in the hand: the arm stays known, three numbers are learnt anew, within one second of a camera.
+"""Tool change: the arm stays known, and the tool's three numbers are relearnt within one second of camera frames.
 
-A recursive rigid chain corrects itself with each pair and keeps none. Told that the tool has changed, it forgets where
-the marker was on the hand and nothing else.
+A recursive rigid chain updates with each pair and stores none. On a tool change it forgets only the position of the
+marker on the hand.
 """
 
 from __future__ import annotations

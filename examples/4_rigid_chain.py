@@ -1,7 +1,7 @@
-"""Thirty noisy pairs calibrate an arm, and what one does with that: report, next pose, reach, keep, write a URDF.
+"""Calibrate an arm from thirty noisy pairs, then use the result: report, next pose, reach, save, write a URDF.
 
-The drawing is the prior: tolerances say how far the real arm may be from it. What no motion can show (the first zero is
-a turn of the camera) rests on them, and is named.
+The nominal model is the prior: tolerances state how far the real arm may be from it. Parameters that are not
+identifiable (the first offset is equivalent to a rotation of the camera) rest on the prior, and are reported.
 """
 
 from __future__ import annotations

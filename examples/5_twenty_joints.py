@@ -17,7 +17,7 @@ REACH = np.radians(40)
 
 
 def drawn_arm() -> RigidChain:
-    """Links of 60 mm, axes in turn about z, y and x."""
+    """Return the nominal arm: links of 60 mm, axes in turn about z, y and x."""
     fixed = np.tile(np.eye(4), (JOINTS + 1, 1, 1))
     fixed[1:, :3, 3] = [0.05, 0.02, 0.03]
     return RigidChain(fixed, np.eye(3)[[2 - k % 3 for k in range(JOINTS)]], np.zeros(JOINTS, dtype=bool))

@@ -17,7 +17,7 @@ import zenoh
 
 
 def session_to(endpoint: str) -> zenoh.Session:
-    """A client session to one endpoint: nobody else is looked for."""
+    """Open a client session to one endpoint, without scouting for others."""
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", json.dumps([endpoint]))
@@ -26,7 +26,7 @@ def session_to(endpoint: str) -> zenoh.Session:
 
 
 def ask(session: zenoh.Session, key: str, request: object) -> dict:
-    """The reply to a request; RuntimeError with the learner's own words when it refuses, or nobody answers."""
+    """Return the reply to a request. Raise RuntimeError with the learner's message, or if there is no reply."""
     payload = json.dumps(request)
     for reply in session.get(key, payload=payload, encoding=zenoh.Encoding.APPLICATION_JSON, timeout=5.0):
         if reply.ok is not None:

@@ -19,7 +19,7 @@ SILENCE_S = 2.0
 
 
 def session_to(endpoint: str) -> zenoh.Session:
-    """A client session to one endpoint: nobody else is looked for."""
+    """Open a client session to one endpoint, without scouting for others."""
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", json.dumps([endpoint]))
@@ -28,7 +28,7 @@ def session_to(endpoint: str) -> zenoh.Session:
 
 
 def stored(session: zenoh.Session, prefix: str, first: int) -> dict:
-    """Stored pairs from the one numbered `first` on, as many as fit into a reply."""
+    """Return stored pairs from number `first` on, as many as fit into a reply."""
     for reply in session.get(f"{prefix}/pairs?from={first}", timeout=5.0):
         if reply.ok is not None:
             return json.loads(reply.ok.payload.to_bytes())
@@ -38,7 +38,7 @@ def stored(session: zenoh.Session, prefix: str, first: int) -> dict:
 
 
 def follow(session: zenoh.Session, prefix: str, first: int) -> Iterator[dict]:
-    """Every pair of one store from `first` on, once and in order, without end."""
+    """Yield every pair of one store from `first` on, once and in order, without end."""
     heard: queue.SimpleQueue[dict] = queue.SimpleQueue()
     # Subscribed before history is asked: what comes meanwhile comes both ways, and is taken once.
     subscriber = session.declare_subscriber(

@@ -1,1 +1,1 @@
-"""What this library set out to reach, measured: `python -m benchmarks.goals`."""
+"""Measured results against the goals of this library: `python -m benchmarks.goals`."""

@@ -23,7 +23,7 @@ def _curves(name: str, seed: int) -> Values:
 
 
 def _share(way: str, pairs: int) -> Estimate:
-    """Pairs chosen over random ones to the same mean error; its standard error by bootstrap over the seeds."""
+    """Estimate the ratio of chosen to random pairs at equal mean error, with a bootstrapped standard error."""
 
     def estimate(samples: Sequence[Sequence[Values]]) -> Measured:
         chosen, random = (

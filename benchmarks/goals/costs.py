@@ -81,7 +81,7 @@ def _speed_rows() -> list[Row]:
 
 
 def _growth(seed: int) -> Values:
-    """Factors of time and memory between sizes, over what theory says."""
+    """Return the growth factors of time and memory between sizes, relative to theory."""
     del seed  # sizes have their own arms
     entries = {(e.what, e.competitor, e.size): (e.seconds, e.mebibytes) for e in measure([], lambda: False)}
     values: dict[str, float] = {}

@@ -14,7 +14,7 @@ BOUND_FACTOR = 1.15
 
 
 class Verdict(Enum):
-    """How a figure stands to its goal."""
+    """Verdict on a figure against its goal."""
 
     MET = "met"
     NOT_MET = "**not met**"
@@ -23,7 +23,7 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class Goal:
-    """What a figure should be: at least `low` and at most `high`, in `unit`."""
+    """Target range of a figure: at least `low` and at most `high`, in `unit`."""
 
     low: float = -math.inf
     high: float = math.inf
@@ -38,7 +38,7 @@ class Goal:
         return f"{number(self.low)} to {number(self.high)}{unit}"
 
     def with_bound(self, bound: Measured | None) -> Goal:
-        """1.15 times the bound where that is more."""
+        """Return the goal, raised to 1.15 times the bound where that is more."""
         return self if bound is None else Goal(self.low, max(self.high, BOUND_FACTOR * bound.value), self.unit)
 
 
@@ -122,7 +122,7 @@ class Cell:
 
 
 def judged(figure: Figure, results: Mapping[str, Sequence[Values]]) -> Cell:
-    """A figure over all seeds that there are of its studies."""
+    """Judge a figure over all measured seeds of its studies."""
     samples = [results.get(study.key, ()) for study in figure.studies]
     seeds, wanted = min(map(len, samples)), min(study.seeds for study in figure.studies)
     if not seeds:
@@ -132,7 +132,7 @@ def judged(figure: Figure, results: Mapping[str, Sequence[Values]]) -> Cell:
 
 
 def number(value: float) -> str:
-    """Three digits; infinity is "never"."""
+    """Format with three digits; infinity is "never"."""
     if math.isinf(value):
         return "never"
     if value != 0.0 and abs(value) < 1e-3:

@@ -36,7 +36,7 @@ _EXACT_M = 1e-9
 
 
 def _full_net(seed: int) -> Values:
-    """Exactly as many pairs as control points, for each number of joints; a mixed chain of another size each seed."""
+    """Learn as many pairs as control points, for each number of joints; the mixed chain's size varies by seed."""
     rng = np.random.default_rng(seed)
     alpha = np.radians(_ALPHAS_DEG[seed % len(_ALPHAS_DEG)])
     turning = {joints: _net_error(random_chain(joints, rng), alpha, rng) for joints in _JOINTS}
@@ -49,7 +49,7 @@ def _full_net(seed: int) -> Values:
 
 
 def _net_error(chain: RigidChain, alpha: float, rng: np.random.Generator, times: float = 1.0) -> tuple[float, float]:
-    """Mean error over the whole turn [m] of the solution as a net of this alpha, and CPU time to learn it [s]."""
+    """Return the mean error [m] over the whole turn of the solution as a net of this alpha, and its CPU time [s]."""
     reach = np.where(chain.prismatic, _SLIDE_M, _REACH)
     turn = np.where(chain.prismatic, _SLIDE_M, np.pi)
     net = tuple(
@@ -93,7 +93,7 @@ def _rigid_from_nothing(pairs: int, reach_deg: float, seed: int) -> Values:
 
 
 def _rigid_rough(joints: int, pairs: int, seed: int) -> Values:
-    """The rigid chain on the train's task: random links, rough drawing."""
+    """Run the rigid chain on the tensor train's task: random links, rough nominal model."""
     rng = np.random.default_rng(seed)
     parameters = ChainParameters(random_chain(joints, rng))
     change = parameters.standard_deviations(ROUGH) * rng.normal(size=parameters.size)

@@ -35,7 +35,7 @@ def _studies(truth: str, pairs: int) -> dict[str, Study]:
 
 
 def _over_best(models: Sequence[str]) -> Estimate:
-    """The geometric mean, over the set-ups, of the mean error over that of the best single model."""
+    """Estimate the mean error relative to the best single model, as a geometric mean over the set-ups."""
     return lambda samples: Measured(float(np.exp(np.mean(np.log(_ratios(models, samples))))))
 
 
@@ -44,7 +44,7 @@ def _most_over_best(models: Sequence[str]) -> Estimate:
 
 
 def _ratios(models: Sequence[str], samples: Sequence[Sequence[Values]]) -> list[float]:
-    """The samples are those of all models, set-up by set-up."""
+    """Return the error ratio of each set-up; samples are ordered by set-up, then by model."""
     ratios: list[float] = []
     for first in range(0, len(samples), len(models)):
         errors = {
@@ -85,7 +85,7 @@ def _ladder_row() -> Row:
 
 
 def _split(data: Path | None, pairs: int | None, seed: int) -> Values:
-    """Held-out mean errors of a random split; None learns four fifths of the rows."""
+    """Return held-out mean errors of a random split; None learns four fifths of the rows."""
     if data is None:
         raise NotHereError(f"no folder with recordings is given (--data FOLDER or {DATA_VARIABLE})")
     folder = data / _RECORDING

@@ -1,4 +1,4 @@
-"""What was measured, in a JSON file that later runs, and runs beside this one, add to."""
+"""Measured results in a JSON file that later and concurrent runs extend."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ class Results:
         self._seeds.setdefault(study.key, {})[str(seed)] = {name: float(value) for name, value in values.items()}
 
     def forget(self, studies: Collection[Study]) -> None:
-        """Drops what is known of some studies, to measure them again."""
+        """Drop the results of some studies, to measure them again."""
         for study in studies:
             self._seeds.pop(study.key, None)
             self._forgotten.add(study.key)
 
     def values(self) -> dict[str, list[Values]]:
-        """What the seeds gave, by study."""
+        """Return the values of all seeds, by study."""
         return {key: list(seeds.values()) for key, seeds in self._seeds.items()}
 
     def save(self) -> None:
-        """Adds what another run has saved in the meantime, and replaces the file as a whole."""
+        """Merge the results that another run has saved meanwhile, and replace the file atomically."""
         for key, seeds in _read(self._path).items():
             if key not in self._forgotten:
                 self._seeds[key] = seeds | self._seeds.get(key, {})

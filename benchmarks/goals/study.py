@@ -10,12 +10,12 @@ import numpy as np
 
 from kbmaps.arrays import FloatArray
 
-# What one seed of a study gives, by name, in the unit that is shown.
+# Values of one seed of a study, by name, in the unit shown.
 Values = Mapping[str, float]
 
 
 class NotHereError(Exception):
-    """Something that a study needs is not there; the message says what to do."""
+    """Something that a study needs is missing; the message gives the remedy."""
 
 
 @dataclass(frozen=True)
@@ -46,32 +46,32 @@ Estimate = Callable[[Sequence[Sequence[Values]]], Measured]
 
 
 def mean(name: str) -> Estimate:
-    """The mean over all seeds. Of zeros and ones it is a rate."""
+    """Estimate the mean over all seeds; for zeros and ones it is a rate."""
     return lambda samples: _mean(_all(name, samples))
 
 
 def worst(name: str) -> Estimate:
-    """The largest over all seeds."""
+    """Estimate the maximum over all seeds."""
     return lambda samples: Measured(float(_all(name, samples).max()))
 
 
 def least(name: str) -> Estimate:
-    """The smallest over all seeds: of times, what the machine takes when it is disturbed least."""
+    """Estimate the minimum over all seeds; for times, that of the least disturbed run."""
     return lambda samples: Measured(float(_all(name, samples).min()))
 
 
 def median(name: str) -> Estimate:
-    """The median over all seeds."""
+    """Estimate the median over all seeds."""
     return lambda samples: Measured(float(np.median(_all(name, samples))))
 
 
 def share_below(name: str, level: float) -> Estimate:
-    """The share of seeds at or below a level [%]."""
+    """Estimate the share of seeds at or below a level [%]."""
     return lambda samples: _mean(100.0 * (_all(name, samples) <= level).astype(np.float64))
 
 
 def ratio(above: str, below: str) -> Estimate:
-    """The ratio of two means over the same seeds; its standard error to first order."""
+    """Estimate the ratio of two means over the same seeds, with a first-order standard error."""
 
     def estimate(samples: Sequence[Sequence[Values]]) -> Measured:
         top, bottom = _all(above, samples), _all(below, samples)
@@ -83,19 +83,19 @@ def ratio(above: str, below: str) -> Estimate:
 
 
 def lowest(name: str) -> Estimate:
-    """The lowest of the studies' means."""
+    """Estimate the lowest of the studies' means."""
     return lambda samples: min((_mean(_all(name, [one])) for one in samples), key=lambda each: each.value)
 
 
 def highest(name: str) -> Estimate:
-    """The highest of the studies' means."""
+    """Estimate the highest of the studies' means."""
     return lambda samples: max((_mean(_all(name, [one])) for one in samples), key=lambda each: each.value)
 
 
 def first_below(names: Mapping[int, str], level: float) -> Estimate:
-    """The size at which the mean first falls to a level, between sizes by a straight line in logarithms.
+    """Estimate the size at which the mean first falls to a level, interpolated log-log between sizes.
 
-    Infinite where it never does.
+    The estimate is infinite if the mean never falls that far.
     """
 
     def estimate(samples: Sequence[Sequence[Values]]) -> Measured:

@@ -14,7 +14,7 @@ HEADER = "| what | goal | measured | bound | seeds | |\n| --- | --- | --- | --- 
 
 
 def table(rows: Iterable[Row], results: Mapping[str, Sequence[Values]]) -> str:
-    """All rows: each with its name and what it is about, and a line for each figure."""
+    """Format all rows: each with its name and subject, and a line for each figure."""
     return "\n".join([HEADER, *(line for row in rows for line in _lines(row, results))])
 
 
@@ -37,7 +37,7 @@ def _standing(cells: Sequence[Cell]) -> str:
 
 
 def _goal(cell: Cell) -> str:
-    """The goal, and the number alone where the bound has raised it."""
+    """Format the goal; if the bound has raised it, append the original goal."""
     text = cell.goal.text()
     return text if cell.goal == cell.figure.goal else f"{text} ({cell.figure.goal.text()})"
 

@@ -56,7 +56,7 @@ class _Arm:
         return _Arm(RoughArm(self.arm.parameters, change), self.sigma, self.learning, self.rng)
 
     def teach(self, q: FloatArray) -> Iterable[int]:
-        """Learns pairs, all background work done after each; yields how many."""
+        """Learn pairs, with all background work done after each; yield their number."""
         cov = frozen_array(self.sigma**2 * np.eye(3))
         first = self.learning.counters.last_seq + 1
         for k, (row, x) in enumerate(zip(q, self.arm.measured(q, self.sigma, self.rng), strict=True)):
@@ -72,7 +72,7 @@ class _Arm:
 
 
 def _found(on_path: bool, seed: int) -> Values:
-    """Nobody tells of the new tool. Pairs until it is noticed, and the error over +-80 degrees after ten pairs.
+    """Run an unannounced tool change: pairs until detected, and the error over +-80 degrees after ten pairs.
 
     Args:
         on_path: seven joints on a guided path, else six at poses drawn independently.
@@ -100,7 +100,7 @@ def _found(on_path: bool, seed: int) -> Values:
 
 
 def _bound_mm(arm: RoughArm, q: FloatArray, q_after: FloatArray, test: FloatArray) -> float:
-    """What the posterior of the right model leaves [mm] when it is told of the change.
+    """Return the posterior error [mm] of the right model when the change is known.
 
     Args:
         arm: with the new tool.
@@ -131,7 +131,7 @@ def _told(seed: int) -> Values:
 
 
 def _demo(seed: int) -> Values:
-    """The demo's course on a guided path: another tool, told, and the error near where the arm was since."""
+    """Run the demo on a guided path: an announced tool change, then errors near the poses visited since."""
     rng = np.random.default_rng(seed)
     before = _Arm.new(7, _DEMO_TOLERANCES, _DEMO_SIGMA_M, rng)
     q, q_after = np.split(guided_path(_DEMO_BEFORE + _DEMO_STAGES[-1], rng).q, [_DEMO_BEFORE])

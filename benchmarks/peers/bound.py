@@ -9,12 +9,12 @@ from benchmarks.rough_arm import RoughArm
 from kbmaps.arrays import FloatArray
 
 _DRAWS = 64
-# Prior standard deviation [rad, m] of what nobody told: so wide that the pairs alone decide, and still a proper prior.
+# Prior standard deviation [rad, m] without tolerances: so wide that the pairs decide, and still a proper prior.
 _UNTOLD = 10.0
 
 
 def bounds(trial: Trial) -> dict[str, float]:
-    """Expected mean error [m] of each test of the trial; empty where the right model is not a rigid chain."""
+    """Return the expected mean error [m] of each test of the trial; empty if the right model is not a rigid chain."""
     arm, problem = trial.arm, trial.problem
     if arm is None or problem.sigma is None:
         return {}
@@ -38,14 +38,14 @@ def bounds(trial: Trial) -> dict[str, float]:
 
 
 def _information(arm: RoughArm, q: FloatArray, std: FloatArray, sigma: float) -> FloatArray:
-    """Precision of the parameters in units of their prior's standard deviations, from pairs at q."""
+    """Return the precision of the parameters in units of their prior's standard deviations, from pairs at q."""
     _, jacobian = arm.parameters.linearised(arm.change, q)
     design = (jacobian * std).reshape(3 * len(q), -1) / sigma
     return design.T @ design
 
 
 def _with_moved_tool(precision: FloatArray, tool: slice, std: FloatArray, move: float) -> FloatArray:
-    """The precision after the marker moved by about `move` [m] in an unknown direction."""
+    """Return the precision after the marker moved by about `move` [m] in an unknown direction."""
     covariance = np.linalg.inv(precision)
     index = np.arange(len(precision))[tool]
     covariance[index, index] += move**2 / 3.0 / std[tool] ** 2

@@ -17,7 +17,7 @@ _NARROW_DECADES = 1.6
 
 @dataclass(frozen=True)
 class Style:
-    """How a line looks wherever it appears: its colour, dashes and weight."""
+    """Appearance of a line: its colour, dashes and weight."""
 
     colour: str
     dashes: str = ""
@@ -157,7 +157,7 @@ class _Axes:
 
 
 def apart(heights: Sequence[float]) -> list[float]:
-    """Ascending heights, a name's height apart at least and within the chart."""
+    """Return ascending heights, a name's height apart at least and within the chart."""
     placed: list[float] = []
     for height in heights:
         placed.append(max(height, placed[-1] + _NAME_HEIGHT) if placed else height)

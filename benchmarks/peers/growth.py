@@ -1,4 +1,4 @@
-"""How time and memory grow with the joints and with the pairs, beside what theory says."""
+"""Growth of time and memory with the joints and with the pairs, compared with theory."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ SERIES = (
 
 
 def measure(known: Sequence[Growth], deadline: Callable[[], bool]) -> list[Growth]:
-    """What is known and what is missing of it, one entry a size; stops early when `deadline()` says so."""
+    """Return the known entries and measure the missing ones, one per size; stop early once `deadline()` is true."""
     entries = list(known)
     measured = {(entry.what, entry.competitor, entry.size) for entry in known}
     for series in SERIES:
@@ -68,14 +68,14 @@ def measure(known: Sequence[Growth], deadline: Callable[[], bool]) -> list[Growt
 
 
 def _shape(series: Series, size: int) -> tuple[int, int]:
-    """Joints and pairs."""
+    """Return the numbers of joints and pairs."""
     if series.what == "pairs":
         return _JOINTS_BY_PAIRS, size
     return size, _PAIRS_FULL_MAP if series.competitor == "nlms" else _PAIRS_A_JOINT * size
 
 
 def _cost(series: Series, size: int) -> tuple[float, float]:
-    """CPU time to learn [s], best of several, and the most memory that it holds at once [MiB]."""
+    """Return the best CPU time to learn [s], and the peak memory [MiB]."""
     problem = _problem(*_shape(series, size))
     learn = BY_KEY[series.competitor].learn
     best = math.inf

@@ -14,7 +14,7 @@ _LABELS = {"joints": "joints d", "pairs": "pairs n"}
 
 
 def growth_section(results: Results, competitors: Sequence[Competitor], looks: dict[str, Style]) -> str:
-    """Charts of time and memory against joints and pairs; nothing where they were not measured."""
+    """Return charts of time and memory against joints and pairs; nothing where they were not measured."""
     if not results.growth:
         return ""
     titles = {competitor.key: competitor.title for competitor in competitors}
@@ -67,7 +67,7 @@ def _chart(
 
 
 def _slope(law: Law, points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """The law through the largest size, as far down as the chart goes."""
+    """Return points of the law through the largest size, down to the bottom of the chart."""
     size, largest = points[-1]
     lowest = min(y for _, y in points)
     return [(x, y) for x, _ in points if (y := largest * law(x) / law(size)) > _ROOM_BELOW * lowest]

@@ -13,7 +13,7 @@ from benchmarks.peers.results import Cell, Results, cell
 from benchmarks.peers.tasks import Task
 
 _OURS = ("#e4572e", "#f0a202", "#2a9d5c", "#1f8fe0", "#8e5bd6", "#d6409f", "#12a5a5", "#b5651d", "#5a7d00", "#c1121f")
-# Peers are told apart by what is written on their lines: one grey for other learners, ink for calibration.
+# Peers are distinguished by the labels on their lines: one grey for other learners, ink for calibration.
 _LEARNT, _CALIBRATED = "#929aa5", "var(--ink)"
 _DASHES = ("6 3", "2 3", "8 3 2 3", "12 3")
 # So many of ours, and of each group of peers, have their names at their lines' ends.
@@ -25,7 +25,7 @@ _GOAL_FACTOR = 1.15
 
 
 def styles(competitors: Sequence[Competitor]) -> dict[str, Style]:
-    """One look for each competitor: ours solid, heavy and in a colour of their own, peers dashed and light."""
+    """Return one look for each competitor: ours solid, heavy and in a colour of their own, peers dashed and light."""
     ours, calibrated, learnt = (
         [competitor.key for competitor in competitors if _group(competitor) == group] for group in _GROUPS
     )
@@ -36,14 +36,14 @@ def styles(competitors: Sequence[Competitor]) -> dict[str, Style]:
 
 
 def _group(competitor: Competitor) -> str:
-    """Whose line it is, and of which kind."""
+    """Return the group of a competitor: ours, calibration or learnt."""
     if competitor.family == "ours":
         return "ours"
     return "calibration" if competitor.calibrates else "learnt"
 
 
 def write_page(path: Path, results: Results, tasks: Sequence[Task], competitors: Sequence[Competitor]) -> None:
-    """The page for all that has been measured, task by task."""
+    """Write the page of all results, task by task."""
     looks = styles(competitors)
     shown = [task for task in tasks if any(key[0] == task.key for key in results.outcomes)]
     body = [
@@ -65,17 +65,17 @@ def write_page(path: Path, results: Results, tasks: Sequence[Task], competitors:
 
 
 def tests_of(task: Task, results: Results) -> list[str]:
-    """Names of the tests that a task has results for, in the order met."""
+    """Return names of the tests that a task has results for, in the order met."""
     return list(dict.fromkeys(t for key, o in results.outcomes.items() if key[0] == task.key for t in o.errors))
 
 
 def counts_of(task: Task, results: Results) -> list[int]:
-    """Pairs that a task has results at."""
+    """Return pairs that a task has results at."""
     return sorted({key[2] for key in results.outcomes if key[0] == task.key})
 
 
 def goal(task: Task, results: Results, pairs: int, test: str) -> float | None:
-    """The figure to reach [m], or 1.15 times the bound if that is larger."""
+    """Return the target error [m], or 1.15 times the bound if that is larger; None without a target."""
     bound = results.bound(task.key, pairs, test)
     figure = task.goals.get(pairs)
     if figure is None or (test == "drawn alike" and "extrapolated" in tests_of(task, results)):
@@ -192,7 +192,7 @@ def _panel(
 
 
 def _best(lines: Sequence[Line], competitors: Sequence[Competitor]) -> list[str]:
-    """Keys of the best few of each group after the most pairs."""
+    """Return keys of the best few of each group after the most pairs."""
     last = max(line.points[-1][0] for line in lines)
     ended = sorted((line for line in lines if line.points[-1][0] == last), key=lambda line: line.points[-1][1])
     group = {competitor.key: _group(competitor) for competitor in competitors}
@@ -280,7 +280,7 @@ def _mm(metres: float | None) -> str:
 
 
 def _short(value: float | None) -> str:
-    """Two digits, without a power of ten."""
+    """Format two digits, without a power of ten."""
     if value is None:
         return ""
     return f"{value:,.0f}" if value >= 100 else f"{value:.2g}"

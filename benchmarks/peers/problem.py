@@ -1,4 +1,4 @@
-"""What a competitor is given, and what it has to hand back."""
+"""Interface of a competitor: the problem it gets, and the fitted model it returns."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ class Fitted(Protocol):
     """Something that has learnt."""
 
     def predict(self, q: FloatArray, /) -> FloatArray:
-        """Positions (n, 3) [m] at q (n, d) [rad]."""
+        """Return positions (n, 3) [m] at q (n, d) [rad]."""
         ...
 
 
 @dataclass(frozen=True)
 class Problem:
-    """One fit: the pairs, and all else that is known.
+    """One fit: the pairs and all prior knowledge.
 
     Attributes:
         q, x: pairs, (n, d) [rad] and (n, 3) [m].
-        low, high: the joints' working range (d,) [rad]; the pairs may fill but a part of it.
+        low, high: the joints' working range (d,) [rad]; the pairs may cover only part of it.
         rng: for what the competitor draws.
-        sigma: noise of a coordinate [m]; None where nobody knows it (recordings).
-        drawing: the nominal chain; None where learning is from nothing.
+        sigma: noise of a coordinate [m]; None if unknown (recordings).
+        drawing: the nominal chain; None if there is no prior model.
         tolerances: how far the real arm may be from it.
         measure: takes readings at poses of the competitor's own choice; None where
             the poses are given.
@@ -59,7 +59,7 @@ class Problem:
         return len(self.q)
 
     def scaled(self, q: FloatArray) -> FloatArray:
-        """Angles with the working range as -1 .. 1."""
+        """Return angles with the working range as -1 .. 1."""
         return (2.0 * q - self.low - self.high) / (self.high - self.low)
 
 
@@ -117,7 +117,7 @@ class _Drawn:
 
 
 def drawn(chain: RigidChain) -> Fitted:
-    """The drawing itself as a model."""
+    """Return the nominal model itself as a fitted model."""
     return _Drawn(chain)
 
 
@@ -134,5 +134,5 @@ def at_most(joints: int, why: str) -> Refusal:
 
 
 def any_of(*refusals: Refusal) -> Refusal:
-    """The first reason of several."""
+    """Combine refusals: return the first reason that applies."""
     return lambda problem: next((reason for check in refusals if (reason := check(problem)) is not None), None)

@@ -20,7 +20,7 @@ _MOST_HELD_OUT = 500
 class Splits:
     """Random splits of a recording: some pairs to learn, the others held out.
 
-    Where the instrument stood and the reflector sat is fitted to the pairs first, for all competitors alike.
+    The poses of the instrument and the reflector are fitted to the pairs first, for all competitors.
     """
 
     recording: Recording
@@ -46,7 +46,7 @@ class Splits:
 
 
 def recorded_tasks(data: Path | None) -> list[Task]:
-    """One task a recording below `data`; none without."""
+    """Return one task per recording below `data`; none without `data`."""
     folders = [] if data is None else sorted(path.parent for path in data.glob("*/robot.toml"))
     return [
         Task(

@@ -1,4 +1,4 @@
-"""What was measured, kept in a JSON file that later runs add to."""
+"""Measured results, kept in a JSON file that later runs extend."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Results:
 
     @classmethod
     def load(cls, path: Path) -> Results:
-        """The results in a file; none yet if it does not exist."""
+        """Load the results of a file; return empty results if it does not exist."""
         if not path.exists():
             return cls()
         content = json.loads(path.read_text())
@@ -82,7 +82,7 @@ class Results:
         )
 
     def save(self, path: Path) -> None:
-        """Written beside and moved into place, so that a killed run leaves the file of before."""
+        """Write a temporary file and move it into place, so that a killed run leaves the previous file."""
         content = {
             "runs": self.runs,
             "bounds": [[*key, value] for key, value in self.bounds.items()],
@@ -94,7 +94,7 @@ class Results:
         os.replace(written, path)
 
     def forget(self, competitors: set[str]) -> None:
-        """Drops what was measured of some competitors, to measure them again."""
+        """Drop the results of some competitors, to measure them again."""
         self.outcomes = {
             key: outcome for key, outcome in self.outcomes.items() if outcome.competitor not in competitors
         }
@@ -105,7 +105,7 @@ class Results:
         return [outcome for outcome in self.outcomes.values() if outcome.key[:3] == wanted]
 
     def bound(self, task: str, pairs: int, test: str) -> float | None:
-        """Mean of the bound [m] over the seeds."""
+        """Return the mean of the bound [m] over the seeds."""
         values = [value for key, value in self.bounds.items() if (key[0], key[1], key[3]) == (task, pairs, test)]
         return float(np.mean(values)) if values else None
 
@@ -130,7 +130,7 @@ class Cell:
 
 
 def cell(outcomes: list[Outcome], test: str) -> Cell:
-    """Summary of the outcomes for one test."""
+    """Return the summary of the outcomes for one test."""
     good = [outcome for outcome in outcomes if outcome.status == "ok" and test in outcome.errors]
     failed = sum(outcome.status == "failed" for outcome in outcomes)
     reasons = [outcome.reason for outcome in outcomes if outcome.reason]
@@ -150,7 +150,7 @@ def cell(outcomes: list[Outcome], test: str) -> Cell:
 
 
 def machine() -> dict[str, str]:
-    """Where a run takes place."""
+    """Describe the machine of a run."""
     model = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.exists():

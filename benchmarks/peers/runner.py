@@ -25,7 +25,7 @@ class TooSlow(Exception):
 
 @dataclass(frozen=True)
 class Plan:
-    """What to run.
+    """Plan of a run.
 
     Attributes:
         seeds: how many, from 0.
@@ -52,7 +52,7 @@ class Job:
 
 
 def jobs(plan: Plan) -> Iterator[Job]:
-    """Every task at few pairs first, then the next seed; sizes that cost more come once the cheap ones are done."""
+    """Yield every task at few pairs first, then the next seed; costlier sizes come after the cheap ones."""
     counts = sorted({n for task in plan.tasks for n in task.counts if plan.fewest_pairs <= n <= plan.most_pairs})
     for cheap in (True, False):
         for seed in range(plan.seeds):
@@ -62,7 +62,7 @@ def jobs(plan: Plan) -> Iterator[Job]:
 
 
 def run(plan: Plan, results: Results, after_job: Callable[[Job, list[Outcome]], None]) -> bool:
-    """Adds what is missing to the results; False when the time was up before all was done."""
+    """Add the missing results; return False if the time ran out first."""
     for job in jobs(plan):
         missing = [
             competitor
@@ -106,7 +106,7 @@ def _outcome(job: Job, competitor: Competitor, trial: Trial, plan: Plan, results
 
 
 def _slower_size(results: Results, blank: Outcome) -> str | None:
-    """The reason of a fit with no more pairs that was given up."""
+    """Return the reason of an abandoned fit of as many or fewer pairs, or None."""
     for outcome in results.outcomes.values():
         same = (outcome.task, outcome.competitor) == (blank.task, blank.competitor)
         if same and outcome.status == "too slow" and outcome.pairs <= blank.pairs:
@@ -131,7 +131,7 @@ def _own(problem: Problem, seed: int) -> Problem:
 
 
 def _tested(fitted: Fitted, trial: Trial) -> tuple[dict[str, float], float]:
-    """Mean error of each test [m], and the processor's best time a row [µs], once warm."""
+    """Return the mean error of each test [m], and the processor's best time a row [µs], once warm."""
     errors: dict[str, float] = {}
     rates: list[float] = []
     for name, (q, x) in trial.tests.items():
@@ -145,9 +145,9 @@ def _tested(fitted: Fitted, trial: Trial) -> tuple[dict[str, float], float]:
 
 @contextmanager
 def _time_limit(seconds: float) -> Iterator[None]:
-    """Raises TooSlow in this thread after so long on the processor; a call into compiled code is finished first.
+    """Raise TooSlow in this thread after `seconds` of CPU time; a call into compiled code is finished first.
 
-    What else runs on the machine does not count.
+    Other processes on the machine do not count.
     """
     if threading.current_thread() is not threading.main_thread():
         raise RuntimeError("fits are limited by a signal, which only the main thread receives")

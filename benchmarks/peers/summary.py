@@ -13,7 +13,7 @@ SIZES = (30, 100, 300, 1000, 3000)
 
 
 def summary(results: Results, tasks: Sequence[Task], competitors: Sequence[Competitor]) -> str:
-    """Mean errors [mm] of the last test of each task, the best of a row in bold."""
+    """Return the mean errors [mm] of the last test of each task, the best of a row in bold."""
     return "\n\n".join(_table(results, tasks, competitors, pairs) for pairs in SIZES) + "\n"
 
 
@@ -35,7 +35,7 @@ def _seeds(results: Results, task: Task, pairs: int) -> int:
 
 
 def _row(results: Results, task: Task, competitors: Sequence[Competitor], pairs: int) -> list[str]:
-    """Empty where nothing was run."""
+    """Return a row of the summary; empty if nothing was run."""
     tests = tests_of(task, results)
     if not tests:
         return []

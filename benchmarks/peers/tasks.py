@@ -17,7 +17,7 @@ from kbmaps.arrays import FloatArray
 
 COUNTS = (30, 100, 300, 1000, 3000)
 TEST_POSES = 500
-# Draws what is not rigid about an arm of so many joints.
+# Draws a non-rigid effect for an arm with this number of joints.
 Effect = Callable[[int, np.random.Generator], Eccentric | GearGain | Sag | Affine | Radial | None]
 MILD = ChainTolerances(axes=math.radians(2.0), points=0.01, tool=0.03)
 HUMANOID_JOINTS = 7
@@ -62,11 +62,11 @@ class Task:
 
 @dataclass(frozen=True)
 class Setting:
-    """How a simulated trial is drawn; angles in degrees.
+    """Distribution of simulated trials; angles in degrees.
 
     Attributes:
         joints: up to 7 the humanoid arm without its last joints, above that a random chain.
-        drawn: whether the drawing is told.
+        drawn: whether the learner gets the nominal model.
         zone: half the range that the pairs come from, about a random centre; None: the whole range.
         effect: draws what is not rigid about the arm.
         tool_move: by how far the marker moves after 600 pairs [m].
@@ -181,7 +181,7 @@ BENT: dict[str, tuple[str, Setting]] = {
 
 
 def simulated_tasks() -> list[Task]:
-    """All tasks that need no recording."""
+    """Return all tasks that need no recording."""
     tasks = [
         Task(
             f"nothing{d}",

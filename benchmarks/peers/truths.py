@@ -22,13 +22,13 @@ _SLIGHTEST_SHARE = 0.1
 
 
 class JointEffect(Protocol):
-    """What the joints really do when the encoders read q."""
+    """Map from encoder readings q to true joint angles."""
 
     def __call__(self, arm: Arm, q: FloatArray, /) -> FloatArray: ...
 
 
 class CameraEffect(Protocol):
-    """What the camera makes of a position in its frame."""
+    """Map from a position in the camera frame to the measured one."""
 
     def __call__(self, x: FloatArray, /) -> FloatArray: ...
 
@@ -58,7 +58,7 @@ class Arm:
         return len(self.axes)
 
     def frames(self, joint_angles: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Rotations (d+1, n, 3, 3) and origins (d+1, n, 3) after F_0 .. F_d, for the joints' true angles (n, d)."""
+        """Return rotations (d+1, n, 3, 3) and origins (d+1, n, 3) after F_0 .. F_d, for true joint angles (n, d)."""
         rotation = np.broadcast_to(self.fixed[0, :3, :3], (len(joint_angles), 3, 3))
         origin = np.broadcast_to(self.fixed[0, :3, 3], (len(joint_angles), 3))
         rotations, origins = [rotation], [origin]
@@ -71,7 +71,7 @@ class Arm:
         return np.stack(rotations), np.stack(origins)
 
     def positions(self, q: FloatArray, marker_shift: FloatArray | None = None) -> FloatArray:
-        """Where the camera sees the marker (n, 3) [m] when the encoders read q (n, d) [rad]."""
+        """Return the marker positions (n, 3) [m] that the camera measures at encoder readings q (n, d) [rad]."""
         rotations, origins = self.frames(q if self.joint_effect is None else self.joint_effect(self, q))
         x = origins[-1] if marker_shift is None else origins[-1] + rotations[-1] @ marker_shift
         return x if self.camera_effect is None else self.camera_effect(x)
@@ -135,7 +135,7 @@ class Sag:
         return bent
 
     def torques(self, arm: Arm, joint_angles: FloatArray) -> FloatArray:
-        """Gravity's torque (n, d - first) [N m] about each joint that carries the arm."""
+        """Return gravity's torque (n, d - first) [N m] about each joint that carries the arm."""
         torso = Arm(np.concatenate([np.eye(4)[None], arm.fixed[self.first + 1 :]]), arm.axes[self.first :])
         rotations, origins = torso.frames(joint_angles[:, self.first :])
         torques = np.zeros((len(joint_angles), torso.joints))

@@ -9,7 +9,7 @@ import sys
 
 
 class Correction:
-    """What an arm makes of its readings, as bodyschema found it."""
+    """True joint angles and marker pose of an arm from its readings, with the effects that bodyschema found."""
 
     def __init__(self, text):
         file = json.loads(text)
@@ -23,7 +23,7 @@ class Correction:
         self.gravity = file["gravity_m_s2"]
 
     def read(self, q, pace=1.0):
-        """True joint angles, and the marker's pose (3 rows of 4) in the measurement frame, at the next readings.
+        """Return true joint angles, and the marker's pose (3 rows of 4) in the measurement frame, at the next readings.
 
         pace: time since the last readings, as a multiple of the usual one; None after an interruption.
         """
@@ -42,7 +42,7 @@ class Correction:
         return angles, product(back, marker)
 
     def error(self, effect, q, pace):
-        """What an effect adds to the reading of its joint."""
+        """Return the error that an effect adds to the reading of its joint."""
         kind, values, state, reading = effect["effect"], effect["values"], effect["state"], q[effect["joint"]]
         if kind == "joint_offset":
             return values[0]
@@ -69,7 +69,7 @@ class Correction:
         raise ValueError(f"unknown effect {kind}")
 
     def frames(self, angles):
-        """Frames of all joints in the root link's; the last is that link's own."""
+        """Return frames of all joints in the root link's; the last is that link's own."""
         frames = [(1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)] * (len(angles) + 1)
         for k, parent, slides, pose in self.chain:
             a, b, c, x, d, e, f, y, g, h, i, z = product(frames[parent], pose)
@@ -83,7 +83,7 @@ class Correction:
         return frames
 
     def torques(self, frames):
-        """Gravity's torque about each joint, or force along it."""
+        """Return gravity's torque about each joint, or force along it."""
         mass, mx, my = ([0.0] * len(frames) for _ in range(3))
         torques = [0.0] * (len(frames) - 1)
         for k, parent, slides, _ in reversed(self.chain):
@@ -99,7 +99,7 @@ class Correction:
 
 
 def product(P, Q):
-    """One pose after another."""
+    """Return the product of two poses."""
     a, b, c, x, d, e, f, y, g, h, i, z = P
     A, B, C, X, D, E, F, Y, G, H, J, Z = Q
     return (

@@ -1,6 +1,6 @@
-"""Least-squares calibration with scipy, and the drawing as it is.
+"""Least-squares calibration with scipy, and the nominal model as it is.
 
-What calibration toolboxes do (FIGAROH; Hollerbach, Khalil and Gautier 2008): small placement errors of every joint
+Method of calibration toolboxes (FIGAROH; Hollerbach, Khalil and Gautier 2008): small placement errors of every joint
 frame, reduced to the identifiable ones by a pivoted QR of the regressor, then Levenberg-Marquardt without a prior.
 """
 
@@ -33,7 +33,7 @@ class Placements:
         return self.linearised(self.change, q)[0]
 
     def linearised(self, change: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Positions (n, 3) and their derivatives (n, 3, 6 d + 6) by the change, (turn, shift) frame by frame."""
+        """Return positions (n, 3) and their derivatives (n, 3, 6 d + 6) by the change, (turn, shift) frame by frame."""
         motions = change.reshape(-1, 6)
         rotation, origin = np.broadcast_to(np.eye(3), (len(q), 3, 3)), np.zeros((len(q), 3))
         rotations: list[FloatArray] = []
@@ -67,7 +67,7 @@ def _left_jacobian(turn: FloatArray) -> FloatArray:
 
 
 def identifiable(model: Placements, q: FloatArray) -> IntArray:
-    """Indices of parameters that the poses tell apart (pivoted QR of the regressor at the present change)."""
+    """Return the indices of the parameters identifiable from q (pivoted QR of the regressor at the present change)."""
     _, jacobian = model.linearised(model.change, q)
     flat = jacobian.reshape(3 * len(q), -1)
     # The stubs of scipy know neither what pivoting adds to the result, nor a function as jac below.
@@ -83,7 +83,7 @@ def learn(problem: Problem, earlier: Fitted | None) -> Fitted:
         raise ValueError("calibration starts from a drawing")
     start = Placements(problem.drawing, np.zeros(6 * (problem.joints + 1)))
     if isinstance(earlier, Placements):
-        # Only the tool has changed: its three numbers are calibrated anew, the rest stays.
+        # Only the tool has changed: recalibrate its three parameters, keep the rest.
         start = earlier
         free = np.arange(start.change.size)[-3:]
     else:

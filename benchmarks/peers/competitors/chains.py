@@ -24,7 +24,7 @@ _ALL = TensorSettings(refit_every=1_000_000)
 
 
 def learn_rigid(problem: Problem, earlier: Fitted | None) -> Fitted:
-    """The batch learner; after a tool change on from what the earlier one and the tool's move leave open."""
+    """Fit the batch learner; after a tool change start from the earlier posterior, widened by the tool's move."""
     if isinstance(earlier, RigidLearner):
         learner = _with_other_tool(earlier, problem)
     else:
@@ -79,7 +79,7 @@ def learn_train(problem: Problem, earlier: Fitted | None) -> Fitted:
 
 
 def drawing_of(problem: Problem) -> tuple[RigidChain, ChainTolerances]:
-    """The drawing and its tolerances. Raises ValueError where there are none."""
+    """Return the nominal model and its tolerances. Raise ValueError if the problem has none."""
     if problem.drawing is None or problem.tolerances is None:
         raise ValueError("this learner starts from a drawing")
     return problem.drawing, problem.tolerances

@@ -16,7 +16,7 @@ from kbmaps.arrays import FloatArray
 
 # Marginal likelihoods cost n³ each, so the kernel is found on so many pairs and then used on all.
 _PAIRS_FOR_KERNEL = 200
-# Of the working range scaled to -1 .. 1.
+# In units of the working range scaled to -1 .. 1.
 _FIRST_SCALE = 1.5
 
 

@@ -34,7 +34,7 @@ class BodySchema:
 
     @classmethod
     def drawn(cls, chain: RigidChain) -> BodySchema:
-        """A drawing in this form: axes and links as they stand with all joints at zero."""
+        """Convert a nominal model: axes and links with all joints at zero."""
         transform = np.eye(4)
         axes, points = [], [np.zeros(3)]
         for fixed, axis in zip(chain.fixed[:-1], chain.axes, strict=True):
@@ -47,7 +47,7 @@ class BodySchema:
 
     @classmethod
     def random(cls, problem: Problem) -> BodySchema:
-        """A random arm about as large as the cloud of positions and with its centre where theirs is."""
+        """Draw a random arm about as large as the cloud of positions, with the same centre."""
         size = float(np.linalg.norm(problem.x - problem.x.mean(axis=0), axis=1).mean())
         axes = problem.rng.normal(size=(problem.joints, 3))
         axes /= np.linalg.norm(axes, axis=1, keepdims=True)
@@ -63,7 +63,7 @@ class BodySchema:
         return x
 
     def learn(self, q: FloatArray, x: FloatArray, order: IntArray, rates: FloatArray) -> None:
-        """One step for each pair of an order, of q (n, d) and x (n, 3), at its rate."""
+        """Take one step for each pair of an order, of q (n, d) and x (n, 3), at its rate."""
         step = _Stepper(self)
         cosines, sines = np.cos(q)[..., None], np.sin(q)[..., None]
         for index, rate in zip(order.tolist(), rates.tolist(), strict=True):
@@ -84,7 +84,7 @@ class _Stepper:
         self.products = [(self.before[k], self.turns[k], self.before[k + 1]) for k in range(joints)]
 
     def __call__(self, cosine: FloatArray, sine: FloatArray, x: FloatArray, rate: float) -> None:
-        """One step for cosines and sines (d, 1) of a pair's angles and its position x (3,)."""
+        """Take one step for cosines and sines (d, 1) of a pair's angles and its position x (3,)."""
         axes, links, before = self.axes, self.links, self.before
         versine = 1.0 - cosine
         # Rodrigues: R = a aᵀ (1 − cos q) + sin q [a]× + cos q 1
@@ -113,7 +113,7 @@ class _Stepper:
 
 
 def rotations(axes: FloatArray, angles: FloatArray) -> FloatArray:
-    """Rotations (k, 3, 3) by angles (k,) about unit axes (k, 3), or all about one (3,)."""
+    """Return rotations (k, 3, 3) by angles (k,) about unit axes (k, 3), or all about one (3,)."""
     outer = axes[..., :, None] * axes[..., None, :]
     cosine, sine = np.cos(angles)[:, None, None], np.sin(angles)[:, None, None]
     return cosine * np.eye(3) + (1.0 - cosine) * outer + sine * cross_matrix(axes)

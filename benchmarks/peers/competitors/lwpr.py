@@ -28,7 +28,7 @@ _NOWHERE = -1
 
 @dataclass(frozen=True)
 class Settings:
-    """What the paper leaves to the user.
+    """Settings that the paper leaves to the user.
 
     Attributes:
         first_metric: diagonal of a new field's distance metric D (inputs scaled to about -1 .. 1).
@@ -75,7 +75,7 @@ class LWPR:
         self._upper = np.triu(np.ones((inputs, inputs)))
 
     def learn(self, x: FloatArray, y: FloatArray) -> None:
-        """One pair: x (d,) and y (outputs,)."""
+        """Learn one pair: x (d,) and y (outputs,)."""
         activation = self._activations(x)
         closest = np.zeros(self.outputs)
         np.maximum.at(closest, self._output[: self.fields], activation)
@@ -86,7 +86,7 @@ class LWPR:
         self._update(active, activation[active], x, y[self._output[active]])
 
     def predict(self, x: FloatArray) -> FloatArray:
-        """Outputs (n, outputs) at x (n, d): the fields' local predictions, weighted by activation."""
+        """Predict outputs (n, outputs) at x (n, d): the fields' local predictions, weighted by activation."""
         out = np.zeros((len(x), self.outputs))
         for start in range(0, len(x), 256):
             part = slice(start, start + 256)
@@ -114,7 +114,7 @@ class LWPR:
         return out
 
     def _activations(self, x: FloatArray) -> FloatArray:
-        """Activations (..., fields) at x (d,) or (n, 1, d)."""
+        """Return activations (..., fields) at x (d,) or (n, 1, d)."""
         off = x - self._centre[: self.fields]
         distances = self.settings.first_metric * np.einsum("...i,...i->...", off, off)
         if len(self._moved):
@@ -138,7 +138,7 @@ class LWPR:
         self._output[at], self._centre[at], self._place[at] = output, x, _NOWHERE
 
     def _named(self, columns: FloatArray) -> dict[str, FloatArray]:
-        """The same memory (numbers, ...) by name."""
+        """Return views of the table's columns (numbers, ...) by name."""
         named: dict[str, FloatArray] = {}
         begin = 0
         for name, shape in self._layout.items():
@@ -148,7 +148,7 @@ class LWPR:
         return named
 
     def _update(self, at: IntArray, w: FloatArray, x: FloatArray, y: FloatArray) -> None:
-        """Recursive sums of the local models (table 3 of the paper), then the metric."""
+        """Update the recursive sums of the local models (table 3 of the paper), then the metric."""
         columns = self._table.take(at, axis=0).T.copy()
         field = self._named(columns)
         keep, settings = field["forgetting"].copy(), self.settings
@@ -196,7 +196,7 @@ class LWPR:
         return projected
 
     def _grow(self, field: dict[str, FloatArray]) -> None:
-        """Another projection where the last one paid, with enough pairs to tell."""
+        """Add a projection to fields whose last one reduced the error, once they have enough pairs."""
         used, error = field["used"], field["mse"]
         able = np.flatnonzero((used < self.projections) & (field["seen"] > self.settings.trusted_pairs * self.inputs))
         if len(able):
@@ -212,9 +212,10 @@ class LWPR:
         s: FloatArray,
         keep: FloatArray,
     ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray] | None:
-        """What a pair says of J = Σ w e²/(1 − h)² / W + γ/d Σ D².
+        """Update the sums of J = Σ w e²/(1 − h)² / W + γ/d Σ D² with one pair.
 
-        Returns which fields are ready to move, and of these w dJ/dw, w / W and how settled they are; None if none is.
+        Return the fields that are ready to move, with their w dJ/dw, w / W and degree of settling, or None if no field
+        is ready.
         """
         total = field["weight"]
         squares = np.concatenate([total[None], field["moments"][:, -1]])
@@ -242,7 +243,7 @@ class LWPR:
         return ready, by_weight[ready] / total[ready], w[ready] / total[ready], settled
 
     def _move(self, at: IntArray, x: FloatArray, by_weight: FloatArray, share: FloatArray, settled: FloatArray) -> None:
-        """A step of the Cholesky roots of these fields, cut to what a single pair may change."""
+        """Step the Cholesky roots of these fields down the gradient, limited to the change allowed per pair."""
         place = self._places(at)
         root, off = self._root[place], x - self._centre[at]
         # dw/dM = -w M off offᵀ; d(Σ D²)/dM = 4 M D
@@ -256,7 +257,7 @@ class LWPR:
         self._root[place] = root - np.where(np.isfinite(size)[:, None, None], step, 0.0)
 
     def _places(self, at: IntArray) -> IntArray:
-        """Where the roots of these fields are; those that have not moved before get one."""
+        """Return the indices of these fields' roots; add a root for fields that have not moved before."""
         fresh = at[self._place[at] == _NOWHERE]
         if len(fresh):
             first = np.sqrt(self.settings.first_metric) * np.eye(self.inputs)
@@ -267,14 +268,15 @@ class LWPR:
 
 
 def _dots(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Inner products (k,) of columns (m, k)."""
+    """Return inner products (k,) of columns (m, k)."""
     return np.add.reduce(first * second, axis=0)
 
 
 def _layout(inputs: int, projections: int) -> dict[str, tuple[int, ...]]:
-    """What a field's row holds: sums that a pair decays first, those that the metric needs as they were, and the rest.
+    """Return the names and shapes in a field's row.
 
-    `moments` are those of a projection with inputs, output and itself.
+    First come the sums that a pair decays first, then those that the metric needs undecayed, then the rest. `moments`
+    are those of a projection with inputs, output and itself.
     """
     d, r = inputs, projections
     first = {"u": (r, d), "moments": (r, d + 2), "weight": (), "mse": (r + 1,)}
@@ -310,7 +312,7 @@ def learn(problem: Problem, earlier: Fitted | None) -> Fitted:
 
 
 def _best_metric(q: FloatArray, y: FloatArray, problem: Problem) -> float:
-    """The first width that serves best for a fifth of the pairs when learnt from the others."""
+    """Return the first metric with the lowest error on a held-out fifth of the pairs."""
     held = len(q) // 5
     errors = []
     for metric in _METRICS:

@@ -18,7 +18,7 @@ _MOST_JOINTS_NLMS, _MOST_JOINTS_EXACT = 10, 8
 
 @dataclass(frozen=True)
 class LearntMap:
-    """A map, and the chain whose orientations tell how a moved tool shows."""
+    """A map, and the chain whose orientations determine the effect of a moved tool."""
 
     kbmap: KBMap
     chain: RigidChain | None
@@ -28,7 +28,7 @@ class LearntMap:
 
 
 def start_map(problem: Problem) -> KBMap:
-    """The drawing's map, or one that says the mean of the pairs everywhere, in bases over the working range."""
+    """Return the nominal map, or one that predicts the mean of the pairs, in bases over the working range."""
     prismatic = None if problem.drawing is None else list(problem.drawing.prismatic)
     bases = learning_bases(problem.low, problem.high, prismatic)
     if problem.drawing is not None:
@@ -39,7 +39,7 @@ def start_map(problem: Problem) -> KBMap:
 
 
 def _start(problem: Problem, earlier: Fitted | None) -> KBMap:
-    """The start map; after a tool change the earlier map with the marker refitted."""
+    """Return the start map; after a tool change, the earlier map with the marker refitted."""
     if not isinstance(earlier, LearntMap):
         return start_map(problem)
     if earlier.chain is None:

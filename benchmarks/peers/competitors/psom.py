@@ -37,12 +37,12 @@ class Grid:
         return math.prod(self.nodes)
 
     def poses(self) -> FloatArray:
-        """The grid's poses (size, d) [rad], last joint fastest."""
+        """Return the grid's poses (size, d) [rad], last joint fastest."""
         scaled = np.array(list(product(*(chebyshev(count) for count in self.nodes))))
         return self.low + 0.5 * (scaled + 1.0) * (self.high - self.low)
 
     def weights(self, q: FloatArray) -> FloatArray:
-        """Lagrange weights (n, size) at q (n, d) [rad]."""
+        """Return Lagrange weights (n, size) at q (n, d) [rad]."""
         scaled = 2.0 * (q - self.low) / (self.high - self.low) - 1.0
         out = np.ones((len(q), 1))
         for angles, count in zip(scaled.T, self.nodes, strict=True):
@@ -55,7 +55,7 @@ def chebyshev(count: int) -> FloatArray:
 
 
 def lagrange(angles: FloatArray, nodes: FloatArray) -> FloatArray:
-    """Values (n, k) of the polynomials that are 1 at their own node and 0 at the others."""
+    """Return values (n, k) of the polynomials that are 1 at their own node and 0 at the others."""
     out = np.ones((len(angles), len(nodes)))
     for i, node in enumerate(nodes):
         for other in np.delete(nodes, i):
@@ -89,7 +89,7 @@ class PSOM:
 
 
 def interpolated(grid: Grid, readings: FloatArray) -> PSOM:
-    """Through readings (size, 3) at the grid's poses."""
+    """Interpolate readings (size, 3) at the grid's poses."""
     return PSOM(grid, readings)
 
 
@@ -116,13 +116,13 @@ def learn_scattered(problem: Problem, earlier: Fitted | None) -> Fitted:
 
 
 def roughness(nodes: Sequence[int]) -> FloatArray:
-    """Penalty (size,) of each product of Chebyshev polynomials: the fourth power of its order, as of a curvature."""
+    """Return the penalty (size,) of each product of Chebyshev polynomials: the fourth power of its order."""
     orders = np.array(list(product(*(range(count) for count in nodes))), dtype=np.float64)
     return np.square(np.square(orders).sum(axis=1)) + _PENALTY_OF_MEAN
 
 
 def chebyshev_polynomials(nodes: Sequence[int]) -> FloatArray:
-    """All products of Chebyshev polynomials of the grid's degrees, at the grid's poses (size, size)."""
+    """Return all products of Chebyshev polynomials of the grid's degrees, at the grid's poses (size, size)."""
     out: FloatArray = np.ones((1, 1))
     for count in nodes:
         values = np.cos(np.arange(count) * np.arccos(chebyshev(count))[:, None])
@@ -131,7 +131,7 @@ def chebyshev_polynomials(nodes: Sequence[int]) -> FloatArray:
 
 
 def ridge(design: FloatArray, x: FloatArray, penalties: FloatArray) -> FloatArray:
-    """Coefficients that minimise the squared error plus Σ penalty · coefficient²."""
+    """Return coefficients that minimise the squared error plus Σ penalty · coefficient²."""
     if len(design) < design.shape[1]:
         scaled = design / penalties
         coefficients = scaled.T @ np.linalg.solve(scaled @ design.T + np.eye(len(design)), x)
@@ -141,7 +141,7 @@ def ridge(design: FloatArray, x: FloatArray, penalties: FloatArray) -> FloatArra
 
 
 def _held_out_error(design: FloatArray, x: FloatArray, penalties: FloatArray) -> float:
-    """Squared error of a fifth of the pairs, by a fit to the others."""
+    """Return the squared error on a held-out fifth of the pairs."""
     held = np.arange(len(x)) % _FOLDS == 0
     fitted = ridge(design[~held], x[~held], np.count_nonzero(~held) * penalties)
     return float(np.square(design[held] @ fitted - x[held]).sum())

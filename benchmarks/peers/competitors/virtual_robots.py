@@ -50,7 +50,7 @@ class VirtualRobots:
 
 
 def hand_pose(markers: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Rotations (n, 3, 3), re-orthonormalised, and origins (n, 3) from three markers (n, 3)."""
+    """Return rotations (n, 3, 3), re-orthonormalised, and origins (n, 3) from three markers (n, 3)."""
     x, y = (markers[1] - markers[0]) / BASELINE_M, (markers[2] - markers[0]) / BASELINE_M
     u, _, vt = np.linalg.svd(np.stack([x, y, np.cross(x, y)], axis=2))
     u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]

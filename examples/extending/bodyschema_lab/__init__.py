@@ -1,1 +1,1 @@
-"""What one laboratory adds to bodyschema: a driver, a tracker and an effect."""
+"""Extensions of bodyschema by one laboratory: a driver, a tracker and an effect."""

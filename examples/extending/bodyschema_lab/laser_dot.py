@@ -24,10 +24,10 @@ class LaserDot:
         self._least = float(settings.get("least_brightness", 120))
 
     def forget(self) -> None:
-        """Nothing is kept from frame to frame."""
+        """Do nothing: no state is kept from frame to frame."""
 
     def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
-        """The dot in both eyes, or why there is none."""
+        """Locate the dot with both cameras, or return the reason for a miss."""
         right = None if frame.right is None else self._centre(frame.right)
         left = self._centre(frame.left)
         if left is None or right is None:
@@ -42,7 +42,7 @@ class LaserDot:
         return MarkerFix(frame.t, located[0], located[1], (ul, vl, ur, vr))
 
     def _centre(self, image: ImageArray) -> FloatArray | None:
-        """Column and row (2,) [px] of the greenest spot's centre of mass; None where nothing is green enough."""
+        """Return column and row (2,) [px] of the greenest spot's centre of mass; None where nothing is green enough."""
         blue, green, red = np.moveaxis(image.astype(np.float64), 2, 0)
         excess = green - np.maximum(blue, red)
         v, u = np.unravel_index(int(np.argmax(excess)), excess.shape)

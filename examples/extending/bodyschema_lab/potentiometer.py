@@ -25,18 +25,18 @@ class PotentiometerLoading(EncoderEffect):
     turns_only = True
 
     def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
-        """The ratio of the resistances; 0.05 is usual, and it cannot be negative."""
+        """Return the one parameter: the ratio of the resistances, typically 0.05, never negative."""
         return (Parameter("loading", 0.05, never_negative=True),)
 
     def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
-        """Derivative (n, 1) of the true angle by the ratio."""
+        """Return the derivative (n, 1) [rad] of the true angle with respect to the ratio."""
         share = motion.q[:, [place.joint]] / TRAVEL_RAD + 0.5
         return TRAVEL_RAD * share**2 * (1.0 - share)
 
     def finding(self, at: str, numbers: Mapping[str, float]) -> str:
-        """The clause of the verdict."""
+        """Return the clause for the verdict."""
         return f"the potentiometer of {at} is loaded: its resistance is {100 * numbers['loading']:.2g} % of the input's"
 
     def remedy(self, at: str) -> str:
-        """What to do."""
+        """Return the recommended repair."""
         return f"Put a buffer between the potentiometer of {at} and the input that reads it"

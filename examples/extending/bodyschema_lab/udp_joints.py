@@ -38,7 +38,7 @@ class UdpJoints:
 
     @property
     def health(self) -> tuple[str, ...]:
-        """What is wrong, and what to do; shown by status, joints and doctor."""
+        """The present problem and its remedy; shown by status, joints and doctor."""
         if not self._refused:
             return ()
         return (
@@ -64,7 +64,7 @@ class UdpJoints:
             self._socket = None
 
     def read(self, timeout_s: float) -> JointReading | None:
-        """The next reading; None when none came within `timeout_s`."""
+        """Return the next reading; None if none came within `timeout_s` [s]."""
         if self._socket is None:
             raise SourceError("the UDP port is not open")
         self._socket.settimeout(max(timeout_s, 1e-3))
@@ -82,7 +82,7 @@ class UdpJoints:
         return JointReading(t, frozen_array(q))
 
     def _parsed(self, data: bytes) -> list[float] | None:
-        """What a datagram says; None where it is not one finite number a joint."""
+        """Parse a datagram into joint values; None unless it is one finite number a joint."""
         try:
             q = [float(word) for word in data.split()]
         except ValueError:
