@@ -88,9 +88,10 @@ class _Fit:
 def fit_limb(
     image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray
 ) -> Circle | None:
-    """The ellipse through the limb near the outline given, which is right to half a pixel or so.
+    """Fit an ellipse to the limb near the given outline, which must be right to about half a pixel.
 
-    None when nothing there is like a ball's limb, or not all around. What the last of all looks still moved is claimed.
+    Return None if there is no ball's limb all around. If the iteration has not settled, its last step is added to the
+    covariance.
     """
     blur_px = USUAL_BLUR_PX
     fit: _Fit | None = None
@@ -127,7 +128,7 @@ def fit_limb(
 
 
 def _fit(limb: Limb, radius_px: float) -> _Fit | None:
-    """The circle through the limb; an oval one where no circle fits, but that does all around."""
+    """Fit a circle to the limb, or an oval if no circle fits and the oval fits all around."""
     fit = _least_squares(limb, radius_px, oval=False)
     if fit is None or fit.waves.slow < _BENT_DENSITY:
         return fit
@@ -136,7 +137,7 @@ def _fit(limb: Limb, radius_px: float) -> _Fit | None:
 
 
 def _least_squares(limb: Limb, radius_px: float, *, oval: bool) -> _Fit | None:
-    """Weighted least squares; what is far off counts little."""
+    """Fit by robust weighted least squares: outliers get low weight."""
     design = limb.rays
     if oval:
         cos, sin = design[:, 0], design[:, 1]
@@ -169,11 +170,11 @@ def _least_squares(limb: Limb, radius_px: float, *, oval: bool) -> _Fit | None:
 
 
 def _pulls(full: FloatArray, used: FloatArray, residual: FloatArray) -> FloatArray:
-    """What the rays pull the circle by, shape (n,): their influence on an M-estimate, in sigmas of `used`.
+    """Return the influence (n,) of the rays on the circle as an M-estimate, in sigmas of `used`.
 
-    What is far off has less weight, so that the residuals under the weights tell less than the truth, and so does the
-    inverse normal matrix. With the weights' share f = 1/(1 + z²/ν) of a residual z the influence is z·f over the mean
-    of its slope 2f² − f (Huber 1981, Robust Statistics, section 7.6).
+    Outliers have less weight, so the weighted residuals and the inverse normal matrix underestimate the uncertainty.
+    With the weights' share f = 1/(1 + z²/ν) of a residual z the influence is z·f over the mean of its slope 2f² − f
+    (Huber 1981, Robust Statistics, section 7.6).
     """
     share = np.divide(used, full, out=np.zeros_like(full), where=full > 0)
     told = np.count_nonzero(full)

@@ -92,14 +92,14 @@ class Outline:
 
 @dataclass(frozen=True, slots=True)
 class _Edges:
-    """Where rays leave the ball, in the frame in which the outline is a circle around the rough centre.
+    """Edge of the ball on each ray, in the frame in which the outline is a circle around the rough centre.
 
     Attributes:
-        angles: directions of the rays, shape (n,) [rad].
+        rays: cosine and sine of the rays' directions, and 1, shape (n, 3).
         distance_px: distance of the edge from the rough centre, shape (n,) [px].
-        weight: how much each counts, 0..1, shape (n,); 0 where the ray does not tell.
-        covered: where something else shows just inside the rough outline, shape (n,).
-        uneven: where the background is too uneven to say that an edge elsewhere is not the ball's, shape (n,).
+        weight: weight of each ray, 0..1, shape (n,); 0 if the ray shows no edge.
+        covered: mask (n,) of rays on which something else shows just inside the rough outline.
+        uneven: mask (n,) of rays whose background is too uneven to rule out that an edge elsewhere is the ball's.
     """
 
     rays: FloatArray
@@ -125,7 +125,7 @@ def fit_outline(
         outline, moved_px = _step(image, gate, centre_px, radius_px, shape, _WIDE_PX)
         if moved_px > max(2.0, 0.5 * radius_px):
             return None
-        # The wide ring settles nothing.
+        # A fit in the wide ring is not final.
         moved_px = max(moved_px, _SETTLED_PX)
     for _ in range(2):
         if outline is None or moved_px < _SETTLED_PX:
@@ -138,7 +138,7 @@ def fit_outline(
 
 
 def refine_outline(image: Float32Array, gate: Gate, rough: Outline, shape: FloatArray) -> Outline | None:
-    """An outline with the centre, radius and covariance that the limb tells; None when that is no ball's limb."""
+    """Refine an outline's centre, radius and covariance by the limb; None if there is no ball's limb."""
     fitted = fit_limb(image, gate, rough.centre_px, rough.radius_px, shape)
     if fitted is None:
         return None
@@ -162,7 +162,7 @@ def refine_outline(image: Float32Array, gate: Gate, rough: Outline, shape: Float
 def _step(
     image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray, window_px: float
 ) -> tuple[Outline | None, float]:
-    """The outline within a ring of half-width `window_px` about a circle, and how far it is from that circle [px]."""
+    """Fit the outline in a ring of half-width `window_px` about a circle; return it and its shift [px]."""
     edges = _find_edges(image, gate, centre_px, radius_px, shape, min(window_px, 0.6 * radius_px))
     outline = None if edges is None else _fit_circle(edges, centre_px, shape)
     if outline is None:
@@ -260,9 +260,9 @@ def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> Outl
 
 
 def _share_off(weight: FloatArray, residual: FloatArray) -> float:
-    """Share of the weights (n,) where the residuals (n,) [px], averaged over an arc, are no edge noise.
+    """Return the share of the weights (n,) where the residuals (n,) [px], averaged over an arc, exceed edge noise.
 
-    Noise and aliased pixels change from ray to ray; what covers a part of the ball moves the edge in a whole arc.
+    Noise and aliasing change from ray to ray; an object that covers part of the ball moves the edge in a whole arc.
     """
     half = max(_LEAST_HALF_ARC, round(len(weight) * _ARC / 2))
     clipped = weight * np.clip(residual, -_LARGEST_GATE_PX, _LARGEST_GATE_PX)
@@ -271,16 +271,16 @@ def _share_off(weight: FloatArray, residual: FloatArray) -> float:
 
 
 def _arc_sums(values: FloatArray, half: int) -> FloatArray:
-    """Sums of each of `values` (n,) and its `half` neighbours on both sides, along the closed axis."""
+    """Sum each of `values` (n,) and its `half` neighbours on both sides, along the closed axis."""
     sums = np.concatenate([[0.0], np.cumsum(np.concatenate([values[-half:], values, values[:half]]))])
     return sums[2 * half + 1 :] - sums[: -2 * half - 1]
 
 
 def _agreeing(design: FloatArray, edges: _Edges) -> FloatArray:
-    """The weights of the points, shape (n,); 0 for those far from the circle that most of them agree on.
+    """Return the points' weights (n,), with 0 for those far from the circle that most points agree on.
 
-    Rousseeuw's least median of squares, over circles through the means of three arcs. What hides the ball does so in
-    arcs, up to nearly half of the outline, and all of them pull inwards: least squares would go along.
+    Rousseeuw's least median of squares, over circles through the means of three arcs. Occlusions hide whole arcs, up to
+    nearly half of the outline, and all of them pull inwards: plain least squares would follow them.
     """
     told = np.flatnonzero(edges.weight > 0)
     if len(told) < 2 * _ARCS or _all_agree(design, edges):
@@ -299,7 +299,7 @@ def _agreeing(design: FloatArray, edges: _Edges) -> FloatArray:
 
 
 def _all_agree(design: FloatArray, edges: _Edges) -> bool:
-    """Whether one circle fits all points."""
+    """Return True if one circle fits all points."""
     weighted = design * edges.weight[:, None]
     inverse = inverse_of_normal(weighted.T @ design, _LEAST_DETERMINANT)
     if inverse is None:

@@ -44,7 +44,7 @@ class TagImage:
 
 
 def measure_tag(grey: ImageArray, id: int, corners_px: FloatArray, config: TagConfig) -> TagImage | Reason:
-    """The tag whose corners are about at `corners_px` (4, 2) in a grey image, or why it is doubtful."""
+    """Measure the tag whose corners are near `corners_px` (4, 2) in a grey image, or return why it is doubtful."""
     edges: list[Edge] = []
     blur_px = _USUAL_BLUR_PX
     for _ in range(_ROUNDS):
@@ -64,9 +64,9 @@ def measure_tag(grey: ImageArray, id: int, corners_px: FloatArray, config: TagCo
 
 
 def _blur(edges: list[Edge], before_px: float) -> float:
-    """The blur (1-sigma) [px] of all edges, which was thought to be `before_px`.
+    """Estimate the blur (1-sigma) [px] of all edges, from the previous estimate `before_px`.
 
-    An edge whose lines end where its blur does hardly tells.
+    An edge whose lines hardly reach beyond its blur has little weight.
     """
     weights = [max(edge.reach_px / before_px - 1.0, 0.0) ** 2 for edge in edges]
     ratios = [edge.area_px / edge.expected_area_px for edge in edges]
@@ -75,10 +75,10 @@ def _blur(edges: list[Edge], before_px: float) -> float:
 
 
 def _likeness(edges: list[Edge]) -> float:
-    """By how much neighbouring points err alike: variance of their mean, in units of what independent ones make.
+    """Return the variance of neighbouring points' mean relative to that of independent points.
 
-    Interpolation and blur give a part of a pixel's noise to its neighbours. So slow waves along the edges, which place
-    and slope are but the slowest of, have more of it than the quick ones.
+    Interpolation and blur spread a pixel's noise to its neighbours. So slow waves along the edges, of which place and
+    slope are the slowest, have more noise than quick ones.
     """
     power, count = _SMOOTHED_WAVES * _SMOOTHED, float(_SMOOTHED_WAVES)
     for edge in edges:
@@ -89,7 +89,7 @@ def _likeness(edges: list[Edge]) -> float:
 
 
 def _meeting(one: Edge, other: Edge) -> FloatArray:
-    """Where two edges' lines meet (2,) [px]."""
+    """Return the intersection (2,) [px] of two edges' lines."""
     steps = np.linalg.solve(np.column_stack([one.direction, -other.direction]), other.point - one.point)
     return one.point + steps[0] * one.direction
 

@@ -214,7 +214,7 @@ class TagTracker:
         return [fitted_motion(np.array(body), np.array(points))] if len(points) >= 3 else []
 
     def _mirrored(self, rotation: FloatArray, x: FloatArray, seen: list[dict[int, TagImage]]) -> FloatArray:
-        """The rotation under which the plane that the corners lie in, or nearest to, looks nearly the same."""
+        """Return the mirrored rotation, with which the corners' (best-fitting) plane looks nearly the same."""
         corners = np.concatenate([self.body.corners[id] for id in sorted(_ids(seen))])
         axes = np.linalg.svd(corners - corners.mean(axis=0))[2].T
         axes[:, 2] *= np.sign(np.linalg.det(axes))

@@ -35,7 +35,7 @@ class Waves:
 
     @property
     def mean(self) -> float:
-        """Of slow and quick ones, where both tell one noise."""
+        """Mean of the slow and the quick waves' power, for noise that is the same in both."""
         return 0.5 * (self.slow + self.quick)
 
     def once_round(self) -> float:

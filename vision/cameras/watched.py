@@ -73,7 +73,7 @@ class WatchedCamera:
 
 
 class PlainEyes:
-    """Frames of cameras that nobody has calibrated yet: nothing is looked for in them.
+    """Frames of cameras without a calibration: nothing is searched for in them.
 
     Attributes:
         frames: how many were looked at.
@@ -103,7 +103,7 @@ class PlainEyes:
 
     @property
     def said(self) -> str:
-        """How many frames there were."""
+        """Number of frames read, as text."""
         return f"{self.frames} frames"
 
 
