@@ -119,7 +119,7 @@ class Sight:
         )
 
     def _clearance_pairs(self) -> list[tuple[int, int]]:
-        """Pairs of the moving arm's outer links and the links that the arm does not move."""
+        """Return the pairs of the moving arm's outer links and the links that the arm does not move."""
         tree, body = self._truth.tree, self._body
         first = tree.joints[self._truth.robot.joints[self._roles.guided[0]]]
         arm = _below(tree.joints.values(), first.child)

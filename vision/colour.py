@@ -106,7 +106,7 @@ class ColourGate:
 
 
 class BrightGate:
-    """Tells what is brighter than all around it, of whatever colour: a lamp, a white ball, a retro-reflective one."""
+    """Gate for a marker brighter than its surroundings, of any colour: a lamp, a white or retro-reflective ball."""
 
     # Its brightness is all that tells it.
     shading_sigma = 0.1

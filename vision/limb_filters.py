@@ -1,4 +1,4 @@
-"""Filters that tell, best of all linear ones, where a ray of samples leaves a ball.
+"""Optimal linear filters for the position at which a ray of samples leaves a ball.
 
 Samples at t [px] along a ray, t = 0 where the outline is thought to be, are
 
@@ -22,7 +22,7 @@ import numpy as np
 from bodyschema.interfaces.records import FloatArray
 
 STEP_PX = 0.5
-# Half-widths of what is looked at, on the ball and beyond [px], for a blur of USUAL_BLUR_PX; more needs more room.
+# Sampled lengths on the ball and beyond [px], for a blur of USUAL_BLUR_PX; a wider blur needs longer ones.
 _INSIDE_PX, _OUTSIDE_PX, USUAL_BLUR_PX = 4.0, 8.0, 0.86
 # Textures that are told apart: 1-sigma of the random walk over 1 px, and the slope's variance [1/px²], in units of the
 # noise.

@@ -1,4 +1,4 @@
-"""Follows one ball of known size through the images of one camera alone: its direction, and its depth from its size."""
+"""Track one ball of known size in the images of a single camera: direction, and depth from its size."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class OneEyeBallTracker:
     """
 
     def __init__(self, calibration: StereoCalibration, config: VisionConfig | None = None) -> None:
-        """Prepare for images of `calibration`; ConfigError when it describes no camera."""
+        """Prepare for images of `calibration`. Raise ConfigError if it describes no camera."""
         check_calibration(calibration)
         self.calibration = calibration
         self.config = config or VisionConfig()

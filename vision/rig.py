@@ -98,7 +98,7 @@ class StereoRig:
 
     @cached_property
     def R_right_left(self) -> FloatArray:
-        """Turns directions of the left eye's frame into the right one's, shape (3, 3)."""
+        """Rotation (3, 3) of directions from the left eye's frame to the right eye's."""
         return frozen_array(cv2.Rodrigues(self.rotation_rad)[0])
 
     @property

@@ -22,27 +22,27 @@ from .tag_config import TagConfig
 
 # Black border, data and border of all dictionaries that are offered: 6 + 2 modules.
 MODULES = 8.0
-# The black border and the white margin are one module wide each. Lines across an edge stay so many blurs from where
-# they end: beyond, more than a twentieth of what is there shows.
+# Distance in blurs that lines across an edge keep from the ends of black border and white margin (one module each);
+# nearer, more than a twentieth of the modules beyond shows.
 _CLEAR_BLURS = 1.7
 LONGEST_REACH_PX, _SHORTEST_REACH_PX = 6.0, 1.0
-# Lines so short beside the blur that an edge shows by less than this part of what it is off by do not tell.
+# Least ratio of an edge's apparent shift to its true shift; lines that are too short beside the blur have less.
 _LEAST_GAIN = 0.12
 _SAMPLE_PX = 0.5
 # Ends of the lines across, as a share of their reach, which show plain black and plain white.
 _PLAIN = 0.35
-# Free of the corners, whose blur rounds the edges off.
+# Distance from the corners, whose blur rounds the edges off: blurs, and share of the side.
 _CORNER_BLURS, _CORNER_SHARE = 2.6, 0.08
 _FEWEST_POINTS, _MOST_POINTS = 6, 80
 # The sharpest edge (1-sigma) [px].
 SHARPEST_PX = 0.45
 # Variance that interpolation between pixels adds to a blur [px²].
 _INTERPOLATION = 1.0 / 6.0
-# What the beyond brings is known up to this part: no lens blurs quite as a Gaussian does.
+# Relative error of the correction for the modules beyond: no lens blurs exactly like a Gaussian.
 _BEYOND_SHARE = 0.2
-# What is left of an edge's place on long lines when all noise has averaged out [px]; on short ones it is more.
+# Systematic error of an edge's position on long lines [px]; larger on short ones.
 _FLOOR_PX = 0.002
-# Points so many (robust) standard deviations off their line are no part of it.
+# Points farther from their line than this, in robust standard deviations, are outliers.
 _STRAY = 3.5
 _MAD_TO_SIGMA = 1.4826
 Pixels = NDArray[np.intp]
@@ -117,7 +117,7 @@ def find_edge(grey: ImageArray, corners_px: FloatArray, side: int, blur_px: floa
     reach = min(float(np.abs(_module_ends(to_px, quad[:2], normal)).min()) - _CLEAR_BLURS * blur_px, LONGEST_REACH_PX)
     if not reach >= _SHORTEST_REACH_PX:
         return Reason.NO_MARKER
-    # Where a corner is acute, lines near it leave the tag by its other side.
+    # At an acute corner, nearby lines leave the tag through its other side.
     sides = quad[[3, 2]] - quad[:2]
     leaning = (sides @ along) / (sides @ normal) * (-reach, reach)
     free = max(_CORNER_BLURS * blur_px, _CORNER_SHARE * length) + np.maximum(leaning, 0.0)

@@ -32,11 +32,11 @@ _log = logging.getLogger(__name__)
 
 # Half the side of the region searched around the predicted centre: radii, plus pixels, plus steps between frames.
 _REGION_RADII, _REGION_PX, _REGION_STEPS = 1.6, 14.0, 0.7
-# What is smaller than this part of the marker that is followed is something else near it, such as part of a brick.
+# A patch smaller than this share of the tracked marker is another object, such as part of a brick.
 _LEAST_SIZE = 0.5
-# A disc is where the marker was expected when it is nearer than this, and its size as near, in radii of the marker.
+# A disc fits the prediction if its position and its size differ by less than this, in radii of the marker.
 _AS_EXPECTED = 0.25
-# After a longer pause the last fixes predict nothing [s].
+# After a longer pause the last fixes give no prediction [s].
 _LONGEST_PAUSE_S = 0.5
 # So long after the last fix the marker is expected within reach of it [s], if it moved on for no longer than this [s];
 # the reach is so many radii larger. Without a fix, what is left of two is the marker after that time.
@@ -110,7 +110,7 @@ class StereoTracker:
     """
 
     def __init__(self, calibration: StereoCalibration, config: VisionConfig | None = None) -> None:
-        """Prepare for images of `calibration`; ConfigError when it describes no stereo pair."""
+        """Prepare for images of `calibration`. Raise ConfigError if it describes no stereo pair."""
         check_calibration(calibration)
         self.calibration = calibration
         self.config = config or VisionConfig()

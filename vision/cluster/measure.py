@@ -28,7 +28,7 @@ _FIRST_DAMPING, _MOST_DAMPING = 1e-4, 1e8
 _MOST_OFF = 6.0
 # ... in units of what is usual, which calibrated cameras bring to so much at most.
 _MOST_USUAL = 5.0
-# In so many of the views, and of one tag's, something may be left out, where these are more than one.
+# Largest shares of all views, and of the views of one tag, with outliers; a single one is always allowed.
 _MOST_LEFT_OUT, _MOST_OF_A_TAG = 0.25, 0.34
 _LEAST_VIEWS = 3
 
