@@ -18,12 +18,12 @@ def cast_ball(
     bgr: FloatArray,
     to_light: FloatArray | None,
 ) -> tuple[np.ndarray, FloatArray]:
-    """Which rays hit the ball before anything else, and its colour there.
+    """Return the mask of the rays that hit the ball before anything else, and its colour there.
 
     Args:
         directions: rays (n, m, 3) in the eye's optical frame with z = 1.
         centre: of the ball in that frame (3,) [m].
-        depth: distance along z of what else is there (n, m) [m].
+        depth: distance along z of everything else (n, m) [m].
         bgr: the ball's colour (3,), 0 to 1.
         to_light: unit vector to the light (3,) in that frame; None: the ball glows by itself.
 

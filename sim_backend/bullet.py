@@ -1,4 +1,4 @@
-"""pybullet, loaded late and quietly."""
+"""A robot in its own pybullet world; pybullet is imported only when needed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .physics_urdf import PhysicsUrdf
 
 
 def load_pybullet() -> Any:
-    """The module pybullet.
+    """Import and return the module pybullet.
 
     Raises:
         ConfigError: it is not installed.
@@ -36,7 +36,7 @@ def load_pybullet() -> Any:
 
 
 class Body:
-    """One robot in a pybullet world of its own. Angles are true ones, over the named joints.
+    """One robot in its own pybullet world. All angles are true angles of the named joints.
 
     Args:
         urdf: the robot, with its meshes.
@@ -85,17 +85,17 @@ class Body:
         self.client = -1
 
     def set_angles(self, angles: FloatArray) -> None:
-        """Put the joints (n,) there, at rest."""
+        """Set the joints to `angles` (n,) [rad or m], at rest."""
         for joint, angle in zip(self.joints, angles, strict=True):
             self.bullet.resetJointState(self.id, joint, angle, 0.0, physicsClientId=self.client)
 
     def angles(self) -> FloatArray:
-        """True angles (n,) [rad or m]."""
+        """Return the true angles (n,) [rad or m]."""
         states = self.bullet.getJointStates(self.id, self.joints, physicsClientId=self.client)
         return np.array([state[0] for state in states])
 
     def stands(self, link: str) -> bool:
-        """Whether no joint moves a link."""
+        """Return True if no joint moves the link."""
         index = self.links[link]
         while index >= 0:
             info = self.bullet.getJointInfo(self.id, index, physicsClientId=self.client)
@@ -105,14 +105,17 @@ class Body:
         return True
 
     def link_pose(self, link: str) -> FloatArray:
-        """Pose (4, 4) of a link's URDF frame in the world."""
+        """Return the pose (4, 4) of a link's URDF frame in the world."""
         state = self.bullet.getLinkState(
             self.id, self.links[link], computeForwardKinematics=1, physicsClientId=self.client
         )
         return self._pose(state)
 
     def link_motion(self, link: str) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Pose (4, 4) of a link's URDF frame, the velocity of its origin [m/s] and its turning [rad/s], each (3,)."""
+        """Return the pose (4, 4) of a link's URDF frame, and its linear [m/s] and angular velocity [rad/s], each (3,).
+
+        The linear velocity is that of the frame's origin.
+        """
         state = self.bullet.getLinkState(
             self.id, self.links[link], computeLinkVelocity=1, computeForwardKinematics=1, physicsClientId=self.client
         )
@@ -128,12 +131,12 @@ class Body:
         return T
 
     def mass_matrix(self, angles: FloatArray) -> FloatArray:
-        """Joint-space inertia (n, n) [kg·m² or kg] at the angles (n,)."""
+        """Return the joint-space inertia (n, n) [kg·m² or kg] at the angles (n,)."""
         M = self.bullet.calculateMassMatrix(self.id, angles[self._order].tolist(), physicsClientId=self.client)
         return np.array(M)[np.ix_(self._place, self._place)]
 
     def jacobians(self, link: str, angles: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Linear and angular Jacobian (3, n) of a link's centre of mass at the angles (n,)."""
+        """Return the linear and the angular Jacobian (3, n) of a link's centre of mass at the angles (n,)."""
         zero = [0.0] * len(angles)
         linear, angular = self.bullet.calculateJacobian(
             self.id, self.links[link], zero[:1] * 3, angles[self._order].tolist(), zero, zero,
@@ -142,7 +145,7 @@ class Body:
         return np.array(linear)[:, self._place], np.array(angular)[:, self._place]
 
     def gravity_torques(self, angles: FloatArray) -> FloatArray:
-        """Torques (n,) [N·m or N] that bear the robot's weight at the angles (n,)."""
+        """Return the torques (n,) [N·m or N] that compensate gravity at the angles (n,)."""
         zero = [0.0] * len(angles)
         torques = self.bullet.calculateInverseDynamics(
             self.id, angles[self._order].tolist(), zero, zero, physicsClientId=self.client

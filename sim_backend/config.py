@@ -105,7 +105,7 @@ class ErrorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         camera_position_m: each coordinate of the cameras' place [m].
         camera_rotation_rad: each component of their rotation [rad].
         tool_m: each coordinate of the marker's place on the hand [m].
-        tool_rotation_rad: each component of the marker's rotation on the hand [rad]; of a ball nobody sees it.
+        tool_rotation_rad: each component of the marker's rotation on the hand [rad]; without effect for a ball.
     """
 
     joint_offset_rad: NonNegative = 0.045

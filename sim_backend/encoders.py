@@ -1,4 +1,4 @@
-"""Joint encoders: true angles in, ticks out."""
+"""Simulate joint encoders: convert true angles to readings quantised to ticks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .config import EncoderConfig
 
 
 class Encoders:
-    """Turns true angles, or where the drives stand, into readings: offset, noise, whole ticks.
+    """Encoder model that adds offset and noise to angles and rounds them to whole ticks.
 
     Args:
         offsets: reported minus true angle [rad or m], shape (d,).
@@ -26,7 +26,7 @@ class Encoders:
         self._rng = rng
 
     def read(self, true: FloatArray) -> FloatArray:
-        """The readings (d,) at the true angles (d,) [rad or m]."""
+        """Return the readings (d,) [rad or m] at the true angles, or drive positions, `true` (d,)."""
         exact = (true + self._offsets) / self._tick
         noisy = exact + self._noise * self._rng.standard_normal(exact.shape)
         return np.round(noisy) * self._tick

@@ -31,10 +31,10 @@ _NOISE_SHIFT_PX = 64
 
 
 class StereoEyes:
-    """Paints stereo frames.
+    """Painter of stereo frames.
 
     Args:
-        seed: background and image noise are drawn from it; a frame's noise from its number too.
+        seed: seed of the background and the image noise; the noise also depends on the frame number.
     """
 
     def __init__(
@@ -67,8 +67,8 @@ class StereoEyes:
 
         Args:
             T_world_camera: pose of the left eye (4, 4).
-            x_eyes: where the marker's centre looks to be in each eye's optical frame (eyes, 3) [m].
-            R_camera_marker: how it is turned there (3, 3).
+            x_eyes: apparent position of the marker's centre in each eye's optical frame (eyes, 3) [m].
+            R_camera_marker: orientation of the marker in the left eye's optical frame (3, 3).
         """
         far = background(self._room, self._directions, T_world_camera[:3, :3])
         rng = generator(self._seed, Stream.IMAGE_NOISE, number)
@@ -111,19 +111,22 @@ class StereoEyes:
             light = to_light if self._config.light == 1.0 else None
             mask, colours = cast_ball(directions, x_eye, self._config.marker_radius_m, depth, self._bgr, light)
         else:
-            # Rays in rows would all miss a straight edge along the row at once.
+            # Jitter: with rays in exact rows, a whole row would miss a straight edge parallel to it at once.
             directions[..., :2] += (rng.random((*depth.shape, 2)) - 0.5) / (fine * self._calibration.focal_px)
             mask, colours = self._sheets.cast(directions, x_eye, R_eye_marker, depth, to_light)
         samples[mask] = colours
         patch[:] = np.round(samples.reshape(height, fine, width, fine, 3).mean(axis=(1, 3)))
 
     def _lit(self, image: ImageArray) -> ImageArray:
-        """Return what is not the marker as brightly as it is lit."""
+        """Return the image, without the marker, scaled by the configured light."""
         light = self._config.light
         return image if light == 1.0 else (light * image).astype(np.uint8)
 
     def _window(self, x_eye: FloatArray) -> tuple[int, int, int, int] | None:
-        """The rectangle (left, top, width, height) around the marker, as far as in the image; None when it is not."""
+        """Return the rectangle (left, top, width, height) [px] around the marker, clipped to the image, or None.
+
+        None: the marker is outside the image or too near to the eye.
+        """
         radius = self._config.marker_radius_m
         if x_eye[2] < 2 * radius:
             return None
@@ -139,7 +142,7 @@ class StereoEyes:
         return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
 
     def _noise_fields(self, width: int, height: int) -> np.ndarray:
-        """A stock of noise images: drawing one afresh for every frame would cost as much as rendering it."""
+        """Return a stock of noise images; a new one for every frame would cost as much as rendering it."""
         if self._config.noise == 0:
             return np.zeros(0, dtype=np.int16)
         shape = (_NOISE_FIELDS, height + _NOISE_SHIFT_PX, width + _NOISE_SHIFT_PX, 3)
@@ -157,14 +160,14 @@ class StereoEyes:
 def portraits(calibration: StereoCalibration, config: CameraConfig) -> Iterator[tuple[ImageArray, ...]]:
     """Yield the marker alone before a plain wall in each eye's image (height, width, 3), BGR, without noise.
 
-    It is in the middle between the images, near enough to be measured well, and a tag is turned a little away.
+    The marker is centred between the images and near enough to be measured well; a tag is turned a little away.
     """
     eyes = StereoEyes(EmptyWorld(), calibration, msgspec.structs.replace(config, clutter=0, noise=0.0), seed=0)
     width, height = calibration.image_size_px
     middle_px = np.array([width - 1, height - 1]) / 2 - calibration.principal_point_px
     faced = Rotation.from_euler("xyz", config.tags[0].rpy).inv() if config.tags else Rotation.identity()
     for radius_px, turn_deg in _PORTRAITS:
-        # As large as that, unless it would leave the images.
+        # Limit the size so that the marker stays inside both images.
         z = calibration.focal_px * max(config.marker_radius_m / radius_px, 2.0 * calibration.baseline_m / width)
         x, y = middle_px * z / calibration.focal_px
         left = np.array([x + calibration.baseline_m / 2, y, z])

@@ -1,4 +1,4 @@
-"""The gaze: the head turned so that the nominal model sees the marker in the middle of both images."""
+"""Gaze control: turn the head so that, by the nominal model, the marker is in the middle of both images."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _TRACK_GAIN = 0.25
 
 
 class Gaze:
-    """Solves and tracks the angles of the gazing joints. All angles are reported ones.
+    """Solver and tracker of the gazing joints' angles. All angles are reported angles.
 
     Args:
-        robot: the description; its nominal model is all that the gaze knows.
+        robot: the description; the gaze uses only its nominal model.
         joints: indices of the gazing joints in q; may be empty.
-        speed_rad_s: greatest speed of each joint [rad/s].
+        speed_rad_s: maximum speed of each joint [rad/s].
     """
 
     def __init__(
@@ -33,11 +33,11 @@ class Gaze:
         self._chain = robot.chain
 
     def hold_tool(self, marker_xyz: FloatArray) -> None:
-        """From now on look at a marker at `marker_xyz` (3,) [m] in the marker link."""
+        """Look at a marker at `marker_xyz` (3,) [m] in the marker link from now on."""
         self._chain = nominal_chain(self._robot, marker_xyz)
 
     def solve(self, q: FloatArray) -> FloatArray:
-        """q (n, d) with the gazing joints turned to the marker, each as far as its limits allow."""
+        """Return q (n, d) with the gazing joints turned to the marker, each within its limits."""
         q = q.copy()
         if self._joints:
             for _ in range(_SOLVE_STEPS):
@@ -46,7 +46,7 @@ class Gaze:
         return q
 
     def track(self, q: FloatArray, command: FloatArray, dt: float) -> FloatArray:
-        """The next command (g,) to the gazing joints' servos, from the reading q (d,) and the last command."""
+        """Return the next command (g,) to the gazing joints' servos, from the reading q (d,) and the last command."""
         if not self._joints:
             return command
         step = _TRACK_GAIN * self._pointing.step(q[None], self._chain.positions)[0]
@@ -54,5 +54,5 @@ class Gaze:
 
 
 def nominal_chain(robot: RobotDescription, marker_xyz: FloatArray) -> RigidChain:
-    """The robot's described chain with its marker at `marker_xyz` (3,) [m] in the marker link."""
+    """Return the robot's described chain with its marker at `marker_xyz` (3,) [m] in the marker link."""
     return robot.chain.with_tool(marker_xyz - np.array(robot.robot.marker_xyz))

@@ -16,12 +16,12 @@ from .physics import Physics
 from .truth import TrueRobot
 from .world import stereo_calibration
 
-# Finer than any encoder: whoever is told the angles adds the resolution of his own.
+# Finer than any encoder: the user of the angles adds the resolution of the real encoders.
 FINEST = 2**30
 
 
 def exact_encoders(config: SimConfig) -> SimConfig:
-    """The same with encoders that have neither noise nor a resolution to speak of."""
+    """Return the configuration with encoders that have no noise and a negligible quantisation."""
     rate_hz = config.encoders.rate_hz
     exact = EncoderConfig(ticks_per_turn=FINEST, ticks_per_metre=FINEST, noise_ticks=0.0, rate_hz=rate_hz)
     return msgspec.structs.replace(config, encoders=exact)
@@ -34,13 +34,13 @@ def guided_path(
     extension: Simulation | None = None,
     tell: Callable[[float], None] = lambda _: None,
 ) -> FloatArray:
-    """What encoders without noise would read, shape (n, d) [rad or m], `config.encoders.rate_hz` rows a second.
+    """Return noise-free encoder readings (n, d) [rad or m], `config.encoders.rate_hz` rows a second.
 
     Args:
-        tell: called with the seconds that are done.
+        tell: called with the simulated seconds done so far.
 
     Raises:
-        ConfigError: [camera] describes no stereo pair, whose sight the hand keeps the marker in; or pybullet is not
+        ConfigError: [camera] describes no stereo pair (the hand keeps the marker in its view), or pybullet is not
             installed.
     """
     calibration = stereo_calibration(robot)

@@ -1,4 +1,4 @@
-"""The virtual hand: a spring wrench at the wrist and a spring at the elbow pull the torque-free arm along."""
+"""The virtual hand: a spring wrench at the wrist and a spring at the elbow pull the torque-free arm."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _FRICTION_TIME_S = 0.15
 
 @dataclass(frozen=True, slots=True)
 class Goals:
-    """Where the hand pulls, step by step.
+    """Targets of the hand, step by step.
 
     Attributes:
         wrist: poses of the wrist link in the world (n, 4, 4).
@@ -35,10 +35,10 @@ class Goals:
 
 
 class VirtualHand:
-    """Pulls a body's guided joints towards a posture.
+    """Springs that pull a body's guided joints towards a posture.
 
     Args:
-        postures: typical postures (n, d) by reported angles; the stiffness suits the lightest.
+        postures: typical postures (n, d) by reported angles; the stiffness suits the smallest inertia among them.
     """
 
     def __init__(
@@ -54,14 +54,14 @@ class VirtualHand:
         self.friction = inertias.joints / _FRICTION_TIME_S
 
     def goals(self, postures: FloatArray) -> Goals:
-        """What the hand aims at along the postures (n, d), given by reported angles."""
+        """Return the hand's targets along the postures (n, d), given by reported angles."""
         return Goals(
             wrist=self._wrist_chain.poses(postures[:, self._wrist_joints]),
             elbow=self._elbow_chain.positions(postures[:, self._elbow_joints]),
         )
 
     def pull(self, goals: Goals, k: int) -> None:
-        """Apply this step's forces towards the goals' entry `k`; the entry before tells how fast they move."""
+        """Apply this step's forces towards entry `k` of the goals; their velocity is the difference to entry k - 1."""
         T, v, spin = self._body.link_motion(self._wrist)
         x_goal = goals.wrist[k, :3, 3]
         v_goal = (x_goal - goals.wrist[k - 1, :3, 3]) / self._body.dt

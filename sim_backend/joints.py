@@ -1,7 +1,7 @@
-"""From where the drives stand to where the joints really are, and to what the encoders read.
+"""Convert drive positions to true joint angles and to encoder inputs.
 
-The physics moves the drives: each stands where its joint would, were the encoder right but for its zero. The effects
-(`effects`) say from what the encoders read where the joint really is: every step of the physics drives them.
+The physics moves the drives. A drive's position is the joint angle that an encoder with only a joint offset would
+imply. The effects (`effects`) compute the true joint angle from the reading, at every step of the physics.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from .truth import TrueRobot
 
 
 class JointPaths:
-    """The joints over time, step by step of the physics.
+    """Joint angles over time, for each step of the physics.
 
-    A late time stamp shows as a frame of the past: it has the joints as they were. One that is early shows as readings
-    of the past. What has not come to rest lags by a fraction of the move during the last frame's interval: so it is
-    that of the last move between pairs as long as every frame becomes a pair; its memory is of the frame before.
+    With a positive camera latency, a frame shows the joints as they were earlier. With a negative one, the readings are
+    those of an earlier time. Effects that depend on the last move use the move during the last frame interval. This is
+    the move between successive pairs as long as every frame becomes a pair.
 
     Args:
         rate_hz: steps a second, a multiple of the frames.
         camera_hz: frames a second.
-        begins: when what drifts begins to: the time of the first frame [s].
+        begins: start time of drift, that of the first frame [s].
     """
 
     def __init__(self, truth: TrueRobot, rate_hz: int, camera_hz: int, *, begins: float) -> None:
@@ -44,14 +44,14 @@ class JointPaths:
 
     @property
     def plain(self) -> bool:
-        """Whether the joints are where the drives are: no effect moves them."""
+        """True if the joints are at the drive positions: no effect moves them."""
         return not any(
             effect.kind.encoder is not None or effect.name in ("joint_compliance", "gravity_backlash", "camera_latency")
             for effect in self._truth.beyond.all_effects
         )
 
     def record(self, angles: FloatArray, t: float) -> None:
-        """The drives stand at `angles` (d,) [rad or m] at the time t [s], a step after the last time."""
+        """Record the drive positions `angles` (d,) [rad or m] at the time t [s], one step after the last record."""
         self._past.append(angles)
         self._t = t
         if not self.plain:
@@ -62,23 +62,23 @@ class JointPaths:
 
     @property
     def read(self) -> FloatArray:
-        """Where the drives stand in the encoders' eyes (d,) [rad or m], their zeros not counted."""
+        """Drive positions (d,) [rad or m] that the encoders sample now, without the joint offsets."""
         return self._ago(self._early)
 
     @property
     def seen(self) -> FloatArray:
-        """True joint angles (d,) [rad or m] in a frame that is taken now."""
+        """True joint angles (d,) [rad or m] in a frame taken now."""
         if self.plain:
             return self._past[-1]
         return self._unloaded + self._truth.beyond.given_way(self._unloaded[None], self._hung)[0]
 
     @property
     def row(self) -> Motion:
-        """What the encoders would read exactly at the time of a frame that is taken now, one row."""
+        """Exact encoder readings at the time of a frame taken now, one row."""
         return Motion.at(self.read + self._truth.offsets, self._t, self._begins)
 
     def _ago(self, steps: float) -> FloatArray:
-        """Where the drives stood so many steps ago, by the parabola through three steps; at first, where they began."""
+        """Return the drive positions `steps` steps ago, by a parabola through three steps; at first, the oldest."""
         if steps == 0.0:
             return self._past[-1]
         middle = min(max(round(steps), 1), len(self._past) - 2)

@@ -232,7 +232,7 @@ _NONE = np.zeros(0, dtype=np.int64)
 
 
 def _fans(sizes: np.ndarray) -> np.ndarray:
-    """Return for polygons of so many corners, listed one after the other, the places of their triangles' corners."""
+    """Return the indices of the triangles' corners, for polygons given by their corner counts, one after another."""
     first = np.repeat(np.cumsum(sizes) - sizes, sizes - 2)
     begin = np.cumsum(sizes - 2) - (sizes - 2)
     step = np.arange(len(first)) - np.repeat(begin, sizes - 2)

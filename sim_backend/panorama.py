@@ -17,7 +17,7 @@ def cluttered_room(
 
     Args:
         ball_hue_deg: hue of the ball [deg].
-        gap_deg: nothing has a hue nearer to it [deg].
+        gap_deg: smallest difference between the hue of an object and that of the ball [deg].
     """
     rows = np.linspace(205, 120, _HEIGHT)[:, None, None]
     picture = np.ascontiguousarray(np.broadcast_to(rows * [0.93, 0.97, 1.0], (_HEIGHT, _WIDTH, 3)).astype(np.uint8))
@@ -36,7 +36,7 @@ def cluttered_room(
 
 
 def background(room: ImageArray, directions: FloatArray, R_world_camera: FloatArray) -> ImageArray:
-    """The room as a camera with this orientation (3, 3) sees it.
+    """Return the room's image as seen by a camera with this orientation (3, 3).
 
     Args:
         directions: viewing direction of each pixel in the camera, shape (height, width, 3), any length.
@@ -50,8 +50,8 @@ def background(room: ImageArray, directions: FloatArray, R_world_camera: FloatAr
 
 
 def _colour(rng: np.random.Generator, ball: int, gap: int) -> tuple[int, int, int]:
-    """Return any hue but the ball's, at any strength; OpenCV's hue circle has 180 steps and red at 0."""
-    # A mixture of two hues at an edge lies between them: more room on the side of the shorter wavelengths.
+    """Return a random BGR colour whose hue is not near the ball's; OpenCV's hue circle has 180 steps, red at 0."""
+    # Hues mix at an edge: leave a wider gap on the side of the shorter wavelengths.
     hue = (ball + rng.integers(gap, 168 - gap)) % 180
     hsv = np.array([[[hue, rng.integers(20, 230), rng.integers(40, 240)]]], dtype=np.uint8)
     blue, green, red = cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR)[0, 0]

@@ -9,7 +9,7 @@ import numpy as np
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
 
-# Postures of one tour. Few: the nearest of few is farther away, and the tour sees all of the range sooner.
+# Postures of one tour. With few, the nearest is farther away, so the tour covers the joint ranges sooner.
 POSTURES = 50
 _BATCH = 1000
 _MOST_BATCHES = 40
@@ -23,22 +23,22 @@ _SPACING = 0.01
 
 
 class Judge(Protocol):
-    """What the path needs to know of postures q (n, d)."""
+    """Interface to judge the visibility of the marker at postures q (n, d)."""
 
     def gazed(self, q: FloatArray) -> FloatArray:
-        """q with the head turned to the marker."""
+        """Return q with the head turned to the marker."""
         ...
 
     def in_images(self, q: FloatArray) -> np.ndarray:
-        """Which of them have the ball inside both images."""
+        """Return a mask (n,) of the postures with the ball inside both images."""
         ...
 
     def clear(self, q: FloatArray) -> bool:
-        """Whether nothing blocks the view at one posture (d,)."""
+        """Return True if nothing blocks the view at one posture (d,)."""
         ...
 
     def visible(self, q: FloatArray) -> np.ndarray:
-        """Which of them pass both."""
+        """Return a mask (n,) of the postures that pass both checks."""
         ...
 
 
@@ -51,7 +51,7 @@ class GuidePath:
         step: Euclidean distance over all learnt joints, the gaze's included, between postures [rad].
 
     Raises:
-        ConfigError: there is hardly a posture at which the ball is visible.
+        ConfigError: the ball is visible at hardly any posture.
     """
 
     def __init__(
@@ -74,11 +74,11 @@ class GuidePath:
 
     @property
     def waypoints(self) -> FloatArray:
-        """The visible postures (n, d) between which the path runs; it begins at the first."""
+        """Visible postures (n, d) between which the path runs; it begins at the first."""
         return self._pool
 
     def hop(self) -> FloatArray:
-        """The postures (n, d) on the way to the next waypoint; n is 0 when it is nearer than a step."""
+        """Return the postures (n, d) on the way to the next waypoint; n is 0 if it is nearer than a step."""
         start, end = self._at, self._next
         after = self._choose(end)
         curve = self._judge.gazed(np.clip(self._curve(start, end, after), self._lower, self._upper))
@@ -94,7 +94,7 @@ class GuidePath:
         self._next = self._choose(posture)
 
     def _curve(self, start: FloatArray, end: FloatArray, after: FloatArray) -> FloatArray:
-        """A cubic from start to end with Catmull-Rom tangents, so that the corner at the end is round."""
+        """Return a cubic from start to end with Catmull-Rom tangents, so that the path is smooth at its end."""
         leave, arrive = (end - self._before) / 2, (after - start) / 2
         count = max(2, int(np.linalg.norm((end - start)[self._guided]) / _SPACING))
         s = np.linspace(0.0, 1.0, count + 1)[1:, None]
@@ -106,7 +106,7 @@ class GuidePath:
         )
 
     def _at_even_steps(self, points: FloatArray) -> FloatArray:
-        """Postures one step apart along a polyline; what remains at its end counts for the next hop."""
+        """Return postures one step apart along a polyline; the rest at its end is carried over to the next hop."""
         lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
         along = np.concatenate([[0.0], np.cumsum(lengths)])
         count = int((along[-1] + self._left_over) / self._step)
@@ -115,7 +115,7 @@ class GuidePath:
         return np.column_stack([np.interp(wanted, along, column) for column in points.T])
 
     def _choose(self, start: FloatArray) -> FloatArray:
-        """The nearest unvisited posture with a free view along the way there, else the nearest of best view."""
+        """Return the nearest unvisited posture with a free view all along the hop, else that with the best view."""
         if not self._unvisited:
             self._pool = self._visible_postures()
             self._unvisited = list(range(len(self._pool)))
@@ -132,7 +132,7 @@ class GuidePath:
         return self._pool[self._unvisited.pop(best)]
 
     def _visible_postures(self) -> FloatArray:
-        """Postures (n, d) at which the ball is visible, uniform over the guided joints' ranges otherwise."""
+        """Sample postures (n, d) uniformly over the guided joints' ranges, and return those with a visible ball."""
         found: list[FloatArray] = []
         for _ in range(_MOST_BATCHES):
             q = np.tile((self._lower + self._upper) / 2, (_BATCH, 1))

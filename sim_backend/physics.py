@@ -1,4 +1,4 @@
-"""The mechanical side of the simulated world: the hand, the arm, the head, step by step."""
+"""Simulate the mechanics of the world step by step: hand, arm and head."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ _SLOWEST_PHYSICS_HZ = 240
 
 
 def physics_rate(encoder_hz: int, camera_hz: int) -> int:
-    """Steps a second: at least 240, and a whole number between any two readings or frames."""
+    """Return the steps a second: at least 240, and a multiple of both the encoder and the camera rate."""
     common = lcm(encoder_hz, camera_hz)
     return common * max(1, -(-_SLOWEST_PHYSICS_HZ // common))
 
 
 class Physics:
-    """The guided robot. Time is counted in steps; nothing here knows who reads what."""
+    """The guided robot. Time is counted in steps, independent of the readers."""
 
     def __init__(self, truth: TrueRobot, calibration: StereoCalibration, config: SimConfig) -> None:
         self._truth, self._calibration, self._config = truth, calibration, config
@@ -56,7 +56,7 @@ class Physics:
         with ExitStack() as stack:
             self.body = stack.enter_context(Body(self.urdf, robot.joints, dt=1 / self.rate_hz))
             watched = stack.enter_context(Body(self.urdf, robot.joints))
-            # What the cameras see stands where the joints really are.
+            # The cameras see the joints at their true angles.
             self._seen = self.body if self._paths.plain else stack.enter_context(Body(self.urdf, robot.joints))
             roles = JointRoles.of(robot)
             self._gazing = list(roles.gaze)
@@ -88,7 +88,7 @@ class Physics:
         self._exit.__exit__(kind, error, trace)
 
     def step(self) -> None:
-        """One step of time."""
+        """Advance by one time step."""
         if self._next == len(self._postures):
             self._plan(self._postures[-1])
         self._hand.pull(self._goals, self._next)
@@ -98,19 +98,19 @@ class Physics:
         self._paths.record(self.body.angles(), self.steps / self.rate_hz)
 
     def read_encoders(self) -> FloatArray:
-        """A reading (d,) of all encoders; the gaze follows it."""
+        """Return a reading (d,) of all encoders, and update the gaze command from it."""
         q = self._encoders.read(self._paths.read)
         self._command = self._gaze.track(q, self._command, 1 / self._config.encoders.rate_hz)
         return q
 
     def scene(self) -> Scene:
-        """What a frame taken now shows."""
+        """Return the scene of a frame taken now."""
         if not self._paths.plain:
             self._seen.set_angles(self._paths.seen)
         return scene_of(self._seen, self._truth, self.marker_xyz, self._calibration, self._paths.row)
 
     def change_tool(self, marker_xyz: FloatArray) -> None:
-        """From now on the hand holds a tool with its marker at `marker_xyz` (3,) [m] in the marker link."""
+        """Put a tool into the hand whose marker is at `marker_xyz` (3,) [m] in the marker link."""
         self.marker_xyz = marker_xyz
         self._gaze.hold_tool(marker_xyz)
         self.sight.hold_tool(marker_xyz)
@@ -119,7 +119,7 @@ class Physics:
         self._plan(here)
 
     def _plan(self, posture: FloatArray) -> None:
-        """Plan the next hop, from `posture` (d,), where the path is now."""
+        """Plan the next hop from `posture` (d,), the current position on the path."""
         hop = self._path.hop()
         while not len(hop):
             hop = self._path.hop()

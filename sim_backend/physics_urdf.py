@@ -65,7 +65,7 @@ def physics_urdf(truth: TrueRobot) -> PhysicsUrdf:
 
 
 class _Inertia(NamedTuple):
-    """What an <inertial> says: mass [kg], ixx to izz [kg·m²], and its frame [m], [rad]."""
+    """Content of an <inertial> element: mass [kg], ixx to izz [kg·m²], and its frame [m], [rad]."""
 
     mass_kg: float
     moments: tuple[float, ...]
@@ -75,7 +75,7 @@ class _Inertia(NamedTuple):
 
 _ZERO = (0.0, 0.0, 0.0)
 _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-# Of a link that states none.
+# Default for a link without <inertial>.
 _SMALL = _Inertia(0.1, (0.0003, 0.0, 0.0, 0.0003, 0.0, 0.0003), _ZERO, _ZERO)
 
 
@@ -278,7 +278,7 @@ def _numbers(values: Sequence[float] | FloatArray) -> str:
 
 
 def _floats(text: str | None, count: int) -> tuple[float, ...] | None:
-    """Return so many finite numbers; None where the text is none."""
+    """Return the `count` finite numbers in a text; None if it is anything else."""
     try:
         values = tuple(float(word) for word in (text or "").split())
     except ValueError:
@@ -287,13 +287,13 @@ def _floats(text: str | None, count: int) -> tuple[float, ...] | None:
 
 
 def _sizes(text: str | None, count: int) -> tuple[float, ...] | None:
-    """Return so many lengths [m] that a link may have; None where the text is none."""
+    """Return the `count` lengths [m] in a text, each possible for a link; None if it is anything else."""
     values = _floats(text, count)
     return values if values is not None and all(0.0 < value <= LARGEST_M for value in values) else None
 
 
 def _origin(element: ElementTree.Element) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
-    """Return the xyz and rpy of an element's <origin>; None where they are no place near the link."""
+    """Return xyz and rpy of an element's <origin>; None if they are invalid or too far from the link."""
     origin = element.find("origin")
     if origin is None:
         return _ZERO, _ZERO

@@ -1,4 +1,4 @@
-"""The simulated robot at rest: put into one posture after the other, read and painted there."""
+"""Simulate a robot at rest: move it to each of a list of postures, read the encoders and render a frame there."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ from .world import stereo_calibration, stereo_frame
 
 log = logging.getLogger(__name__)
 
-# From one posture to the next [s].
+# Time from one posture to the next [s].
 PERIOD_S = 1.0
-# Frames that the renderer works on ahead.
+# Number of frames that are rendered ahead.
 _AHEAD = 2
 
 
 class PosedWorld:
     """A robot that stands still in given postures when its encoders are read and its frames are taken.
 
-    One reading and one frame a posture, both at the same time; the same arguments give the same ones, bit by bit.
+    Each posture gives one reading and one frame with the same time. The same arguments reproduce them bit by bit.
 
     Args:
         robot: the robot as described; it needs a stereo calibration.
         postures: reported joint angles (n, d) [rad or m] to go to; encoders report them in whole ticks.
-        extension: the robot with effects, to which the drawn errors come; None: it has none. A late time stamp is none
-            of a robot that stands still.
+        extension: the robot with effects, to which the random errors are added; None: no effects. Camera latency has
+            no influence on a robot that stands still.
 
     Raises:
         ConfigError: [camera] has no stereo calibration, or pybullet is not installed (both on entering).
@@ -93,24 +93,24 @@ class PosedWorld:
             self._exit.__exit__(kind, error, trace)
 
     def now(self) -> float:
-        """Time of the posture that was last seen [s]."""
+        """Return the time of the posture seen last [s]."""
         return self._delivered * PERIOD_S
 
     def true_chain(self) -> RigidChain:
-        """The truth, for judges: true left eye to true marker over the angles that the encoders report."""
+        """Return the ground-truth chain from the left eye to the marker, over reported angles."""
         return self._truth.chain(self._marker)
 
     def open_joints(self, is_open: bool) -> None:
-        """Readings go on with the first posture that was not read."""
+        """Do nothing: readings continue with the first posture that was not read."""
 
     def open_camera(self, is_open: bool) -> None:
-        """Frames go on with the first posture that was not fetched."""
+        """Request frames when opened; they continue with the first posture that was not fetched."""
         with self._fetching:
             if is_open:
                 self._ask_ahead()
 
     def next_reading(self, timeout_s: float) -> JointReading:  # noqa: ARG002 - nothing to wait for
-        """The encoders in the next posture. SourceEnded: there is none."""
+        """Return the encoders' reading in the next posture. Raise SourceEnded after the last one."""
         if self._read == len(self._postures):
             raise SourceEnded("the encoders were read in all postures")
         q = self._encoders.read(self._postures[self._read] - self._truth.offsets)
@@ -118,7 +118,7 @@ class PosedWorld:
         return JointReading(self._read * PERIOD_S, frozen_array(q))
 
     def next_frame(self, timeout_s: float) -> StereoFrame | None:
-        """The next posture's frame; None when it is not painted in time. SourceEnded: there is no other posture."""
+        """Return the next posture's frame, None if it is not rendered in time. Raise SourceEnded after the last one."""
         with self._fetching:
             if self._delivered == len(self._postures):
                 raise SourceEnded("all postures were seen")
@@ -135,13 +135,13 @@ class PosedWorld:
             self._asked += 1
 
     def scene(self, number: int) -> Scene:
-        """What the frame of posture `number` shows."""
+        """Return the scene of the frame of posture `number`."""
         self._body.set_angles(self._angles[number])
         row = Motion.at(self._postures[number], (number + 1) * PERIOD_S, PERIOD_S)
         return scene_of(self._body, self._truth, self._marker, self._calibration, row)
 
     def _true_angles(self) -> FloatArray:
-        """True joint angles in all postures (n, d) [rad or m]."""
+        """Return the true joint angles in all postures (n, d) [rad or m]."""
         count = len(self._postures)
         times = PERIOD_S * np.arange(1.0, count + 1.0)
         beyond, motion = self._truth.beyond, Motion(self._postures, times, np.zeros(count, dtype=np.int64))

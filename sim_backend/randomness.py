@@ -8,7 +8,7 @@ import numpy as np
 
 
 class Stream(IntEnum):
-    """What a stream is for."""
+    """Purpose of a random stream."""
 
     ERRORS = 1
     ENCODERS = 2
@@ -18,5 +18,5 @@ class Stream(IntEnum):
 
 
 def generator(seed: int, stream: Stream, *index: int) -> np.random.Generator:
-    """The generator of one stream (and, where given, of one frame)."""
+    """Return the generator of one stream and, if an index is given, of one frame."""
     return np.random.default_rng([seed, int(stream), *index])

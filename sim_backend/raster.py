@@ -1,4 +1,4 @@
-"""What the robot looks like from one eye: TinyRenderer on a grid of samples whose place in the image is exact.
+"""Render the robot from one eye: TinyRenderer on a grid of samples at exact image positions.
 
 Integer image coordinates are pixel centres. TinyRenderer samples column i of a frustum at its left edge plus i, row j
 at its top edge plus j + 1 (measured), so the frustum is shifted to put the samples where they belong.
@@ -36,7 +36,7 @@ class Grid:
     per_pixel: float
 
     def directions(self, calibration: StereoCalibration) -> FloatArray:
-        """Rays (rows, columns, 3) through the samples, z = 1."""
+        """Return the rays (rows, columns, 3) through the samples, with z = 1."""
         cx, cy = calibration.principal_point_px
         u = self.left - 0.5 + (np.arange(self.columns) + 0.5) / self.per_pixel
         v = self.top - 0.5 + (np.arange(self.rows) + 0.5) / self.per_pixel
@@ -46,7 +46,7 @@ class Grid:
         return rays
 
     def projection(self, bullet: Any, calibration: StereoCalibration) -> list[float]:
-        """The frustum, for OpenGL, under which TinyRenderer samples exactly there."""
+        """Return the OpenGL projection matrix with which TinyRenderer samples exactly at the grid's positions."""
         cx, cy = calibration.principal_point_px
         half = 0.5 / self.per_pixel
         u = self.left - 0.5 + half
@@ -64,7 +64,7 @@ class Grid:
 
 
 class Raster:
-    """Renders one pybullet world.
+    """Renderer of one pybullet world.
 
     Args:
         to_light: unit vector to the light in the world (3,).
@@ -75,7 +75,7 @@ class Raster:
         self._to_light = to_light.tolist()
 
     def render(self, T_world_eye: FloatArray, grid: Grid) -> tuple[ImageArray, FloatArray]:
-        """Colours (rows, columns, 3), BGR, and depths along z (rows, columns) [m]; inf where there is nothing."""
+        """Return colours (rows, columns, 3), BGR, and depths along z (rows, columns) [m]; inf where nothing is hit."""
         view = _FLIP @ np.linalg.inv(T_world_eye)
         _, _, rgba, buffer, _ = self._bullet.getCameraImage(
             grid.columns,
@@ -98,7 +98,7 @@ class Raster:
 
 
 class EmptyWorld:
-    """What a `Raster` would render of a world without anything in it; needs no pybullet."""
+    """Renderer of an empty world, with the interface of `Raster`; needs no pybullet."""
 
     def render(self, T_world_eye: FloatArray, grid: Grid) -> tuple[ImageArray, FloatArray]:  # noqa: ARG002
         """Return black colours (rows, columns, 3), and depths (rows, columns) of inf."""

@@ -1,4 +1,4 @@
-"""What the world says to its renderer: length-prefixed MessagePack over a pipe."""
+"""Messages from the world to its renderer: length-prefixed MessagePack over a pipe."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Setup(msgspec.Struct, frozen=True, tag=True):
 
     @property
     def eyes(self) -> int:
-        """How many there are."""
+        """Number of eyes."""
         return len(self.calibration.eyes_m)
 
 
@@ -56,8 +56,8 @@ class Frame(msgspec.Struct, frozen=True, tag=True):
     Attributes:
         angles: true joint angles [rad or m].
         T_world_camera: pose of the left eye, row by row, 16 numbers.
-        x_eyes: where the marker's centre looks to be in the left, then in the right eye's frame [m], 3 numbers each.
-        R_camera_marker: how it is turned there, row by row, 9 numbers.
+        x_eyes: apparent position of the marker's centre in the left, then the right eye's frame [m], 3 numbers each.
+        R_camera_marker: orientation of the marker in the left eye's frame, row by row, 9 numbers.
     """
 
     number: int
@@ -73,7 +73,7 @@ _decoder = msgspec.msgpack.Decoder(Message)
 
 
 def send(pipe: int, message: Message) -> None:
-    """Write a message to a file descriptor; BrokenPipeError when nobody reads."""
+    """Write a message to a file descriptor. Raise BrokenPipeError if the reader is gone."""
     body = _encoder.encode(message)
     data = memoryview(_LENGTH.pack(len(body)) + body)
     while data:
@@ -81,7 +81,7 @@ def send(pipe: int, message: Message) -> None:
 
 
 def receive(pipe: int) -> Message | None:
-    """The next message from a file descriptor; None at its end."""
+    """Return the next message from a file descriptor; None at its end."""
     head = _read(pipe, _LENGTH.size)
     if head is None:
         return None
@@ -90,13 +90,13 @@ def receive(pipe: int) -> Message | None:
 
 
 def frame_bytes(setup: Setup) -> int:
-    """Bytes of one frame, all its eyes' images."""
+    """Return the size of one frame [bytes], the images of all eyes together."""
     width, height = setup.image_size_px
     return setup.eyes * width * height * 3
 
 
 def slot_images(shared: Any, number: int, setup: Setup) -> tuple[ImageArray, ...]:
-    """The image (height, width, 3) of each eye, the left one first, of frame `number` in the shared memory."""
+    """Return each eye's image (height, width, 3), the left one first, of frame `number` in the shared memory."""
     width, height = setup.image_size_px
     size = frame_bytes(setup)
     pixels = np.frombuffer(shared, dtype=np.uint8, count=size, offset=(number % SLOTS) * size)

@@ -1,6 +1,6 @@
 """The renderer's process, `python -m bodyschema.sim_backend.renderer MEMORY REQUESTS ANSWERS`: inherited descriptors.
 
-It ends when its parent closes the pipe, or when the parent is no more: then nobody reads what it paints.
+It ends when its parent closes the pipe or has exited: then its frames have no reader.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def _paint(frame: Frame, body: Body, stick: Stick, eyes: StereoEyes, images: tup
 
 
 def _next(requests: int) -> Message | None:
-    """The next request; None when the parent has closed the pipe or is gone (a fork of it may keep the pipe open)."""
+    """Return the next request; None if the parent closed the pipe or is gone (its fork may keep the pipe open)."""
     parent = os.getppid()
     while not select.select([requests], [], [], _PARENT_CHECK_S)[0]:
         if os.getppid() != parent:

@@ -1,4 +1,4 @@
-"""Which learnt joints turn the cameras towards the marker, which ones the virtual hand moves, and where it holds on."""
+"""Assign the learnt joints to gaze or guidance, and choose the links that the virtual hand holds."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from .truth import TrueRobot, with_offsets
 
 @dataclass(frozen=True)
 class JointRoles:
-    """The parts that the learnt joints play.
+    """Roles of the learnt joints in the simulation.
 
-    The way from the cameras to the marker first goes up to a common link and then down. Joints on the way up carry the
-    cameras: they gaze. Joints on the way down carry the marker: they are guided. Where there is no way down (cameras
-    on a hand that looks at a marker in the world), those on the way up are guided.
+    The path from the cameras to the marker goes up to a common link and then down. Joints on the way up carry the
+    cameras: they gaze. Joints on the way down carry the marker: they are guided. If there is no way down (cameras on
+    the hand, marker fixed in the world), the joints on the way up are guided.
 
     Attributes:
         gaze: indices of the gazing joints in q.
         guided: indices of the guided joints in q, in their order from the robot's root.
         wrist: the link that carries the marker (or the hand's cameras); the hand holds it.
-        elbow: the link of the guided joint half-way to the wrist; the other hand holds it there.
+        elbow: the link of the guided joint half-way to the wrist, which the other hand holds.
     """
 
     gaze: tuple[int, ...]
@@ -36,7 +36,7 @@ class JointRoles:
 
     @classmethod
     def of(cls, robot: RobotDescription) -> JointRoles:
-        """The roles of a robot's learnt joints."""
+        """Return the roles of a robot's learnt joints."""
         way = robot.tree.path(robot.camera.parent_link, robot.robot.marker_link)
         upward = {joint.name: up for joint, up in way}
         index = {name: k for k, name in enumerate(robot.joints)}
@@ -50,13 +50,13 @@ class JointRoles:
 
 
 def root_link(tree: UrdfTree) -> str:
-    """The link that hangs on no joint."""
+    """Return the link that is the child of no joint."""
     children = {joint.child for joint in tree.joints.values()}
     return next(link for link in tree.links if link not in children)
 
 
 def chain_from_root(truth: TrueRobot, roles: JointRoles, link: str) -> tuple[RigidChain, tuple[int, ...]]:
-    """The true chain from the robot's root to a guided link, over reported angles; and which entries of q it needs."""
+    """Return the true chain from the root to a guided link, over reported angles, and its joints' indices in q."""
     root = root_link(truth.tree)
     on_way = {joint.name for joint, _ in truth.tree.path(root, link)}
     indices = tuple(k for k in roles.guided if truth.robot.joints[k] in on_way)
@@ -66,7 +66,7 @@ def chain_from_root(truth: TrueRobot, roles: JointRoles, link: str) -> tuple[Rig
 
 
 def _half_way(robot: RobotDescription, guided: tuple[int, ...], wrist: str) -> int:
-    """Position in `guided` of the joint nearest to half the arm's length, with all joints at zero."""
+    """Return the index in `guided` of the joint nearest to half the arm's length, with all joints at zero."""
     links = [*(robot.tree.joints[robot.joints[k]].child for k in guided), wrist]
     origins = np.array([_origin(robot.tree, link) for link in links])
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(origins, axis=0), axis=1))])
@@ -74,7 +74,7 @@ def _half_way(robot: RobotDescription, guided: tuple[int, ...], wrist: str) -> i
 
 
 def _origin(tree: UrdfTree, link: str) -> FloatArray:
-    """Place (3,) of a link's frame in the root link with all joints at zero [m]."""
+    """Return the position (3,) of a link's frame in the root link with all joints at zero [m]."""
     T = np.eye(4)
     for joint, _ in tree.path(root_link(tree), link):
         T = T @ joint.T_parent_joint

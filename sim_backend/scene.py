@@ -1,4 +1,4 @@
-"""What a frame shows: the robot as it stands, and the marker as each eye sees it."""
+"""Compute the content of a frame: the robot's posture and the marker's apparent position in each eye."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from .truth import TrueRobot
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """What a frame shows.
+    """Content of a frame.
 
     Attributes:
         angles: true joint angles [rad or m], shape (d,).
         T_world_camera: pose of the left eye, shape (4, 4).
         x_world: centre of the ball [m], shape (3,).
-        tip: the same in the marker link, where the tool ends [m], shape (3,).
-        x_eyes: where it looks to be in each eye's optical frame [m], shape (eyes, 3): where it is,
+        tip: the same point in the marker link, the end of the tool [m], shape (3,).
+        x_eyes: its apparent position in each eye's optical frame [m], shape (eyes, 3); the true one
             unless the lenses differ from the calibration.
-        R_camera_marker: how the marker is turned in the left eye's optical frame, shape (3, 3).
-        x_seen: what an ideal tracker with the described calibration makes of it [m], shape (3,).
+        R_camera_marker: orientation of the marker in the left eye's optical frame, shape (3, 3).
+        x_seen: position that an ideal tracker with the described calibration reports [m], shape (3,).
     """
 
     angles: FloatArray
@@ -41,10 +41,10 @@ class Scene:
 def scene_of(
     body: Body, truth: TrueRobot, marker_xyz: FloatArray, calibration: StereoCalibration, row: Motion
 ) -> Scene:
-    """What a frame shows of a body as it stands, with its tool's marker described at `marker_xyz` (3,) [m].
+    """Return the scene of a body in its current posture, with its tool's marker described at `marker_xyz` (3,) [m].
 
     Args:
-        row: what the encoders read at the frame's time, one row.
+        row: encoder readings at the frame's time, one row.
     """
     robot, beyond = truth.robot, truth.beyond
     T_world_hand = body.link_pose(robot.robot.marker_link)
@@ -61,10 +61,10 @@ def scene_of(
 def _through_lenses(
     simulation: Simulation, calibration: StereoCalibration, x_camera: FloatArray, added: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Where a point (3,) [m] looks to be in each eye (eyes, 3), and what is triangulated of it (3,).
+    """Return a point's apparent position in each eye (eyes, 3) and its triangulated position (3,) [m].
 
-    What is `added` (3,) [m] to the triangulated position moves the images accordingly. The longer the focal length, the
-    larger the image, so the nearer the point looks.
+    The shift `added` (3,) [m] of the triangulated position moves the images accordingly. A longer focal length makes
+    the image larger, so the point appears nearer.
     """
     optics = simulation.optics
     eyes = calibration.eyes_m

@@ -1,4 +1,4 @@
-"""Whether both cameras really see the marker at a posture, and whether the arm is clear of the body there."""
+"""Check that both cameras truly see the marker at a posture, and that the arm is clear of the body there."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _RIM = 0.8
 
 
 class Sight:
-    """Judges postures of the true robot.
+    """Visibility and clearance checks for postures of the true robot.
 
     Args:
         body: the true robot in a pybullet world that nothing else uses.
@@ -51,17 +51,17 @@ class Sight:
         self._chain = truth.chain(np.array(truth.robot.robot.marker_xyz))
 
     def hold_tool(self, marker_xyz: FloatArray) -> None:
-        """From now on judge for a tool with its marker at `marker_xyz` (3,) [m]."""
+        """Check for a tool with its marker at `marker_xyz` (3,) [m] from now on."""
         self._chain = self._truth.chain(marker_xyz)
 
     def gazed(self, q: FloatArray) -> FloatArray:
-        """q (n, d) with the head turned to the marker."""
+        """Return q (n, d) with the head turned to the marker."""
         return self._gaze.solve(q)
 
     def in_images(self, q: FloatArray) -> np.ndarray:
-        """Which of the postures (n, d) have the whole marker inside both images, at a sensible distance.
+        """Return a mask (n,) of the postures (n, d) with the whole marker inside both images, at a sensible distance.
 
-        Of tags one has to face the eyes, as a person shows it to them.
+        At least one tag, if there are tags, must face the eyes.
         """
         T = self._chain.poses(q)
         x = T[:, :3, 3]
@@ -73,7 +73,7 @@ class Sight:
         return inside & (x[:, 2] > _NEAREST_M) & (x[:, 2] < _FARTHEST_M) & self._faced(T)
 
     def _faced(self, T: FloatArray) -> np.ndarray:
-        """At which poses (n, 4, 4) of the marker one of its tags faces the middle between the eyes."""
+        """Return a mask (n,) of the marker's poses (n, 4, 4) with a tag that faces the midpoint between the eyes."""
         if not len(self._facing):
             return np.ones(len(T), dtype=bool)
         away = T[:, :3, 3] - [0.5 * self._calibration.baseline_m, 0.0, 0.0]
@@ -82,14 +82,14 @@ class Sight:
         return cosines.max(axis=1) > np.cos(_MOST_OBLIQUE)
 
     def clear(self, q: FloatArray) -> bool:
-        """Whether nothing stands between the eyes and the ball at one posture (d,), and the arm touches no body."""
+        """Return True if, at one posture (d,), nothing hides the ball from the eyes and the arm touches nothing."""
         body = self._body
         body.set_angles(q - self._truth.offsets)
         body.bullet.performCollisionDetection(physicsClientId=body.client)
         return not self._blocked(q) and not self._touching()
 
     def visible(self, q: FloatArray) -> np.ndarray:
-        """Which of the postures (n, d) pass both tests."""
+        """Return a mask (n,) of the postures (n, d) that pass both checks."""
         seen = self.in_images(q)
         for k in np.flatnonzero(seen):
             seen[k] = self.clear(q[k])
@@ -119,7 +119,7 @@ class Sight:
         )
 
     def _clearance_pairs(self) -> list[tuple[int, int]]:
-        """Pairs of the moving arm's outer links and the links that the arm does not move."""
+        """Return the pairs of the moving arm's outer links and the links that the arm does not move."""
         tree, body = self._truth.tree, self._body
         first = tree.joints[self._truth.robot.joints[self._roles.guided[0]]]
         arm = _below(tree.joints.values(), first.child)
@@ -129,7 +129,7 @@ class Sight:
 
 
 def _below(joints, link: str) -> set[str]:
-    """The link and all that hang on it."""
+    """Return the link and all its descendants."""
     found = {link}
     grown = True
     while grown:

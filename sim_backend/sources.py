@@ -1,4 +1,4 @@
-"""What the simulated world looks like to the sampler: a joint source, a stereo camera and a clock, as hardware has."""
+"""Joint source, stereo camera and clock of the simulated world, with the interfaces of real hardware."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bodyschema.interfaces.robot import RobotDescription
 
 
 class World(Protocol):
-    """What the sources need of the world."""
+    """Interface of the world that the sources read from."""
 
     robot: RobotDescription
 
@@ -25,22 +25,22 @@ class World(Protocol):
 
 
 class SimClock:
-    """Simulated time. Its wall clock shows when the world was opened, plus simulated time."""
+    """Simulated time. The wall-clock time is that of opening the world plus simulated time."""
 
     def __init__(self, now: Callable[[], float]) -> None:
         self._now = now
         self._opened = datetime.min
 
     def start(self, clock: Clock) -> None:
-        """The world is open: take the wall clock's time."""
+        """Set the wall-clock time at which the world was opened, from `clock`."""
         self._opened = datetime.fromisoformat(clock.utc())
 
     def now(self) -> float:
-        """Simulated time [s]."""
+        """Return the simulated time [s]."""
         return self._now()
 
     def utc(self) -> str:
-        """Wall-clock time at which the world was opened plus simulated time, ISO 8601 in UTC."""
+        """Return the wall-clock time of opening the world plus simulated time, ISO 8601 in UTC."""
         return (self._opened + timedelta(seconds=self._now())).isoformat(timespec="milliseconds")
 
 
@@ -65,7 +65,7 @@ class SimJoints:
         self._world.open_joints(False)
 
     def read(self, timeout_s: float) -> JointReading | None:
-        """The next reading; None when the world waits for the camera to be read longer than `timeout_s`.
+        """Return the next reading; None if the world waits longer than `timeout_s` for the camera to be read.
 
         Raises:
             SourceEnded: the world was closed.
@@ -81,7 +81,7 @@ class SimStereoCamera:
 
     @property
     def calibration(self) -> StereoCalibration:
-        """The described calibration; the simulated lenses agree with it, but for the effects that they are given."""
+        """The described calibration; the simulated lenses agree with it except for their simulated effects."""
         return self._calibration
 
     def __enter__(self) -> Self:
@@ -94,7 +94,7 @@ class SimStereoCamera:
         self._world.open_camera(False)
 
     def read(self, timeout_s: float) -> StereoFrame | None:
-        """The next frame; None when none came within `timeout_s`.
+        """Return the next frame; None if none arrived within `timeout_s`.
 
         Raises:
             SourceEnded: the world was closed.

@@ -31,12 +31,12 @@ class TagSheets:
     def cast(
         self, directions: FloatArray, x: FloatArray, R: FloatArray, depth: FloatArray, to_light: FloatArray
     ) -> tuple[np.ndarray, FloatArray]:
-        """Which rays hit a sheet before anything else, and its colour there.
+        """Return the mask of the rays that hit a sheet before anything else, and its colour there.
 
         Args:
             directions: rays (n, m, 3) in the eye's optical frame with z = 1.
             x, R: the marker's pose in that frame, (3,) [m] and (3, 3).
-            depth: distance along z of what else is there (n, m) [m].
+            depth: distance along z of everything else (n, m) [m].
             to_light: unit vector to the light (3,) in that frame.
 
         Returns:
@@ -60,7 +60,7 @@ class TagSheets:
 
 
 def _is_black(place: FloatArray, black: np.ndarray) -> np.ndarray:
-    """Whether points (k, 2) of a tag of side 1, x right and y up from its middle, are black."""
+    """Return a mask (k,) of the points (k, 2) that are black on a tag of side 1, x right and y up from its middle."""
     column = np.floor((place[:, 0] + 0.5) * _SQUARES).astype(np.intp)
     row = np.floor((0.5 - place[:, 1]) * _SQUARES).astype(np.intp)
     inside = (column >= 0) & (column < _SQUARES) & (row >= 0) & (row < _SQUARES)

@@ -1,4 +1,4 @@
-"""The true robot: the described one with errors drawn from the seed. For judges and for the simulation itself only."""
+"""The simulator's ground truth: the described robot with random errors from the seed. Not for the learner."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from .config import ErrorConfig, SimConfig
 from .geometry import joint_motion, transform
 from .randomness import Stream, generator
 
-# A slide's zero is known better than a turn's: metres for radians, at this rate.
+# The offset of a prismatic joint is known better than that of a revolute one: metres of error per radian.
 _METRES_PER_RADIAN = 0.1
-# Effects that a true kinematic chain has in it.
+# Effects that the true kinematic chain includes.
 GEOMETRY = frozenset({"joint_offset", "link_geometry", "tool_offset", "camera_pose"})
 
 
@@ -31,12 +31,12 @@ class TrueRobot:
 
     Attributes:
         robot: its description, the nominal model.
-        beyond: the robot with those of its effects, and the residual, that no chain has in it.
+        beyond: the robot with those effects, and the residual, that no rigid chain can represent.
         tree: its true kinematics; joints that are not learnt are locked (kind fixed, their position in their origin).
         offsets: reported minus true angle [rad or m], shape (d,), in the order of `robot.joints`.
         T_parent_camera: true pose of the left eye in the camera's parent link, shape (4, 4).
-        tool_error: true minus described place of the marker in the marker link [m], shape (3,).
-        tool_turn: rotation of the marker in the marker link, shape (3, 3); described as none.
+        tool_error: true minus described position of the marker in the marker link [m], shape (3,).
+        tool_turn: rotation of the marker in the marker link, shape (3, 3); the description has no rotation.
     """
 
     robot: RobotDescription
@@ -49,10 +49,10 @@ class TrueRobot:
 
     @classmethod
     def draw(cls, robot: RobotDescription, config: SimConfig, extension: Simulation | None = None) -> TrueRobot:
-        """Draw the true robot; the same arguments give the same one.
+        """Sample the true robot; the same arguments give the same robot.
 
         Args:
-            extension: the robot with effects, to which the drawn errors come; None: it has none.
+            extension: the robot with effects, to which the random errors are added; None: no effects.
         """
         extension = Simulation(robot) if extension is None else extension
         rng = generator(config.seed, Stream.ERRORS)
@@ -89,17 +89,17 @@ class TrueRobot:
         )
 
     def true_eyes(self, calibration: StereoCalibration) -> StereoCalibration:
-        """The described calibration with the true distance of the eyes."""
+        """Return the described calibration with the true baseline."""
         return replace(calibration, baseline_m=calibration.baseline_m / (1.0 + self.beyond.optics.scale_error))
 
     def marker(self, marker_xyz: FloatArray) -> FloatArray:
-        """Where the marker of a tool described by `marker_xyz` (3,) really is in the marker link [m]."""
+        """Return the true position (3,) [m] in the marker link of a marker described at `marker_xyz` (3,)."""
         return marker_xyz + self.tool_error
 
     def chain(self, marker_xyz: FloatArray) -> RigidChain:
-        """True left eye to true marker over the reported angles, for a tool described by `marker_xyz` (3,) [m].
+        """Return the true chain from left eye to marker over reported angles, for a tool at `marker_xyz` (3,) [m].
 
-        Without the effects that are `beyond` any chain.
+        The effects in `beyond` are not included.
         """
         chain = chain_between(
             self.tree,
@@ -114,7 +114,7 @@ class TrueRobot:
 
 
 def with_offsets(chain: RigidChain, offsets: FloatArray) -> RigidChain:
-    """A chain over true angles as one over reported angles = true angles + offsets (d,)."""
+    """Convert a chain over true angles to one over reported angles = true angles + offsets (d,)."""
     fixed = chain.fixed.copy()
     for k, offset in enumerate(offsets):
         fixed[k + 1] = joint_motion(chain.axes[k], bool(chain.prismatic[k]), -offset) @ fixed[k + 1]
@@ -122,7 +122,7 @@ def with_offsets(chain: RigidChain, offsets: FloatArray) -> RigidChain:
 
 
 def _bent(effects: Iterable[Effect]) -> list[Effect]:
-    """Those that no tree of rigid links can have in it."""
+    """Return the effects that no tree of rigid links can represent."""
     return [effect for effect in effects if effect.name not in GEOMETRY]
 
 

@@ -1,4 +1,4 @@
-"""The simulated world in lock step: physics, encoders and cameras on one simulated clock."""
+"""Run physics, encoders and cameras in lock step on one simulated clock."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from .truth import TrueRobot
 
 log = logging.getLogger(__name__)
 
-# How far the world runs ahead of its readers: frames that were taken but not read, and seconds of joint readings.
+# Limits on running ahead of the readers: frames taken but not read, and seconds of joint readings.
 FRAMES_AHEAD = 2
 _READINGS_AHEAD_S = 1.0
 
@@ -45,16 +45,16 @@ class WorldStats:
 
 
 class SimWorld:
-    """A robot that is guided by hand, its encoders and its stereo cameras.
+    """Simulated robot guided by hand, with its encoders and stereo cameras.
 
-    Whoever reads next moves the world on: nothing happens between reads, and simulated time passes as fast as the
-    readers take it. The world never runs more than two frames, or a second of joint readings, ahead of an
-    open source, so two threads may read joints and camera each at its own pace. The same description and
-    configuration give the same readings and frames, bit by bit. Open both sources before the first read.
+    Every read advances the world; nothing happens between reads. Simulated time therefore passes as fast as the
+    readers read. The world never runs more than two frames, or a second of joint readings, ahead of an open source,
+    so two threads may read joints and camera each at its own pace. The same description and configuration reproduce
+    readings and frames bit by bit. Open both sources before the first read.
 
     Args:
         robot: the robot as described; it needs a stereo calibration.
-        extension: the robot with effects, to which the drawn errors come; None: it has none.
+        extension: the robot with effects, to which the random errors are added; None: no effects.
 
     Raises:
         ConfigError: [camera] has no stereo calibration, or pybullet is not installed (both on entering).
@@ -107,7 +107,7 @@ class SimWorld:
             self._exit.__exit__(kind, error, trace)
 
     def now(self) -> float:
-        """Simulated time of the world's front [s]; a frame may be up to two frame intervals older."""
+        """Return the simulated time of the last step [s]; a frame may be up to two frame intervals older."""
         return self._physics.steps / self._physics.rate_hz
 
     @property
@@ -128,27 +128,27 @@ class SimWorld:
             return self.now()
 
     def true_chain(self) -> RigidChain:
-        """The truth, for judges: true left eye to true marker over the angles that the encoders report.
+        """Return the ground-truth chain from the left eye to the marker, over reported angles.
 
-        Of the effects that `extension` has, only those that a chain can have in it.
+        It includes only those effects of `extension` that a rigid chain can represent.
         """
         with self._moved:
             wanted = self._physics.marker_xyz if self._wanted_tool is None else self._wanted_tool
             return self._truth.chain(wanted)
 
     def true_turn(self) -> FloatArray:
-        """The truth, for judges: how the marker is turned on the hand, shape (3, 3)."""
+        """Return the ground-truth rotation (3, 3) of the marker on the hand."""
         return self._truth.tool_turn
 
     def open_joints(self, is_open: bool) -> None:
-        """Begin or end to keep readings for the joint source."""
+        """Start or stop keeping readings for the joint source."""
         with self._moved:
             self._joints_open = is_open
             self._readings.clear()
             self._moved.notify_all()
 
     def open_camera(self, is_open: bool) -> None:
-        """Begin or end to take frames for the camera; begins with a new renderer when the old one has died."""
+        """Start or stop taking frames for the camera; replace the renderer first if it has died."""
         with self._fetching, self._moved:
             if is_open and self._renderer.process.poll() is not None:
                 self._renew_renderer()
@@ -156,7 +156,7 @@ class SimWorld:
             self._moved.notify_all()
 
     def next_reading(self, timeout_s: float) -> JointReading | None:
-        """The next reading; None when none came within `timeout_s`, because the camera has to be read first."""
+        """Return the next reading; None if none arrived within `timeout_s` because the camera must be read first."""
         end = time.monotonic() + timeout_s
         with self._moved:
             while True:
@@ -171,7 +171,7 @@ class SimWorld:
                     return None
 
     def next_frame(self, timeout_s: float) -> StereoFrame | None:
-        """The next frame; None when none came within `timeout_s`."""
+        """Return the next frame; None if none arrived within `timeout_s`."""
         end = time.monotonic() + timeout_s
         with self._fetching:
             if not self._take_frames(end):
@@ -186,7 +186,7 @@ class SimWorld:
             return stereo_frame(t, images)
 
     def _take_frames(self, end: float) -> bool:
-        """Move on until there are frames for the renderer to work on ahead; False when there is none at all in time."""
+        """Advance until the renderer has frames to render ahead; return False if there is none in time."""
         with self._moved:
             while self._may_take_frame():
                 self._check_running()
@@ -202,7 +202,7 @@ class SimWorld:
             return True
 
     def _renew_renderer(self) -> None:
-        """The frames that were under way are lost."""
+        """Restart the renderer; the frames in progress are lost."""
         self._renderer.__exit__(None, None, None)
         self._renderer.__enter__()
         self._delivered = self._taken
@@ -219,7 +219,7 @@ class SimWorld:
             raise SourceEnded("the simulated world has been closed")
 
     def _step(self) -> None:
-        """One step of time, and what falls due at its end: first a reading, then a frame."""
+        """Advance by one time step, then take the reading and the frame due at its end, in this order."""
         physics = self._physics
         physics.step()
         self._change_tool_when_due()
@@ -257,18 +257,18 @@ def true_chain(
     *,
     extension: Simulation | None = None,
 ) -> RigidChain:
-    """The truth of the world that `robot` and `config` would open, for judges in another process; needs no pybullet.
+    """Return the ground-truth chain of the world that `robot` and `config` would open; needs no pybullet.
 
     Args:
         marker_xyz: the described marker of the tool in the hand [m]; None for that of robot.toml.
-        extension: the robot with effects; those that no chain has in it are left out.
+        extension: the robot with effects; those that no rigid chain can represent are left out.
     """
     described = robot.robot.marker_xyz if marker_xyz is None else marker_xyz
     return TrueRobot.draw(robot, config, extension).chain(np.array(described, dtype=np.float64))
 
 
 def stereo_calibration(robot: RobotDescription) -> StereoCalibration:
-    """What [camera] says of the stereo pair, or of the one camera. ConfigError: nothing."""
+    """Return the calibration of the stereo pair, or single camera, in [camera]. Raise ConfigError if there is none."""
     if robot.calibration is None:
         raise ConfigError(
             "the simulation renders images, but [camera] does not describe how the cameras see",
@@ -279,7 +279,7 @@ def stereo_calibration(robot: RobotDescription) -> StereoCalibration:
 
 
 def stereo_frame(t: float, images: tuple[ImageArray, ...]) -> StereoFrame:
-    """A frame of each eye's image (height, width, 3), BGR, the left one first; they become read-only."""
+    """Build a frame from each eye's image (height, width, 3), BGR, the left one first; they become read-only."""
     for image in images:
         image.setflags(write=False)
     return StereoFrame(t, images[0], images[1] if len(images) > 1 else None)

@@ -15,18 +15,18 @@ from .config import HueBand, VisionConfig
 Float32Array = NDArray[np.float32]
 
 
-# How much of the way to the ball's present colour the band goes at a fix, and how far in all (of its half-width).
+# Share of the way to the ball's present colour that the band moves at a fix; limit of its total shift (half-widths).
 _FOLLOWED, _FARTHEST = 0.05, 0.5
-# Limits of saturation and brightness stay at this part of what the ball shows.
+# Lower limits of saturation and brightness, relative to the ball's own.
 _ROOM = 0.6
 
 
 class Gate(Protocol):
-    """What tells the marker's pixels from all others."""
+    """Classifier of the marker's pixels."""
 
     @property
     def shading_sigma(self) -> float:
-        """How much the marker's brightness at its limb may differ from that a little inside (1-sigma, relative)."""
+        """Relative difference (1-sigma) of the marker's brightness between its limb and a little inside."""
         ...
 
     def mask(self, image: ImageArray) -> ImageArray:
@@ -49,7 +49,7 @@ class Gate(Protocol):
 
 
 class ColourGate:
-    """Tells pixels of one band of hues from all others.
+    """Gate for pixels of one band of hues.
 
     The band follows the ball's colour through changing light: slowly, only by pixels of accepted fixes, and never
     farther from where it began than `_FARTHEST` says, so that it cannot walk off to another thing.
@@ -106,7 +106,7 @@ class ColourGate:
 
 
 class BrightGate:
-    """Tells what is brighter than all around it, of whatever colour: a lamp, a white ball, a retro-reflective one."""
+    """Gate for a marker brighter than its surroundings, of any colour: a lamp, a white or retro-reflective ball."""
 
     # Its brightness is all that tells it.
     shading_sigma = 0.1
@@ -140,7 +140,7 @@ def gate_of(config: VisionConfig) -> Gate:
 
 
 def _followed(limit: float, wanted: float, first: float) -> float:
-    """A step of `limit` towards `wanted`, between half of the `first` one and that."""
+    """Move `limit` one step towards `wanted`, clipped to between half of `first` and `first`."""
     return min(max(limit + _FOLLOWED * (wanted - limit), 0.5 * first), first)
 
 

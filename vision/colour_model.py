@@ -1,4 +1,4 @@
-"""The colour of a ball, learnt from images: from one that it is shown in, or from its own motion."""
+"""Learn a ball's colour from a pixel in one image, or from the ball's motion through several."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from bodyschema.interfaces.records import FloatArray, ImageArray
 from .config import HueBand
 from .image_file import read_image
 
-# Around a click the colour is taken from this radius first; the ball is all that joins it with nearly the same [px].
+# Radius around a click for the first colour [px]; the ball is the connected region of nearly that colour.
 _SEED_PX = 3
-# Pixels nearer to grey or black than this have no hue to speak of (parts of 255).
+# Pixels nearer to grey or black than this have no usable hue (parts of 255).
 _LEAST_SATURATION, _LEAST_VALUE = 64, 40
-# The band holds this share of the ball's pixels on either side, and so much more for other light [°].
+# Quantile of the ball's hues cut off on either side, and margin for other light [°].
 _SHARE, _MARGIN_DEG = 0.02, 6.0
 _NARROWEST_DEG, _WIDEST_DEG = 10.0, 40.0
-# In other light the ball may have this part of the saturation and of the brightness that it has here.
+# Lowest saturation and brightness of the ball in other light, relative to those seen here.
 _DIMMER_SATURATION, _DIMMER_VALUE = 0.6, 0.35
-# Pixels that changed by this much between frames have moved [grey levels]; a ball has at least so many of them.
+# Change that marks a moving pixel [grey levels], and the fewest moving pixels of a ball.
 _CHANGED, _LEAST_PIXELS = 25, 30
 _HUES_OF_A_CLICK_DEG = 25.0
 
 
 class ColourUnlearnt(BodyschemaError):
-    """The images do not show a ball of one colour where it was looked for."""
+    """Error for images that do not show a ball of one colour at the expected position."""
 
     def __init__(self, what: str, *, remedy: str = "") -> None:
         super().__init__(f"{what}{f'. {remedy}' if remedy else ''}")
 
 
 def colour_at(image: ImageArray, u: float, v: float) -> HueBand:
-    """The band of hues of the ball that covers the pixel (u, v) of a BGR image (height, width, 3).
+    """Return the hue band of the ball that covers the pixel (u, v) of a BGR image (height, width, 3).
 
     Raises:
-        ColourUnlearnt: the pixel is outside the image, or what is there is grey, black or white.
+        ColourUnlearnt: the pixel is outside the image, or its surroundings are grey, black or white.
     """
     height, width = image.shape[:2]
     column, row = round(u), round(v)
@@ -63,9 +63,9 @@ def colour_at(image: ImageArray, u: float, v: float) -> HueBand:
 
 
 def colour_of_the_moving(images: Iterable[ImageArray]) -> HueBand:
-    """The band of hues of the one colourful thing that moves through BGR images of a camera that stands still.
+    """Return the hue band of the one colourful object that moves through BGR images of a fixed camera.
 
-    The hand that moves it has a hue too, but skin is paler than a marker: each pixel counts by its saturation.
+    Pixels are weighted by their saturation, because the hand moves too and skin is paler than a marker.
 
     Raises:
         ColourUnlearnt: fewer than three images, or nothing colourful moves.

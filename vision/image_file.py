@@ -15,7 +15,7 @@ MOST_BYTES = 2**28
 
 
 def read_image(file: Path, flags: int = cv2.IMREAD_COLOR) -> ImageArray | None:
-    """Return the image (height, width, 3) in `file`; None where there is none that can be read.
+    """Return the image (height, width, 3) in `file`; None if there is no readable image.
 
     Args:
         flags: of `cv2.imdecode`; those of a colour image.

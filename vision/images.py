@@ -1,4 +1,4 @@
-"""What a tracker asks of its images and their calibration."""
+"""Check a tracker's images and their calibration."""
 
 from __future__ import annotations
 

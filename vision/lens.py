@@ -1,4 +1,4 @@
-"""A camera's lens: where a direction is seen, and the direction to what is seen."""
+"""Lens model of a camera: project directions to the image, and image points back to directions."""
 
 from __future__ import annotations
 
@@ -64,11 +64,11 @@ class Lens:
     def project_posed(
         self, x: FloatArray, rotation: FloatArray, translation: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Where points of a frame are seen that stands at a pose in the eye's frame, and how that depends on both.
+        """Project points of a posed frame to the image, with derivatives by the pose and the lens parameters.
 
         Args:
             x: points, shape (n, 3).
-            rotation, translation: the frame's pose as rotation vector [rad] and position, shape (3,) each.
+            rotation, translation: the frame's pose in the eye's frame as rotation vector [rad] and position, (3,) each.
 
         Returns:
             Image coordinates (n, 2) [px]; their derivatives (2n, 6) by rotation and translation, and (2n, p) by

@@ -1,12 +1,12 @@
-"""Where rays leave a ball, to a hundredth of a pixel: matched filters along rays, each made for its background.
+"""Measure a ball's edge along rays to a hundredth of a pixel, by matched filters adapted to the background.
 
-The filters are those of `limb_filters`. Which texture a ray's background has is what its samples make likeliest.
-Colours are turned so that the first channel is the ball's own colour: its shading is unknown there, while the other
-two channels show nothing of the ball but its gloss.
+The filters are those of `limb_filters`. The texture of a ray's background is the most likely one given its samples.
+Colours are rotated so that the first channel is the ball's own colour. Its shading is unknown there, while the other
+two channels show only the ball's gloss.
 
-Each channel tells the edge by itself. Where something narrow lies along the limb, a bar or the rest of a box that the
-ball hides, each channel mixes its light into the edge differently, and they tell different edges. No residual of the
-fit shows that, as whole arcs are off alike; but the channels' disagreement does, and such rays count little.
+Each channel gives its own estimate of the edge. A narrow object along the limb, such as a bar or the rest of a box that
+the ball hides, mixes its light into each channel differently, so the estimates differ. The residuals of the fit do not
+show this, because whole arcs are shifted alike. The disagreement of the channels does, and such rays get low weight.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from .colour import Float32Array, Gate
 from .limb_filters import STEP_PX, Filters, filters, places
 from .polar import ball_colour, mean_of_three, median, rays_round, sample
 
-# Samples on the ball that tell its colour and the noise, from this part of its radius on.
+# Number of samples on the ball for its colour and the noise, and where they begin (share of the radius).
 _INNER_COLUMNS, _INNER_PART = 4, 0.3
-# A sample's noise is at least this [grey levels]; so many of the rays have a background that shows not much else.
+# Least noise of a sample [grey levels]; share of the rays whose background is assumed to show little but noise.
 _LEAST_NOISE, _EVEN_RAYS = 1.0, 0.3
-# Beyond so many blurs the ball no longer shows.
+# Distance from the edge beyond which the ball no longer shows, in blurs.
 _BEYOND_BLURS = 2.0
-# No ray tells its edge better than this, and one that tells it worse tells nothing [px].
+# Smallest sigma of a ray's edge; a ray with a sigma above the largest is ignored [px].
 _BEST_SIGMA_PX, _WORST_SIGMA_PX = 0.03, 0.5
 # The channels' disagreement (chi-squared, 2 degrees of freedom): more than this, and than this times the median of the
 # ball's rays, is no noise, and makes a ray's variance larger by that power of it; what its median is of noise alone.
 _LEAST_DISAGREEMENT, _USUAL_DISAGREEMENT, _DISAGREEMENT_POWER, _OF_NOISE = 2.0, 1.5, 3, 3.0
-# The blur changes by this factor at most from one look to the next.
+# Largest factor of the blur's change from one iteration to the next.
 _LARGEST_WIDENING = 1.5
 
 
@@ -44,10 +44,10 @@ class Limb:
 
     Attributes:
         rays: cosine and sine of their directions, and 1, shape (n, 3).
-        offset_px: how far beyond the outline that was thought of the edge is, shape (n,) [px].
-        weight: inverse variances of `offset_px`, shape (n,) [1/px²]; 0 where a ray does not tell.
-        blur_px: 1-sigma of lens and interpolation, as the edge shows it [px].
-        excess: the variance of what the channels disagree by, over the one that the pixels' noise makes; 1 or more.
+        offset_px: distance of the edge outside the assumed outline, shape (n,) [px].
+        weight: inverse variances of `offset_px`, shape (n,) [1/px²]; 0 where a ray gives no estimate.
+        blur_px: blur of lens and interpolation (1-sigma), estimated from the edge [px].
+        excess: variance of the channels' disagreement relative to that from pixel noise; 1 or more.
     """
 
     rays: FloatArray
@@ -58,24 +58,24 @@ class Limb:
 
     @property
     def evenness(self) -> float:
-        """1 where all rays count alike, k/n where k of n rays do and the others tell nothing."""
+        """Evenness of the weights: 1 if all rays count alike, k/n if k of n rays do and the others have no weight."""
         return float(self.weight.sum()) ** 2 / (len(self.weight) * float(self.weight @ self.weight))
 
     @property
     def noise_share(self) -> float:
-        """The part of the variances of `offset_px` that is the pixels' noise, mean of the rays that tell."""
+        """Share of pixel noise in the variances of `offset_px`, averaged over the rays with weight."""
         return 1.0 - _BEST_SIGMA_PX**2 * float(self.weight[self.weight > 0].mean())
 
 
 def find_limb(
     image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray, blur_px: float
 ) -> Limb | None:
-    """The edge about an outline that is right to a few tenths of a pixel; None when no ball shows there.
+    """Measure the edge near an outline that is right to a few tenths of a pixel; None if no ball shows there.
 
     Args:
         image: BGR, shape (height, width, 3), grey levels.
         centre_px, radius_px, shape: the outline, see `sphere.Ellipse`.
-        blur_px: how wide the edge is thought to be, to a third [px].
+        blur_px: assumed blur of the edge, right to about a third of itself [px].
     """
     rays = rays_round(radius_px)
     at = places(radius_px, blur_px)
@@ -91,7 +91,7 @@ def find_limb(
 
 
 def _filtered(rays: FloatArray, channels: FloatArray, both: tuple[Filters, Filters], blur_px: float) -> Limb:
-    """What the filters make of the samples (3, n, m) of n rays in units of the noise, the ball's own colour first."""
+    """Apply the filters to the samples (3, n, m) of n rays, in units of the noise, the ball's own colour first."""
     own, across = both
     informations, shifts = np.zeros((2, len(channels), len(rays)))
     widening, widening_information = 0.0, 1e-9
@@ -124,13 +124,13 @@ def _filtered(rays: FloatArray, channels: FloatArray, both: tuple[Filters, Filte
 def _doubt(
     informations: FloatArray, shifts: FloatArray, mean: FloatArray, told: NDArray[np.bool_]
 ) -> tuple[FloatArray, float]:
-    """By how much the variances of the rays are larger, shape (n,), as their channels disagree; and `Limb.excess`.
+    """Return the factor on each ray's variance due to disagreeing channels, shape (n,), and `Limb.excess`.
 
     Args:
-        informations: inverse variances of what each channel tells, shape (3, n) [1/px²].
-        shifts: what it tells, times those, shape (3, n) [1/px].
-        mean: what they tell together, shape (n,) [px].
-        told: which rays tell anything, shape (n,).
+        informations: inverse variances of each channel's estimate, shape (3, n) [1/px²].
+        shifts: the estimates times these, shape (3, n) [1/px].
+        mean: the combined estimate, shape (n,) [px].
+        told: mask of the rays with an estimate, shape (n,).
     """
     off = shifts - informations * mean
     chi_squared = np.divide(off**2, informations, out=np.zeros_like(off), where=informations > 0).sum(axis=0)
@@ -141,7 +141,7 @@ def _doubt(
 
 
 def _likeliest(channels: FloatArray, one: Filters) -> NDArray[np.intp]:
-    """Which texture is the likeliest of each ray (n) of some channels (c), by three neighbours: shape (c, n)."""
+    """Return the index of each ray's most likely texture, averaged over three neighbours, per channel: (c, n)."""
     _, count, columns = channels.shape
     flat = channels.reshape(-1, columns)
     whitened = (flat @ one.precisions).reshape(len(flat), -1, columns)
@@ -151,22 +151,23 @@ def _likeliest(channels: FloatArray, one: Filters) -> NDArray[np.intp]:
 
 
 def _own_colour_first(colour: FloatArray) -> FloatArray:
-    """An orthonormal basis of colours, as columns: the ball's own, then what grey has across it, then the rest."""
+    """Return an orthonormal basis of colours as columns: the ball's own, grey's part orthogonal to it, the third."""
     own = colour / np.linalg.norm(colour)
     grey = np.ones(3) - own.sum() * own
     if np.linalg.norm(grey) < 0.1:
         grey = np.array([1.0, 0.0, 0.0]) - own[0] * own
     grey /= np.linalg.norm(grey)
-    # The cross product; NumPy's own costs more than all else here.
+    # The cross product by hand: np.cross costs more than everything else here.
     rest = own[[1, 2, 0]] * grey[[2, 0, 1]] - own[[2, 0, 1]] * grey[[1, 2, 0]]
     return np.column_stack([own, grey, rest])
 
 
 def _noise(inside: Float32Array, beyond: Float32Array) -> float:
-    """A sample's noise (1-sigma) [grey levels].
+    """Estimate the noise of a sample (1-sigma) [grey levels].
 
-    Of neighbours on the ball, across its colour, shape (n, columns, 2); and, as light brings noise with it, along the
-    rays of the most even part of what is beyond, shape (n, columns, 3).
+    It is the larger of two estimates, because brighter pixels have more noise: from neighbouring samples inside the
+    ball, orthogonal to its colour, shape (n, columns, 2); and along the rays with the most even background beyond the
+    ball, shape (n, columns, 3).
     """
     on_ball = 1.4826 * median(np.abs(np.diff(inside, axis=0)).ravel()) / math.sqrt(2.0)
     apart = round(1.0 / STEP_PX)

@@ -1,4 +1,4 @@
-"""Filters that tell, best of all linear ones, where a ray of samples leaves a ball.
+"""Optimal linear filters for the position at which a ray of samples leaves a ball.
 
 Samples at t [px] along a ray, t = 0 where the outline is thought to be, are
 
@@ -22,7 +22,7 @@ import numpy as np
 from bodyschema.interfaces.records import FloatArray
 
 STEP_PX = 0.5
-# Half-widths of what is looked at, on the ball and beyond [px], for a blur of USUAL_BLUR_PX; more needs more room.
+# Sampled lengths on the ball and beyond [px], for a blur of USUAL_BLUR_PX; a wider blur needs longer ones.
 _INSIDE_PX, _OUTSIDE_PX, USUAL_BLUR_PX = 4.0, 8.0, 0.86
 # Textures that are told apart: 1-sigma of the random walk over 1 px, and the slope's variance [1/px²], in units of the
 # noise.
@@ -60,7 +60,10 @@ class Filters:
 
 
 def places(radius_px: float, blur_px: float) -> FloatArray:
-    """Where to sample rays, shape (m,) [px] from the outline: little of a small ball, more where the blur is wide."""
+    """Return the sample positions along a ray, shape (m,) [px] from the outline.
+
+    A small ball has fewer samples inside; a wide blur needs more on both sides.
+    """
     wider = max(1.0, blur_px / USUAL_BLUR_PX)
     inside = min(round(_INSIDE_PX * wider / STEP_PX), max(3, round(0.9 * radius_px / (2 * STEP_PX))))
     outside = round(_OUTSIDE_PX * wider / STEP_PX)
@@ -68,9 +71,9 @@ def places(radius_px: float, blur_px: float) -> FloatArray:
 
 
 def filters(radius_px: float, blur_px: float) -> tuple[Filters, Filters]:
-    """The filters towards the ball's own colour and across it, at `places(radius_px, blur_px)`.
+    """Return the filters along the ball's own colour and orthogonal to it, at `places(radius_px, blur_px)`.
 
-    Both figures count to a few per cent, so that those of a ball that is followed are computed once.
+    Radius and blur are rounded to a few per cent, so that the filters of a tracked ball are computed only once.
     """
     at = tuple(places(radius_px, blur_px).tolist())
     radius_px, blur_px = _rounded(radius_px, 10), _rounded(blur_px, 20)
@@ -111,14 +114,14 @@ def _filters(at: tuple[float, ...], radius_px: float, blur_px: float, own_colour
 
 
 def _best_filter(cov: FloatArray, signal: FloatArray) -> tuple[FloatArray, float]:
-    """The unbiased linear filter (m,) of least variance for how much of `signal` (m,) there is, and that variance."""
+    """Return the minimum-variance unbiased linear filter (m,) for the amplitude of `signal` (m,), and its variance."""
     weighted: FloatArray = np.linalg.solve(cov, signal).astype(np.float64)
     variance = 1.0 / float(signal @ weighted)
     return weighted * variance, variance
 
 
 def _blurred_normal(t: FloatArray, radius_px: float, blur_px: float) -> FloatArray:
-    """The part along the line of sight of a sphere's normal, 0 beyond the sphere, as a blurred image shows it."""
+    """Return the line-of-sight component of a sphere's normal, 0 outside the sphere, blurred as in the image."""
     reach = 4.0 * blur_px
     fine = np.arange(t[0] - reach, t[-1] + reach, _FINE_PX)
     normal = np.sqrt(np.clip(1.0 - (1.0 + np.minimum(fine, 0.0) / radius_px) ** 2, 0.0, None))

@@ -1,4 +1,4 @@
-"""The ellipse through a ball's limb, and how sure it is."""
+"""Fit an ellipse to a ball's limb, with its uncertainty."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from .normal import inverse_of_normal
 from .polar import median
 from .waves import Waves, waves
 
-# The limb is looked for so often at most, and is found when a look moved it and its blur less than this [px].
+# Most iterations; converged when the limb and its blur changed by less than these [px].
 _LOOKS, _SETTLED_PX, _SETTLED_BLUR_PX = 4, 0.02, 0.05
-# Blurs that are looked for [px].
+# Range of the blur [px].
 _SHARPEST_PX, _WIDEST_PX = 0.4, 3.0
-# An edge sharper than this after interpolation [px] was not anti-aliased: coverage tells more than its place does.
+# An edge sharper than this after interpolation [px] was not anti-aliased: coverage is then the better measure.
 _ALIASED_PX = 0.55
-# Student's degrees of freedom of an edge's error: how little what is far off counts. Beyond this nothing counts [px].
+# Student's degrees of freedom of an edge's error, which set the weight of outliers; residual limit [px]; iterations.
 _FREEDOM, _FARTHEST_PX, _ROUNDS = 4.0, 1.0, 3
 # Below this, relative to the cubed trace, the limb does not determine centre and radius.
 _LEAST_DETERMINANT = 1e-6
@@ -30,8 +30,7 @@ _LEAST_DETERMINANT = 1e-6
 # waves are small is no sign that it is. Beside that it is this part of what the few waves tell, and where they tell of
 # far more it is the square, over the last: a bend that shows is a sign of one that the fit has removed.
 _LEAST_DENSITY, _NOISE, _TOLD, _USUAL_DENSITY = 0.5, 1.75, 0.4, 12.0
-# Where fewer rays carry the circle than this share of them, what pulls some of them is not averaged: the claim's sigma
-# is larger by as much as they are fewer.
+# If a smaller share of the rays carries the circle, their errors are not averaged out: sigma grows in proportion.
 _LEAST_EVENNESS = 0.5
 # Of an estimate's slope by its residuals (1 where none is far off, 0 where all are) at least this part counts.
 _LEAST_SLOPE = 0.4
@@ -39,28 +38,28 @@ _LEAST_SLOPE = 0.4
 # arcs, in the slow ones, which the claim follows. Beyond so many times the variance of the samples, as far as the
 # channels agree on that, it is no ball's limb alone.
 _LARGEST_DENSITY = 10.0
-# What leaves the circle by more of its radius (RMS, noise apart) is angular: a small square, whose corners blur rounds.
+# A larger deviation from the circle (RMS without noise, share of the radius) is angular: a small, blurred square.
 _MOST_ANGULAR = 0.05
 # What a lens leaves of its distortion makes a limb oval, by this part of its radius at most, but fits all around.
 _MOST_OVAL, _CLEAN_DENSITY = 0.015, 3.0
-# No ball is rounder than this part of its radius (RMS): seams, dust and dents are no fingers.
+# Smaller deviations (RMS, share of the radius) occur on every ball (seams, dust, dents) and are no occlusion.
 _ROUND = 0.0075
-# An oval is tried where the slow waves are this large.
+# An oval is tried if the slow waves are this large.
 _BENT_DENSITY = 20.0
 
 
 @dataclass(frozen=True, slots=True)
 class Circle:
-    """The circle whose image under the ellipse's shape is the limb.
+    """Circle whose image under the ellipse's shape is the limb.
 
     Attributes:
         centre_px: shape (2,) [px].
         radius_px: [px].
         cov_px: covariance of the centre, shape (2, 2) [px²].
         radius_sigma_px: 1-sigma of the radius [px].
-        unrest: how far the limb leaves the circle, slowly and quickly, in variances of its samples; 0 where it is as
-            round as balls are.
-        aliased: whether the image was not anti-aliased, so that all this is worth little.
+        unrest: deviation of the limb from the circle, in slow and quick waves, in variances of its samples; 0 if it is
+            as round as usual.
+        aliased: True if the image was not anti-aliased, so that the fit is unreliable.
     """
 
     centre_px: FloatArray
@@ -73,8 +72,16 @@ class Circle:
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """Shift (2,) and growth [px] of the circle, the inverse normal matrix (3, 3) [px²], the waves of its residuals,
-    what the rays pull it by, shape (n,), with the slowest wave left in, and the RMS residual, noise apart [px]."""
+    """Result of one fit.
+
+    Attributes:
+        shift_px, growth_px: change of the circle's centre (2,) and radius [px].
+        inverse: inverse normal matrix (3, 3) [px²].
+        waves: waves of the residuals.
+        pulls: influence of the rays on the circle, shape (n,), see `_pulls`.
+        first: slowest wave that the fit left in.
+        off_px: RMS residual without noise [px].
+    """
 
     shift_px: FloatArray
     growth_px: float
@@ -88,9 +95,10 @@ class _Fit:
 def fit_limb(
     image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray
 ) -> Circle | None:
-    """The ellipse through the limb near the outline given, which is right to half a pixel or so.
+    """Fit an ellipse to the limb near the given outline, which must be right to about half a pixel.
 
-    None when nothing there is like a ball's limb, or not all around. What the last of all looks still moved is claimed.
+    Return None if there is no ball's limb all around. If the iteration has not settled, its last step is added to the
+    covariance.
     """
     blur_px = USUAL_BLUR_PX
     fit: _Fit | None = None
@@ -127,7 +135,7 @@ def fit_limb(
 
 
 def _fit(limb: Limb, radius_px: float) -> _Fit | None:
-    """The circle through the limb; an oval one where no circle fits, but that does all around."""
+    """Fit a circle to the limb, or an oval if no circle fits and the oval fits all around."""
     fit = _least_squares(limb, radius_px, oval=False)
     if fit is None or fit.waves.slow < _BENT_DENSITY:
         return fit
@@ -136,7 +144,7 @@ def _fit(limb: Limb, radius_px: float) -> _Fit | None:
 
 
 def _least_squares(limb: Limb, radius_px: float, *, oval: bool) -> _Fit | None:
-    """Weighted least squares; what is far off counts little."""
+    """Fit by robust weighted least squares: outliers get low weight."""
     design = limb.rays
     if oval:
         cos, sin = design[:, 0], design[:, 1]
@@ -169,11 +177,11 @@ def _least_squares(limb: Limb, radius_px: float, *, oval: bool) -> _Fit | None:
 
 
 def _pulls(full: FloatArray, used: FloatArray, residual: FloatArray) -> FloatArray:
-    """What the rays pull the circle by, shape (n,): their influence on an M-estimate, in sigmas of `used`.
+    """Return the influence (n,) of the rays on the circle as an M-estimate, in sigmas of `used`.
 
-    What is far off has less weight, so that the residuals under the weights tell less than the truth, and so does the
-    inverse normal matrix. With the weights' share f = 1/(1 + z²/ν) of a residual z the influence is z·f over the mean
-    of its slope 2f² − f (Huber 1981, Robust Statistics, section 7.6).
+    Outliers have less weight, so the weighted residuals and the inverse normal matrix underestimate the uncertainty.
+    With the weights' share f = 1/(1 + z²/ν) of a residual z the influence is z·f over the mean of its slope 2f² − f
+    (Huber 1981, Robust Statistics, section 7.6).
     """
     share = np.divide(used, full, out=np.zeros_like(full), where=full > 0)
     told = np.count_nonzero(full)

@@ -28,7 +28,7 @@ _SAME_SIZE, _SAME_ROW_PX, _LEAST_SHOWN = 1.2, 2.0, 0.6
 
 
 class StereoMatcher:
-    """Checks pairs of discs against the geometry of two eyes and one ball of known size."""
+    """Check of pairs of discs against the geometry of two eyes and one ball of known size."""
 
     def __init__(self, calibration: StereoCalibration, config: VisionConfig) -> None:
         self._calibration, self._config = calibration, config
@@ -63,14 +63,14 @@ class StereoMatcher:
     def shows_too(
         self, disc: Disc, others: Sequence[Disc], mask: ImageArray, found: Location, *, in_left: bool
     ) -> bool:
-        """Whether a disc of one eye may be a second marker that the other eye sees, too, but not as a disc.
+        """Return True if a disc of one eye may be a second marker that the other eye sees too, but not as a disc.
 
         Args:
             disc: measured or rough, and not the marker that was found.
-            others: the discs of the other eye, which tell that such a pair has been checked.
-            mask: what has the marker's colour in the other eye, shape (height, width).
+            others: the discs of the other eye; a pair with one of them has already been checked.
+            mask: pixels of the marker's colour in the other eye, shape (height, width).
             found: the marker.
-            in_left: whether `disc` is the left eye's.
+            in_left: True if `disc` is the left eye's.
         """
         if any(_alike(disc, other) for other in others):
             return False
@@ -120,7 +120,7 @@ class StereoMatcher:
 
 
 def _alike(one: Disc, other: Disc) -> bool:
-    """Whether two discs, one of each eye, are at the same row and of the same size, roughly."""
+    """Return True if two discs, one of each eye, are roughly at the same row and of the same size."""
     size = max(one.radius_px, other.radius_px) / min(one.radius_px, other.radius_px)
     return size < _SAME_SIZE and abs(float(one.centre_px[1] - other.centre_px[1])) < _SAME_ROW_PX
 
@@ -134,5 +134,5 @@ def _without_reflections(found: list[Location]) -> list[Location]:
 
 
 def is_reflection_of(one: Location, level: float, distance_m: float) -> bool:
-    """Whether `one` may be the mirrored copy of a marker of `level` [grey levels] at `distance_m` [m]."""
+    """Return True if `one` may be the mirrored copy of a marker of `level` [grey levels] at `distance_m` [m]."""
     return one.level < _MIRRORED_LIGHT * level and float(np.linalg.norm(one.x)) > distance_m

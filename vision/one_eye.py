@@ -1,4 +1,4 @@
-"""Where one camera alone begins: a first pose of points that it knows."""
+"""Estimate a first pose of known points from one camera alone."""
 
 from __future__ import annotations
 
@@ -12,10 +12,14 @@ from bodyschema.interfaces.records import FloatArray
 def first_pose(
     calibration: StereoCalibration, points: FloatArray, pixels: FloatArray
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Poses under which points of a body (k, 3) [m] are seen near `pixels` (k, 2): rotation (3, 3) and origin (3,) [m].
+    """Return the poses, as rotation (3, 3) and origin (3,) [m], with which `points` project near `pixels`.
 
-    The least squares of the points off their rays in space, without a first guess (SQPnP: Terzakis and Lourakis 2020).
-    Empty where there is none.
+    Least squares of the points' distances from their rays in space, without an initial guess (SQPnP: Terzakis and
+    Lourakis 2020). The list is empty if there is no solution.
+
+    Args:
+        points: points of a body in its own frame (k, 3) [m].
+        pixels: their image coordinates (k, 2) [px].
     """
     rays = (pixels - np.array(calibration.principal_point_px)) / calibration.focal_px
     found, turns, places, _ = cv2.solvePnPGeneric(

@@ -1,4 +1,4 @@
-"""Follows one ball of known size through the images of one camera alone: its direction, and its depth from its size."""
+"""Track one ball of known size in the images of a single camera: direction, and depth from its size."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _ROUNDS = 5
 
 
 class OneEyeBallTracker:
-    """Finds one coloured ball in the images of one camera.
+    """Tracker of one coloured ball in the images of one camera.
 
-    The direction is as sharp as in a stereo image, the depth as sure as the ball's radius is known: nothing else tells
-    it, nor whether it is the ball. So two things that look like one are none.
+    The direction is as precise as in a stereo image. The depth follows only from the ball's known radius, and nothing
+    else confirms that an object is the ball. So two candidates give no fix.
     """
 
     def __init__(self, calibration: StereoCalibration, config: VisionConfig | None = None) -> None:
-        """Prepare for images of `calibration`; ConfigError when it describes no camera."""
+        """Prepare for images of `calibration`. Raise ConfigError if it describes no camera."""
         check_calibration(calibration)
         self.calibration = calibration
         self.config = config or VisionConfig()
@@ -35,7 +35,7 @@ class OneEyeBallTracker:
         self._whole = Region(0, 0, *calibration.image_size_px)
 
     def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
-        """The marker in `frame`, in the camera's optical frame, or why there is none.
+        """Return the marker in `frame`, in the camera's optical frame, or the reason for a miss.
 
         Raises:
             SourceError: the image is not uint8 BGR of the calibration's size.
@@ -49,10 +49,10 @@ class OneEyeBallTracker:
         return MarkerFix(frame.t, frozen_array(x), frozen_array(cov))
 
     def forget(self) -> None:
-        """Every frame is looked at as if it were the first."""
+        """Do nothing: every frame is processed independently."""
 
     def _disc(self, frame: StereoFrame) -> Disc | Reason:
-        """The one ball in the image."""
+        """Return the one ball in the image, or the reason for a miss."""
         discs: list[Disc] = []
         reason = Reason.NO_MARKER
         for patch in find_patches(frame.left, self._whole, self._gate, self.config):
@@ -66,7 +66,7 @@ class OneEyeBallTracker:
         return discs[0] if discs else reason
 
     def _located(self, disc: Disc) -> tuple[FloatArray, FloatArray] | Reason:
-        """Place (3,) [m] and its covariance (3, 3) [m²]."""
+        """Return the position (3,) [m] and its covariance (3, 3) [m²], or the reason for a miss."""
         radius_m = self.config.radius_m
         distance = radius_m * self._eye.distance_over_radius(disc.centre_px, disc.radius_px)
         sight = self._sight(disc, distance)
@@ -77,14 +77,14 @@ class OneEyeBallTracker:
             distance *= outline.radius_px / disc.radius_px
             sight = self._sight(disc, distance)
         x = distance * sight
-        # A pixel turns the line of sight; what it adds along it is the size's to say.
+        # A pixel error only turns the line of sight; the error along it comes from the size.
         across = (np.eye(3) - np.outer(sight, sight))[:, :2] * x[2] / self._eye.focal_px
         pixels = disc.cov_px + self.calibration.pixel_sigma**2 * np.eye(2)
         depth = (disc.radius_sigma_px / disc.radius_px) ** 2 + RADIUS_SIGMA**2
         return x, across @ pixels @ across.T + depth * np.outer(x, x)
 
     def _sight(self, disc: Disc, distance: float) -> FloatArray:
-        """The direction (3,) of the ball's centre, of length 1, if it is so far away [m]."""
+        """Return the unit vector (3,) to the ball's centre, for this distance [m]."""
         centre_px = self._eye.sphere_centre(disc.centre_px, distance / self.config.radius_m)
         ray = np.append((centre_px - np.array(self._eye.principal_point_px)) / self._eye.focal_px, 1.0)
         return ray / np.linalg.norm(ray)

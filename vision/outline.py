@@ -1,11 +1,11 @@
-"""Sub-pixel outline of a ball's image.
+"""Fit the sub-pixel outline of a ball's image.
 
 The image is sampled along rays from a rough centre. Along each ray the pixels go from the ball's colour to the
-background's; how much of the ray the ball covers tells where its edge is. Coverage is measured along the direction in
-colour space that tells ball from background best while the ball's brightness, which varies with shading, counts
-for little: a shaded limb before a grey wall is told by its hue, a limb before black by its light. Both ends of
-the mixture are taken next to the edge, per ray. So neither shading nor highlights pull the centre, and an
-anti-aliased edge counts by its coverage.
+background's, and the share of the ray that the ball covers gives its edge. Coverage is measured along the direction in
+colour space that best separates ball and background, with little weight on the ball's brightness, which varies with
+shading: a shaded limb before a grey wall is found by its hue, a limb before black by its light. Both ends of the
+mixture are taken next to the edge, per ray. So neither shading nor highlights bias the centre, and an anti-aliased
+edge counts by its coverage.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from .waves import waves
 
 BoolArray = NDArray[np.bool_]
 
-# Half-widths [px] of the ring in which the edge is looked for: about a circle right to a pixel, and about others.
+# Half-widths [px] of the ring in which the edge is searched: about a circle right to a pixel, and about others.
 _NARROW_PX, _WIDE_PX = 2.0, 4.0
-# The outline is found when a step in the narrow ring moved it less than the first of these [px]; a rough circle that is
-# off by more than the second one is looked at in the wide ring.
+# The fit has converged when a step in the narrow ring moved it less than the first of these [px]; a rough circle that
+# is off by more than the second one is fitted in the wide ring.
 _SETTLED_PX, _ROUGH_PX = 0.4, 1.0
 _RING_STEP_PX = 0.5
 _BACKGROUND_PX = 2.0
 _INNER_COLUMNS = 6
-# How much any channel at the limb may differ from the one a little inside, brightness apart (1-sigma, grey levels).
+# Difference of any channel between the limb and a little inside, apart from brightness (1-sigma, grey levels).
 _CHANNEL_SIGMA = 4.0
-# A ray tells the edge where ball and background are this many of these sigmas apart.
+# A ray shows the edge if ball and background differ by this many of these sigmas.
 _LEAST_SEPARATION = 3.0
-# A limb with less than this part of the usual level is hidden behind something.
+# A limb with less than this share of the usual level is occluded.
 _LEAST_LEVEL = 0.2
 # Error of one edge point before an even background [px]; an uneven one adds to it.
 _EDGE_SIGMA_PX = 0.06
@@ -47,19 +47,19 @@ _EDGE_SIGMA_PX = 0.06
 _UNEVEN_PX = 0.4
 # Residuals beyond this are no longer edge noise [px], whatever the spread is.
 _LEAST_GATE_PX, _LARGEST_GATE_PX, _GATE_SIGMAS = 0.8, 2.0, 3.5
-# An arc of this part of the outline, of so many rays to both sides at least, whose mean is farther off than this [px]
-# is not the ball's edge.
+# An arc is not the ball's edge if its mean is off by more than this: arc's share of the outline, least number of rays
+# to either side, limit [px].
 _ARC, _LEAST_HALF_ARC, _OFF_PX = 0.1, 3, 0.35
-# The outline in so many arcs, of which any three may tell the circle.
+# Number of arcs of the outline; any three give a candidate circle.
 _ARCS = 10
-# Where no point is farther than this from the circle through all, none has to be left out [px].
+# If no point is farther than this from the circle through all, none is left out [px].
 _AGREED_PX = 0.4
-# About so many points are enough to tell which circle most agree on.
+# Number of points sufficient to find the circle that most points agree on.
 _ENOUGH = 60
 _TRIPLES = np.array(list(combinations(range(_ARCS), 3)))
-# What is left when all noise has averaged out [px].
+# Systematic error that averaging does not reduce [px].
 _FLOOR_PX = 0.001
-# What coverage and limb disagree by beyond so many of their sigmas is claimed as uncertainty.
+# A larger disagreement between coverage and limb, in sigmas, is added to the covariance.
 _LARGEST_CONTRADICTION = 4.0
 # Below this, relative to the cubed trace, the outline points do not determine centre and radius.
 _LEAST_DETERMINANT = 1e-5
@@ -74,10 +74,10 @@ class Outline:
         radius_px: radius of the circle of the same area [px].
         cov_px: covariance of the centre, shape (2, 2) [px²].
         radius_sigma_px: 1-sigma of the radius [px].
-        visible: share of the outline that nothing hides.
-        uneven: share of the outline at which the background is too uneven to tell.
+        visible: share of the outline that is not occluded.
+        uneven: share of the outline with a background too uneven to show the edge.
         off: share of the fit's weights where the outline leaves the ellipse in whole arcs.
-        unrest: how far the limb leaves the ellipse, in variances of its samples; 0 where that was not looked at.
+        unrest: deviation of the limb from the ellipse, in variances of its samples; 0 if it was not checked.
     """
 
     centre_px: FloatArray
@@ -92,14 +92,14 @@ class Outline:
 
 @dataclass(frozen=True, slots=True)
 class _Edges:
-    """Where rays leave the ball, in the frame in which the outline is a circle around the rough centre.
+    """Edge of the ball on each ray, in the frame in which the outline is a circle around the rough centre.
 
     Attributes:
-        angles: directions of the rays, shape (n,) [rad].
+        rays: cosine and sine of the rays' directions, and 1, shape (n, 3).
         distance_px: distance of the edge from the rough centre, shape (n,) [px].
-        weight: how much each counts, 0..1, shape (n,); 0 where the ray does not tell.
-        covered: where something else shows just inside the rough outline, shape (n,).
-        uneven: where the background is too uneven to say that an edge elsewhere is not the ball's, shape (n,).
+        weight: weight of each ray, 0..1, shape (n,); 0 if the ray shows no edge.
+        covered: mask (n,) of rays on which something else shows just inside the rough outline.
+        uneven: mask (n,) of rays whose background is too uneven to rule out that an edge elsewhere is the ball's.
     """
 
     rays: FloatArray
@@ -125,7 +125,7 @@ def fit_outline(
         outline, moved_px = _step(image, gate, centre_px, radius_px, shape, _WIDE_PX)
         if moved_px > max(2.0, 0.5 * radius_px):
             return None
-        # The wide ring settles nothing.
+        # A fit in the wide ring is not final.
         moved_px = max(moved_px, _SETTLED_PX)
     for _ in range(2):
         if outline is None or moved_px < _SETTLED_PX:
@@ -138,7 +138,7 @@ def fit_outline(
 
 
 def refine_outline(image: Float32Array, gate: Gate, rough: Outline, shape: FloatArray) -> Outline | None:
-    """An outline with the centre, radius and covariance that the limb tells; None when that is no ball's limb."""
+    """Refine an outline's centre, radius and covariance by the limb; None if there is no ball's limb."""
     fitted = fit_limb(image, gate, rough.centre_px, rough.radius_px, shape)
     if fitted is None:
         return None
@@ -162,7 +162,7 @@ def refine_outline(image: Float32Array, gate: Gate, rough: Outline, shape: Float
 def _step(
     image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray, window_px: float
 ) -> tuple[Outline | None, float]:
-    """The outline within a ring of half-width `window_px` about a circle, and how far it is from that circle [px]."""
+    """Fit the outline in a ring of half-width `window_px` about a circle; return it and its shift [px]."""
     edges = _find_edges(image, gate, centre_px, radius_px, shape, min(window_px, 0.6 * radius_px))
     outline = None if edges is None else _fit_circle(edges, centre_px, shape)
     if outline is None:
@@ -260,9 +260,9 @@ def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> Outl
 
 
 def _share_off(weight: FloatArray, residual: FloatArray) -> float:
-    """Share of the weights (n,) where the residuals (n,) [px], averaged over an arc, are no edge noise.
+    """Return the share of the weights (n,) where the residuals (n,) [px], averaged over an arc, exceed edge noise.
 
-    Noise and aliased pixels change from ray to ray; what covers a part of the ball moves the edge in a whole arc.
+    Noise and aliasing change from ray to ray; an object that covers part of the ball moves the edge in a whole arc.
     """
     half = max(_LEAST_HALF_ARC, round(len(weight) * _ARC / 2))
     clipped = weight * np.clip(residual, -_LARGEST_GATE_PX, _LARGEST_GATE_PX)
@@ -271,16 +271,16 @@ def _share_off(weight: FloatArray, residual: FloatArray) -> float:
 
 
 def _arc_sums(values: FloatArray, half: int) -> FloatArray:
-    """Sums of each of `values` (n,) and its `half` neighbours on both sides, along the closed axis."""
+    """Sum each of `values` (n,) and its `half` neighbours on both sides, along the closed axis."""
     sums = np.concatenate([[0.0], np.cumsum(np.concatenate([values[-half:], values, values[:half]]))])
     return sums[2 * half + 1 :] - sums[: -2 * half - 1]
 
 
 def _agreeing(design: FloatArray, edges: _Edges) -> FloatArray:
-    """The weights of the points, shape (n,); 0 for those far from the circle that most of them agree on.
+    """Return the points' weights (n,), with 0 for those far from the circle that most points agree on.
 
-    Rousseeuw's least median of squares, over circles through the means of three arcs. What hides the ball does so in
-    arcs, up to nearly half of the outline, and all of them pull inwards: least squares would go along.
+    Rousseeuw's least median of squares, over circles through the means of three arcs. Occlusions hide whole arcs, up to
+    nearly half of the outline, and all of them pull inwards: plain least squares would follow them.
     """
     told = np.flatnonzero(edges.weight > 0)
     if len(told) < 2 * _ARCS or _all_agree(design, edges):
@@ -299,7 +299,7 @@ def _agreeing(design: FloatArray, edges: _Edges) -> FloatArray:
 
 
 def _all_agree(design: FloatArray, edges: _Edges) -> bool:
-    """Whether one circle fits all points."""
+    """Return True if one circle fits all points."""
     weighted = design * edges.weight[:, None]
     inverse = inverse_of_normal(weighted.T @ design, _LEAST_DETERMINANT)
     if inverse is None:

@@ -21,13 +21,13 @@ _FIRST_DAMPING, _MOST_DAMPING = 1e-4, 1e6
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """What one eye sees of some points of the body.
+    """Measurements by one eye of some points of the body.
 
     Attributes:
-        points: in the body's frame (k, 3) [m].
-        pixels: where they are seen (k, 2) [px].
+        points: positions in the body's frame (k, 3) [m].
+        pixels: image coordinates (k, 2) [px].
         cov_px: covariance (2k, 2k) [px²] of u and v of the first, then of the second point ...
-        right: whether it is the right eye.
+        right: True for the right eye.
     """
 
     points: FloatArray

@@ -26,7 +26,7 @@ _WIDEST = 1.2
 
 @dataclass(frozen=True, eq=False)
 class Rectification:
-    """How both eyes' images become those of two pinholes that look the same way, side by side.
+    """Rectification of both eyes' images to those of two parallel pinhole cameras side by side.
 
     The rectified left frame has the left eye's optical centre as its origin; it is the left camera's own frame turned
     by `R_rectified_left`: its x axis points to the right eye, and its z axis is as near as that allows to the mean of
@@ -40,7 +40,7 @@ class Rectification:
 
     @cached_property
     def R_rectified_left(self) -> FloatArray:
-        """Turns directions of the left camera's own frame into the rectified one's, shape (3, 3)."""
+        """Rotation (3, 3) of directions from the left camera's own frame to the rectified one."""
         if isinstance(self.rig, OneEyeRig):
             return np.eye(3)
         R, t = self.rig.R_right_left, self.rig.translation_m

@@ -26,15 +26,15 @@ class OtherCameras(CalibrationError, SourceError):
 
 @dataclass(frozen=True)
 class Made:
-    """How a calibration was made.
+    """Provenance of a calibration.
 
     Attributes:
         date: ISO 8601 in UTC.
-        board: what was shown.
-        views: how many pairs of images it was made of.
-        left_out: how many were left out as outliers.
-        reprojection_px: RMS distance per image coordinate of the corners from where they should be, in the fit [px].
-        held_out_px: the same in views that were not fitted [px].
+        board: the calibration board.
+        views: number of image pairs used.
+        left_out: number of pairs left out as outliers.
+        reprojection_px: RMS reprojection error of the corners per image coordinate, in the fit [px].
+        held_out_px: the same in held-out views [px].
         scale_sigma: 1-sigma of the board's size, as a share of it; it is in the covariance too.
     """
 
@@ -98,7 +98,7 @@ class StereoRig:
 
     @cached_property
     def R_right_left(self) -> FloatArray:
-        """Turns directions of the left eye's frame into the right one's, shape (3, 3)."""
+        """Rotation (3, 3) of directions from the left eye's frame to the right eye's."""
         return frozen_array(cv2.Rodrigues(self.rotation_rad)[0])
 
     @property

@@ -1,4 +1,4 @@
-"""How a pinhole sees a sphere: an ellipse whose centre is not the image of the sphere's centre.
+"""Project a sphere into a pinhole camera: an ellipse whose centre is not the image of the sphere's centre.
 
 The rays that touch a sphere form a circular cone around the direction of its centre, with half-angle
 γ = asin(radius / distance). The image plane cuts that cone in an ellipse whose major axis points away from the

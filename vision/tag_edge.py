@@ -1,8 +1,8 @@
-"""One straight edge of a tag's black square: where it is, to hundredths of a pixel, and how sure that is.
+"""Measure one straight edge of a tag's black square to hundredths of a pixel, with its uncertainty.
 
-Along lines across the edge the share of black tells where it is, so that an anti-aliased edge counts by its coverage.
-What blur brings there from the modules beyond, and from the end of the paper, is taken off; and so is by how much an
-ideal edge of that blur would seem to be off on the same pixels.
+The share of black along lines across the edge gives its position, so an anti-aliased edge counts by its coverage. Two
+errors are subtracted: the light that blur brings from the modules beyond and from the end of the paper, and the
+apparent shift of an ideal edge of that blur on the same pixels.
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ from .tag_config import TagConfig
 
 # Black border, data and border of all dictionaries that are offered: 6 + 2 modules.
 MODULES = 8.0
-# The black border and the white margin are one module wide each. Lines across an edge stay so many blurs from where
-# they end: beyond, more than a twentieth of what is there shows.
+# Distance in blurs that lines across an edge keep from the ends of black border and white margin (one module each);
+# nearer, more than a twentieth of the modules beyond shows.
 _CLEAR_BLURS = 1.7
 LONGEST_REACH_PX, _SHORTEST_REACH_PX = 6.0, 1.0
-# Lines so short beside the blur that an edge shows by less than this part of what it is off by do not tell.
+# Least ratio of an edge's apparent shift to its true shift; lines that are too short beside the blur have less.
 _LEAST_GAIN = 0.12
 _SAMPLE_PX = 0.5
 # Ends of the lines across, as a share of their reach, which show plain black and plain white.
 _PLAIN = 0.35
-# Free of the corners, whose blur rounds the edges off.
+# Distance from the corners, whose blur rounds the edges off: blurs, and share of the side.
 _CORNER_BLURS, _CORNER_SHARE = 2.6, 0.08
 _FEWEST_POINTS, _MOST_POINTS = 6, 80
 # The sharpest edge (1-sigma) [px].
 SHARPEST_PX = 0.45
 # Variance that interpolation between pixels adds to a blur [px²].
 _INTERPOLATION = 1.0 / 6.0
-# What the beyond brings is known up to this part: no lens blurs quite as a Gaussian does.
+# Relative error of the correction for the modules beyond: no lens blurs exactly like a Gaussian.
 _BEYOND_SHARE = 0.2
-# What is left of an edge's place on long lines when all noise has averaged out [px]; on short ones it is more.
+# Systematic error of an edge's position on long lines [px]; larger on short ones.
 _FLOOR_PX = 0.002
-# Points so many (robust) standard deviations off their line are no part of it.
+# Points farther from their line than this, in robust standard deviations, are outliers.
 _STRAY = 3.5
 _MAD_TO_SIGMA = 1.4826
 Pixels = NDArray[np.intp]
@@ -55,11 +55,11 @@ class Edge:
     """A line u·normal = place + slope·s, s from −1 to 1 between the edge's ends.
 
     Attributes:
-        scatter: covariance (2, 2) of place and slope [px²] that the points' scatter makes, were they independent.
-        shared: what all points have in common (2, 2) [px²].
-        residuals: of the points (n,) in units of their scatter; 0 where a point was left out.
-        reach_px: how far the lines across it go to both sides [px].
-        area_px, expected_area_px: how wide the edge shows, and how wide it was thought to, see `_spread` [px].
+        scatter: covariance (2, 2) of place and slope [px²] from the points' scatter, if they were independent.
+        shared: covariance (2, 2) of the error common to all points [px²].
+        residuals: residuals of the points (n,) in units of their scatter; 0 where a point was left out.
+        reach_px: length of the lines across the edge to either side [px].
+        area_px, expected_area_px: apparent and expected width of the edge, see `_spread` [px].
     """
 
     origin: FloatArray
@@ -86,9 +86,15 @@ class Edge:
 
 @dataclass(frozen=True, slots=True)
 class _Points:
-    """Where an edge is on each line across it (n,) [px], outward; what each line makes of the edge's place (n,) [px];
-    what was taken off for what is beyond (n,) [px]; how much farther off the edge is than these say together; and how
-    wide it shows, see `_spread` [px]."""
+    """Points of an edge on the lines across it.
+
+    Attributes:
+        places: position of the edge on each line, outward (n,) [px].
+        together: contribution of each line to the position of the whole edge (n,) [px].
+        beyond: correction for the modules beyond (n,) [px].
+        farther: factor by which the edge is farther off than these say together.
+        area_px, expected_area_px: apparent and expected width of the edge, see `_spread` [px].
+    """
 
     places: FloatArray
     together: FloatArray
@@ -99,7 +105,7 @@ class _Points:
 
 
 def find_edge(grey: ImageArray, corners_px: FloatArray, side: int, blur_px: float, config: TagConfig) -> Edge | Reason:
-    """The edge from corner `side` to the next one."""
+    """Measure the edge from corner `side` to the next one, or return the reason why it cannot be measured."""
     quad = np.roll(corners_px, -side, axis=0)
     begin, end = quad[:2]
     length = float(np.linalg.norm(end - begin))
@@ -111,7 +117,7 @@ def find_edge(grey: ImageArray, corners_px: FloatArray, side: int, blur_px: floa
     reach = min(float(np.abs(_module_ends(to_px, quad[:2], normal)).min()) - _CLEAR_BLURS * blur_px, LONGEST_REACH_PX)
     if not reach >= _SHORTEST_REACH_PX:
         return Reason.NO_MARKER
-    # Where a corner is acute, lines near it leave the tag by its other side.
+    # At an acute corner, nearby lines leave the tag through its other side.
     sides = quad[[3, 2]] - quad[:2]
     leaning = (sides @ along) / (sides @ normal) * (-reach, reach)
     free = max(_CORNER_BLURS * blur_px, _CORNER_SHARE * length) + np.maximum(leaning, 0.0)
@@ -138,8 +144,9 @@ def find_edge(grey: ImageArray, corners_px: FloatArray, side: int, blur_px: floa
 
 
 def _module_ends(to_px: FloatArray, points: FloatArray, normal: FloatArray) -> FloatArray:
-    """How far along `normal` from points (n, 2) of a tag's first edge the black border inside it ends, and a margin of
-    one module outside it, shape (n, 2) [px].
+    """Return the distances (n, 2) [px] along `normal` from points (n, 2) of a tag's first edge to two lines.
+
+    They are the inner end of the black border and the outer end of a margin of one module.
 
     `to_px` (3, 3) is the homography from modules, the edge from (0, 0) to (8, 0), to pixels.
     """
@@ -152,7 +159,7 @@ def _module_ends(to_px: FloatArray, points: FloatArray, normal: FloatArray) -> F
 
 
 def _beyond(to_px: FloatArray, places: FloatArray) -> FloatArray:
-    """The middles (n, 2, 2) [px] of the modules beyond where black border and margin end (n, 2, 2) [px]."""
+    """Return the centres (n, 2, 2) [px] of the modules beyond the ends (n, 2, 2) [px] of black border and margin."""
     homogeneous = np.concatenate([places, np.ones((*places.shape[:2], 1))], axis=2)
     modules = homogeneous @ np.linalg.inv(to_px).T
     columns = np.clip(modules[..., 0] / modules[..., 2], 0.5, MODULES - 0.5)
@@ -161,31 +168,31 @@ def _beyond(to_px: FloatArray, places: FloatArray) -> FloatArray:
 
 
 def _steps(reach: float) -> FloatArray:
-    """Where lines across an edge are sampled, shape (m,) [px], outward."""
+    """Return the sample positions along a line across an edge, shape (m,) [px], outward."""
     count = 2 * math.ceil(reach / _SAMPLE_PX)
     return np.asarray((np.arange(count) + 0.5) * (2.0 * reach / count) - reach, dtype=np.float64)
 
 
 def _leave(grey: ImageArray, places: FloatArray) -> bool:
-    """Whether some places (..., 2) are too near to the image's border to be sampled."""
+    """Return True if some places (..., 2) are too near to the image's border to be sampled."""
     height, width = grey.shape
     return bool((places < 1.0).any() or (places > (width - 2.0, height - 2.0)).any())
 
 
 def _within(grey: ImageArray, places: FloatArray) -> FloatArray:
-    """Places (..., 2), or the nearest to them that can be sampled."""
+    """Return the places (..., 2), each moved to the nearest one that can be sampled."""
     height, width = grey.shape
     return np.clip(places, 1.0, (width - 2.0, height - 2.0))
 
 
 def _sampled(grey: ImageArray, places: FloatArray) -> FloatArray:
-    """Grey levels at places (..., 2)."""
+    """Return the grey levels at places (..., 2)."""
     # By hand: cv2.remap would round places to 1/32 px.
     return _interpolated(lambda u, v: grey[v, u].astype(np.float64), places)
 
 
 def _ideal(places: FloatArray, origin: FloatArray, normal: FloatArray, blur_px: float) -> FloatArray:
-    """Shares of white that an edge through `origin` (2,) shows at places (..., 2), interpolated from pixels."""
+    """Return the shares of white of an edge through `origin` (2,) at places (..., 2), interpolated from pixels."""
     # Interpolation adds to the pixels' own blur.
     sigma = math.sqrt(max(blur_px**2 - _INTERPOLATION, SHARPEST_PX**2 - _INTERPOLATION))
     first = float(origin @ normal)
@@ -193,7 +200,7 @@ def _ideal(places: FloatArray, origin: FloatArray, normal: FloatArray, blur_px: 
 
 
 def _interpolated(pixel: Callable[[Pixels, Pixels], FloatArray], places: FloatArray) -> FloatArray:
-    """Values at places (..., 2) between pixels, given those at columns and rows."""
+    """Interpolate bilinearly at places (..., 2), given the values at columns and rows."""
     whole = np.floor(places).astype(np.intp)
     part = places - whole
     u, v = whole[..., 0], whole[..., 1]
@@ -211,12 +218,13 @@ def _points(
     blur_px: float,
     min_contrast: float,
 ) -> _Points | Reason:
-    """Where the edge is on the lines across it; a reason where there is no black inside or no white outside, or the
-    lines are too short to tell.
+    """Return the edge's points on the lines across it, or the reason why there are none.
+
+    Reasons: no black inside or no white outside, or lines that are too short.
 
     Args:
         profiles: grey levels (n, m) at `steps` (m,) [px].
-        ideal: what an edge at 0 would show there, 0 black and 1 white.
+        ideal: levels of an ideal edge at 0 there, 0 black and 1 white.
         beyond: grey levels (n, 2) beyond `ends` (n, 2) [px], inside and outside.
     """
     step = float(steps[1] - steps[0])
@@ -260,8 +268,10 @@ def _points(
 
 
 def _spread(share: FloatArray, steps: FloatArray, place: float, blur_px: float) -> tuple[float, float]:
-    """The area between the edge that the shares of black (m,) at `steps` (m,) [px] show and a sharp one at 0, and that
-    of an edge at `place` [px] with this blur, from the same steps [px]."""
+    """Return the area between the shares of black (m,) at `steps` (m,) [px] and a sharp edge at 0, and that expected.
+
+    The expected area is that of an edge at `place` [px] with this blur, at the same steps. Both are in px.
+    """
     expected = ndtr((place - steps) / blur_px)
     step = float(steps[1] - steps[0])
     area, expected_area = (float(np.where(steps < 0.0, 1.0 - each, each).sum()) for each in (share, expected))
@@ -271,8 +281,10 @@ def _spread(share: FloatArray, steps: FloatArray, place: float, blur_px: float) 
 def _line(
     s: FloatArray, points: _Points, config: TagConfig
 ) -> tuple[float, float, FloatArray, FloatArray, FloatArray] | Reason:
-    """Place, slope, `scatter`, `shared` and `residuals` (see `Edge`) of the line through points at s (n,); a reason
-    where there is none."""
+    """Fit a line through the points at s (n,); return the reason if there is none.
+
+    The result is place, slope, `scatter`, `shared` and `residuals`, see `Edge`.
+    """
     design, places = np.column_stack([np.ones_like(s), s]), points.places
     kept, spread, solution = np.ones(len(s), dtype=bool), 0.0, np.zeros(2)
     for _ in range(3):

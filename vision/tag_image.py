@@ -1,7 +1,7 @@
-"""One eye's image of a tag: its four corners to hundredths of a pixel, with their covariance.
+"""Measure a tag in one eye's image: its four corners to hundredths of a pixel, with their covariance.
 
-The four edges of the black square are measured where they are straight, between the corners, see `tag_edge`; how wide
-the blur is they tell themselves. The corners are where the edges' lines meet.
+The four edges of the black square are measured where they are straight, between the corners, see `tag_edge`. The blur
+is estimated from the edges themselves. The corners are the intersections of the edges' lines.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
 from .tag_config import TagConfig
 from .tag_edge import LONGEST_REACH_PX, SHARPEST_PX, Edge, find_edge
 
-# So many looks at most; the last one moved no corner by more [px], and the blur by no more than this part.
+# Most iterations; converged when no corner moved by more than this [px] and the blur by no more than this share.
 _ROUNDS, _SETTLED_PX, _SETTLED_BLUR = 8, 0.01, 0.02
-# Blur of lens and interpolation (1-sigma) as it is thought to be at first [px] ...
+# Initial blur of lens and interpolation (1-sigma), and the largest [px].
 _USUAL_BLUR_PX, _WIDEST_PX = 0.85, 3.0
-# ... and the weight of that, where an edge whose lines reach twice as far as its blur has 1.
+# Weight of the initial blur; an edge whose lines reach twice as far as its blur has weight 1.
 _USUAL_WEIGHT = 0.1
-# Interpolation between pixels takes this factor from the variance of a point, and gives it to its neighbours: so it is
-# thought at first, with the weight of so many waves along the edges. Slow ones are as long as so many points, or more.
+# Prior factor by which interpolation correlates neighbouring points' errors, and its weight in waves along the edges.
 _SMOOTHED, _SMOOTHED_WAVES = 1.5, 10
+# Slow waves have half-periods of at least this many points; least upper bound of their indices.
 _SLOW, _LEAST_QUICKEST = 4, 4
 
 
 @dataclass(frozen=True, slots=True)
 class TagImage:
-    """A tag as one eye sees it.
+    """A tag in one eye's image.
 
     Attributes:
         id: its number in the dictionary.
@@ -44,7 +44,7 @@ class TagImage:
 
 
 def measure_tag(grey: ImageArray, id: int, corners_px: FloatArray, config: TagConfig) -> TagImage | Reason:
-    """The tag whose corners are about at `corners_px` (4, 2) in a grey image, or why it is doubtful."""
+    """Measure the tag whose corners are near `corners_px` (4, 2) in a grey image, or return why it is doubtful."""
     edges: list[Edge] = []
     blur_px = _USUAL_BLUR_PX
     for _ in range(_ROUNDS):
@@ -64,9 +64,9 @@ def measure_tag(grey: ImageArray, id: int, corners_px: FloatArray, config: TagCo
 
 
 def _blur(edges: list[Edge], before_px: float) -> float:
-    """The blur (1-sigma) [px] of all edges, which was thought to be `before_px`.
+    """Estimate the blur (1-sigma) [px] of all edges, from the previous estimate `before_px`.
 
-    An edge whose lines end where its blur does hardly tells.
+    An edge whose lines hardly reach beyond its blur has little weight.
     """
     weights = [max(edge.reach_px / before_px - 1.0, 0.0) ** 2 for edge in edges]
     ratios = [edge.area_px / edge.expected_area_px for edge in edges]
@@ -75,10 +75,10 @@ def _blur(edges: list[Edge], before_px: float) -> float:
 
 
 def _likeness(edges: list[Edge]) -> float:
-    """By how much neighbouring points err alike: variance of their mean, in units of what independent ones make.
+    """Return the variance of neighbouring points' mean relative to that of independent points.
 
-    Interpolation and blur give a part of a pixel's noise to its neighbours. So slow waves along the edges, which place
-    and slope are but the slowest of, have more of it than the quick ones.
+    Interpolation and blur spread a pixel's noise to its neighbours. So slow waves along the edges, of which place and
+    slope are the slowest, have more noise than quick ones.
     """
     power, count = _SMOOTHED_WAVES * _SMOOTHED, float(_SMOOTHED_WAVES)
     for edge in edges:
@@ -89,13 +89,13 @@ def _likeness(edges: list[Edge]) -> float:
 
 
 def _meeting(one: Edge, other: Edge) -> FloatArray:
-    """Where two edges' lines meet (2,) [px]."""
+    """Return the intersection (2,) [px] of two edges' lines."""
     steps = np.linalg.solve(np.column_stack([one.direction, -other.direction]), other.point - one.point)
     return one.point + steps[0] * one.direction
 
 
 def _corner_covariance(edges: list[Edge]) -> FloatArray:
-    """Covariance (8, 8) of the corners: each belongs to the edge before it and to its own.
+    """Return the covariance (8, 8) of the corners; each lies on the edge before it and on its own edge.
 
     A corner x on both lines n·x = place moves by dx with n₁·dx = dp₁ and n₂·dx = dp₂, where dp is the line's shift
     there: that of its place, and of its slope times s.

@@ -1,4 +1,4 @@
-"""Follows a tag, or a rigid cluster of tags, through rectified images of one eye or two: position and orientation."""
+"""Track the pose of a tag, or of a rigid cluster of tags, in rectified images of one or two eyes."""
 
 from __future__ import annotations
 
@@ -33,34 +33,34 @@ from .triangulate import triangulate
 
 _log = logging.getLogger(__name__)
 
-# Around the corners of the last frame: so many times their extent, and pixels more.
+# Margin of the search region around the last frame's corners: share of their extent, plus pixels.
 _REGION_SHARE, _REGION_PX = 0.6, 30
 # After a longer pause the last fix predicts nothing [s].
 _LONGEST_PAUSE_S = 0.5
-# Two poses this much apart [rad] are two; the worse one has to be so much less likely (difference of squares).
+# Poses farther apart than this [rad] are distinct; the worse must be less likely by this difference of squares.
 _TWO_POSES_RAD, _CLEARLY_WORSE = 0.05, 12.0
-# Of two poses that the image does not tell apart, the one that the marker is known to have been in: no farther from
-# the last frame's than this part of the way between the two.
+# Of two poses that the image does not distinguish, take one that is no farther from the last frame's pose than this
+# share of the angle between the two.
 _STAYED = 1.0 / 3.0
-# The most telling reason, where all tags were refused.
+# Reasons, the most informative first, for a frame in which all tags were rejected.
 _TELLING = (Reason.AMBIGUOUS, Reason.EPIPOLAR, Reason.OCCLUDED, Reason.AT_BORDER, Reason.NO_MARKER)
 
 
 class TagTracker:
-    """Finds one marker made of tags in rectified images of one eye or two.
+    """Tracker of one marker made of tags in rectified images of one or two eyes.
 
-    Near where the last frame had it, else in the whole images. Whatever the images show, `track` answers with a fix or
-    a reason.
+    It searches near the marker's last position, else in the whole images. `track` always returns a fix or the reason
+    for a miss.
 
-    A small plane looks nearly the same tilted one way and the other. Two eyes hardly ever leave that open, one does:
-    where the image does not tell, the pose of the frame before does, if that was told; else the frame is ambiguous.
+    A small plane looks nearly the same tilted one way and the other. Two eyes nearly always resolve this, one eye does
+    not. Then the pose of the previous frame decides, if it was unambiguous; else the frame is ambiguous.
     """
 
     def __init__(self, calibration: StereoCalibration, body: TagBody, config: TagConfig | None = None) -> None:
         """Prepare for images of `calibration`.
 
         Raises:
-            ConfigError: that describes no cameras, or a tag's number is not in the dictionary.
+            ConfigError: the calibration describes no cameras, or a tag's number is not in the dictionary.
         """
         check_calibration(calibration)
         self.calibration, self.body, self.config = calibration, body, config or TagConfig()
@@ -214,7 +214,7 @@ class TagTracker:
         return [fitted_motion(np.array(body), np.array(points))] if len(points) >= 3 else []
 
     def _mirrored(self, rotation: FloatArray, x: FloatArray, seen: list[dict[int, TagImage]]) -> FloatArray:
-        """The rotation under which the plane that the corners lie in, or nearest to, looks nearly the same."""
+        """Return the mirrored rotation, with which the corners' (best-fitting) plane looks nearly the same."""
         corners = np.concatenate([self.body.corners[id] for id in sorted(_ids(seen))])
         axes = np.linalg.svd(corners - corners.mean(axis=0))[2].T
         axes[:, 2] *= np.sign(np.linalg.det(axes))

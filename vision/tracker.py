@@ -32,11 +32,11 @@ _log = logging.getLogger(__name__)
 
 # Half the side of the region searched around the predicted centre: radii, plus pixels, plus steps between frames.
 _REGION_RADII, _REGION_PX, _REGION_STEPS = 1.6, 14.0, 0.7
-# What is smaller than this part of the marker that is followed is something else near it, such as part of a brick.
+# A patch smaller than this share of the tracked marker is another object, such as part of a brick.
 _LEAST_SIZE = 0.5
-# A disc is where the marker was expected when it is nearer than this, and its size as near, in radii of the marker.
+# A disc fits the prediction if its position and its size differ by less than this, in radii of the marker.
 _AS_EXPECTED = 0.25
-# After a longer pause the last fixes predict nothing [s].
+# After a longer pause the last fixes give no prediction [s].
 _LONGEST_PAUSE_S = 0.5
 # So long after the last fix the marker is expected within reach of it [s], if it moved on for no longer than this [s];
 # the reach is so many radii larger. Without a fix, what is left of two is the marker after that time.
@@ -52,7 +52,7 @@ _COLOUR_EVERY = 5
 
 @dataclass(frozen=True, slots=True)
 class _Track:
-    """Where the marker was: time [s], (ul, vl, ur, vr) [px], their velocity [px/s], larger radius of the two [px]."""
+    """Track of the marker: time [s], (ul, vl, ur, vr) [px], their velocity [px/s], larger radius of the two [px]."""
 
     t: float
     centres_px: FloatArray
@@ -62,7 +62,7 @@ class _Track:
 
 @dataclass(frozen=True, slots=True)
 class _Expected:
-    """Where an eye looks for the marker that is followed: centre (2,) [px] and radius [px]."""
+    """Predicted image of the tracked marker in one eye: search region, centre (2,) [px] and radius [px]."""
 
     region: Region
     centre_px: FloatArray
@@ -76,7 +76,7 @@ class _Expected:
 
 @dataclass(frozen=True, slots=True)
 class _Last:
-    """The last fix: time [s], place (3,) [m], level of its colour [grey levels]."""
+    """Last fix: time [s], position (3,) [m], level of its colour [grey levels]."""
 
     t: float
     x: FloatArray
@@ -85,7 +85,7 @@ class _Last:
 
 @dataclass(frozen=True, slots=True)
 class _Refused:
-    """What was found last, but cannot have been the marker: time [s], place (3,) [m], level [grey levels], and why."""
+    """Last rejected candidate: time [s], position (3,) [m], level [grey levels], and the reason."""
 
     t: float
     x: FloatArray
@@ -95,7 +95,7 @@ class _Refused:
 
 @dataclass(frozen=True, slots=True)
 class _Sighting:
-    """A disc in a frame without a fix: time [s], how far off a marker of its size is [m], level of its colour."""
+    """Disc in a frame without a fix: time [s], distance of a marker of its size [m], level of its colour."""
 
     t: float
     distance_m: float
@@ -103,14 +103,14 @@ class _Sighting:
 
 
 class StereoTracker:
-    """Finds one coloured ball in rectified stereo images.
+    """Tracker of one coloured ball in rectified stereo images.
 
-    Near where the last frames predict it, else in the whole images. Whatever the images show, `track` answers with
-    a fix or a reason.
+    It searches near the position predicted from the last frames, else in the whole images. `track` always returns a
+    fix or the reason for a miss.
     """
 
     def __init__(self, calibration: StereoCalibration, config: VisionConfig | None = None) -> None:
-        """Prepare for images of `calibration`; ConfigError when it describes no stereo pair."""
+        """Prepare for images of `calibration`. Raise ConfigError if it describes no stereo pair."""
         check_calibration(calibration)
         self.calibration = calibration
         self.config = config or VisionConfig()
@@ -203,10 +203,9 @@ class StereoTracker:
         return None
 
     def _discs(self, image: ImageArray, expected: _Expected | None) -> tuple[list[Disc] | Reason, list[Disc]]:
-        """The discs in one eye; when there is none, why the most disc-like patch is none. And what is round, but could
-        not be measured.
+        """Return the discs in one eye, or the reason why there is none; and round objects that could not be measured.
 
-        Beside a marker that is where it was expected, what is not round is not looked at closely.
+        Once a disc fits the prediction, patches that are not whole are skipped.
         """
         region = self._whole if expected is None else expected.region
         least_radius_px = 0.0 if expected is None else _LEAST_SIZE * expected.radius_px

@@ -68,11 +68,12 @@ def triangulate(
 
 
 def locate(calibration: StereoCalibration, radius_m: float, left: Disc, right: Disc) -> Location | None:
-    """The ball of `radius_m` whose images are the two discs; None when its rays do not meet so far before the eyes that
-    both can see it.
+    """Locate the ball of `radius_m` whose images are the two discs.
 
-    How far the sphere's centre is from the ellipse's depends on its distance: first the one its size tells, then
-    the triangulated one.
+    Return None if the rays do not meet far enough in front of the eyes for both to see the ball.
+
+    The shift between the sphere's centre and the ellipse's depends on the distance: first the one from the size is
+    used, then the triangulated one.
     """
     eye = Pinhole(calibration.focal_px, calibration.principal_point_px)
     variances = np.concatenate([np.diag(disc.cov_px) for disc in (left, right)]) + calibration.pixel_sigma**2

@@ -1,8 +1,8 @@
-"""Errors round an outline, as waves: how large is the one that moves the centre?
+"""Estimate the centre's error from the residuals round an outline, decomposed into waves.
 
-Neighbouring points of an outline share pixels and background, so their variance alone would claim too little. A shift
-of the centre is the wave that goes once round. The fit has removed it, and the next ones tell its size, the nearer the
-better.
+Neighbouring points of an outline share pixels and background, so their variance alone would underestimate the error. A
+shift of the centre is the wave that goes once round. The fit has removed it, so its size is estimated from the next
+slowest waves.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
 
-# The slow waves are so many, or up to the one of radius / _WAVE_RADIUS_PX if that is more.
+# Least number of slow waves; larger outlines count those up to the wave number radius / _WAVE_RADIUS_PX.
 _LEAST_WAVES, _WAVE_RADIUS_PX = 3, 3.0
 # Lens and interpolation smooth along the outline too, which takes power from the quicker waves (1-sigma) [px].
 _SMOOTHING_PX = 1.0
@@ -26,7 +26,7 @@ class Waves:
     Attributes:
         slow: in the slowest waves that the fit left in.
         quick: in those that are quicker.
-        count: how many waves the slow ones are worth.
+        count: effective number of slow waves.
     """
 
     slow: float
@@ -35,7 +35,7 @@ class Waves:
 
     @property
     def mean(self) -> float:
-        """Of slow and quick ones, where both tell one noise."""
+        """Mean of the slow and the quick waves' power, for noise that is the same in both."""
         return 0.5 * (self.slow + self.quick)
 
     def once_round(self) -> float:

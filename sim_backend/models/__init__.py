@@ -10,7 +10,7 @@ from bodyschema.interfaces.suggest import did_you_mean
 
 
 def model_file(name: str) -> Path:
-    """The robot.toml of the shipped model `name` (`upper_body`).
+    """Return the path of robot.toml of the shipped model `name` (`upper_body`).
 
     Raises:
         ConfigError: there is no such model.

@@ -30,12 +30,13 @@ MANY_APART = 10
 
 @dataclass(frozen=True, slots=True)
 class CameraFigures:
-    """How one camera does.
+    """State of one camera.
 
     Attributes:
-        frames: that came since it was opened. fps: as measured, None as long as too few came.
+        frames: number received since it was opened.
+        fps: measured frame rate; None while too few frames have arrived.
         stamps: "kernel" or "arrival"; None before any.
-        damaged, doubted: images with a part missing, and with a time not to be believed.
+        damaged, doubted: numbers of images with a missing part, and with an implausible time.
     """
 
     name: str
@@ -47,10 +48,10 @@ class CameraFigures:
 
 
 class LiveEyes:
-    """`StereoEyes` of devices. Each is read in its own thread, the newest images win, and none is kept for later.
+    """`StereoEyes` of devices. Each is read in its own thread; only the newest images are kept.
 
     Attributes:
-        dropped: stereo images that came and were not asked for in time.
+        dropped: number of stereo images that were not read in time.
     """
 
     def __init__(
@@ -87,12 +88,12 @@ class LiveEyes:
 
     @property
     def health(self) -> tuple[str, ...]:
-        """What is wrong with the cameras, and what to do."""
+        """Problems of the cameras, each with its remedy."""
         return tuple(self._complaints())
 
     @property
     def figures(self) -> tuple[CameraFigures, ...]:
-        """How each camera does."""
+        """State of each camera."""
         return tuple(_figures(capture) for capture in self._captures)
 
     def __enter__(self) -> Self:
@@ -154,7 +155,7 @@ class LiveEyes:
             self._changed.notify_all()
 
     def _take(self, eye: int, shot: Shot) -> None:
-        """An image came; in its camera's thread."""
+        """Handle a new image; called in its camera's thread."""
         with self._changed:
             frame = self._whole(shot) if len(self._captures) == 1 else self._paired(eye, shot)
             if frame is not None and frame.t > self._last_t:
@@ -163,7 +164,7 @@ class LiveEyes:
             self._changed.notify_all()
 
     def _whole(self, shot: Shot) -> StereoFrame:
-        """The frame of a camera that is alone, cut where it shows two eyes' images."""
+        """Return the frame of a single camera, split into two images if it shows both eyes side by side."""
         if isinstance(self._layout, OneConfig):
             sigma = math.hypot(shot.t_sigma, self._config.sigma_s)
             return StereoFrame(shot.t - self._config.latency_s, shot.image, None, sigma)

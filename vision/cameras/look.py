@@ -1,4 +1,4 @@
-"""What a glance at images and their times says of a camera: too slow, dark, too bright."""
+"""Check a camera's images and their times: too slow, too dark, over-exposed."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ def of_image(image: ImageArray, name: str) -> str | None:
 
 
 class Look:
-    """Looks at one camera's images; used by the thread that takes them, asked by others.
+    """Monitor of one camera's images, fed by the capturing thread and queried by others.
 
     Attributes:
-        frames: how many came.
+        frames: number of images received.
     """
 
     def __init__(self, name: str, fps: float) -> None:
@@ -46,7 +46,7 @@ class Look:
         self.fps: float | None = None
 
     def see(self, t: float, image: ImageArray) -> None:
-        """The newest image, and its time [s]."""
+        """Check the newest image, taken at the time t [s]."""
         self.frames += 1
         self._times.append(t)
         while self._times[-1] - self._times[0] > OVER_S:
@@ -57,13 +57,16 @@ class Look:
             self.fps = self._rate()
 
     def _rate(self) -> float | None:
-        """By the middle step, which a lost frame does not change; a camera that loses every second one is slow."""
+        """Return the frame rate [1/s] from the median interval; None if there are too few frames.
+
+        Single lost frames do not change the median, but a camera that loses every second one is slow.
+        """
         if len(self._times) < FEWEST:
             return None
         return 1.0 / float(np.median([later - earlier for earlier, later in pairwise(self._times)]))
 
     def complaints(self) -> Iterator[str]:
-        """What is wrong, and what to do."""
+        """Yield each problem with its remedy."""
         fps = self.fps
         if fps is not None and fps < SLOW * self._fps:
             yield (

@@ -7,17 +7,17 @@ from collections import deque
 
 from .shot import Shot
 
-KEPT = 4  # of each camera; older ones are of no use
+KEPT = 4  # images of each camera; older ones are never paired
 
 
 class Pairing:
-    """Pairs each image of the camera that lags with the nearest of the other one. Newest wins, none is used twice.
+    """Matcher of each image of the lagging camera with the nearest of the other one; no image is used twice.
 
-    The one that lags is bracketed by the other one's images, so the nearest is known: nothing better can come.
+    An image of the lagging camera is bracketed by the other camera's images, so no later one can be nearer.
 
     Attributes:
-        too_far: how many found no partner near enough.
-        apart_s: how far apart the last two were [s], near enough or not; None before any.
+        too_far: number of images without a partner near enough in time.
+        apart_s: time between the last two candidates [s], near enough or not; None before the first.
     """
 
     def __init__(self, longest_apart_s: float) -> None:
@@ -29,11 +29,11 @@ class Pairing:
         self.apart_s: float | None = None
 
     def put(self, eye: int, shot: Shot) -> None:
-        """The newest image of the left (0) or the right (1) eye."""
+        """Add the newest image of the left (0) or the right (1) eye."""
         self._shots[eye].append(shot)
 
     def take(self) -> tuple[Shot, Shot] | None:
-        """The newest pair that was not given before."""
+        """Return the newest pair not returned before, or None."""
         if not all(self._shots):
             return None
         lagging = 0 if self._shots[0][-1].t <= self._shots[1][-1].t else 1

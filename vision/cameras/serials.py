@@ -1,4 +1,4 @@
-"""What tells a camera from all others, and which there are on this machine."""
+"""Identify cameras by serial number, and list those of this machine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What one camera took at one instant."""
+"""One image of one camera, with its time."""
 
 from __future__ import annotations
 

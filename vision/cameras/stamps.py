@@ -1,25 +1,25 @@
-"""Whether a camera's own time stamps can be believed, and what stands in for them."""
+"""Choose between a camera's own time stamps, if they are believable, and the images' arrival times."""
 
 from __future__ import annotations
 
 import math
 from itertools import pairwise
 
-TRIALS = 3  # frames that are looked at before any is given away
-FARTHEST_S = 1.0  # from the kernel's stamp to the arrival
+TRIALS = 3  # frames checked before the first is returned
+FARTHEST_S = 1.0  # largest delay from the kernel's stamp to the arrival
 AHEAD_S = 1e-3  # no image is taken after it arrived
 KERNEL_SIGMA_S = 1e-3
-ARRIVAL_SIGMA_S = 0.02  # of when an image was handed over: decoding, scheduling, a busy bus
+ARRIVAL_SIGMA_S = 0.02  # of arrival times: decoding, scheduling, a busy bus
 
 
 class Stamps:
-    """Decides at the start between the kernel's stamps and the times of arrival, and keeps time strictly increasing.
+    """Choice at the start between the kernel's stamps and the arrival times, with strictly increasing times.
 
     The kernel stamps frames of USB cameras with CLOCK_MONOTONIC. Other drivers, and uvcvideo with clock=REALTIME, give
     zero or the wall clock's time.
 
     Attributes:
-        source: "kernel" or "arrival"; None while it is not decided.
+        source: "kernel" or "arrival"; None until decided.
         sigma_s: 1-sigma of the stamps [s].
     """
 
@@ -38,7 +38,8 @@ class Stamps:
         """Return the time of a frame [s]; None for the first ones, and for one with an implausible stamp.
 
         Args:
-            kernel_s: what the driver said. arrival_s: when the frame was handed over. Both [s], monotonic.
+            kernel_s: the driver's stamp [s], monotonic.
+            arrival_s: time at which the frame was handed over [s], monotonic.
         """
         if self.source is None:
             self._seen.append((kernel_s, arrival_s))

@@ -1,4 +1,4 @@
-"""Cameras as a person looks at them: what they see, and what the tracker makes of it."""
+"""Camera frames for display, with the tracker's result drawn into them."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from bodyschema.vision.trackers import tracker_of
 
 from .annotate import Annotator
 
-MOSTLY = 0.5  # of the frames: what is the matter in so many is advised on
+MOSTLY = 0.5  # share of the frames above which a reason for misses gets advice
 
 
 class WatchedCamera:
-    """Frames with what was seen drawn into them.
+    """Camera frames annotated with the tracker's result.
 
     Attributes:
-        frames: how many were looked at.
-        fixes: in how many the marker was found.
-        reasons: in how many it was not, by reason.
+        frames: number of frames read.
+        fixes: number of frames with a marker fix.
+        reasons: number of misses, by reason.
     """
 
     def __init__(self, camera: StereoCamera, config: VisionConfig) -> None:
@@ -61,7 +61,7 @@ class WatchedCamera:
 
     @property
     def said(self) -> str:
-        """In how many frames the marker was found, why not in the others, and what to do where that is in most."""
+        """Summary of fixes and misses by reason, with a remedy if one reason dominates."""
         counts = sorted(self.reasons.items(), key=lambda item: -item[1])
         text = f"{self.frames} frames"
         if self.frames:
@@ -73,10 +73,10 @@ class WatchedCamera:
 
 
 class PlainEyes:
-    """Frames of cameras that nobody has calibrated yet: nothing is looked for in them.
+    """Frames of cameras without a calibration: nothing is searched for in them.
 
     Attributes:
-        frames: how many were looked at.
+        frames: number of frames read.
     """
 
     def __init__(self, eyes: StereoEyes) -> None:
@@ -103,7 +103,7 @@ class PlainEyes:
 
     @property
     def said(self) -> str:
-        """How many frames there were."""
+        """Number of frames read, as text."""
         return f"{self.frames} frames"
 
 

@@ -1,4 +1,4 @@
-"""Where the tags of a cluster are on it, from images that show several at once: one least-squares problem of all."""
+"""Measure the tags' poses on a cluster by one least-squares fit to images that show several tags at once."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _FIRST_DAMPING, _MOST_DAMPING = 1e-4, 1e8
 _MOST_OFF = 6.0
 # ... in units of what is usual, which calibrated cameras bring to so much at most.
 _MOST_USUAL = 5.0
-# In so many of the views, and of one tag's, something may be left out, where these are more than one.
+# Largest shares of all views, and of the views of one tag, with outliers; a single one is always allowed.
 _MOST_LEFT_OUT, _MOST_OF_A_TAG = 0.25, 0.34
 _LEAST_VIEWS = 3
 
@@ -54,9 +54,9 @@ class MeasuredTag:
     """A tag on the cluster, in the frame of the first one.
 
     Attributes:
-        placed: where it is.
-        xyz_sigma_m, turn_sigma_rad: 1-sigma of its place along the axes, and of its turn about them, each (3,).
-        views: how many show it.
+        placed: its pose.
+        xyz_sigma_m, turn_sigma_rad: 1-sigma of its position along the axes and its rotation about them, each (3,).
+        views: number of views that show it.
     """
 
     placed: PlacedTag
@@ -71,11 +71,11 @@ class MeasuredCluster:
 
     Attributes:
         tags: in the order of their numbers, the first one at the origin.
-        views: how many pairs of images it was made of.
-        misfit: RMS of what is left, in units of the corners' own sigmas.
+        views: number of image pairs used.
+        misfit: RMS of the residuals, in units of the corners' own sigmas.
         left_out: names of views, and numbers of the tags in them that did not fit.
         unused: names of views that do not show two tags to both eyes.
-        grown, grown_sigma: by how much the printed squares seem larger than told, as a share, and its 1-sigma.
+        grown, grown_sigma: relative excess of the printed squares' size over the given one, and its 1-sigma.
     """
 
     tags: tuple[MeasuredTag, ...]
@@ -93,14 +93,15 @@ def measure_cluster(
     side_m: float,
     other_sides_m: Mapping[int, float] | None = None,
 ) -> MeasuredCluster:
-    """Where the tags are, from rectified views.
+    """Measure the tags' poses on the cluster from rectified views.
 
     Args:
-        side_m: side of the black squares [m] ...
-        other_sides_m: ... but for tags of these numbers [m].
+        side_m: side of the black squares [m].
+        other_sides_m: different sides [m], by tag number.
 
     Raises:
-        CalibrationError: too few views show two tags and more, or some tags were never seen together with the others.
+        CalibrationError: too few views show two or more tags, some tags were never seen together with the others, or
+            the tags do not fit one rigid body.
     """
     usable = _usable(views)
     if len(usable) < _LEAST_VIEWS:
@@ -143,7 +144,7 @@ def _odd_one(
     side_m: float,
     other_sides_m: Mapping[int, float] | None,
 ) -> int | None:
-    """The tag without which all others fit, where there is one."""
+    """Return the tag without which all the others fit, or None."""
     fits: dict[int, float] = {}
     for id in sorted(set[int]().union(*(view.ids for view in views))):
         rest = _usable([_only(view, lambda other, id=id: other != id) for view in views])
@@ -158,7 +159,7 @@ def _odd_one(
 
 
 def _is_odd(left_out: Sequence[tuple[str, int]], views: Sequence[ClusterView]) -> bool:
-    """Whether so much is left out of so many views, or a tag so often, that it cannot be by chance."""
+    """Return True if too many views, or too many views of one tag, have outliers for this to be chance."""
     shown, times = Counter(id for view in views for id in view.ids), Counter(id for _, id in left_out)
     if len({name for name, _ in left_out}) > max(1.0, _MOST_LEFT_OUT * len(views)):
         return True
@@ -166,7 +167,7 @@ def _is_odd(left_out: Sequence[tuple[str, int]], views: Sequence[ClusterView]) -
 
 
 def _not_rigid(left_out: Sequence[tuple[str, int]], odd: int | None) -> str:
-    """What to say of tags that differ from view to view."""
+    """Return the error message for tags whose positions differ from view to view."""
     if odd is not None:
         return (
             f"the tags do not fit one rigid body, and without tag {odd} all others do. Is its number there twice, does "
@@ -190,10 +191,12 @@ def _only(view: ClusterView, is_kept: Callable[[int], bool]) -> ClusterView:
 
 @dataclass(frozen=True)
 class _Block:
-    """What one eye sees in one view.
+    """Measurements of one eye in one view.
 
     Attributes:
-        view: its number. eye: (3,), where the eye is in the left one's frame [m]. root: makes residuals independent.
+        view: number of the view.
+        eye: position (3,) of the eye in the left eye's frame [m].
+        root: matrix that whitens the residuals.
     """
 
     view: int
@@ -204,7 +207,7 @@ class _Block:
 
 
 class _Problem:
-    """All poses: of the cluster in the views, and of the tags on it. The first tag's frame is the cluster's."""
+    """Least-squares problem of all poses: the cluster's in the views and the tags' on it, in the first tag's frame."""
 
     def __init__(
         self,
@@ -237,7 +240,7 @@ class _Problem:
     # --- where it begins
 
     def _located(self, view: ClusterView) -> dict[int, FloatArray]:
-        """The corners (4, 3) [m] of each tag that both eyes see."""
+        """Triangulate the corners (4, 3) [m] of each tag that both eyes see."""
         found: dict[int, FloatArray] = {}
         for id in sorted(view.left.keys() & view.right.keys()):
             px = np.hstack([view.left[id].corners_px, view.right[id].corners_px])
@@ -248,7 +251,7 @@ class _Problem:
         return found
 
     def _first_tags(self, alone: Sequence[Mapping[int, Motion]]) -> dict[int, Motion]:
-        """Tags in the first one's frame, from tag to tag through views that show both."""
+        """Return initial tag poses in the first tag's frame, from tag to tag through views that show both."""
         known: dict[int, Motion] = {self.ids[0]: (np.eye(3), np.zeros(3))}
         while len(known) < len(self.ids):
             # The tag that most views show together with one that is known.
@@ -353,7 +356,7 @@ class _Problem:
         return float(np.sqrt(residuals @ residuals / max(len(residuals) - J.shape[1], 1)))
 
     def worst(self) -> tuple[str, int] | None:
-        """Name of the view and number of the tag in it that fits worst, where that is too bad."""
+        """Return the view's name and the tag's number of the worst outlier, or None."""
         residuals = self._linearised()[0]
         squares: dict[tuple[str, int], list[FloatArray]] = {}
         place = 0
@@ -367,7 +370,7 @@ class _Problem:
         return key if off[key] > _MOST_OFF * min(max(usual, 1.0), _MOST_USUAL) else None
 
     def result(self, left_out: Sequence[tuple[str, int]], unused: Sequence[str]) -> MeasuredCluster:
-        """The solution with its uncertainty: what the claimed noise does not explain is taken for more noise."""
+        """Return the solution with its uncertainty, scaled up if the residuals exceed the assumed noise."""
         residuals, J, grown = self._linearised()
         misfit = self.misfit**2
         cov = np.linalg.inv(J.T @ J) * max(misfit, 1.0)
@@ -394,7 +397,7 @@ def _inverse(motion: Motion) -> Motion:
 
 
 def _middle(motions: Sequence[Motion]) -> Motion:
-    """The one that most of the others agree with."""
+    """Return the motion whose rotation has the smallest median angle to the others."""
     turns = [Rotation.from_matrix(rotation) for rotation, _ in motions]
     apart = [np.median([(turn * other.inv()).magnitude() for other in turns]) for turn in turns]
     return motions[int(np.argmin(apart))]

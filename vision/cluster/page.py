@@ -13,19 +13,20 @@ from bodyschema.vision.tag_edge import MODULES
 
 from .shapes import Cell, Shape
 
-# A tag's face is this many of its sides wide: a white margin of a module all around, and a little for the scissors.
+# Width of a tag's face in sides of the tag: a white margin of one module all around, and a little for cutting.
 FACE_SIDES = 1.0 + 2.5 / MODULES
 _DASH_MM = 2.0
-# Between single tags, with room for their numbers.
+# Gap between single tags, with room for their numbers.
 _GAP_MM = 6.0
 _NUMBER_MM = 3.0
 
 
 def shape_page(shape: Shape, ids: Sequence[int], dictionary: Dictionary, side_mm: float, paper: str) -> Page:
-    """A shape to cut out and fold, with tags of these numbers row by row.
+    """Lay out a shape to cut out and fold, with tags of these numbers row by row.
 
     Raises:
-        ConfigError: as many faces there are not, no such tag or paper, or it does not fit.
+        ConfigError: the number of ids differs from that of the faces, there is no such tag or paper, or the shape
+            does not fit.
     """
     width = FACE_SIDES * side_mm
     placed = shape.placed(ids, 1e-3 * width)
@@ -46,10 +47,10 @@ def shape_page(shape: Shape, ids: Sequence[int], dictionary: Dictionary, side_mm
 
 
 def tags_page(ids: Sequence[int], dictionary: Dictionary, side_mm: float, paper: str) -> Page:
-    """Single tags to cut apart, each with its number below.
+    """Lay out single tags to cut apart, each with its number below.
 
     Raises:
-        ConfigError: no such tag or paper, or they do not fit.
+        ConfigError: there is no such tag or paper, or the tags do not fit.
     """
     width = FACE_SIDES * side_mm
     pitch = width + _GAP_MM
@@ -92,7 +93,7 @@ def _outline(x: float, y: float, width: float) -> list[Rectangle]:
 
 
 def _between(cell: Cell, other: Cell, width: float, *, dashed: bool) -> list[Rectangle]:
-    """The line between two neighbouring cells, the middle of which is on the edge."""
+    """Return the line between two neighbouring cells, centred on their common edge."""
     column, row = max(cell[0], other[0]), max(cell[1], other[1])
     x, y = column * width, row * width
     count = math.floor(width / (2 * _DASH_MM)) if dashed else 1

@@ -72,10 +72,10 @@ class Shape:
         return [(cell, other) for cell, other in beside if other not in cells]
 
     def placed(self, ids: Sequence[int], width_m: float) -> tuple[PlacedTag, ...]:
-        """Where the tags of these numbers are on the body, for faces of this width [m].
+        """Return the poses on the body of the tags of these numbers, for faces of this width [m].
 
         Raises:
-            ConfigError: as many tags there are not.
+            ConfigError: the number of ids differs from that of the faces.
         """
         if len(ids) != len(self.faces):
             raise ConfigError(f"{self.name} has {len(self.faces)} tags, not {len(ids)}", remedy="Give as many --ids")
@@ -86,18 +86,18 @@ class Shape:
 
 
 def cube() -> Shape:
-    """A cube; its frame is in its middle, turned as the tag in the middle of the cross is."""
+    """Return a cube; its frame is at its centre, oriented as the tag in the middle of the unfolded cross."""
     links = [((1, 1), cell) for cell in ((0, 1), (2, 1), (1, 0), (1, 2))] + [((2, 1), (3, 1))]
     return _folded("a cube", Face((1, 1), np.eye(3), np.array([0.0, 0.0, 0.5])), [(*link, 90.0) for link in links])
 
 
 def plate(columns: int, rows: int, fold_deg: float) -> Shape:
-    """A plate, each of its columns folded away from the one before; its frame is that of the first tag.
+    """Return a plate with each column folded away from the previous one; its frame is that of the first tag.
 
-    Folded by 0° it is flat; four columns folded by 90° each are the sides of a box.
+    With folds of 0° it is flat; four columns folded by 90° each are the sides of a box.
 
     Raises:
-        ConfigError: there are no tags, or the columns meet.
+        ConfigError: there are no tags, or the columns run into each other.
     """
     if columns < 1 or rows < 1:
         raise ConfigError(f"a plate of {columns}x{rows} tags", remedy="Take one and more each way")
@@ -111,7 +111,7 @@ def plate(columns: int, rows: int, fold_deg: float) -> Shape:
 
 
 def _folded(name: str, first: Face, links: Sequence[tuple[Cell, Cell, float]]) -> Shape:
-    """The body of a face and of those that hang on it; each link is of a face that is there and its neighbour."""
+    """Build a shape from its first face and the fold angles [deg] of links, each from a known face to a neighbour."""
     faces = {first.cell: first}
     for known, cell, degrees in links:
         parent = faces[known]

@@ -71,7 +71,7 @@ class Page:
 
 
 def sheets(paper: str) -> tuple[tuple[float, float], tuple[float, float]]:
-    """A paper's sizes across and upright [mm]; ConfigError where there is no such paper."""
+    """Return a paper's (width, height) in landscape and in portrait [mm]. Raise ConfigError for an unknown paper."""
     known = {name.lower(): size for name, size in PAPERS_MM.items()}
     if paper.lower() not in known:
         raise ConfigError(f"there is no paper {paper!r}", remedy=f"Take one of {', '.join(PAPERS_MM)}")
@@ -82,15 +82,15 @@ def sheets(paper: str) -> tuple[tuple[float, float], tuple[float, float]]:
 def page(
     size_mm: tuple[float, float], paper: str, name: str, rectangles: Sequence[Rectangle], texts: Sequence[Text] = ()
 ) -> Page | None:
-    """A drawing with its rulers on a sheet, upright or across, whichever leaves more room; None where it does not fit.
+    """Place a drawing with rulers on a sheet, portrait or landscape, whichever leaves more room; None if too large.
 
     Args:
         size_mm: width and height of the drawing.
-        name: what it is; stands below the ruler.
+        name: title, printed below the ruler.
         rectangles, texts: the drawing, from its upper left corner.
 
     Raises:
-        ConfigError: no such paper.
+        ConfigError: there is no such paper.
     """
     width, height = size_mm
     fitting = [each for each in sheets(paper) if each[0] >= width + AROUND_MM and each[1] >= height + AROUND_MM]
@@ -110,19 +110,19 @@ def page(
 
 
 def _line(text: str, x: float, y: float, sheet_mm: float) -> Text:
-    """A line of text that begins at x, or further left where it would leave the sheet."""
+    """Return a line of text that begins at x, or further left if it would leave the sheet."""
     longest = _LETTER * _TEXT_MM * len(text)
     return Text(max(min(x, sheet_mm - MARGIN_MM - longest), MARGIN_MM), y, text)
 
 
 def rulers_mm(size_mm: tuple[float, float]) -> tuple[float, float]:
-    """Lengths of the rulers beside a drawing of this size, across and upright."""
+    """Return the lengths of the horizontal and the vertical ruler [mm] beside a drawing of this size."""
     width, height = (_ruler_length(side) for side in size_mm)
     return width, height
 
 
 def pattern(white: FloatArray, x_mm: float, y_mm: float, side_mm: float) -> list[Rectangle]:
-    """The black cells of a square pattern (cells, cells), 1 white and 0 black, with its upper left corner at (x, y)."""
+    """Return the black cells of a square pattern (cells, cells), 1 white and 0 black, with upper left corner (x, y)."""
     cell = side_mm / len(white)
     return [
         Rectangle(x_mm + first * cell, y_mm + row * cell, (last - first) * cell, cell)
@@ -132,12 +132,12 @@ def pattern(white: FloatArray, x_mm: float, y_mm: float, side_mm: float) -> list
 
 
 def _ruler_length(room_mm: float) -> float:
-    """As long as the board has room for, in tens of millimetres; below that, in millimetres."""
+    """Return the longest ruler that fits, in whole centimetres, or in whole millimetres below 1 cm [mm]."""
     return 10.0 * math.floor(room_mm / 10.0 + 1e-9) or math.floor(room_mm)
 
 
 def _black_runs(cells: list[float]) -> list[tuple[int, int]]:
-    """Neighbouring black cells are one rectangle: viewers draw hairs between two."""
+    """Return (first, end) of each run of black cells; one rectangle a run avoids hairlines between cells in viewers."""
     edges = [
         k for k in range(len(cells) + 1) if (0 < k < len(cells) and cells[k] != cells[k - 1]) or k in (0, len(cells))
     ]
@@ -145,7 +145,7 @@ def _black_runs(cells: list[float]) -> list[tuple[int, int]]:
 
 
 def _ruler(x: float, y: float, length: float, *, upright: bool) -> list[Rectangle]:
-    """A line with a tick at each centimetre; the outer edges of its end ticks are `length` apart."""
+    """Return a line with a tick at each centimetre; the outer edges of its end ticks are `length` apart."""
     ticks = [min(max(10.0 * k - 0.5 * LINE_MM, 0.0), length - LINE_MM) for k in range(int(length / 10.0) + 1)]
     ticks[-1] = length - LINE_MM
     if upright:
