@@ -241,6 +241,6 @@ def _tolerances(robot: RobotDescription, zeros_rad: float, trusted: Trusted) -> 
 
 
 def _claimed(learner: RigidLearner) -> ChainBelief:
-    """What the learner believes, as much less surely as its intervals are wider where the noise was estimated."""
+    """Return the learner's belief, widened like its intervals to allow for a noise level that was estimated."""
     belief = learner.belief
     return replace(belief, root=learner.report().widening * belief.root)

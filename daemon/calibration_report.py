@@ -1,4 +1,4 @@
-"""What a calibration found, in the units of people."""
+"""Report of a calibration in degrees and millimetres."""
 
 from __future__ import annotations
 
@@ -127,14 +127,14 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
         frame: str = CAMERA_LINK,
         free: Calibration | None = None,
     ) -> CalibrationReport:
-        """The answers of `calibration`.
+        """Build the report of `calibration`.
 
         Args:
-            seen: what its recording looks like.
-            source: what the recording is called.
-            first: the number of its first row.
-            frame: what ROS calls the measurement frame.
-            free: the same with nothing held as the URDF has it, for comparison.
+            seen: plausibility of its recording.
+            source: name of the recording.
+            first: number of its first row.
+            frame: ROS name of the measurement frame.
+            free: the same calibration with nothing fixed to the URDF, for comparison.
         """
         jump = tool_jump(calibration.learner, calibration.recording)
         robot, recording, learner = calibration.robot, calibration.recording, calibration.learner
@@ -207,7 +207,7 @@ def _zeros(calibration: Calibration, values: FloatArray, halves: FloatArray) -> 
 
 
 def _far_off(calibration: Calibration, zeros: list[Zero], times: float) -> list[str]:
-    """Sentences about zeros that are so many times as far off as was told."""
+    """Return messages about joint offsets larger than `times` their tolerance."""
     told = calibration.learner.tolerances
     said: list[str] = []
     for zero, slides in zip(zeros, calibration.robot.chain.prismatic, strict=True):
@@ -222,7 +222,7 @@ def _far_off(calibration: Calibration, zeros: list[Zero], times: float) -> list[
 
 
 def _badly_made(calibration: Calibration) -> list[str]:
-    """A sentence where the pairs need an arm that is worse than any."""
+    """Return a message if the geometric errors reach the largest that are considered; else an empty list."""
     made, (axes, points) = calibration.workmanship, WORKMANSHIP[-1]
     if made is None or made.axes < axes:
         return []

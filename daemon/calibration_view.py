@@ -1,4 +1,4 @@
-"""What a calibration found, for a terminal of 80 columns."""
+"""Print a calibration report on a terminal of 80 columns."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def view(report: CalibrationReport) -> Group:
 
 
 def sentences(report: CalibrationReport) -> list[str]:
-    """The report in words."""
+    """Return the report as sentences."""
     said = [_expected(report)] if report.expected_mm is not None else []
     said += [
         f"Mean distance to the pairs: {report.drawn_error_mm:.3f} mm for the drawn arm in its best place, "
@@ -74,7 +74,7 @@ def sentences(report: CalibrationReport) -> list[str]:
 
 
 def two_tools(report: CalibrationReport) -> str:
-    """What to do where the pairs are of two tools."""
+    """Return advice for a recording made with two different tools."""
     return (
         f"From number {report.other_tool_from} on the marker sits about {report.other_tool_mm:.0f} mm elsewhere on the "
         "hand: these are pairs of two tools, and no figure is right for both. Calibrate them apart: "
