@@ -52,7 +52,7 @@ class TagFigures(msgspec.Struct):
 
 
 class ClusterFile(msgspec.Struct):
-    """What `bodyschema marker cluster --json` prints."""
+    """Output of `bodyschema marker cluster --json`."""
 
     views: int
     misfit: float
@@ -133,7 +133,7 @@ def _require_tags(views: Sequence[ClusterView], twice: Mapping[int, Sequence[str
 
 
 def tables(found: MeasuredCluster, wanted: Wanted) -> str:
-    """The tables of robot.toml, with the uncertainty of each tag."""
+    """Return the tables for robot.toml, with the uncertainty of each tag in a comment."""
     notes = [
         "the marker's frame"
         if k == 0
@@ -144,7 +144,7 @@ def tables(found: MeasuredCluster, wanted: Wanted) -> str:
 
 
 def figures(found: MeasuredCluster) -> ClusterFile:
-    """A measured cluster in figures."""
+    """Return the figures of a measured cluster."""
     return ClusterFile(
         views=found.views,
         misfit=found.misfit,
@@ -172,7 +172,7 @@ def _scaled(values: object, by: float) -> tuple[float, float, float]:
 
 
 def said(found: MeasuredCluster) -> str:
-    """The fit in a sentence or two."""
+    """Summarise the fit in a few sentences."""
     text = (
         f"{len(found.tags)} tags in {found.views} pairs of images that show two or more to both eyes; what "
         f"is left is {found.misfit:.2f} times what the "

@@ -192,10 +192,10 @@ class Config:
         )
 
     def with_state_dir(self, folder: Path) -> Config:
-        """The same with another place for store and checkpoint, relative to the working directory.
+        """Return a copy with another folder for store and checkpoint, relative to the working directory.
 
         Raises:
-            ConfigError: it is a file.
+            ConfigError: `folder` is a file.
         """
         if os.path.exists(folder) and not os.path.isdir(folder):
             raise ConfigError("is a file, and store and checkpoint need a folder", file=folder, remedy=_STATE_REMEDY)
@@ -203,11 +203,11 @@ class Config:
         return replace(self.with_tables(msgspec.structs.replace(self.tables, daemon=daemon)), given_state_dir=folder)
 
     def with_tables(self, tables: Tables) -> Config:
-        """The same with other settings."""
+        """Return a copy with other settings."""
         return replace(self, tables=tables)
 
     def reread(self) -> Config:
-        """What the file says now, under the same command line; ConfigError as by `load`."""
+        """Load the file again with the same command-line settings. Raise ConfigError as `load` does."""
         again = Config.load(self.file)
         return again if self.given_state_dir is None else again.with_state_dir(self.given_state_dir)
 
@@ -216,7 +216,7 @@ class Config:
         return self.tables.zenoh.route(process, self.file.parent)
 
     def zenoh_settings(self, process: str) -> dict[str, Any]:
-        """What zenoh is told in `sampler` or `learner`: whom to connect to, as whom, and who may do what."""
+        """Return the zenoh settings of `sampler` or `learner`: endpoints, TLS identity, access control."""
         return self.tables.zenoh.settings_of(process, self.robot.name, self.file.parent)
 
     @property
@@ -241,7 +241,7 @@ _STATE_REMEDY = "Give a folder with --state-dir; one that is not there yet is ma
 
 
 def state_home() -> Path:
-    """The folder of all robots' states."""
+    """Return the folder that holds the state of every robot."""
     return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "bodyschema"
 
 
@@ -293,7 +293,7 @@ def _override(raw: dict[str, Any], known: list[str], environment: Mapping[str, s
 
 
 def _checked(variable: str, table: str, key: str, value: Any) -> Any:
-    """The value; ConfigError naming the environment variable when the table has no such key or it does not fit."""
+    """Return the value. Raise ConfigError naming the environment variable if key or value is invalid in the table."""
     kind = {"robot": RobotSection, "camera": CameraSection}.get(table) or hint_at(Tables, (table,))
     fields = {field.encode_name: field.type for field in msgspec.structs.fields(kind)}
     if key not in fields:

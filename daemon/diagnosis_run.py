@@ -98,13 +98,13 @@ class Source:
 def measured(
     config: Config, file: Path | None, opened: Callable[[Path], Recording] | None = None, *, live: bool
 ) -> Source:
-    """The pairs of a recording, of a store, or of the running sampler.
+    """Return the pairs of a recording, of a store, or of the running sampler.
 
     Args:
-        opened: reads `file`; by default as a recording or a store.
+        opened: function that reads `file`; by default as a recording or a store.
 
     Raises:
-        RequestError: neither or both were asked for.
+        RequestError: neither or both of `file` and `live` were given.
         BusError: no sampler is running.
         RecordingError: they cannot be read, or are not in radians and metres.
     """

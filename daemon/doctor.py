@@ -1,4 +1,4 @@
-"""Whether this machine and this arm are fit: one check after the other, each with the command that mends it."""
+"""Check that machine and arm are ready for use; each failed check names the command that fixes it."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ Step = tuple[str, Callable[[], Iterator[Check]]]
 
 
 def steps(config: Config) -> Iterator[Step]:
-    """What is looked at, with the function that does it."""
+    """Yield the name of each step with the function that runs its checks."""
     yield "robot.toml", lambda: _description(config)
     if configured_ports(config):
         yield "ports", lambda: port_checks(config, _samplers(config))
@@ -73,7 +73,7 @@ def steps(config: Config) -> Iterator[Step]:
 
 
 def as_json(checks: list[Check]) -> str:
-    """The checks as JSON; `well` when none is wrong."""
+    """Return the checks as JSON; `well` is true if none is wrong."""
     contents = {"well": all(check.state != "wrong" for check in checks), "checks": checks}
     return msgspec.json.format(msgspec.json.encode(contents)).decode()
 
@@ -98,7 +98,7 @@ def _description(config: Config) -> Iterator[Check]:
 
 
 def _cameras(config: Config) -> Iterator[Check]:
-    """What the cameras send; while the sampler runs it has them, and tells."""
+    """Yield checks of what the cameras send; a running sampler holds them, so its status is used instead."""
     if not is_alive(config.route("sampler"), Keys(config.robot.name).alive("sampler"), open_timeout_s=OPEN_S):
         require_extra("cameras", "looking at the cameras")
         from .camera_wiring import camera_checks
@@ -111,7 +111,7 @@ def _cameras(config: Config) -> Iterator[Check]:
 
 
 def _on_the_ports(config: Config, look: Callable[[Config], Iterator[Check]]) -> Iterator[Check]:
-    """What `look` finds there; what the running sampler tells where that has the port."""
+    """Yield the checks of `look`; if a running sampler holds the ports, those of its status instead."""
     if not ports_are_there(config):
         return
     if other_holders(config):

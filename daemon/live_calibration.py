@@ -30,7 +30,7 @@ MORE_VIEWS = 4
 
 @dataclass(frozen=True)
 class Shown:
-    """What a person who holds the board has to know.
+    """Feedback for the person who holds the board.
 
     Attributes:
         coverage: what the views cover. views: how many were taken.
@@ -49,7 +49,7 @@ class Shown:
 
     @property
     def wish(self) -> str:
-        """What to show next."""
+        """Advice on what to show next."""
         missing = self.coverage.missing()
         if missing:
             return missing[0]
@@ -149,10 +149,10 @@ class LiveCalibration:
         self._stopping = True
 
     def run(self) -> tuple[Gathered, Calibrated]:
-        """The views, and the calibration of them.
+        """Gather views until their calibration is good enough; return both.
 
         Raises:
-            CalibrationError: the images ended or `stop` was called before it was good enough; the reasons.
+            CalibrationError: the images ended or `stop` was called before it was good enough; with the reasons.
             SourceError: the cameras cannot be opened.
         """
         with self._source, suppress(SourceEnded):
@@ -176,7 +176,7 @@ class LiveCalibration:
         return self._views.look(frame)
 
     def _tried(self) -> Calibrated | None:
-        """The calibration, where nothing is missing and it is good enough."""
+        """Return the calibration if the views cover enough and it is good enough; else None."""
         if len(self._views.found.views) < self._next_try or self._views.coverage.missing():
             return None
         try:

@@ -1,4 +1,4 @@
-"""What a simulation would have measured at the joint angles of a recording."""
+"""Simulate the measurements at the joint angles of a recording."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from kbmaps import KBMapsError
 
 
 def simulated(simulation: Simulation, like: Recording) -> Recording:
-    """The recording that the simulation would have given, with the times, runs and joint angles of `like`.
+    """Return a simulated recording with the times, segments and joint angles of `like`.
 
     Raises:
         RecordingError: the simulation gives no position at a row.
@@ -35,10 +35,10 @@ def simulated(simulation: Simulation, like: Recording) -> Recording:
 
 
 def with_noise(simulation: Simulation, exact: Recording, like: Recording, rng: np.random.Generator) -> Recording:
-    """An exact recording with the noise that its positions would have had: by the covariances of `like`, else [camera].
+    """Return `exact` with noise added to its positions, by the covariances of `like` or else by [camera].
 
     Raises:
-        ConfigError: neither says how large it is.
+        ConfigError: neither gives the size of the noise.
     """
     calibration = simulation.robot.calibration
     if like.cov is not None:

@@ -161,7 +161,7 @@ def _of_lerobot(name: str, urdf: Path | None, robot: Path, calibration: Path | N
 
 
 def _effect_line(effect: Effect) -> str:
-    """An effect in one line: name, place, numbers."""
+    """Return an effect as one line: name, place, numbers."""
     place = "" if effect.where is None else f" at {effect.where}"
     source = "" if effect.source is None else f", from {effect.source}"
     numbers = (f"{p.name} = {value:.4g}" for p, value in zip(effect.parameters, effect.values, strict=True))
@@ -181,7 +181,7 @@ def _camera_lines(config: Config) -> list[str]:
 
 
 def _standing_still(description: RobotDescription) -> list[str]:
-    """Moving joints between camera and marker that are not learnt."""
+    """Return the names of the moving joints between camera and marker that are not learnt."""
     from bodyschema.interfaces.urdf import MOVING
 
     path = description.tree.path(description.camera.parent_link, description.robot.marker_link)

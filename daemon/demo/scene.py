@@ -118,7 +118,7 @@ def prepare(
 
 
 def _described(model: Path, camera: Camera) -> str:
-    """The robot as it ships; its right eye closed where there is one camera alone."""
+    """Return the robot.toml shipped with the model, reduced to one eye if there is only one camera."""
     text = model.read_text(encoding="utf-8")
     return text if camera == "stereo" else re.sub(r"(?m)^baseline_m = .*$", "eyes = 1", text)
 
@@ -140,7 +140,7 @@ seed = {seed}
 
 
 def _marker(marker: Marker, model: Path) -> str:
-    """The table [vision] for what is in the hand."""
+    """Return the [vision] tables for the marker in the hand."""
     towards_hand = -np.array(RobotDescription.load(model).robot.marker_xyz)
     match marker:
         case "ball":
@@ -152,7 +152,7 @@ def _marker(marker: Marker, model: Path) -> str:
 
 
 def _joints(bus: Bus) -> str:
-    """The arm's joints as one would build them."""
+    """Return the [drivers] tables for the arm's joints on this kind of bus."""
     match bus:
         case "dynamixel":
             return _servos("dynamixel", DYNAMIXEL)

@@ -241,7 +241,7 @@ def _turned(chain: RigidChain, q: FloatArray, x: FloatArray, fit: _Fit) -> Plaus
 
 
 def _turned_last(names: tuple[str, ...], as_it_is: _Fit, reading: Reading, fit: _Fit) -> Plausibility:
-    """The last joint's zero is a quarter turn off: nothing else brings the marker to where it is known to be."""
+    """Report that the last joint's zero is off by quarter turns: only that explains the known marker position."""
     return Plausibility(
         f"it seems that {reading.looks(names, fit.zeros)}: the marker then comes out {_mm(fit.tool_m)} from its place "
         f"in [robot] of robot.toml, and as the columns are {_mm(as_it_is.tool_m)} from it",
@@ -320,9 +320,9 @@ class _Search:
         return float(held.errors(MEASURED)[0])
 
     def with_marker_known(self, reading: Reading) -> tuple[Reading, _Fit] | None:
-        """The reading with the last joint some quarter turns on, and its fit, where the known marker tells these.
+        """Return the reading with the last joint off by quarter turns, and its fit, if the known marker shows it.
 
-        With a free marker such a turn makes no difference.
+        With a free marker position such a turn makes no difference.
         """
         if self._chain.prismatic[-1]:
             return None
