@@ -79,7 +79,7 @@ class ReplayJoints:
         self._pace.close(_JOINTS)
 
     def read(self, timeout_s: float) -> JointReading | None:
-        """The next row's joint angles; see `JointSource.read`."""
+        """Return the next row's joint angles; see `JointSource.read`."""
         row = self._pace.next_row(_JOINTS, timeout_s)
         return None if row is None else JointReading(float(self._t[row]), frozen_array(self._recording.q[row]))
 
@@ -100,7 +100,7 @@ class ReplayMarker:
         self._pace.close(_MARKER)
 
     def read(self, timeout_s: float) -> MarkerFix | None:
-        """The next row's marker position; see `MarkerSource.read`."""
+        """Return the next row's marker position; see `MarkerSource.read`."""
         row = self._pace.next_row(_MARKER, timeout_s)
         if row is None:
             return None
@@ -176,7 +176,7 @@ class _Pace:
             self._turn.notify_all()
 
     def next_row(self, reader: int, timeout_s: float) -> int | None:
-        """The reader's next row, or None when it is not its turn within `timeout_s`."""
+        """Return the reader's next row; None if its turn does not come within `timeout_s`."""
         with self._turn:
             if not self._is_open[reader]:
                 raise SourceError("the recording is not open; use its sources in with statements")

@@ -56,7 +56,7 @@ class LeRobotArm:
         return tuple(name for name in self.models if name != GRIPPER)
 
     def id(self, motor: str) -> int:
-        """The ID that LeRobot gives the motor."""
+        """Return the ID that LeRobot gives the motor."""
         return list(self.models).index(motor) + 1
 
 

@@ -45,7 +45,7 @@ class JointSource(Source, Protocol):
         ...
 
     def read(self, timeout_s: float) -> JointReading | None:
-        """The next reading, in strictly increasing time; None when none came within `timeout_s`.
+        """Return the next reading, in strictly increasing time; None if none arrives within `timeout_s`.
 
         Raises:
             SourceEnded: there will be no more.
@@ -69,7 +69,7 @@ class StereoEyes(Source, Protocol):
         ...
 
     def read(self, timeout_s: float) -> StereoFrame | None:
-        """The next pair of images, in strictly increasing time; None when none came within `timeout_s`.
+        """Return the next pair of images, in strictly increasing time; None if none arrives within `timeout_s`.
 
         Raises:
             SourceEnded: there will be no more.
@@ -88,7 +88,7 @@ class StereoCamera(Source, Protocol):
         ...
 
     def read(self, timeout_s: float) -> StereoFrame | None:
-        """The next frame, in strictly increasing time; None when none came within `timeout_s`.
+        """Return the next frame, in strictly increasing time; None if none arrives within `timeout_s`.
 
         Raises:
             SourceEnded: there will be no more.
@@ -102,7 +102,7 @@ class MarkerSource(Source, Protocol):
     """The marker's position: a tracked camera, or a recording."""
 
     def read(self, timeout_s: float) -> MarkerFix | MarkerMiss | None:
-        """The next fix or the reason why there is none, in strictly increasing time; None after `timeout_s`.
+        """Return the next fix or the reason for a missing one, in strictly increasing time; None after `timeout_s`.
 
         Raises:
             SourceEnded: there will be no more.

@@ -18,7 +18,7 @@ LARGEST_Q = 1e6
 
 
 def frozen_array(values: ArrayLike) -> FloatArray:
-    """A read-only float64 copy of `values`."""
+    """Return a read-only float64 copy of `values`."""
     array = np.array(values, dtype=np.float64)
     array.setflags(write=False)
     return array

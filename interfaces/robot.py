@@ -138,7 +138,7 @@ class RobotDescription:
         return cls._assemble(robot, camera, text, file)
 
     def with_placement(self, T_parent_camera: FloatArray, marker_xyz: FloatArray) -> RobotDescription:
-        """The same robot with its camera at a pose (4, 4) in its parent link, and its marker (3,) [m] elsewhere."""
+        """Return a copy with the camera at a pose (4, 4) in its parent link and the marker at (3,) [m] in its link."""
         x, y, z = T_parent_camera[:3, 3].tolist()
         roll, pitch, yaw = rpy_of(T_parent_camera[:3, :3]).tolist()
         camera = msgspec.structs.replace(self.camera, xyz=(x, y, z), rpy=(roll, pitch, yaw))
@@ -276,7 +276,7 @@ def _blamed_on(file: Path, text: str, *keys: str, naming: str | None = None) -> 
 
 
 def _line_naming(text: str, name: str, first: int) -> int:
-    """The first line from `first` on that has `name` in quotes; `first` when none has."""
+    """Return the number of the first line from `first` on with `name` in quotes; `first` if no line has it."""
     for number, line in enumerate(text.splitlines()[first - 1 :], first):
         if f'"{name}"' in line or f"'{name}'" in line:
             return number

@@ -84,11 +84,11 @@ class ServosConfig(msgspec.Struct, Generic[BusT], frozen=True, forbid_unknown_fi
     restore_torque: bool = False
 
     def bus_of(self, servo: ServoConfig) -> str:
-        """The name of the bus that the servo is on."""
+        """Return the name of the servo's bus."""
         return next(iter(self.buses)) if servo.bus is None else servo.bus
 
     def model_of(self, servo: ServoConfig) -> Model:
-        """What it is said to be."""
+        """Return the configured model of the servo."""
         return self.models[servo.model]
 
     def check(self, joints: Sequence[str], file: Path, text: str) -> None:

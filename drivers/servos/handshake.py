@@ -64,15 +64,15 @@ class FittedServo:
 
     @property
     def ticks_per_turn(self) -> int | None:
-        """After so many ticks its sensor tells the same again; None where it does not turn on."""
+        """Ticks after which the sensor's position repeats; None if it does not wrap around."""
         return self.model.ticks_per_turn
 
     def angle(self, ticks: int) -> float:
-        """The joint's angle [rad] at a position with its turns [ticks]."""
+        """Return the joint angle [rad] at a multi-turn position [ticks]."""
         return self.direction * (ticks - self.zero_ticks) * self.model.rad_per_tick
 
     def ticks(self, angle: float) -> float:
-        """The position [ticks] at a joint's angle [rad]."""
+        """Return the multi-turn position [ticks] at a joint angle [rad]."""
         return self.zero_ticks + self.direction * angle / self.model.rad_per_tick
 
     def record(self) -> Mapping[str, object]:
@@ -138,7 +138,7 @@ def identify(bus: Bus, config: ServoConfig, model: Model, known: Mapping[int, Mo
 
 
 def require_all(findings: Iterable[Finding], ports: str) -> list[FittedServo]:
-    """The servos; SourceError with a table of all when one is not as it should be."""
+    """Return the servos. Raise SourceError with a table of all servos if any is not as configured."""
     findings = list(findings)
     wrong = [finding for finding in findings if finding.servo is None]
     if not wrong:

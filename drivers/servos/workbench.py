@@ -85,7 +85,7 @@ class Workbench:
             self._buses.clear()
 
     def bus(self, port: str, baud: int) -> Bus:
-        """The bus at `port`, opened at this rate; SourceError when it cannot be."""
+        """Return the bus at `port`, opened at this baud rate. Raise SourceError if it cannot be opened."""
         if port in self._buses:
             rate, bus = self._buses[port]
             if rate == baud:
@@ -98,7 +98,7 @@ class Workbench:
         return self._buses[port][1]
 
     def fitted(self, bus: Bus, config: ServoConfig, model: Model) -> FittedServo:
-        """The servo, as it is; SourceError when it is another, or does not answer."""
+        """Return the servo as found on the bus. Raise SourceError if it is another, or does not answer."""
         finding = identify(bus, config, model, self.make.models)
         if finding.servo is None:
             raise SourceError(
@@ -108,7 +108,7 @@ class Workbench:
         return finding.servo
 
     def model_at(self, bus: Bus, id: int) -> Model | None:
-        """What the servo of an ID is, asked in every protocol of the make; None when none understands it."""
+        """Identify the model of the servo with an ID by trying every protocol of the make; None if it stays unknown."""
         by_protocol = {model.protocol: model for model in self.make.models.values()}
         for protocol, any_of_it in by_protocol.items():
             register = any_of_it.layout["model"]
@@ -124,7 +124,7 @@ class Workbench:
         return any(bus.ping(model, id).trouble is not Trouble.TIMEOUT for model in by_protocol.values())
 
     def value(self, bus: Bus, servo: FittedServo, setting: Setting) -> int:
-        """What stands in its EEPROM; SourceError when it does not answer."""
+        """Return the setting's value in the servo's EEPROM. Raise SourceError if the servo does not answer."""
         data, trouble = read_register(bus, servo.model, servo.id, setting.register)
         if data is None:
             raise SourceError(f"joint {servo.joint!r} (ID {servo.id}) on {bus.name}: {trouble}. Nothing was written")
@@ -139,7 +139,7 @@ class Workbench:
         return position.value(data)
 
     def homing_offset(self, bus: Bus, servo: FittedServo) -> int:
-        """The homing offset with which the servo's position here and now would be its `zero_ticks`, or a turn off."""
+        """Return the homing offset that makes the servo's present position its `zero_ticks`, modulo full turns."""
         moved = round(servo.zero_ticks - self.position(bus, servo))
         turn = servo.ticks_per_turn
         wanted = servo.homing_offset + self.make.homing_sign * moved
@@ -184,7 +184,7 @@ class Workbench:
         return Done(change, Outcome.OTHER, found, f"{change.setting.shown(found)} was read back")
 
     def _still_there(self, bus: Bus, change: Change, trouble: Trouble | None) -> Done:
-        """Nobody answers to the new ID."""
+        """Return the outcome of an ID change when no servo answers to the new ID: read from the old one."""
         data, _ = read_register(bus, change.servo.model, change.servo.id, change.setting.register)
         if data is None:
             return _lost(change, trouble)
@@ -208,7 +208,7 @@ class Workbench:
         bus.listen(self._clock.now() + EEPROM_S)
 
     def _unlock(self, bus: Bus, servo: FittedServo) -> None:
-        """What is written while its EEPROM is locked would be lost with the power."""
+        """Unlock the servo's EEPROM; values written while it is locked are lost at power-off."""
         if LOCK in servo.model.layout:
             self._tell(bus, servo, servo.model.layout[LOCK], 0)
 
