@@ -20,8 +20,8 @@ from bodyschema.interfaces.robot import RobotDescription
 
 # A joint that moved less is named [rad, m].
 STILL_RAD, STILL_M = math.radians(10.0), 0.02
-# A zero is said to be far off from so many times its tolerance on, and not written from so many on. The first is one in
-# 370 arms whose zeros are as good as was told; the second leaves room for a guess of the tolerance that is half of it.
+# Multiples of its tolerance beyond which a joint offset is reported, and beyond which it is not written. One in 370
+# exceeds the first if the tolerance is right; the second allows for a tolerance guessed at half its true value.
 FAR_OFF, TOO_FAR_OFF = 3.0, 5.0
 _DEG = math.degrees(1.0)
 _UNITS = (1e3, 1e3, 1e3, _DEG, _DEG, _DEG, 1e3, 1e3, 1e3)
@@ -36,10 +36,10 @@ class Figure(msgspec.Struct, frozen=True):
 
 
 class Zero(msgspec.Struct, frozen=True):
-    """What has to be added to a joint's reading, in `unit` (° or mm).
+    """Joint offset to add to the joint's reading, in `unit` (° or mm).
 
-    `half_width` of its 95 % interval is null where no motion shows it and it is left as drawn: the other figures are
-    given that it is right.
+    `half_width` of its 95 % interval is null if the offset is not identifiable and kept at nominal; the other figures
+    are conditional on that.
     """
 
     joint: str

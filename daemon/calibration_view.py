@@ -12,8 +12,8 @@ from bodyschema.daemon.calibration_report import CalibrationReport, Figure, Zero
 
 # Told noise that explains the residuals leaves less than this.
 MISFIT = 1.5
-# Errors on new poses that are so many times those of free links: the URDF is wrong by as much as is measured. What 5
-# blocks of a good arm show by chance stays below 1.1.
+# If held-out errors exceed those with free links by this factor, the URDF is measurably wrong. Chance on 5 blocks of a
+# good arm stays below 1.1.
 WRONG_URDF = 1.25
 
 

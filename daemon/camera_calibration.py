@@ -33,7 +33,7 @@ from .pages import write_page
 
 REPORT = "report.html"
 NORMAL_95 = 1.96
-# Where the uncertainty of a position is told: straight ahead, at this distance [m].
+# Position uncertainty is reported for a point straight ahead at this distance [m].
 AHEAD_M = 0.6
 _SQUARES = re.compile(r"(\d{1,9})\s*[xX×]\s*(\d{1,9})")
 
@@ -42,13 +42,13 @@ Tell = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Images:
-    """Where images are.
+    """Location of the images.
 
     Attributes:
         folder: the folder.
         left, right: patterns of the eyes' files.
-        side_by_side: whether each image shows both eyes.
-        one: whether all images are of one camera alone.
+        side_by_side: each image shows both eyes.
+        one: all images are of one camera.
     """
 
     folder: Path
@@ -207,7 +207,7 @@ def from_images(images: Images, board: Board, tell: Tell) -> Gathered:
 
 @dataclass(frozen=True)
 class Wanted:
-    """Of a calibration, besides views and board; as `bodyschema.vision.calibration.calibrate.Asked` has it."""
+    """Settings of a calibration besides views and board; see `bodyschema.vision.calibration.calibrate.Asked`."""
 
     serials: tuple[str, ...] = ("", "")
     model: ModelChoice = "auto"

@@ -87,10 +87,10 @@ class ChainFigures:
 
     @cached_property
     def shown(self) -> BoolArray:
-        """Which joints' zeros (d,) the pairs show; a turn of the camera or of the marker may do what others do.
+        """Mask (d,) of identifiable joint offsets; others may be equivalent to a rotation of the camera or the marker.
 
-        What exact pairs of all poses would not show, nothing has shown: along such directions a belief that was
-        linearised at several places seems surer than it is.
+        An offset that exact pairs of all poses would not show counts as not identifiable: along such directions a
+        belief that was linearised at several places seems more certain than it is.
         """
         zeros = self._zeros
         return (_spread(self.beliefs[0], zeros) < self._unsure) & (_spread(self._best, zeros) < self._unsure)
@@ -119,7 +119,7 @@ class ChainFigures:
 
     @property
     def _hidden(self) -> IntArray:
-        """Which zeros nothing shows; those that are held as drawn have nothing to show."""
+        """Indices of the joint offsets that are not identifiable, without those that are fixed at nominal."""
         return self._zeros[~self.shown & (_spread(self.prior, self._zeros) > 0.0)]
 
     @property

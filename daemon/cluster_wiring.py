@@ -32,7 +32,7 @@ _SIDE = re.compile(r"(\d{1,9})=(\d{1,9}\.?\d*)")
 
 @dataclass(frozen=True)
 class Wanted:
-    """Which tags: of a dictionary, all or those of some numbers; sides of their black squares [m], some by number."""
+    """Tags of a cluster: dictionary, IDs (None: all) and sides of the black squares [m], exceptions by ID."""
 
     dictionary: Dictionary
     side_m: float
@@ -64,11 +64,11 @@ class ClusterFile(msgspec.Struct):
 
 
 def measured(images: Images, calibration: Path, wanted: Wanted, tell: Callable[[str], None]) -> MeasuredCluster:
-    """Where the tags are that images of calibrated cameras show.
+    """Measure the poses of the tags in images of calibrated cameras.
 
     Raises:
         ConfigError: the calibration is damaged.
-        CalibrationError: images or tags are not what is needed; or the squares are not of that side.
+        CalibrationError: images or tags are unsuitable, or the squares have another side.
     """
     rig, files = read_rig(calibration), images.files()
     if len(rig.serials) < 2:
@@ -98,7 +98,7 @@ def measured(images: Images, calibration: Path, wanted: Wanted, tell: Callable[[
 
 
 def sides_of(text: str) -> dict[int, float]:
-    """Sides [m] of tags by their number, from a text like 7=25,8=25 [mm]; ConfigError when it is none."""
+    """Parse sides [m] of tags by ID from a text like 7=25,8=25 [mm]. Raise ConfigError if it is invalid."""
     found: dict[int, float] = {}
     for part in text.split(","):
         told = _SIDE.fullmatch(part.strip())

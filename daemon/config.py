@@ -56,10 +56,10 @@ class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         max_time_error_deg: joints that move farther than this while the time of a frame is uncertain (1-sigma, and
             what lies between the two eyes' images) are too fast for a pair.
         segment_gap_s: a pause between pairs longer than this starts a new segment.
-        keep_days: pairs older than this are deleted; without it none is for its age.
-        keep_mb: so much of the store's file is used, in 10^6 bytes; the oldest pairs beyond it are deleted. Without it
-            the disk is the limit.
-        keep_newest: so many of the newest pairs are kept whatever their age and size.
+        keep_days: pairs older than this are deleted; without it, age does not matter.
+        keep_mb: maximum size of the store in 10^6 bytes; the oldest pairs beyond it are deleted. Without it, the disk
+            is the limit.
+        keep_newest: this number of newest pairs is kept whatever their age and size.
     """
 
     state_dir: str | None = None
@@ -87,7 +87,7 @@ class LearnerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         step_size: μ0 of the normalised LMS rule, between 0 and 2.
         replays_per_pair: how often stored pairs are learnt again, on average, for every new one.
         replay_capacity: how many of the newest pairs are kept for replay.
-        solve_every: the rigid chain and the exact map are solved anew after so many new pairs.
+        solve_every: number of new pairs after which the rigid chain and the exact map are solved again.
         angle_tolerance_deg: how far the real arm may be from its description, 1-sigma: each component of a joint's
             axis, the zero of each joint, and each component of the cameras' orientation.
         length_tolerance_m: the same for each coordinate of a joint's place, and for the zero of a sliding joint.
@@ -212,7 +212,7 @@ class Config:
         return again if self.given_state_dir is None else again.with_state_dir(self.given_state_dir)
 
     def route(self, process: str) -> Route:
-        """Where a client finds `sampler` or `learner`, and as whom."""
+        """Return the endpoint and identity with which a client connects to `sampler` or `learner`."""
         return self.tables.zenoh.route(process, self.file.parent)
 
     def zenoh_settings(self, process: str) -> dict[str, Any]:
@@ -221,7 +221,7 @@ class Config:
 
     @property
     def state_dir(self) -> Path:
-        """Where store and checkpoint live."""
+        """Folder of store and checkpoint."""
         if self.tables.daemon.state_dir is not None:
             return (self.file.parent / self.tables.daemon.state_dir).resolve()
         return state_home() / self.robot.name
@@ -258,7 +258,7 @@ def _check_router(tables: Tables, file: Path, text: str) -> None:
 
 
 def _require_size(robot: RobotDescription, tables: Tables, vision: Mapping[str, Any], file: Path, text: str) -> None:
-    """ConfigError where one camera alone is to tell the depth of a marker whose size nobody said."""
+    """Raise ConfigError if a single camera would have to measure the depth of a marker of unknown size."""
     cameras = tables.vision.cameras
     if robot.camera.eyes == 2 and (cameras is None or cameras.eyes == 2):
         return

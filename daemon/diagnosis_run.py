@@ -42,7 +42,7 @@ from .recorder import History
 DIAGNOSIS, REPORT = "diagnosis.json", "report.html"
 # Effects that are always looked for.
 ALWAYS = ("outliers",)
-# So many pairs for each joint are the fewest that say anything.
+# Minimum number of pairs per joint.
 FEWEST_PAIRS_A_JOINT = 5
 Tell = Callable[[str], None]
 
@@ -53,7 +53,7 @@ class DiagnosisError(BodyschemaError):
 
 @dataclass(frozen=True)
 class Asked:
-    """What to look for.
+    """Settings of a diagnosis.
 
     Attributes:
         only, without: names of effects; all when `only` is empty.
@@ -89,7 +89,7 @@ def _names(text: str | None, option: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """What was measured, and what it is called."""
+    """Recording and its name."""
 
     recording: Recording
     name: str
@@ -131,7 +131,7 @@ def _history(history: History, joints: tuple[str, ...]) -> Recording:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A diagnosis and what is told of it.
+    """Diagnosis with its context for the report.
 
     Attributes:
         warnings: what may be wrong with the recording itself.
@@ -161,12 +161,12 @@ class Found:
 
     @property
     def timed(self) -> bool:
-        """Whether the recording has times."""
+        """True if the recording has times."""
         return self.source.recording.t is not None
 
     @property
     def remedies(self) -> list[str]:
-        """What to do about the causes."""
+        """Remedies for the causes found."""
         run = self.diagnosis.extended.run
         torques = np.abs(run.torques).max(axis=0) if run.simulation.gravity.known else None
         return remedies(self.file, self.robot, ticks(self.source.recording.q), torques)

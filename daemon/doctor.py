@@ -156,7 +156,7 @@ def disk_checks(folder: Path) -> Iterator[Check]:
 
 
 def store_checks(file: Path) -> Iterator[Check]:
-    """Whether the disk gives back every pair as it was written."""
+    """Yield checks that the disk returns every pair as it was written."""
     with PairReader(file) as pairs:
         trouble, audit = pairs.trouble(), pairs.audit()
     if trouble is not None:
@@ -174,7 +174,7 @@ def store_checks(file: Path) -> Iterator[Check]:
 
 
 def clock_checks(is_synchronised: Callable[[], bool | None] | None = None) -> Iterator[Check]:
-    """Whether the wall clock is kept right, which dates the pairs. (Time stamps come from the monotonic clock.)"""
+    """Check that the wall clock, which dates the pairs, is synchronised. (Time stamps use the monotonic clock.)"""
     known = (_is_synchronised if is_synchronised is None else is_synchronised)()
     if known is None:
         yield Check("clock", "ok", "the system does not tell whether the clock is kept right")
@@ -214,7 +214,7 @@ def _zenoh(config: Config) -> Iterator[Check]:
 
 
 def router_check(route: Route) -> Check:
-    """Whether the router takes our connection."""
+    """Check that the router accepts our connection."""
     try:
         with Bus(connect=route, client=True, open_timeout_s=OPEN_S):
             return Check("zenoh", "ok", f"the router {route} takes our connection")
@@ -226,7 +226,7 @@ def router_check(route: Route) -> Check:
 
 
 def zenoh_check(process: str, route: Route, token: str) -> Check:
-    """Whether the process answers; if not, whether its place is free."""
+    """Check that the process answers or, if it does not run, that its endpoint is free."""
     endpoint = str(route)
     if not _is_listening(endpoint):
         return Check("zenoh", "ok", f"the {process} does not run; {endpoint} is free for it")
@@ -238,7 +238,7 @@ def zenoh_check(process: str, route: Route, token: str) -> Check:
 
 
 def _is_listening(endpoint: str) -> bool:
-    """Whether somebody takes connections there; also True where that cannot be tried."""
+    """Return True if the endpoint accepts connections, or if that cannot be tried."""
     protocol, _, address = endpoint.partition("/")
     host, _, port = address.rpartition(":")
     if protocol not in ("tcp", "tls"):

@@ -27,11 +27,11 @@ POSITION = ("x", "y", "z")
 
 @dataclass(frozen=True, slots=True)
 class Collected:
-    """What the sources said.
+    """Data recorded from the sources.
 
     Attributes:
-        missed: images without a fix, by why.
-        health: what is wrong with the cameras, and what to do.
+        missed: number of images without a fix, by reason.
+        health: faults of the cameras with their remedies.
     """
 
     wiggle: Wiggle
@@ -40,7 +40,7 @@ class Collected:
 
     @property
     def said(self) -> str:
-        """What became of the images, where one in five gave no fix; else empty."""
+        """Message on missed images if at least one in five gave no fix; else empty."""
         fixes, missed = len(self.wiggle.t_marker), self.missed.total()
         if missed < 0.2 * (fixes + missed):
             return ""

@@ -40,9 +40,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-# A painted ball. Hues that the room does not have reach beyond its band by so much [deg], and are at least so many.
+# A painted ball: saturation, value; how far the room's hue gap exceeds the ball's band, and its minimum [deg].
 _SATURATION, _VALUE, _ROOM_DEG, _GAP_DEG = 0.93, 0.86, 6.0, 36.0
-# A ball that is told by its brightness glows; all else is darker than half of what is looked for.
+# A ball detected by brightness glows; everything else is darker than half the threshold.
 _LAMP, _DIMMED = 0.9, 0.45
 _APART_S = 60.0  # a tracker has forgotten what it saw then
 
@@ -145,7 +145,7 @@ def _last_pose(config: Config) -> list[float] | None:
     try:
         with PairReader(config.store_file) as pairs:
             last = pairs.last()
-    except StoreError as error:  # the sampler says so, too, and mends what can be mended
+    except StoreError as error:  # the sampler reports it, too, and repairs the store
         log.warning("where the joints were last is not known: %s", error)
         return None
     return None if last is None or len(last.q) != len(config.robot.joints) else last.q.tolist()

@@ -42,7 +42,7 @@ class Replay:
         calibration: StereoCalibration | None = None,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Nothing is played before both sources are entered and one is read.
+        """Prepare the replay; it starts once both sources are entered and one is read.
 
         Args:
             speed: 1 as recorded, 2 twice as fast; 0 as fast as it is read.
@@ -157,7 +157,7 @@ _JOINTS, _MARKER = 0, 1
 
 
 class _Pace:
-    """Which row comes next for each of two readers, and when."""
+    """Schedule of the next row for each of two readers."""
 
     def __init__(self, t: FloatArray, speed: float, now: Callable[[], float]) -> None:
         self._t, self._speed, self._now = t, speed, now

@@ -10,7 +10,7 @@ from .records import JointReading, MarkerFix, MarkerMiss, StereoFrame
 
 
 class Clock(Protocol):
-    """Where the time stamps come from."""
+    """Source of the time stamps."""
 
     def now(self) -> float:
         """Monotonic time [s], the clock of all readings and frames."""
@@ -65,7 +65,7 @@ class StereoEyes(Source, Protocol):
 
     @property
     def serials(self) -> tuple[str, ...]:
-        """What tells each eye's device, the left one's first, from all others: serial number, path or file name."""
+        """Identifiers of the eyes' devices, left first: serial number, path or file name."""
         ...
 
     def read(self, timeout_s: float) -> StereoFrame | None:

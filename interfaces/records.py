@@ -1,4 +1,4 @@
-"""What flows: readings, frames, fixes and pairs. Frozen; SI; arrays are float64 and read-only."""
+"""Define readings, frames, fixes and pairs: frozen, in SI units; arrays are float64 and read-only."""
 
 from __future__ import annotations
 

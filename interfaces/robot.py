@@ -126,7 +126,7 @@ class RobotDescription:
 
     @classmethod
     def from_tables(cls, tables: dict[str, Any], text: str, file: Path) -> RobotDescription:
-        """As `load`, from the tables and the text of robot.toml."""
+        """Build the description like `load`, from the tables and the text of robot.toml."""
         for section in ("robot", "camera"):
             if section not in tables:
                 raise ConfigError(

@@ -1,4 +1,4 @@
-"""What commands ask about the calibration board and about images of it; each is one argument of theirs."""
+"""Command-line options for the calibration board and for images of it."""
 
 from __future__ import annotations
 

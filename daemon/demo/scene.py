@@ -41,7 +41,7 @@ FEETECH = {joint: "STS3250" if joint.startswith("shoulder") else "STS3215" for j
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Where everything of one demo is."""
+    """Paths of the files of one demo."""
 
     folder: Path
 
@@ -52,7 +52,7 @@ class Scene:
 
     @property
     def log_file(self) -> Path:
-        """What the two processes logged."""
+        """Log of the two processes."""
         return self.folder / "daemon.log"
 
     @property

@@ -59,7 +59,7 @@ LAST_ZERO_RAD = math.radians(3.0)
 # ... and named where the known marker comes out so many times nearer to its place: with 3, 2 of 32 markers that were
 # 50 mm off in each direction (1-sigma) came out so by chance.
 NEARER = 5.0
-# So many other readings that fit as well are told.
+# Maximum number of other, equally good readings that are listed.
 LISTED = 2
 # Distances below this share of the reach are not distinguished.
 EXACT = 1e-5

@@ -20,7 +20,7 @@ NonNegative = Annotated[float, Meta(ge=0)]
 
 
 class AnyBus(Protocol):
-    """What is asked of the table of a bus."""
+    """Settings that every table of a bus has."""
 
     @property
     def port(self) -> str:
@@ -34,7 +34,7 @@ class AnyBus(Protocol):
 
     @property
     def latency_ms(self) -> float | None:
-        """How long the adapter keeps bytes back; None: the system is asked."""
+        """Latency of the adapter [ms]; None: read from the system."""
         ...
 
 

@@ -95,7 +95,7 @@ class FittedServo:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What was found in the place of a servo."""
+    """Finding for a configured servo."""
 
     config: ServoConfig
     found: str
@@ -177,7 +177,7 @@ def switch_torque_off(bus: Bus, servo: FittedServo) -> FittedServo:
 
 
 def torque_is_on(bus: Bus, servo: FittedServo) -> bool:
-    """Whether it holds its place; SourceLost when it does not answer."""
+    """Return True if the servo's torque is on. Raise SourceLost if it does not answer."""
     data, trouble = read_register(bus, servo.model, servo.id, servo.model.layout["torque"])
     if data is None:
         raise SourceLost(f"joint {servo.joint!r} (ID {servo.id}): {trouble}", retry_s=RETRY_S)
@@ -236,7 +236,7 @@ def _absence(bus: Bus, model: Model, id: int, trouble: Trouble | None) -> str:
 
 
 def _is_garbled(bus: Bus, model: Model, id: int) -> bool:
-    """Whether most of what it measures comes garbled: two of one model say the same of themselves, but not of that."""
+    """Return True if most measurements are garbled, as when two servos of one model, set up alike, share an ID."""
     request = bus.read_request(model, id, model.layout.block)
     garbled = sum(bus.ask(request).trouble is Trouble.GARBLED for _ in range(LOOKS))
     return garbled > LOOKS // 2

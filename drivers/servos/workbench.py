@@ -29,7 +29,7 @@ OpenAt = Callable[[str, int], tuple[Port, float]]
 
 
 class Outcome(StrEnum):
-    """What came of a change."""
+    """Outcome of a change."""
 
     WRITTEN = "written"
     KEPT = "not written"
@@ -49,11 +49,11 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """What came of a change.
+    """Outcome of a change.
 
     Attributes:
-        found: what stands there now; None when nobody could be asked.
-        said: what to know of it besides; empty when it was written and read back.
+        found: value read back; None if no servo answered.
+        said: explanation; empty if the value was written and read back.
     """
 
     change: Change
@@ -69,7 +69,7 @@ class Workbench:
     """
 
     def __init__(self, make: Make, clock: Clock, open_at: OpenAt) -> None:
-        """Nothing is opened yet."""
+        """Store the arguments; open nothing yet."""
         self.make, self._clock, self._open_at = make, clock, open_at
         self._buses: dict[str, tuple[int, Bus]] = {}
 
@@ -119,7 +119,7 @@ class Workbench:
         return None
 
     def is_taken(self, bus: Bus, id: int) -> bool:
-        """Whether somebody answers to an ID, in whatever protocol."""
+        """Return True if a servo answers to an ID in any protocol."""
         by_protocol = {model.protocol: model for model in self.make.models.values()}
         return any(bus.ping(model, id).trouble is not Trouble.TIMEOUT for model in by_protocol.values())
 
@@ -131,7 +131,7 @@ class Workbench:
         return setting.register.value(data)
 
     def position(self, bus: Bus, servo: FittedServo) -> int:
-        """Where it is [ticks]; SourceError when it does not answer."""
+        """Return the servo's position [ticks]. Raise SourceError if it does not answer."""
         position = servo.model.layout["position"]
         data, trouble = read_register(bus, servo.model, servo.id, position)
         if data is None:

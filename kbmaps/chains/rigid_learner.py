@@ -285,7 +285,7 @@ class RigidLearner:
 
     @property
     def _shaped(self) -> bool:
-        """Whether some errors are not as large in all directions."""
+        """True if some errors are anisotropic."""
         return bool((self._shape != np.eye(3)).any())
 
     def _fitted(self) -> RigidFit | None:

@@ -18,8 +18,8 @@ class DrivenShaft:
     """The angle of a servo's shaft: it goes where the servo holds it, and stays where nothing does.
 
     Attributes:
-        servo: that turns it; None: nobody does.
-        jammed: it is held fast, whatever the servo does.
+        servo: the servo that turns it, if any.
+        jammed: the shaft does not move, whatever the servo does.
     """
 
     def __init__(self, angle: float, fastest_rad_s: float = FASTEST_RAD_S) -> None:
@@ -31,7 +31,7 @@ class DrivenShaft:
         self._lock = threading.RLock()  # its servo moves it in one thread, cameras see it in others
 
     def __call__(self, t: float) -> float:
-        """Where it is at `t` [s], or was, as far back as it remembers [rad]."""
+        """Return the angle [rad] at `t` [s], now or as far back as it is stored."""
         with self._lock:
             return self._at(t)
 
