@@ -144,7 +144,7 @@ def _arm(hardware: OnPorts, angles: Mapping[str, Angle], *, return_delay_s: floa
 
 
 def bench_ports(bench: DryRun) -> list[str]:
-    """In words: what is on which port."""
+    """Describe in words the devices on each port."""
     match bench.config:
         case SerialLinesConfig() as config:
             return [f"{_counted(len(config.encoders), 'encoder')} on {config.port} at {config.baud:,} bit/s"]
@@ -243,7 +243,7 @@ def _looking_at_servos(
 def _looking_at_lines(
     hardware: SerialLinesConfig, angles: Mapping[str, Angle], open_driver: OpenDriver
 ) -> Iterator[Behind]:
-    """Each look is at a line whose measurement began after it."""
+    """Yield joints read from a board on a bench; each look waits for a line measured after it."""
     from bodyschema.drivers.serial_lines.bench.listener import Listener
 
     clock = SystemClock()

@@ -187,7 +187,7 @@ class Calibration:
 def _learners(
     nominal: RigidChain, choices: list[ChainTolerances], recording: Recording, sigma_m: float | None
 ) -> tuple[tuple[RigidLearner, ...], FloatArray]:
-    """Learners of all pairs whose tolerances make some of the pairs probable, and their shares."""
+    """Return learners of all pairs with the tolerances that a sample of the pairs makes probable, and their shares."""
     told = None if recording.cov is None else recording.cov + ROUNDING_M**2 * np.eye(3)
     some = np.unique(np.linspace(0, len(recording) - 1, JUDGED_PAIRS).astype(np.intp))
 
@@ -214,7 +214,7 @@ def _told(recording: Recording, learner: RigidLearner, rows: IntArray) -> FloatA
 
 
 def _of_the_arm(learner: RigidLearner, recording: Recording, rows: IntArray) -> float:
-    """Variance [m²] of a coordinate in these rows that the instrument, which tells its own, has not: encoders, play."""
+    """Return the variance [m²] per coordinate that these rows have beyond the instrument's: encoders, backlash."""
     assert recording.cov is not None
     good = rows[learner.inliers]
     residuals = recording.x[good] - learner.predict(recording.q[good])

@@ -28,7 +28,7 @@ _UNITS = (1e3, 1e3, 1e3, _DEG, _DEG, _DEG, 1e3, 1e3, 1e3)
 
 
 class Figure(msgspec.Struct, frozen=True):
-    """One number as drawn and as learnt, with half the width of its 95 % interval."""
+    """Nominal and calibrated value of a parameter, with the half width of its 95 % interval."""
 
     drawn: float
     learnt: float

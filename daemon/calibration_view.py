@@ -18,7 +18,7 @@ WRONG_URDF = 1.25
 
 
 def view(report: CalibrationReport) -> Group:
-    """Tables of the figures, then what they mean in sentences."""
+    """Return tables of the figures, followed by sentences on their meaning."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
     table.add_column(Text(f"{report.robot}, {report.pairs} pairs of {report.source}"), overflow="fold")
     for name in ("drawn", "learnt", "95 %"):
@@ -149,7 +149,7 @@ def _figures(table: Table, names: tuple[str, ...], figures: list[Figure], digits
 
 
 def _fixed(value: float, digits: int) -> str:
-    """Without a minus before nothing but zeros."""
+    """Format with fixed digits, without a minus sign before zero."""
     return f"{round(value, digits) + 0.0:.{digits}f}"
 
 

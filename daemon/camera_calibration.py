@@ -334,7 +334,7 @@ def check_figures(found: Check) -> CheckFile:
 
 
 def _position_half_widths_mm(rig: StereoRig) -> tuple[float, float, float]:
-    """95 % half widths of a position straight ahead, in the left camera's frame, as the calibration alone has them."""
+    """Return 95 % half widths of a position straight ahead in the left camera's frame, due to the calibration alone."""
     eye = -rig.R_right_left.T @ rig.translation_m
     x = np.array([[0.5 * eye[0], 0.5 * eye[1], AHEAD_M]])
     left, right = rig.left.project(x), rig.right.project(x @ rig.R_right_left.T + rig.translation_m)

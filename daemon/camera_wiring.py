@@ -69,10 +69,10 @@ def names_calibration(config: Config) -> bool:
 
 
 def camera_of(config: Config, eyes: LiveEyes | Film) -> StereoCamera:
-    """`eyes` with rectified images, not opened yet: by the calibration file, else as [camera] describes them.
+    """Return `eyes` with rectified images, not opened yet: by the calibration file, else by [camera].
 
     Raises:
-        ConfigError: nothing says how they see, or the file cannot be read.
+        ConfigError: there is no calibration, or the file cannot be read.
     """
     cameras = require_cameras(config)
     if cameras.calibration is not None:

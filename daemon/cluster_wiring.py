@@ -1,4 +1,4 @@
-"""Measuring a cluster of tags from images: what is read, and what is said."""
+"""Measure a cluster of tags from images: inputs and report."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def _seen(finder: TagFinder, image: ImageArray, maps: tuple[ImageArray, ImageArr
 
 
 def _require_tags(views: Sequence[ClusterView], twice: Mapping[int, Sequence[str]], wanted: Wanted) -> None:
-    """CalibrationError where a number is seen twice in one image, more than once, or wanted ones are in none."""
+    """Raise CalibrationError if several images show one ID twice, no tag is found, or a wanted one is missing."""
     for id, names in twice.items():
         if len(names) > 1:
             raise CalibrationError(

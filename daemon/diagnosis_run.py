@@ -66,7 +66,7 @@ class Asked:
 
     @classmethod
     def of(cls, only: str | None, without: str | None, seed: int) -> Asked:
-        """From names with commas between; RequestError where there is no such effect, or none is left."""
+        """Parse comma-separated names. Raise RequestError if an effect is unknown, or none remains."""
         asked = cls(_names(only, "--effects"), _names(without, "--exclude"), seed)
         if set(asked.only or KINDS) <= set(asked.without):
             raise RequestError("--effects and --exclude leave nothing to look for. Exclude fewer")

@@ -121,7 +121,7 @@ def _on_the_ports(config: Config, look: Callable[[Config], Iterator[Check]]) -> 
 
 
 def _samplers(config: Config) -> list[int]:
-    """Those who have a port open and are the sampler, which answers."""
+    """Return the PIDs of sampler processes that have a port open, if the sampler answers."""
     pids = [holder.pid for holder in other_holders(config) if SAMPLER.search(holder.command)]
     route, token = config.route("sampler"), Keys(config.robot.name).alive("sampler")
     return pids if pids and is_alive(route, token, open_timeout_s=OPEN_S) else []
@@ -140,7 +140,7 @@ def _of_the_sampler(config: Config) -> Iterator[Check]:
 
 
 def disk_checks(folder: Path) -> Iterator[Check]:
-    """Room and right for the pairs in `folder`."""
+    """Yield checks of free space and write permission for the pairs in `folder`."""
     there = next(path for path in (folder, *folder.parents) if path.exists())
     if not os.access(there, os.W_OK):
         said = f"{there} cannot be written, and pairs are to be kept in {folder}"
@@ -187,7 +187,7 @@ def clock_checks(is_synchronised: Callable[[], bool | None] | None = None) -> It
 
 
 def unit_checks(root: Path = Path("/")) -> Iterator[Check]:
-    """Units that an older bodyschema installed: they start `python -m daemon`, which is no more."""
+    """Yield a check for each unit of an older bodyschema: these start `python -m daemon`, which no longer exists."""
     files = [*(root / FOLDER).glob("bodyschema-*.service"), *(root / FOLDER).glob("bodyschema-*.service.d/*.conf")]
     for file in sorted(files):
         if OLD_UNIT.search(file.read_text(encoding="utf-8", errors="replace")):
@@ -251,12 +251,12 @@ def _is_listening(endpoint: str) -> bool:
 
 
 def _named(check: Check, file: Path) -> Check:
-    """With the description's own name in what there is to type."""
+    """Return the check with the actual name of robot.toml in its command."""
     return replace(check, mend=check.mend.replace("robot.toml", str(file)))
 
 
 def run(config: Config, tell: Callable[[str], None]) -> list[Check]:
-    """All checks; what fails on the way is one, too."""
+    """Run all checks; an error on the way counts as a failed check."""
     checks: list[Check] = []
     for name, look in steps(config):
         tell(name)

@@ -56,7 +56,7 @@ def with_noise(simulation: Simulation, exact: Recording, like: Recording, rng: n
 
 
 def without_consequence(simulation: Simulation, like: Recording | None = None) -> list[str]:
-    """Sentences on the effects that change nothing: of this robot, and of a recording without times."""
+    """Return sentences on the effects that change nothing for this robot or for a recording without times."""
     said = []
     for name in dict.fromkeys(effect.name for effect in simulation.effects):
         if KINDS[name].needs_times and like is not None and like.t is None:
@@ -69,7 +69,7 @@ def without_consequence(simulation: Simulation, like: Recording | None = None) -
 
 
 def _seen_again(calibration: StereoCalibration, x: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Positions (n, 3) [m] triangulated from the images of x (n, 3) with noise in each coordinate."""
+    """Return positions (n, 3) [m] triangulated from the image points of x (n, 3) with noise in each coordinate."""
     pixels = calibration.project(x)
     u_left, v_left, u_right, v_right = (pixels + calibration.pixel_sigma * rng.standard_normal(pixels.shape)).T
     cx, cy = calibration.principal_point_px

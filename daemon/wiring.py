@@ -274,7 +274,7 @@ def _marker(vision: VisionConfig) -> dict[str, Any]:
 
 
 def _require_found(config: Config, calibration: StereoCalibration, camera: CameraConfig) -> None:
-    """ConfigError where the tracker does not even find the marker by itself before a plain wall."""
+    """Raise ConfigError if the tracker does not find the marker even alone before a plain wall."""
     from bodyschema.sim_backend.eye import portraits
     from bodyschema.vision.trackers import tracker_of
 

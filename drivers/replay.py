@@ -121,14 +121,14 @@ class ReplayClock(SystemClock):
         self._pace = pace
 
     def now(self) -> float:
-        """Time of the newest fix that was played, or of the first one to come [s]."""
+        """Return the time [s] of the newest fix played, before any that of the first one."""
         return self._pace.played_until(_MARKER)
 
 
 def default_covariances(
     recording: Recording, sigma_m: float | None, calibration: StereoCalibration | None
 ) -> FloatArray:
-    """Covariances of the positions [m²], shape (n, 3, 3), of a recording that has none of its own.
+    """Return covariances of the positions [m²], shape (n, 3, 3), for a recording without its own.
 
     Args:
         sigma_m: 1-sigma per axis [m], or None.
@@ -141,7 +141,7 @@ def default_covariances(
 
 
 def stereo_covariances(x: FloatArray, calibration: StereoCalibration) -> FloatArray:
-    """Covariances [m²], shape (n, 3, 3), of points x (n, 3) in front of a stereo camera, from its pixel noise."""
+    """Return covariances [m²], shape (n, 3, 3), of points x (n, 3) before a stereo camera, from its pixel noise."""
     depth = x[:, 2]
     scale = calibration.focal_px / depth
     J = np.zeros((len(x), 4, 3))  # derivative of (ul, vl, ur, vr) [px/m]
@@ -190,7 +190,7 @@ class _Pace:
             return row
 
     def played_until(self, reader: int) -> float:
-        """Time of the newest row that the reader was given, or of the first one to come [s]."""
+        """Return the time [s] of the newest row given to the reader, before any that of the first one."""
         with self._turn:
             return float(self._t[max(self._next[reader] - 1, 0)])
 

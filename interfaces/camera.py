@@ -46,7 +46,7 @@ class StereoCalibration:
         return np.array([[0.0, 0.0, 0.0], [self.baseline_m, 0.0, 0.0]])[: 2 if self.is_stereo else 1]
 
     def project(self, x: FloatArray) -> FloatArray:
-        """Image coordinates (..., 4) as (ul, vl, ur, vr) [px] of points (..., 3) [m] in the left optical frame."""
+        """Project points (..., 3) [m] in the left optical frame to pixels (..., 4), as (ul, vl, ur, vr) [px]."""
         cx, cy = self.principal_point_px
         scale = self.focal_px / x[..., 2]
         u_left, v = cx + scale * x[..., 0], cy + scale * x[..., 1]

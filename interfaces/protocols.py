@@ -13,11 +13,11 @@ class Clock(Protocol):
     """Source of the time stamps."""
 
     def now(self) -> float:
-        """Monotonic time [s], the clock of all readings and frames."""
+        """Return the monotonic time [s], the clock of all readings and frames."""
         ...
 
     def utc(self) -> str:
-        """Wall-clock time, ISO 8601 in UTC."""
+        """Return the wall-clock time, ISO 8601 in UTC."""
         ...
 
 

@@ -176,7 +176,7 @@ class Recording:
             raise RecordingError(f"cannot be written: {error.strerror or error}", file=file) from error
 
     def write_csv_to(self, out: TextIO) -> None:
-        """Write CSV to an open file; OSError when that fails."""
+        """Write CSV to an open file. Raise OSError if that fails."""
         table = self.to_table()
         integers = frozenset(i for i, name in enumerate(table.names) if name in INTEGER_COLUMNS)
         out.write(",".join(table.names) + "\n")

@@ -53,7 +53,7 @@ class _Info(msgspec.Struct, frozen=True):
 
 
 def is_lerobot_dataset(source: Path) -> bool:
-    """Return whether `source` is the folder of a LeRobotDataset."""
+    """Return True if `source` is the folder of a LeRobotDataset."""
     return (source / INFO).is_file()
 
 

@@ -215,7 +215,7 @@ def _check_name(table: Any, text: str, file: Path) -> None:
 
 
 def _check_units(robot: RobotSection, camera: CameraSection, text: str, file: Path) -> None:
-    """ConfigError where a number is one of degrees or millimetres."""
+    """Raise ConfigError if a number looks like degrees or millimetres."""
 
     def refuse(keys: tuple[str, str], value: object, unit: str, remedy: str) -> None:
         what = f"{'.'.join(keys)} = {value}: this looks like {unit}"
@@ -263,7 +263,7 @@ def _moving(tree: UrdfTree, name: str) -> UrdfJoint:
 
 @contextmanager
 def _blamed_on(file: Path, text: str, *keys: str, naming: str | None = None) -> Iterator[None]:
-    """RobotErrors that name no file get this one, and the line of the key; with `naming`, of that name in its value."""
+    """Add `file` and the line of the key, or of `naming` in its value, to RobotErrors that name no file."""
     try:
         yield
     except RobotError as error:

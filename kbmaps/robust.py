@@ -55,7 +55,7 @@ def unexplained_variance(residuals: FloatArray, covariances: FloatArray, freedom
     squares = np.square((axes.swapaxes(1, 2) @ residuals[..., None])[..., 0]) * (residuals.size / freedom)
 
     def slope(variance: float) -> float:
-        """Twice the derivative of the log likelihood."""
+        """Return twice the derivative of the log likelihood."""
         return float(((squares - told - variance) / np.square(told + variance)).sum())
 
     low, high = 0.0, float(squares.max())  # where each term is negative

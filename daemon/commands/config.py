@@ -196,7 +196,7 @@ def say(text: str) -> None:
 
 
 def write_new(file: Path, text: str) -> None:
-    """Write a file that is not there yet; ConfigError when it is."""
+    """Write a new file. Raise ConfigError if it exists."""
     from bodyschema.interfaces.errors import ConfigError
 
     try:

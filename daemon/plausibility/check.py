@@ -52,7 +52,7 @@ NAMED = 0.12
 FAR_ZERO_RAD = math.radians(20.0)
 # A known camera pose is not off by this much.
 TURNED_RAD = math.radians(30.0)
-# Share of its tolerance that a zero is given which is to stay as drawn.
+# Share of its tolerance that is left to a joint offset kept at nominal.
 HELD = 1e-3
 # A zero of the last joint this far off is not fitted where the marker is known: its quarter turns are tried instead.
 LAST_ZERO_RAD = math.radians(3.0)
@@ -315,7 +315,7 @@ class _Search:
             return np.zeros((1, 3))
 
     def held_error(self) -> float:
-        """RMS distance [m] of the nearest pairs as they are, with all zeros as drawn."""
+        """Return the RMS distance [m] of the nearest pairs with columns unchanged and joint offsets kept at nominal."""
         held = place(self._chain, self._q[None], self._x[None], zeros_std=HELD * self._std, tool_std=TOOL_M)
         return float(held.errors(MEASURED)[0])
 

@@ -76,7 +76,7 @@ class FittedServo:
         return self.zero_ticks + self.direction * angle / self.model.rad_per_tick
 
     def record(self) -> Mapping[str, object]:
-        """Its identity and settings, to be kept with the data."""
+        """Return the servo's identity and settings, to be kept with the data."""
         return {
             "joint": self.joint,
             "bus": self.bus,
@@ -198,7 +198,7 @@ def restore_torque(bus: Bus, servo: FittedServo) -> None:
 
 
 def read_register(bus: Bus, model: Model, id: int, register: Register) -> tuple[bytes | None, Trouble | None]:
-    """Its bytes, twice the same where a wrong answer may pass its checksum; else what was wrong the last time."""
+    """Return a register's bytes or the last trouble; repeat until two agree if the checksum is weak."""
     data, trouble = _read_once(bus, model, id, register)
     for _ in range(ATTEMPTS):
         if data is None or not bus.is_weak(bus.read_request(model, id, register)):

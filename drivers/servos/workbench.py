@@ -146,7 +146,7 @@ class Workbench:
         return wanted if turn is None else (wanted + turn // 2) % turn - turn // 2
 
     def torque_off(self, bus: Bus, servos: Iterable[FittedServo]) -> None:
-        """Switch the torque of all off, and verify it; SourceError when one's stays on."""
+        """Switch the torque of all servos off, and verify it. Raise SourceError if one stays on."""
         for servo in servos:
             switch_torque_off(bus, servo)
 
@@ -213,7 +213,7 @@ class Workbench:
             self._tell(bus, servo, servo.model.layout[LOCK], 0)
 
     def _locked(self, bus: Bus, done: Done) -> Done:
-        """Lock the EEPROM again, where there is a lock."""
+        """Lock the EEPROM again, if it has a lock."""
         servo = done.change.servo
         if LOCK not in servo.model.layout or done.outcome is Outcome.UNKNOWN:
             return done

@@ -156,7 +156,7 @@ class RigidLearner:
     def learn(
         self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None, *, cov: ArrayLike | None = None
     ) -> None:
-        """Pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
+        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
 
         Args:
             q: joint values.

@@ -15,7 +15,7 @@ _LONGEST_STEP = 0.1
 
 
 def deviations(belief: ChainBelief, pairs: Pairs, sigma: FloatArray) -> FloatArray:
-    """Root mean square deviation (size,) [rad, m] of each parameter's true value from the mean, to second order.
+    """Return the RMS deviation (size,) [rad, m] of each parameter's true value from the mean, to second order.
 
     Changes that the pairs cannot separate lie along a curve, not along its tangent. An example is another offset of the
     last joint, compensated for by the marker: it takes the marker round the joint's axis. With y standard normal along

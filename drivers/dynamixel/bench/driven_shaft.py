@@ -23,7 +23,7 @@ class DrivenShaft:
     """
 
     def __init__(self, angle: float, fastest_rad_s: float = FASTEST_RAD_S) -> None:
-        """At `angle` [rad] from the beginning, 0 in the middle of the servo's range."""
+        """Start at `angle` [rad], 0 in the middle of the servo's range."""
         self.servo: Servo | None = None
         self.jammed = False
         self._fastest = fastest_rad_s
@@ -36,7 +36,7 @@ class DrivenShaft:
             return self._at(t)
 
     def turn_by_hand(self, angle: float) -> None:
-        """Somebody turns it by `angle` [rad]."""
+        """Turn the shaft by `angle` [rad], as by hand."""
         with self._lock:
             moved_s, before = self._moves[-1]
             self._moves.append((moved_s, before + angle))
