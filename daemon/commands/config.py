@@ -50,7 +50,7 @@ def init(
 
     Needs: your robot's URDF; with --sim nothing at all; with --lerobot also LeRobot's calibration of the arm.
 
-    Next: mend what is marked CHECK, then `bodyschema config check`. With --sim nothing is left to mend:
+    Next: correct what is marked CHECK, then `bodyschema config check`. With --sim nothing is left to correct:
     `bodyschema run --sim`. With --lerobot: `bodyschema joints`.
     """
     from bodyschema.interfaces.errors import ConfigError
@@ -72,7 +72,7 @@ def init(
 
 @config.command(sort_key=2)
 def check(*, robot: RobotFile = HERE) -> None:
-    """Say what was understood, or which line to mend.
+    """Check robot.toml: print what was understood, or the line to correct.
 
     Needs: robot.toml (`bodyschema config init`) and the URDF that it names.
 
