@@ -44,14 +44,14 @@ OnPorts = DynamixelConfig | FeetechConfig | SerialLinesConfig
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """How the joints of a bench move: an angle at a time [rad] by joint, and that in words."""
+    """Motion of a bench: for each joint its angle [rad] as a function of time, and a description in words."""
 
     angles: dict[str, Angle]
     words: str
 
 
 def require_on_ports(config: Config) -> OnPorts:
-    """The servos or encoders of robot.toml; ConfigError when it has none."""
+    """Return the servos or encoders of robot.toml. Raise ConfigError if it has none."""
     match config.tables.drivers.hardware:
         case DynamixelConfig() | FeetechConfig() | SerialLinesConfig() as hardware:
             return hardware
@@ -64,15 +64,15 @@ def require_on_ports(config: Config) -> OnPorts:
 
 
 def limits_of(config: Config) -> list[tuple[float, float]]:
-    """Of each joint [rad]."""
+    """Return the lower and upper limit of each joint [rad]."""
     return list(zip(config.robot.lower.tolist(), config.robot.upper.tolist(), strict=True))
 
 
 def bench_motion(config: Config, tell: Callable[[float], None]) -> Motion:
-    """The simulated hand's guidance where the simulation can run, else a slow swing of each joint.
+    """Return a motion guided by the simulated hand; without the simulation, a slow swing of each joint.
 
     Args:
-        tell: called with the share of the path that is made.
+        tell: called with the fraction of the path that is computed.
     """
     joints = config.robot.joints
     why = _no_simulation(config)
@@ -101,10 +101,10 @@ def _no_simulation(config: Config) -> str:
 def open_bench(
     config: Config, port: Path, motion: Motion, *, faults: Sequence[str] = (), return_delay_s: float, seed: int
 ) -> DryRun:
-    """The arm that robot.toml describes behind `port`, or `port`-NAME for each of several buses; not opened yet.
+    """Return the arm of robot.toml behind `port` (several buses: each at `port`-NAME), not opened yet.
 
     Raises:
-        ConfigError: there are no servos, a fault is none, or something else is in the place of a port.
+        ConfigError: no servos or encoders are configured, a fault is invalid, or a port's path is occupied.
     """
     hardware = require_on_ports(config)
     asked = [AskedFault.parsed(text, config.robot.joints, _kinds(hardware)) for text in faults]
@@ -144,7 +144,7 @@ def _arm(hardware: OnPorts, angles: Mapping[str, Angle], *, return_delay_s: floa
 
 
 def bench_ports(bench: DryRun) -> list[str]:
-    """In words: what is on which port."""
+    """Describe in words the devices on each port."""
     match bench.config:
         case SerialLinesConfig() as config:
             return [f"{_counted(len(config.encoders), 'encoder')} on {config.port} at {config.baud:,} bit/s"]
@@ -157,7 +157,7 @@ def bench_ports(bench: DryRun) -> list[str]:
 
 
 def bench_commands(bench: DryRun) -> tuple[str, ...]:
-    """The commands that speak to what is on the ports."""
+    """Return the names of the commands that can talk to the devices on the ports."""
     return ("doctor", "joints") if isinstance(bench.config, SerialLinesConfig) else ("scan", "doctor", "joints")
 
 
@@ -178,7 +178,7 @@ def _require_free(link: Path) -> None:
 
 
 def bench_robot_file(config: Config, bench: DryRun, port: Path) -> Path:
-    """Write robot.toml anew beside `port`: with the bench's ports, and a state of its own.
+    """Write a copy of robot.toml beside `port`, with the bench's ports and its own state.
 
     Raises:
         ConfigError: another file is there, or it cannot be written.
@@ -209,7 +209,7 @@ def bench_robot_file(config: Config, bench: DryRun, port: Path) -> Path:
 
 
 def require_bench(config: Config) -> OnPorts | Ros2Config:
-    """What the simulation's joints shall be read through; ConfigError when robot.toml has nothing."""
+    """Return the driver settings for reading the simulation's joints. Raise ConfigError if robot.toml has none."""
     robot = config.tables.drivers.ros2
     return require_on_ports(config) if robot is None else robot
 
@@ -218,7 +218,7 @@ OpenDriver = Callable[[OnPorts | Ros2Config], JointSource]
 
 
 def through_bench(config: Config, joints: JointSource, open_driver: OpenDriver) -> JointSource:
-    """The simulation's joints, read from a bench by the driver that robot.toml configures."""
+    """Return the simulation's joints, read from a bench by the driver configured in robot.toml."""
     hardware = require_bench(config)
     match hardware:
         case DynamixelConfig() | FeetechConfig():
@@ -243,7 +243,7 @@ def _looking_at_servos(
 def _looking_at_lines(
     hardware: SerialLinesConfig, angles: Mapping[str, Angle], open_driver: OpenDriver
 ) -> Iterator[Behind]:
-    """Each look is at a line whose measurement began after it."""
+    """Yield joints read from a board on a bench; each look waits for a line measured after it."""
     from bodyschema.drivers.serial_lines.bench.listener import Listener
 
     clock = SystemClock()
@@ -257,7 +257,7 @@ def _looking_at_lines(
 def _looking_at_messages(
     hardware: Ros2Config, angles: Mapping[str, Angle], open_driver: OpenDriver
 ) -> Iterator[Behind]:
-    """A node that publishes when it is looked at, and a router, in this process."""
+    """Yield joints read from a node and a router in this process; the node publishes at each look."""
     from bodyschema.drivers.ros2.bench.node import Node
     from bodyschema.drivers.ros2.bench.zenoh_robot import ZenohRobot
 

@@ -37,13 +37,13 @@ JUDGED_PAIRS = 300
 SLIDE_ZEROS_M = 0.02
 # No measured coordinate is surer.
 ROUNDING_M = 1e-9
-# A number is shown when it is left so much less uncertain than it was.
+# A parameter counts as determined if its uncertainty falls below this share of the prior one.
 MUCH_SURER = 1.0 / 3.0
 # Of what is said to be known, and of what is not, once it has been fitted: then far more than the fit can be off.
 KNOWN_TURN_RAD, KNOWN_PLACE_M = 0.02, 0.01
 FITTED_TURN_RAD, FITTED_PLACE_M = 0.5, 0.5
-# The rows are cut into so many parts that are each predicted from the others, of two stretches far apart. Five leave
-# four fifths of the rows to learn from; more parts cost a fit each.
+# Number of cross-validation folds, each of two stretches far apart. Five leave four fifths of the rows to learn from;
+# more cost a fit each.
 FOLDS = 5
 # Rows that one of these fits takes at most: figures of a millimetre do not change by more, and 20,000 take a minute.
 FOLD_ROWS = 2000
@@ -127,7 +127,7 @@ class Calibration:
 
     @property
     def workmanship(self) -> ChainTolerances | None:
-        """How well the arm seems to be made; None where the pairs do not tell."""
+        """Estimated workmanship of the arm; None if the pairs do not determine it."""
         made = [(learner.tolerances.axes, learner.tolerances.points) for learner in self.learners]
         return self.learner.tolerances if is_told(made) else None
 
@@ -165,9 +165,9 @@ class Calibration:
 
     @cached_property
     def shown(self) -> int:
-        """How many independent numbers of the arm the pairs make much surer than they were: a third of what they were.
+        """Number of independent parameters whose uncertainty the pairs reduce to less than a third (`MUCH_SURER`).
 
-        Before, an arm of the worst workmanship was possible.
+        The prior allows an arm of the worst workmanship.
         """
         report, (axes, points) = self.learner.report(), WORKMANSHIP[-1]
         parameters = ChainParameters(self.placed.chain)
@@ -179,7 +179,7 @@ class Calibration:
 
     @cached_property
     def figures(self) -> ChainFigures:
-        """What was learnt, in the numbers that have names; not knowing how well the arm is made is part of them."""
+        """Calibrated figures; their uncertainty includes that of the workmanship."""
         prior = ChainBelief.from_tolerances(ChainParameters(self.placed.chain), self.learner.tolerances)
         return ChainFigures(self.robot, tuple(map(_claimed, self.learners)), self.shares, prior)
 
@@ -187,7 +187,7 @@ class Calibration:
 def _learners(
     nominal: RigidChain, choices: list[ChainTolerances], recording: Recording, sigma_m: float | None
 ) -> tuple[tuple[RigidLearner, ...], FloatArray]:
-    """Learners of all pairs whose tolerances make some of the pairs probable, and their shares."""
+    """Return learners of all pairs with the tolerances that a sample of the pairs makes probable, and their shares."""
     told = None if recording.cov is None else recording.cov + ROUNDING_M**2 * np.eye(3)
     some = np.unique(np.linspace(0, len(recording) - 1, JUDGED_PAIRS).astype(np.intp))
 
@@ -214,7 +214,7 @@ def _told(recording: Recording, learner: RigidLearner, rows: IntArray) -> FloatA
 
 
 def _of_the_arm(learner: RigidLearner, recording: Recording, rows: IntArray) -> float:
-    """Variance [m²] of a coordinate in these rows that the instrument, which tells its own, has not: encoders, play."""
+    """Return the variance [m²] per coordinate that these rows have beyond the instrument's: encoders, backlash."""
     assert recording.cov is not None
     good = rows[learner.inliers]
     residuals = recording.x[good] - learner.predict(recording.q[good])
@@ -241,6 +241,6 @@ def _tolerances(robot: RobotDescription, zeros_rad: float, trusted: Trusted) -> 
 
 
 def _claimed(learner: RigidLearner) -> ChainBelief:
-    """What the learner believes, as much less surely as its intervals are wider where the noise was estimated."""
+    """Return the learner's belief, widened like its intervals to allow for a noise level that was estimated."""
     belief = learner.belief
     return replace(belief, root=learner.report().widening * belief.root)

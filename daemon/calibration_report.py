@@ -1,4 +1,4 @@
-"""What a calibration found, in the units of people."""
+"""Report of a calibration in degrees and millimetres."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from bodyschema.interfaces.robot import RobotDescription
 
 # A joint that moved less is named [rad, m].
 STILL_RAD, STILL_M = math.radians(10.0), 0.02
-# A zero is said to be far off from so many times its tolerance on, and not written from so many on. The first is one in
-# 370 arms whose zeros are as good as was told; the second leaves room for a guess of the tolerance that is half of it.
+# Multiples of its tolerance beyond which a joint offset is reported, and beyond which it is not written. One in 370
+# exceeds the first if the tolerance is right; the second allows for a tolerance guessed at half its true value.
 FAR_OFF, TOO_FAR_OFF = 3.0, 5.0
 _DEG = math.degrees(1.0)
 _UNITS = (1e3, 1e3, 1e3, _DEG, _DEG, _DEG, 1e3, 1e3, 1e3)
 
 
 class Figure(msgspec.Struct, frozen=True):
-    """One number as drawn and as learnt, with half the width of its 95 % interval."""
+    """Nominal and calibrated value of a parameter, with the half width of its 95 % interval."""
 
     drawn: float
     learnt: float
@@ -36,10 +36,10 @@ class Figure(msgspec.Struct, frozen=True):
 
 
 class Zero(msgspec.Struct, frozen=True):
-    """What has to be added to a joint's reading, in `unit` (° or mm).
+    """Joint offset to add to the joint's reading, in `unit` (° or mm).
 
-    `half_width` of its 95 % interval is null where no motion shows it and it is left as drawn: the other figures are
-    given that it is right.
+    `half_width` of its 95 % interval is null if the offset is not identifiable and kept at nominal; the other figures
+    are conditional on that.
     """
 
     joint: str
@@ -127,14 +127,14 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
         frame: str = CAMERA_LINK,
         free: Calibration | None = None,
     ) -> CalibrationReport:
-        """The answers of `calibration`.
+        """Build the report of `calibration`.
 
         Args:
-            seen: what its recording looks like.
-            source: what the recording is called.
-            first: the number of its first row.
-            frame: what ROS calls the measurement frame.
-            free: the same with nothing held as the URDF has it, for comparison.
+            seen: plausibility of its recording.
+            source: name of the recording.
+            first: number of its first row.
+            frame: ROS name of the measurement frame.
+            free: the same calibration with nothing fixed to the URDF, for comparison.
         """
         jump = tool_jump(calibration.learner, calibration.recording)
         robot, recording, learner = calibration.robot, calibration.recording, calibration.learner
@@ -207,7 +207,7 @@ def _zeros(calibration: Calibration, values: FloatArray, halves: FloatArray) -> 
 
 
 def _far_off(calibration: Calibration, zeros: list[Zero], times: float) -> list[str]:
-    """Sentences about zeros that are so many times as far off as was told."""
+    """Return messages about joint offsets larger than `times` their tolerance."""
     told = calibration.learner.tolerances
     said: list[str] = []
     for zero, slides in zip(zeros, calibration.robot.chain.prismatic, strict=True):
@@ -222,7 +222,7 @@ def _far_off(calibration: Calibration, zeros: list[Zero], times: float) -> list[
 
 
 def _badly_made(calibration: Calibration) -> list[str]:
-    """A sentence where the pairs need an arm that is worse than any."""
+    """Return a message if the geometric errors reach the largest that are considered; else an empty list."""
     made, (axes, points) = calibration.workmanship, WORKMANSHIP[-1]
     if made is None or made.axes < axes:
         return []

@@ -1,4 +1,4 @@
-"""What a calibration found, for a terminal of 80 columns."""
+"""Print a calibration report on a terminal of 80 columns."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from bodyschema.daemon.calibration_report import CalibrationReport, Figure, Zero
 
 # Told noise that explains the residuals leaves less than this.
 MISFIT = 1.5
-# Errors on new poses that are so many times those of free links: the URDF is wrong by as much as is measured. What 5
-# blocks of a good arm show by chance stays below 1.1.
+# If held-out errors exceed those with free links by this factor, the URDF is measurably wrong. Chance on 5 blocks of a
+# good arm stays below 1.1.
 WRONG_URDF = 1.25
 
 
 def view(report: CalibrationReport) -> Group:
-    """Tables of the figures, then what they mean in sentences."""
+    """Return tables of the figures, followed by sentences on their meaning."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
     table.add_column(Text(f"{report.robot}, {report.pairs} pairs of {report.source}"), overflow="fold")
     for name in ("drawn", "learnt", "95 %"):
@@ -35,7 +35,7 @@ def view(report: CalibrationReport) -> Group:
 
 
 def sentences(report: CalibrationReport) -> list[str]:
-    """The report in words."""
+    """Return the report as sentences."""
     said = [_expected(report)] if report.expected_mm is not None else []
     said += [
         f"Mean distance to the pairs: {report.drawn_error_mm:.3f} mm for the drawn arm in its best place, "
@@ -74,7 +74,7 @@ def sentences(report: CalibrationReport) -> list[str]:
 
 
 def two_tools(report: CalibrationReport) -> str:
-    """What to do where the pairs are of two tools."""
+    """Return advice for a recording made with two different tools."""
     return (
         f"From number {report.other_tool_from} on the marker sits about {report.other_tool_mm:.0f} mm elsewhere on the "
         "hand: these are pairs of two tools, and no figure is right for both. Calibrate them apart: "
@@ -149,7 +149,7 @@ def _figures(table: Table, names: tuple[str, ...], figures: list[Figure], digits
 
 
 def _fixed(value: float, digits: int) -> str:
-    """Without a minus before nothing but zeros."""
+    """Format with fixed digits, without a minus sign before zero."""
     return f"{round(value, digits) + 0.0:.{digits}f}"
 
 

@@ -33,7 +33,7 @@ from .pages import write_page
 
 REPORT = "report.html"
 NORMAL_95 = 1.96
-# Where the uncertainty of a position is told: straight ahead, at this distance [m].
+# Position uncertainty is reported for a point straight ahead at this distance [m].
 AHEAD_M = 0.6
 _SQUARES = re.compile(r"(\d{1,9})\s*[xX×]\s*(\d{1,9})")
 
@@ -42,13 +42,13 @@ Tell = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Images:
-    """Where images are.
+    """Location of the images.
 
     Attributes:
         folder: the folder.
         left, right: patterns of the eyes' files.
-        side_by_side: whether each image shows both eyes.
-        one: whether all images are of one camera alone.
+        side_by_side: each image shows both eyes.
+        one: all images are of one camera.
     """
 
     folder: Path
@@ -58,7 +58,7 @@ class Images:
     one: bool = False
 
     def files(self) -> list[PairFiles]:
-        """Which files belong together; CalibrationError when there are none."""
+        """Return the files that belong together. Raise CalibrationError if there are none."""
         if self.one and (self.right is not None or self.side_by_side):
             raise ConfigError("--one is of one camera alone", remedy="Leave --right and --side-by-side away")
         if (self.left is None) != (self.right is None) and not self.one:
@@ -100,7 +100,7 @@ class UnusableImage(msgspec.Struct):
 
 
 class CamerasFile(msgspec.Struct):
-    """What `bodyschema calibrate cameras --json` prints. Half widths are those of 95 % intervals.
+    """Output of `bodyschema calibrate cameras --json`. Half widths are those of 95 % intervals.
 
     One camera alone has no baseline.
     """
@@ -125,7 +125,7 @@ class CamerasFile(msgspec.Struct):
 
 
 class CheckFile(msgspec.Struct):
-    """What `bodyschema calibrate check --json` prints. Half widths are those of 95 % intervals."""
+    """Output of `bodyschema calibrate check --json`. Half widths are those of 95 % intervals."""
 
     holds: bool
     wrong: list[str]
@@ -148,13 +148,13 @@ def board_of(
     dictionary: str | None = None,
     pattern: Pattern = "charuco",
 ) -> Board:
-    """The board that options describe.
+    """Return the board described by the options.
 
     Args:
-        squares: as in 8x6.
+        squares: columns x rows, for example 8x6.
 
     Raises:
-        ConfigError: there is no such board.
+        ConfigError: the options describe no valid board.
     """
     read = _SQUARES.fullmatch(squares.strip())
     if read is None:
@@ -163,10 +163,10 @@ def board_of(
 
 
 def as_printed(drawn: Board, ruler_mm: float | None) -> Board:
-    """The board in the size in which its page's longer ruler measures `ruler_mm`.
+    """Return the board in its printed size, at which the longer ruler of its page measures `ruler_mm`.
 
     Raises:
-        ConfigError: that is another line.
+        ConfigError: `ruler_mm` is not between half and twice the nominal length; another line was measured.
     """
     if ruler_mm is None:
         return drawn
@@ -207,7 +207,7 @@ def from_images(images: Images, board: Board, tell: Tell) -> Gathered:
 
 @dataclass(frozen=True)
 class Wanted:
-    """Of a calibration, besides views and board; as `bodyschema.vision.calibration.calibrate.Asked` has it."""
+    """Settings of a calibration besides views and board; see `bodyschema.vision.calibration.calibrate.Asked`."""
 
     serials: tuple[str, ...] = ("", "")
     model: ModelChoice = "auto"
@@ -216,7 +216,7 @@ class Wanted:
 
 
 def calibrated(found: Gathered, wanted: Wanted, tell: Tell) -> Calibrated:
-    """The calibration of views; CalibrationError with the reasons when it is not good enough."""
+    """Calibrate from the views. Raise CalibrationError with the reasons if the result is not good enough."""
     asked = Asked(
         image_size_px=found.image_size_px,
         serials=wanted.serials[: len(found.eyes)],
@@ -229,7 +229,7 @@ def calibrated(found: Gathered, wanted: Wanted, tell: Tell) -> Calibrated:
 
 
 def of_cameras(wanted: Wanted) -> Callable[[Gathered, tuple[str, ...], Tell], Calibrated]:
-    """As `calibrated`, of cameras whose serials are known; those that are wanted come first."""
+    """Return a variant of `calibrated` for cameras with known serials; the serials in `wanted` take precedence."""
 
     def of(found: Gathered, serials: tuple[str, ...], tell: Tell) -> Calibrated:
         known = tuple(own or told for own, told in zip(wanted.serials, serials, strict=False))
@@ -239,17 +239,17 @@ def of_cameras(wanted: Wanted) -> Callable[[Gathered, tuple[str, ...], Tell], Ca
 
 
 def live_views(board: Board, eyes: int) -> LiveViews:
-    """Views of the board by so many eyes, of which none was taken yet."""
+    """Return an empty collection of views of the board, for one eye or two."""
     return LiveViews(board, eyes=EYES if eyes > 1 else ONE_EYE)
 
 
 def kept_in(folder: Path | None) -> Callable[[ImagePair, int], None]:
-    """A function that writes the images of a view into a folder, where there is one."""
+    """Return a function that writes the images of a view into `folder`; it does nothing if `folder` is None."""
     return lambda pair, number: None if folder is None else write_pair(pair, folder, number)
 
 
 def write_calibrated_cameras(result: Calibrated, found: Gathered, out: Path) -> Path:
-    """Write cameras.toml and its report beside it; where the report is."""
+    """Write cameras.toml with its report beside it, and return the report's path."""
     write_rig(result.rig, out)
     report = out.with_name(f"{out.stem}_{REPORT}")
     report.write_text(report_page(result, found), encoding="utf-8")
@@ -257,10 +257,10 @@ def write_calibrated_cameras(result: Calibrated, found: Gathered, out: Path) -> 
 
 
 def figures(result: Calibrated, found: Gathered, *, size_was_measured: bool) -> CamerasFile:
-    """A calibration in figures.
+    """Return the figures of a calibration.
 
     Args:
-        size_was_measured: whether a ruler told the board's size, or the distance of the lenses.
+        size_was_measured: the board, or the distance between the lenses, was measured with a ruler.
     """
     rig, fitted = result.rig, result.fitted
     pair = rig if isinstance(rig, StereoRig) else None
@@ -306,7 +306,7 @@ def checked(file: Path, images: Images, board: Board) -> tuple[CheckFile, str]:
 
 
 def pair_in(file: Path) -> StereoRig:
-    """The calibration of two cameras in a file; CalibrationError where it is of one, which no single look checks."""
+    """Return the stereo calibration in `file`. Raise CalibrationError if it is of one camera only."""
     rig = read_rig(file)
     if isinstance(rig, OneEyeRig):
         raise CalibrationError(
@@ -317,7 +317,7 @@ def pair_in(file: Path) -> StereoRig:
 
 
 def check_figures(found: Check) -> CheckFile:
-    """A check in figures."""
+    """Return the figures of a check."""
     return CheckFile(
         holds=found.holds,
         wrong=list(found.wrong),
@@ -334,7 +334,7 @@ def check_figures(found: Check) -> CheckFile:
 
 
 def _position_half_widths_mm(rig: StereoRig) -> tuple[float, float, float]:
-    """95 % half widths of a position straight ahead, in the left camera's frame, as the calibration alone has them."""
+    """Return 95 % half widths of a position straight ahead in the left camera's frame, due to the calibration alone."""
     eye = -rig.R_right_left.T @ rig.translation_m
     x = np.array([[0.5 * eye[0], 0.5 * eye[1], AHEAD_M]])
     left, right = rig.left.project(x), rig.right.project(x @ rig.R_right_left.T + rig.translation_m)

@@ -1,4 +1,4 @@
-"""What a camera calibration and its check found, for a terminal of 80 columns."""
+"""Print a camera calibration and its check on a terminal of 80 columns."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _WISHES = 3
 
 
 def cameras_view(found: CamerasFile) -> Group:
-    """The eyes' parameters, then what they are good for in sentences."""
+    """Return a table of the eyes' parameters, followed by sentences on their accuracy."""
     width, height = found.image_size_px
     eyes = ("left", "right") if found.baseline_mm is not None else ("left",)
     titles = ("left", "95 %", "right", "95 %") if len(eyes) > 1 else ("value", "95 %")
@@ -30,7 +30,7 @@ def cameras_view(found: CamerasFile) -> Group:
 
 
 def check_view(found: CheckFile, name: str) -> Group:
-    """The figures with what they should be, then the verdict."""
+    """Return a table of measured and expected figures, followed by the verdict."""
     table = _table(f"{name}: {found.corners} corners", "measured", "95 %", "should be")
     table.add_row(
         Text("rows of both eyes apart [px]"), f"{found.rows_px:+.3f}", f"± {found.rows_half_width_px:.3f}", "0"

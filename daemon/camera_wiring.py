@@ -34,12 +34,12 @@ PAGE = "docs/cameras.md"
 
 
 def cameras_of(config: Config) -> CamerasConfig | None:
-    """The cameras of robot.toml, if it has some."""
+    """Return the cameras configured in robot.toml; None if it has none."""
     return config.tables.vision.cameras
 
 
 def require_cameras(config: Config) -> CamerasConfig:
-    """The cameras of robot.toml; ConfigError when it has none."""
+    """Return the cameras configured in robot.toml. Raise ConfigError if it has none."""
     cameras = cameras_of(config)
     if cameras is None:
         raise ConfigError(
@@ -49,30 +49,30 @@ def require_cameras(config: Config) -> CamerasConfig:
 
 
 def open_eyes(config: Config, clock: Clock) -> LiveEyes | Film:
-    """The cameras of robot.toml, their images as they come; not opened yet.
+    """Return the cameras of robot.toml with unprocessed images, not opened yet.
 
     Raises:
-        ConfigError: it has none.
+        ConfigError: no cameras are configured.
     """
     return eyes_of(require_cameras(config), config.file.parent, clock)
 
 
 def calibration_file(config: Config) -> Path:
-    """The calibration that robot.toml names; else where one is written, beside it."""
+    """Return the calibration file named in robot.toml; by default cameras.toml beside it."""
     cameras = require_cameras(config)
     return config.file.parent / (cameras.calibration or "cameras.toml")
 
 
 def names_calibration(config: Config) -> bool:
-    """Whether robot.toml names a calibration."""
+    """Return True if robot.toml names a calibration."""
     return require_cameras(config).calibration is not None
 
 
 def camera_of(config: Config, eyes: LiveEyes | Film) -> StereoCamera:
-    """`eyes` with rectified images, not opened yet: by the calibration file, else as [camera] describes them.
+    """Return `eyes` with rectified images, not opened yet: by the calibration file, else by [camera].
 
     Raises:
-        ConfigError: nothing says how they see, or the file cannot be read.
+        ConfigError: there is no calibration, or the file cannot be read.
     """
     cameras = require_cameras(config)
     if cameras.calibration is not None:
@@ -90,7 +90,7 @@ def camera_of(config: Config, eyes: LiveEyes | Film) -> StereoCamera:
 
 
 def _of_files(rig: Rig, cameras: CamerasConfig) -> Rig:
-    """The rig without serials, as files do not tell which cameras took them, unless it names these very files."""
+    """Return the rig without serials unless it names these files: files do not tell which cameras took them."""
     layout = cameras.layout
     names = {layout.left, layout.right} if isinstance(layout, ImagesConfig | VideosConfig) else set[str | None]()
     if names & set(rig.serials):
@@ -126,7 +126,7 @@ class Watched:
 
 
 def open_watched(config: Config) -> Watched:
-    """The cameras of robot.toml with what is seen drawn into their images, not opened yet."""
+    """Return the cameras of robot.toml, not opened yet; once calibrated, detections are drawn into their images."""
     eyes = open_eyes(config, SystemClock())
     is_calibrated = require_cameras(config).calibration is not None or config.robot.calibration is not None
     if not is_calibrated:
@@ -138,7 +138,7 @@ def open_watched(config: Config) -> Watched:
 
 
 def camera_checks(config: Config) -> Iterator[Check]:
-    """Of the cameras of robot.toml: are they there, and what do they send when both are open at once?"""
+    """Yield checks that the cameras of robot.toml are present and send images when both are open at once."""
     cameras = require_cameras(config)
     missing = False
     for name, device in cameras.devices.items():
@@ -172,7 +172,7 @@ def _where(device: str) -> str:
 
 
 def _open_checks(eyes: LiveEyes | Film, cameras: CamerasConfig) -> Iterator[Check]:
-    """What both cameras together send for a while."""
+    """Open the cameras together for a while and yield checks of what they send."""
     with ExitStack() as stack:
         stack.enter_context(eyes)
         serials = eyes.serials
@@ -215,7 +215,7 @@ def _told(figures: CameraFigures) -> str:
 
 
 def camera_lines(config: Config) -> Iterator[str]:
-    """Where images come from, in words; ConfigError where the calibration cannot be read."""
+    """Describe in words where images come from. Raise ConfigError if the calibration cannot be read."""
     cameras = require_cameras(config)
     match cameras.layout:
         case UvcSettings() as layout:

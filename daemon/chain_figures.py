@@ -1,4 +1,4 @@
-"""What is believed of a chain, in the numbers that have names: pose of the camera, place of the marker, joint zeros."""
+"""Express the belief about a chain in named parameters: camera pose, marker position, joint offsets."""
 
 from __future__ import annotations
 
@@ -87,10 +87,10 @@ class ChainFigures:
 
     @cached_property
     def shown(self) -> BoolArray:
-        """Which joints' zeros (d,) the pairs show; a turn of the camera or of the marker may do what others do.
+        """Mask (d,) of identifiable joint offsets; others may be equivalent to a rotation of the camera or the marker.
 
-        What exact pairs of all poses would not show, nothing has shown: along such directions a belief that was
-        linearised at several places seems surer than it is.
+        An offset that exact pairs of all poses would not show counts as not identifiable: along such directions a
+        belief that was linearised at several places seems more certain than it is.
         """
         zeros = self._zeros
         return (_spread(self.beliefs[0], zeros) < self._unsure) & (_spread(self._best, zeros) < self._unsure)
@@ -109,7 +109,7 @@ class ChainFigures:
         return after_exact_pairs(self.prior, self.beliefs[0].mean, self.robot)
 
     def _split(self, belief: ChainBelief) -> FloatArray:
-        """The most probable change (size,) given that the zeros which nothing shows are as drawn."""
+        """Return the most probable change (size,) with the joint offsets that are not identifiable kept at nominal."""
         drawn = self._hidden
         covariance = belief.covariance
         gain = np.linalg.solve(covariance[np.ix_(drawn, drawn)], covariance[drawn])
@@ -119,7 +119,7 @@ class ChainFigures:
 
     @property
     def _hidden(self) -> IntArray:
-        """Which zeros nothing shows; those that are held as drawn have nothing to show."""
+        """Indices of the joint offsets that are not identifiable, without those that are fixed at nominal."""
         return self._zeros[~self.shown & (_spread(self.prior, self._zeros) > 0.0)]
 
     @property
@@ -131,7 +131,7 @@ class ChainFigures:
         return self.beliefs[0].parameters
 
     def _geometry(self, change: FloatArray, split: FloatArray) -> CalibratedGeometry:
-        """The chain of one change, with the move of the camera and the zeros of another that makes nearly the same."""
+        """Return the geometry of `change`, with the camera move and joint offsets of the nearly equivalent `split`."""
         parameters = self._parameters
         T_placed_nominal = parameters.reference.fixed[0] @ inverse(self.robot.chain.fixed[0])
         return CalibratedGeometry.of(
@@ -153,7 +153,7 @@ class ChainFigures:
 
 
 def after_exact_pairs(prior: ChainBelief, change: FloatArray, robot: RobotDescription) -> ChainBelief:
-    """The prior with what exact pairs of all poses would leave open, linearised at a change (size,)."""
+    """Return what exact pairs of all poses would leave of the prior, linearised at a change (size,)."""
     _, jacobian = prior.parameters.linearised(change, _poses(robot))
     rows = (jacobian @ prior.root).reshape(-1, prior.root.shape[1]) / _EXACT_M
     _, singular, vt = np.linalg.svd(rows, full_matrices=False)
@@ -161,9 +161,9 @@ def after_exact_pairs(prior: ChainBelief, change: FloatArray, robot: RobotDescri
 
 
 def most_probable_alike(prior: ChainBelief, change: FloatArray, robot: RobotDescription) -> FloatArray:
-    """Of all changes (size,) that make the same positions as `change`, the one that is most probable beforehand.
+    """Return the change (size,) most probable under the prior among all that give the same positions as `change`.
 
-    They lie along a curve, so the way there takes several linearisations.
+    These changes lie along a curve, so several linearisations are needed.
     """
     poses = _poses(robot)
     same, found = prior.parameters.positions(change, poses), change
@@ -176,12 +176,13 @@ def most_probable_alike(prior: ChainBelief, change: FloatArray, robot: RobotDesc
 
 
 def no_surer_than_possible(belief: ChainBelief, prior: ChainBelief, robot: RobotDescription) -> ChainBelief:
-    """A belief made in several linearisations, with what no pair can show left to the prior.
+    """Return a belief made in several linearisations, with the prior restored where pairs are uninformative.
 
-    What one chain does as well as another lies along a curve, and its tangents differ from place to place. Pairs
-    that were linearised at one place therefore seem to tell something about the tangents at another (Huang, Mourikis
-    and Roumeliotis 2010, on the consistency of the extended Kalman filter). In no direction may a belief be surer
-    than exact pairs would make it. Along what pairs cannot show, its mean goes to where the prior is most probable.
+    Chains that give the same positions lie along a curve, and its tangents differ from place to place. Pairs that
+    were linearised at one place therefore seem informative about the tangents at another (Huang, Mourikis and
+    Roumeliotis 2010, on the consistency of the extended Kalman filter). In no direction is the returned belief more
+    certain than exact pairs would make it. Along directions that pairs cannot show, its mean moves to where the prior
+    is most probable.
     """
     change = most_probable_alike(prior, belief.mean, robot)
     best = after_exact_pairs(prior, change, robot)
@@ -197,28 +198,28 @@ def no_surer_than_possible(belief: ChainBelief, prior: ChainBelief, robot: Robot
 
 
 def _poses(robot: RobotDescription) -> FloatArray:
-    """Configurations (m, d) that stand for all."""
+    """Return a fixed random sample of configurations (m, d) within the joint limits."""
     return np.random.default_rng(0).uniform(robot.lower, robot.upper, (_POSES, len(robot.joints)))
 
 
 def is_told(made: Sequence[tuple[float, float]]) -> bool:
-    """Whether pairs that leave these workmanships (axes [rad], places [m]) probable tell how well the arm is made."""
+    """Return True if the probable workmanships (axes [rad], positions [m]) agree within the factor TOLD_WITHIN."""
     axes = [axes for axes, _ in made]
     return max(axes) <= TOLD_WITHIN * min(axes)
 
 
 def _spread(belief: ChainBelief, which: IntArray) -> FloatArray:
-    """1-sigma (k,) of some of the parameters."""
+    """Return 1-sigma (k,) of some of the parameters."""
     return np.sqrt(np.square(belief.root[which]).sum(axis=1))
 
 
 def _given(covariance: FloatArray, known: IntArray) -> FloatArray:
-    """The covariance (m, m) of a Gaussian once some of its components are known."""
+    """Return the covariance (m, m) of a Gaussian conditioned on some of its components."""
     across = covariance[:, known]
     return covariance - across @ np.linalg.solve(covariance[np.ix_(known, known)], across.T)
 
 
 def _unwound(difference: FloatArray) -> FloatArray:
-    """A difference of figures (9 + d,) whose camera angles go the shorter way round."""
+    """Wrap the camera angles of a difference of figures (9 + d,) to [-π, π), in place, and return it."""
     difference[3:6] = np.remainder(difference[3:6] + np.pi, 2.0 * np.pi) - np.pi
     return difference

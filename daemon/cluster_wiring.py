@@ -1,4 +1,4 @@
-"""Measuring a cluster of tags from images: what is read, and what is said."""
+"""Measure a cluster of tags from images: inputs and report."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _SIDE = re.compile(r"(\d{1,9})=(\d{1,9}\.?\d*)")
 
 @dataclass(frozen=True)
 class Wanted:
-    """Which tags: of a dictionary, all or those of some numbers; sides of their black squares [m], some by number."""
+    """Tags of a cluster: dictionary, IDs (None: all) and sides of the black squares [m], exceptions by ID."""
 
     dictionary: Dictionary
     side_m: float
@@ -52,7 +52,7 @@ class TagFigures(msgspec.Struct):
 
 
 class ClusterFile(msgspec.Struct):
-    """What `bodyschema marker cluster --json` prints."""
+    """Output of `bodyschema marker cluster --json`."""
 
     views: int
     misfit: float
@@ -64,11 +64,11 @@ class ClusterFile(msgspec.Struct):
 
 
 def measured(images: Images, calibration: Path, wanted: Wanted, tell: Callable[[str], None]) -> MeasuredCluster:
-    """Where the tags are that images of calibrated cameras show.
+    """Measure the poses of the tags in images of calibrated cameras.
 
     Raises:
         ConfigError: the calibration is damaged.
-        CalibrationError: images or tags are not what is needed; or the squares are not of that side.
+        CalibrationError: images or tags are unsuitable, or the squares have another side.
     """
     rig, files = read_rig(calibration), images.files()
     if len(rig.serials) < 2:
@@ -98,7 +98,7 @@ def measured(images: Images, calibration: Path, wanted: Wanted, tell: Callable[[
 
 
 def sides_of(text: str) -> dict[int, float]:
-    """Sides [m] of tags by their number, from a text like 7=25,8=25 [mm]; ConfigError when it is none."""
+    """Parse sides [m] of tags by ID from a text like 7=25,8=25 [mm]. Raise ConfigError if it is invalid."""
     found: dict[int, float] = {}
     for part in text.split(","):
         told = _SIDE.fullmatch(part.strip())
@@ -114,7 +114,7 @@ def _seen(finder: TagFinder, image: ImageArray, maps: tuple[ImageArray, ImageArr
 
 
 def _require_tags(views: Sequence[ClusterView], twice: Mapping[int, Sequence[str]], wanted: Wanted) -> None:
-    """CalibrationError where a number is seen twice in one image, more than once, or wanted ones are in none."""
+    """Raise CalibrationError if several images show one ID twice, no tag is found, or a wanted one is missing."""
     for id, names in twice.items():
         if len(names) > 1:
             raise CalibrationError(
@@ -133,7 +133,7 @@ def _require_tags(views: Sequence[ClusterView], twice: Mapping[int, Sequence[str
 
 
 def tables(found: MeasuredCluster, wanted: Wanted) -> str:
-    """The tables of robot.toml, with the uncertainty of each tag."""
+    """Return the tables for robot.toml, with the uncertainty of each tag in a comment."""
     notes = [
         "the marker's frame"
         if k == 0
@@ -144,7 +144,7 @@ def tables(found: MeasuredCluster, wanted: Wanted) -> str:
 
 
 def figures(found: MeasuredCluster) -> ClusterFile:
-    """A measured cluster in figures."""
+    """Return the figures of a measured cluster."""
     return ClusterFile(
         views=found.views,
         misfit=found.misfit,
@@ -172,7 +172,7 @@ def _scaled(values: object, by: float) -> tuple[float, float, float]:
 
 
 def said(found: MeasuredCluster) -> str:
-    """The fit in a sentence or two."""
+    """Summarise the fit in a few sentences."""
     text = (
         f"{len(found.tags)} tags in {found.views} pairs of images that show two or more to both eyes; what "
         f"is left is {found.misfit:.2f} times what the "

@@ -56,10 +56,10 @@ class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         max_time_error_deg: joints that move farther than this while the time of a frame is uncertain (1-sigma, and
             what lies between the two eyes' images) are too fast for a pair.
         segment_gap_s: a pause between pairs longer than this starts a new segment.
-        keep_days: pairs older than this are deleted; without it none is for its age.
-        keep_mb: so much of the store's file is used, in 10^6 bytes; the oldest pairs beyond it are deleted. Without it
-            the disk is the limit.
-        keep_newest: so many of the newest pairs are kept whatever their age and size.
+        keep_days: pairs older than this are deleted; without it, age does not matter.
+        keep_mb: maximum size of the store in 10^6 bytes; the oldest pairs beyond it are deleted. Without it, the disk
+            is the limit.
+        keep_newest: this number of newest pairs is kept whatever their age and size.
     """
 
     state_dir: str | None = None
@@ -87,7 +87,7 @@ class LearnerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         step_size: μ0 of the normalised LMS rule, between 0 and 2.
         replays_per_pair: how often stored pairs are learnt again, on average, for every new one.
         replay_capacity: how many of the newest pairs are kept for replay.
-        solve_every: the rigid chain and the exact map are solved anew after so many new pairs.
+        solve_every: number of new pairs after which the rigid chain and the exact map are solved again.
         angle_tolerance_deg: how far the real arm may be from its description, 1-sigma: each component of a joint's
             axis, the zero of each joint, and each component of the cameras' orientation.
         length_tolerance_m: the same for each coordinate of a joint's place, and for the zero of a sliding joint.
@@ -192,10 +192,10 @@ class Config:
         )
 
     def with_state_dir(self, folder: Path) -> Config:
-        """The same with another place for store and checkpoint, relative to the working directory.
+        """Return a copy with another folder for store and checkpoint, relative to the working directory.
 
         Raises:
-            ConfigError: it is a file.
+            ConfigError: `folder` is a file.
         """
         if os.path.exists(folder) and not os.path.isdir(folder):
             raise ConfigError("is a file, and store and checkpoint need a folder", file=folder, remedy=_STATE_REMEDY)
@@ -203,25 +203,25 @@ class Config:
         return replace(self.with_tables(msgspec.structs.replace(self.tables, daemon=daemon)), given_state_dir=folder)
 
     def with_tables(self, tables: Tables) -> Config:
-        """The same with other settings."""
+        """Return a copy with other settings."""
         return replace(self, tables=tables)
 
     def reread(self) -> Config:
-        """What the file says now, under the same command line; ConfigError as by `load`."""
+        """Load the file again with the same command-line settings. Raise ConfigError as `load` does."""
         again = Config.load(self.file)
         return again if self.given_state_dir is None else again.with_state_dir(self.given_state_dir)
 
     def route(self, process: str) -> Route:
-        """Where a client finds `sampler` or `learner`, and as whom."""
+        """Return the endpoint and identity with which a client connects to `sampler` or `learner`."""
         return self.tables.zenoh.route(process, self.file.parent)
 
     def zenoh_settings(self, process: str) -> dict[str, Any]:
-        """What zenoh is told in `sampler` or `learner`: whom to connect to, as whom, and who may do what."""
+        """Return the zenoh settings of `sampler` or `learner`: endpoints, TLS identity, access control."""
         return self.tables.zenoh.settings_of(process, self.robot.name, self.file.parent)
 
     @property
     def state_dir(self) -> Path:
-        """Where store and checkpoint live."""
+        """Folder of store and checkpoint."""
         if self.tables.daemon.state_dir is not None:
             return (self.file.parent / self.tables.daemon.state_dir).resolve()
         return state_home() / self.robot.name
@@ -241,7 +241,7 @@ _STATE_REMEDY = "Give a folder with --state-dir; one that is not there yet is ma
 
 
 def state_home() -> Path:
-    """The folder of all robots' states."""
+    """Return the folder that holds the state of every robot."""
     return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "bodyschema"
 
 
@@ -258,7 +258,7 @@ def _check_router(tables: Tables, file: Path, text: str) -> None:
 
 
 def _require_size(robot: RobotDescription, tables: Tables, vision: Mapping[str, Any], file: Path, text: str) -> None:
-    """ConfigError where one camera alone is to tell the depth of a marker whose size nobody said."""
+    """Raise ConfigError if a single camera would have to measure the depth of a marker of unknown size."""
     cameras = tables.vision.cameras
     if robot.camera.eyes == 2 and (cameras is None or cameras.eyes == 2):
         return
@@ -293,7 +293,7 @@ def _override(raw: dict[str, Any], known: list[str], environment: Mapping[str, s
 
 
 def _checked(variable: str, table: str, key: str, value: Any) -> Any:
-    """The value; ConfigError naming the environment variable when the table has no such key or it does not fit."""
+    """Return the value. Raise ConfigError naming the environment variable if key or value is invalid in the table."""
     kind = {"robot": RobotSection, "camera": CameraSection}.get(table) or hint_at(Tables, (table,))
     fields = {field.encode_name: field.type for field in msgspec.structs.fields(kind)}
     if key not in fields:

@@ -42,7 +42,7 @@ from .recorder import History
 DIAGNOSIS, REPORT = "diagnosis.json", "report.html"
 # Effects that are always looked for.
 ALWAYS = ("outliers",)
-# So many pairs for each joint are the fewest that say anything.
+# Minimum number of pairs per joint.
 FEWEST_PAIRS_A_JOINT = 5
 Tell = Callable[[str], None]
 
@@ -53,7 +53,7 @@ class DiagnosisError(BodyschemaError):
 
 @dataclass(frozen=True)
 class Asked:
-    """What to look for.
+    """Settings of a diagnosis.
 
     Attributes:
         only, without: names of effects; all when `only` is empty.
@@ -66,7 +66,7 @@ class Asked:
 
     @classmethod
     def of(cls, only: str | None, without: str | None, seed: int) -> Asked:
-        """From names with commas between; RequestError where there is no such effect, or none is left."""
+        """Parse comma-separated names. Raise RequestError if an effect is unknown, or none remains."""
         asked = cls(_names(only, "--effects"), _names(without, "--exclude"), seed)
         if set(asked.only or KINDS) <= set(asked.without):
             raise RequestError("--effects and --exclude leave nothing to look for. Exclude fewer")
@@ -89,7 +89,7 @@ def _names(text: str | None, option: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """What was measured, and what it is called."""
+    """Recording and its name."""
 
     recording: Recording
     name: str
@@ -98,13 +98,13 @@ class Source:
 def measured(
     config: Config, file: Path | None, opened: Callable[[Path], Recording] | None = None, *, live: bool
 ) -> Source:
-    """The pairs of a recording, of a store, or of the running sampler.
+    """Return the pairs of a recording, of a store, or of the running sampler.
 
     Args:
-        opened: reads `file`; by default as a recording or a store.
+        opened: function that reads `file`; by default as a recording or a store.
 
     Raises:
-        RequestError: neither or both were asked for.
+        RequestError: neither or both of `file` and `live` were given.
         BusError: no sampler is running.
         RecordingError: they cannot be read, or are not in radians and metres.
     """
@@ -131,7 +131,7 @@ def _history(history: History, joints: tuple[str, ...]) -> Recording:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A diagnosis and what is told of it.
+    """Diagnosis with its context for the report.
 
     Attributes:
         warnings: what may be wrong with the recording itself.
@@ -161,12 +161,12 @@ class Found:
 
     @property
     def timed(self) -> bool:
-        """Whether the recording has times."""
+        """True if the recording has times."""
         return self.source.recording.t is not None
 
     @property
     def remedies(self) -> list[str]:
-        """What to do about the causes."""
+        """Remedies for the causes found."""
         run = self.diagnosis.extended.run
         torques = np.abs(run.torques).max(axis=0) if run.simulation.gravity.known else None
         return remedies(self.file, self.robot, ticks(self.source.recording.q), torques)

@@ -1,4 +1,4 @@
-"""Whether this machine and this arm are fit: one check after the other, each with the command that mends it."""
+"""Check that machine and arm are ready for use; each failed check names the command that fixes it."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ Step = tuple[str, Callable[[], Iterator[Check]]]
 
 
 def steps(config: Config) -> Iterator[Step]:
-    """What is looked at, with the function that does it."""
+    """Yield the name of each step with the function that runs its checks."""
     yield "robot.toml", lambda: _description(config)
     if configured_ports(config):
         yield "ports", lambda: port_checks(config, _samplers(config))
@@ -73,7 +73,7 @@ def steps(config: Config) -> Iterator[Step]:
 
 
 def as_json(checks: list[Check]) -> str:
-    """The checks as JSON; `well` when none is wrong."""
+    """Return the checks as JSON; `well` is true if none is wrong."""
     contents = {"well": all(check.state != "wrong" for check in checks), "checks": checks}
     return msgspec.json.format(msgspec.json.encode(contents)).decode()
 
@@ -98,7 +98,7 @@ def _description(config: Config) -> Iterator[Check]:
 
 
 def _cameras(config: Config) -> Iterator[Check]:
-    """What the cameras send; while the sampler runs it has them, and tells."""
+    """Yield checks of what the cameras send; a running sampler holds them, so its status is used instead."""
     if not is_alive(config.route("sampler"), Keys(config.robot.name).alive("sampler"), open_timeout_s=OPEN_S):
         require_extra("cameras", "looking at the cameras")
         from .camera_wiring import camera_checks
@@ -111,7 +111,7 @@ def _cameras(config: Config) -> Iterator[Check]:
 
 
 def _on_the_ports(config: Config, look: Callable[[Config], Iterator[Check]]) -> Iterator[Check]:
-    """What `look` finds there; what the running sampler tells where that has the port."""
+    """Yield the checks of `look`; if a running sampler holds the ports, those of its status instead."""
     if not ports_are_there(config):
         return
     if other_holders(config):
@@ -121,7 +121,7 @@ def _on_the_ports(config: Config, look: Callable[[Config], Iterator[Check]]) -> 
 
 
 def _samplers(config: Config) -> list[int]:
-    """Those who have a port open and are the sampler, which answers."""
+    """Return the PIDs of sampler processes that have a port open, if the sampler answers."""
     pids = [holder.pid for holder in other_holders(config) if SAMPLER.search(holder.command)]
     route, token = config.route("sampler"), Keys(config.robot.name).alive("sampler")
     return pids if pids and is_alive(route, token, open_timeout_s=OPEN_S) else []
@@ -140,7 +140,7 @@ def _of_the_sampler(config: Config) -> Iterator[Check]:
 
 
 def disk_checks(folder: Path) -> Iterator[Check]:
-    """Room and right for the pairs in `folder`."""
+    """Yield checks of free space and write permission for the pairs in `folder`."""
     there = next(path for path in (folder, *folder.parents) if path.exists())
     if not os.access(there, os.W_OK):
         said = f"{there} cannot be written, and pairs are to be kept in {folder}"
@@ -156,7 +156,7 @@ def disk_checks(folder: Path) -> Iterator[Check]:
 
 
 def store_checks(file: Path) -> Iterator[Check]:
-    """Whether the disk gives back every pair as it was written."""
+    """Yield checks that the disk returns every pair as it was written."""
     with PairReader(file) as pairs:
         trouble, audit = pairs.trouble(), pairs.audit()
     if trouble is not None:
@@ -174,7 +174,7 @@ def store_checks(file: Path) -> Iterator[Check]:
 
 
 def clock_checks(is_synchronised: Callable[[], bool | None] | None = None) -> Iterator[Check]:
-    """Whether the wall clock is kept right, which dates the pairs. (Time stamps come from the monotonic clock.)"""
+    """Check that the wall clock, which dates the pairs, is synchronised. (Time stamps use the monotonic clock.)"""
     known = (_is_synchronised if is_synchronised is None else is_synchronised)()
     if known is None:
         yield Check("clock", "ok", "the system does not tell whether the clock is kept right")
@@ -187,7 +187,7 @@ def clock_checks(is_synchronised: Callable[[], bool | None] | None = None) -> It
 
 
 def unit_checks(root: Path = Path("/")) -> Iterator[Check]:
-    """Units that an older bodyschema installed: they start `python -m daemon`, which is no more."""
+    """Yield a check for each unit of an older bodyschema: these start `python -m daemon`, which no longer exists."""
     files = [*(root / FOLDER).glob("bodyschema-*.service"), *(root / FOLDER).glob("bodyschema-*.service.d/*.conf")]
     for file in sorted(files):
         if OLD_UNIT.search(file.read_text(encoding="utf-8", errors="replace")):
@@ -214,7 +214,7 @@ def _zenoh(config: Config) -> Iterator[Check]:
 
 
 def router_check(route: Route) -> Check:
-    """Whether the router takes our connection."""
+    """Check that the router accepts our connection."""
     try:
         with Bus(connect=route, client=True, open_timeout_s=OPEN_S):
             return Check("zenoh", "ok", f"the router {route} takes our connection")
@@ -226,7 +226,7 @@ def router_check(route: Route) -> Check:
 
 
 def zenoh_check(process: str, route: Route, token: str) -> Check:
-    """Whether the process answers; if not, whether its place is free."""
+    """Check that the process answers or, if it does not run, that its endpoint is free."""
     endpoint = str(route)
     if not _is_listening(endpoint):
         return Check("zenoh", "ok", f"the {process} does not run; {endpoint} is free for it")
@@ -238,7 +238,7 @@ def zenoh_check(process: str, route: Route, token: str) -> Check:
 
 
 def _is_listening(endpoint: str) -> bool:
-    """Whether somebody takes connections there; also True where that cannot be tried."""
+    """Return True if the endpoint accepts connections, or if that cannot be tried."""
     protocol, _, address = endpoint.partition("/")
     host, _, port = address.rpartition(":")
     if protocol not in ("tcp", "tls"):
@@ -251,12 +251,12 @@ def _is_listening(endpoint: str) -> bool:
 
 
 def _named(check: Check, file: Path) -> Check:
-    """With the description's own name in what there is to type."""
+    """Return the check with the actual name of robot.toml in its command."""
     return replace(check, mend=check.mend.replace("robot.toml", str(file)))
 
 
 def run(config: Config, tell: Callable[[str], None]) -> list[Check]:
-    """All checks; what fails on the way is one, too."""
+    """Run all checks; an error on the way counts as a failed check."""
     checks: list[Check] = []
     for name, look in steps(config):
         tell(name)

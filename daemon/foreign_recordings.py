@@ -22,14 +22,14 @@ from .servo_wiring import require_servos
 
 @dataclass(frozen=True)
 class Taken:
-    """What to take from a bag or a dataset, where that is not clear.
+    """Selection from a bag or a dataset whose contents are ambiguous.
 
     Attributes:
         joint_topic, marker_topic, marker_frame: of a bag; see `BagTopics`.
         markers: a file with the marker's positions: t, x, y, z, and in `segment` the episode.
         lerobot: LeRobot's calibration of the arm that a dataset was recorded with.
         lerobot_unit: of a dataset's readings.
-        delay_s: how late the marker's positions are stamped [s].
+        delay_s: delay of the time stamps of the marker's positions [s].
     """
 
     joint_topic: str | None = None

@@ -50,13 +50,13 @@ class Keys:
         return self._key("simulation")
 
     def status(self, process: str) -> str:
-        """State of `sampler` or `learner`, as a publication and a queryable."""
+        """Return the key for the state of `sampler` or `learner`, a publication and a queryable."""
         return self._key(f"status/{process}")
 
     def command(self, process: str) -> str:
-        """Commands to `sampler` or `learner`."""
+        """Return the key for commands to `sampler` or `learner`."""
         return self._key(f"command/{process}")
 
     def alive(self, process: str) -> str:
-        """Liveliness token of `sampler` or `learner`."""
+        """Return the key of the liveliness token of `sampler` or `learner`."""
         return self._key(f"alive/{process}")

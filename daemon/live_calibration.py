@@ -24,13 +24,13 @@ from .camera_calibration import Tell, pair_in
 from .reopen import Reopening
 
 READ_S = 0.2
-# After a refusal so many views more are taken before the next try.
+# Number of further views taken after a refused calibration before the next try.
 MORE_VIEWS = 4
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What a person who holds the board has to know.
+    """Feedback for the person who holds the board.
 
     Attributes:
         coverage: what the views cover. views: how many were taken.
@@ -49,7 +49,7 @@ class Shown:
 
     @property
     def wish(self) -> str:
-        """What to show next."""
+        """Advice on what to show next."""
         missing = self.coverage.missing()
         if missing:
             return missing[0]
@@ -60,7 +60,7 @@ Show = Callable[[Shown], None]
 
 
 class HealthyEyes(StereoEyes, Protocol):
-    """Eyes that say what is wrong with them; see `bodyschema.vision.cameras.live.LiveEyes`."""
+    """Eyes that report their faults; see `bodyschema.vision.cameras.live.LiveEyes`."""
 
     @property
     def health(self) -> tuple[str, ...]: ...
@@ -70,13 +70,13 @@ Require = Callable[[tuple[int, int], tuple[str, ...]], None]
 
 
 class RequiredEyes:
-    """Cameras that are refused at every opening where they are not the right ones."""
+    """Cameras that must satisfy a requirement each time they are opened."""
 
     def __init__(self, eyes: StereoEyes, require: Require) -> None:
-        """Nothing is opened yet.
+        """Store the arguments; open nothing yet.
 
         Args:
-            require: is given image size and serials; SourceError where others are wanted.
+            require: called with image size and serials; raises SourceError if others are required.
         """
         self._eyes, self._require = eyes, require
 
@@ -95,18 +95,18 @@ class RequiredEyes:
         self._eyes.__exit__(kind, error, trace)
 
     def read(self, timeout_s: float) -> StereoFrame | None:
-        """As of the eyes."""
+        """Return the next frame; see `StereoEyes.read`."""
         return self._eyes.read(timeout_s)
 
 
 class SameAsFirst:
-    """What is required of cameras whose views belong together: that they stay those that they were."""
+    """Requirement that cameras and image size stay the same for all views of a calibration."""
 
     def __init__(self) -> None:
         self._first: tuple[tuple[int, int], tuple[str, ...]] | None = None
 
     def __call__(self, image_size_px: tuple[int, int], serials: tuple[str, ...]) -> None:
-        """SourceError where these are others than at the first call."""
+        """Raise SourceError if image size or serials differ from the first call."""
         self._first = self._first or (image_size_px, serials)
         if (image_size_px, serials) != self._first:
             these, first = _named(image_size_px, serials), _named(*self._first)
@@ -129,13 +129,13 @@ class LiveCalibration:
         clock: Clock,
         keep: Callable[[ImagePair, int], None] = lambda _pair, _number: None,
     ) -> None:
-        """Nothing is opened yet.
+        """Store the arguments; open nothing yet.
 
         Args:
-            views: of the board that is shown; none were taken yet.
-            calibrated: makes the calibration of views and serials; CalibrationError where it is not good enough.
-            show: is shown every pair of images, and what is wrong while there are none.
-            keep: is given the images of every view that is taken, and its number from 1 on.
+            views: empty collection of views of the board.
+            calibrated: calibrates from views and serials; raises CalibrationError if the result is not good enough.
+            show: called for every pair of images, and with the trouble while there are none.
+            keep: called with the images of every view taken and its number, from 1 on.
         """
         self._eyes, self._calibrated, self._show, self._keep = eyes, calibrated, show, keep
         self._source = Reopening(RequiredEyes(eyes, SameAsFirst()), "the cameras", clock)
@@ -149,10 +149,10 @@ class LiveCalibration:
         self._stopping = True
 
     def run(self) -> tuple[Gathered, Calibrated]:
-        """The views, and the calibration of them.
+        """Gather views until their calibration is good enough; return both.
 
         Raises:
-            CalibrationError: the images ended or `stop` was called before it was good enough; the reasons.
+            CalibrationError: the images ended or `stop` was called before it was good enough; with the reasons.
             SourceError: the cameras cannot be opened.
         """
         with self._source, suppress(SourceEnded):
@@ -176,7 +176,7 @@ class LiveCalibration:
         return self._views.look(frame)
 
     def _tried(self) -> Calibrated | None:
-        """The calibration, where nothing is missing and it is good enough."""
+        """Return the calibration if the views cover enough and it is good enough; else None."""
         if len(self._views.found.views) < self._next_try or self._views.coverage.missing():
             return None
         try:

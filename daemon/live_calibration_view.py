@@ -1,4 +1,4 @@
-"""What a person who holds the board before the cameras is shown: a screen, or lines where there is no terminal."""
+"""Guide the person who holds the board: a screen on a terminal, lines elsewhere."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _DONE, _OPEN = ("✓", "green"), ("·", "yellow")
 
 
 def now_text(shown: Shown) -> str:
-    """What became of the last pair of images, in words."""
+    """Return in words the outcome of the last pair of images."""
     look = shown.look
     if shown.doing:
         return shown.doing
@@ -72,7 +72,7 @@ def _is_taken(look: Look | None) -> bool:
 
 
 def _cells(coverage: Coverage, look: Look | None, eye: Eye) -> Table:
-    """The image in nine parts."""
+    """Return a table of the image's nine cells: those covered so far, and those the board is in now."""
     table = Table.grid()
     here = None
     if look is not None and look.view.eye(eye) is not None:
@@ -135,7 +135,7 @@ class Lines:
 
 @contextmanager
 def guidance_on(console: Console, heading: str, clock: Clock) -> Iterator[Show]:
-    """A function that shows on a terminal a screen that is written anew, elsewhere lines."""
+    """Yield a function that redraws a screen on a terminal and prints lines elsewhere."""
     if not console.is_terminal:
         yield Lines(lambda text: console.print(text, markup=False, highlight=False, soft_wrap=True), clock)
         return

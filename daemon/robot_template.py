@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class Guess(NamedTuple):
-    """What a URDF lets one guess; the user corrects it."""
+    """Description of a robot guessed from its URDF, for the user to correct."""
 
     name: str
     urdf: str
@@ -100,7 +100,7 @@ _EXAMPLES = "/dev/v4l/by-id/usb-LEFT-video-index0", "/dev/v4l/by-id/usb-RIGHT-vi
 
 
 def robot_toml(guess: Guess, cameras: Sequence[str] = ()) -> str:
-    """The text of a commented robot.toml; with two cameras or more, the first two are its eyes."""
+    """Return the text of a commented robot.toml; with two cameras or more, the first two are its eyes."""
     joints = "[" + ", ".join(quoted(joint) for joint in guess.joints) + "]"
     return _TEMPLATE.format(
         name=quoted(guess.name),
@@ -113,7 +113,7 @@ def robot_toml(guess: Guess, cameras: Sequence[str] = ()) -> str:
 
 
 def _camera_tables(cameras: Sequence[str]) -> str:
-    """The cameras' tables; as an example, which does nothing, where there are not two."""
+    """Return the cameras' tables; with fewer than two cameras, an example that is commented out."""
     left, right = map(quoted, cameras[:2] if len(cameras) >= 2 else _EXAMPLES)
     text = _CAMERAS.format(left=left, right=right)
     if len(cameras) >= 2:
@@ -128,10 +128,10 @@ def quoted(text: str) -> str:
 
 
 def guess_from(urdf: Path, robot: Path) -> Guess:
-    """The longest chain of moving joints of `urdf`, from its root to the last link that is fixed to its end.
+    """Guess the chain with the most moving joints in `urdf`, from its root to the last link fixed to its end.
 
     Args:
-        robot: the robot.toml to be written; the URDF is named relative to it.
+        robot: path of the robot.toml to be written; the URDF is named relative to it.
 
     Raises:
         RobotError: the URDF cannot be read.

@@ -1,4 +1,4 @@
-"""What a simulation would have measured at the joint angles of a recording."""
+"""Simulate the measurements at the joint angles of a recording."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from kbmaps import KBMapsError
 
 
 def simulated(simulation: Simulation, like: Recording) -> Recording:
-    """The recording that the simulation would have given, with the times, runs and joint angles of `like`.
+    """Return a simulated recording with the times, segments and joint angles of `like`.
 
     Raises:
         RecordingError: the simulation gives no position at a row.
@@ -35,10 +35,10 @@ def simulated(simulation: Simulation, like: Recording) -> Recording:
 
 
 def with_noise(simulation: Simulation, exact: Recording, like: Recording, rng: np.random.Generator) -> Recording:
-    """An exact recording with the noise that its positions would have had: by the covariances of `like`, else [camera].
+    """Return `exact` with noise added to its positions, by the covariances of `like` or else by [camera].
 
     Raises:
-        ConfigError: neither says how large it is.
+        ConfigError: neither gives the size of the noise.
     """
     calibration = simulation.robot.calibration
     if like.cov is not None:
@@ -56,7 +56,7 @@ def with_noise(simulation: Simulation, exact: Recording, like: Recording, rng: n
 
 
 def without_consequence(simulation: Simulation, like: Recording | None = None) -> list[str]:
-    """Sentences on the effects that change nothing: of this robot, and of a recording without times."""
+    """Return sentences on the effects that change nothing for this robot or for a recording without times."""
     said = []
     for name in dict.fromkeys(effect.name for effect in simulation.effects):
         if KINDS[name].needs_times and like is not None and like.t is None:
@@ -69,7 +69,7 @@ def without_consequence(simulation: Simulation, like: Recording | None = None) -
 
 
 def _seen_again(calibration: StereoCalibration, x: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Positions (n, 3) [m] triangulated from the images of x (n, 3) with noise in each coordinate."""
+    """Return positions (n, 3) [m] triangulated from the image points of x (n, 3) with noise in each coordinate."""
     pixels = calibration.project(x)
     u_left, v_left, u_right, v_right = (pixels + calibration.pixel_sigma * rng.standard_normal(pixels.shape)).T
     cx, cy = calibration.principal_point_px

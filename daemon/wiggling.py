@@ -27,11 +27,11 @@ POSITION = ("x", "y", "z")
 
 @dataclass(frozen=True, slots=True)
 class Collected:
-    """What the sources said.
+    """Data recorded from the sources.
 
     Attributes:
-        missed: images without a fix, by why.
-        health: what is wrong with the cameras, and what to do.
+        missed: number of images without a fix, by reason.
+        health: faults of the cameras with their remedies.
     """
 
     wiggle: Wiggle
@@ -40,7 +40,7 @@ class Collected:
 
     @property
     def said(self) -> str:
-        """What became of the images, where one in five gave no fix; else empty."""
+        """Message on missed images if at least one in five gave no fix; else empty."""
         fixes, missed = len(self.wiggle.t_marker), self.missed.total()
         if missed < 0.2 * (fixes + missed):
             return ""
@@ -52,13 +52,13 @@ def _reasons(missed: Counter[str]) -> str:
 
 
 def collected(sources: Sources, duration_s: float, tell: Callable[[float], None]) -> Collected:
-    """What the sources say during so long [s], on their own clock, and a little more, for the largest latency.
+    """Record the sources for `duration_s` [s] of their clock, and a little longer for the largest latency.
 
     Args:
         tell: called with the time [s] since the first fix.
 
     Raises:
-        LatencyError: they say nothing, the encoders are lost, or the marker is not found.
+        LatencyError: the sources deliver nothing, the encoders are lost, or the marker is not found.
         SourceError: they cannot be opened, or the cameras are lost.
     """
     readings: list[JointReading] = []
@@ -119,7 +119,7 @@ def collected(sources: Sources, duration_s: float, tell: Callable[[float], None]
 
 
 def wiggle_of(readings: Sequence[JointReading], fixes: Sequence[MarkerFix]) -> Wiggle:
-    """Readings and fixes as arrays; LatencyError when there are none."""
+    """Return readings and fixes as arrays. Raise LatencyError if either is missing."""
     if not readings or not fixes:
         who = "the encoders" if not readings else "the cameras"
         raise LatencyError(f"{who} gave nothing: `bodyschema doctor`, and for the marker `bodyschema watch cameras`")
@@ -132,7 +132,7 @@ def wiggle_of(readings: Sequence[JointReading], fixes: Sequence[MarkerFix]) -> W
 
 
 def write_wiggle(wiggle: Wiggle, joints: Sequence[str], file: Path) -> None:
-    """A row for each reading and each fix in the order of time; the columns of the other one stay empty.
+    """Write one row for each reading and each fix, ordered by time; the columns of the other kind stay empty.
 
     Raises:
         RecordingError: it cannot be written.
@@ -153,10 +153,10 @@ def write_wiggle(wiggle: Wiggle, joints: Sequence[str], file: Path) -> None:
 
 
 def read_wiggle(file: Path, joints: Sequence[str]) -> Wiggle:
-    """What `write_wiggle` wrote.
+    """Read a file written by `write_wiggle`.
 
     Raises:
-        RecordingError: it cannot be read, has other columns, or a row that is neither.
+        RecordingError: it cannot be read, has other columns, or has a row that is neither reading nor fix.
     """
     columns = ["t", *joints, *POSITION]
     readings: list[list[float]] = []

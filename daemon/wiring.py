@@ -40,9 +40,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-# A painted ball. Hues that the room does not have reach beyond its band by so much [deg], and are at least so many.
+# A painted ball: saturation, value; how far the room's hue gap exceeds the ball's band, and its minimum [deg].
 _SATURATION, _VALUE, _ROOM_DEG, _GAP_DEG = 0.93, 0.86, 6.0, 36.0
-# A ball that is told by its brightness glows; all else is darker than half of what is looked for.
+# A ball detected by brightness glows; everything else is darker than half the threshold.
 _LAMP, _DIMMED = 0.9, 0.45
 _APART_S = 60.0  # a tracker has forgotten what it saw then
 
@@ -51,7 +51,7 @@ Hardware = DynamixelConfig | FeetechConfig | SerialLinesConfig | Ros2Config | Pl
 
 @contextmanager
 def open_sources(config: Config, *, sim: bool) -> Iterator[Sources]:
-    """The sources that robot.toml asks for; with `sim`, the simulation in their place.
+    """Yield the sources configured in robot.toml; with `sim`, the simulation instead.
 
     Raises:
         ConfigError: no driver or no cameras are configured, or the simulation cannot be made of this description.
@@ -77,7 +77,7 @@ def check_sources(config: Config, *, sim: bool) -> None:
 
 
 def open_joints(config: Config, clock: Clock) -> EncoderJoints:
-    """The encoders alone of the arm that robot.toml describes, not opened yet.
+    """Return only the encoders of the arm described in robot.toml, not opened yet.
 
     Raises:
         ConfigError: no servos and no ROS 2 robot are configured, or zero-force or gaze do not fit the robot.
@@ -94,10 +94,10 @@ def open_joints(config: Config, clock: Clock) -> EncoderJoints:
 
 
 def driver_of(hardware: Hardware, config: Config, clock: Clock, *, last_pose: list[float] | None) -> EncoderJoints:
-    """The driver of the joints of robot.toml on `hardware`, not opened yet.
+    """Return the driver of the joints of robot.toml on `hardware`, not opened yet.
 
     Args:
-        last_pose: where the joints were at the newest pair [rad]; None: nobody knows.
+        last_pose: joint angles of the newest pair [rad]; None if unknown.
     """
     joints = config.robot.joints
     limits = list(zip(config.robot.lower.tolist(), config.robot.upper.tolist(), strict=True))
@@ -126,9 +126,9 @@ def _ros2_joints(config: Config, robot: Ros2Config, clock: Clock) -> Ros2Joints:
 
 
 def open_marker_topic(config: Config, clock: Clock) -> tuple[StampedJoints, MarkerTopic] | None:
-    """The ROS 2 robot's joints, and the topic for where its marker is expected, neither opened yet.
+    """Return the ROS 2 robot's joints and the topic for its expected marker position, neither opened yet.
 
-    None where [drivers.ros2.marker] is not configured.
+    Return None if [drivers.ros2.marker] is not configured.
     """
     robot = config.tables.drivers.ros2
     if robot is None or robot.marker is None:
@@ -139,13 +139,13 @@ def open_marker_topic(config: Config, clock: Clock) -> tuple[StampedJoints, Mark
 
 
 def _last_pose(config: Config) -> list[float] | None:
-    """Where the joints were at the newest pair [rad]."""
+    """Return the joint angles of the newest pair [rad]; None if unknown."""
     if not config.store_file.exists():
         return None
     try:
         with PairReader(config.store_file) as pairs:
             last = pairs.last()
-    except StoreError as error:  # the sampler says so, too, and mends what can be mended
+    except StoreError as error:  # the sampler reports it, too, and repairs the store
         log.warning("where the joints were last is not known: %s", error)
         return None
     return None if last is None or len(last.q) != len(config.robot.joints) else last.q.tolist()
@@ -192,7 +192,7 @@ def require_simulation() -> None:
 
 
 def demonstration_model() -> Path:
-    """The robot.toml of the humanoid upper body that ships with the simulation, its URDF beside it."""
+    """Return the path of the robot.toml of the humanoid upper body shipped with the simulation."""
     from bodyschema.sim_backend.models import model_file
 
     return model_file("upper_body")
@@ -274,7 +274,7 @@ def _marker(vision: VisionConfig) -> dict[str, Any]:
 
 
 def _require_found(config: Config, calibration: StereoCalibration, camera: CameraConfig) -> None:
-    """ConfigError where the tracker does not even find the marker by itself before a plain wall."""
+    """Raise ConfigError if the tracker does not find the marker even alone before a plain wall."""
     from bodyschema.sim_backend.eye import portraits
     from bodyschema.vision.trackers import tracker_of
 
@@ -302,13 +302,13 @@ def _tags(vision: VisionConfig) -> tuple[SimTag, ...]:
 
 
 def _through_bench(config: Config, joints: JointSource) -> JointSource:
-    """The joints of the simulation, read by the driver that robot.toml configures."""
+    """Return the simulation's joints, read by the driver configured in robot.toml."""
     return through_bench(config, joints, lambda hardware: driver_of(hardware, config, SystemClock(), last_pose=None))
 
 
 @contextmanager
 def open_postures(config: Config, count: int) -> Iterator[Sources]:
-    """The simulation's sources, the robot standing still in so many postures drawn independently.
+    """Yield the simulation's sources with the robot at rest in `count` independently sampled postures.
 
     Raises:
         ConfigError: the simulation cannot be made of this description.
@@ -327,7 +327,7 @@ def open_postures(config: Config, count: int) -> Iterator[Sources]:
 
 
 def simulated_truth(config: Config) -> RigidChain:
-    """The true chain of the robot that the simulation makes of this description, for judges."""
+    """Return the simulation's ground-truth chain for this description, for evaluation only."""
     from bodyschema.sim_backend import true_chain
 
     return true_chain(config.robot, config.tables.sim, extension=config.simulation)

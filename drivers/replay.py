@@ -42,7 +42,7 @@ class Replay:
         calibration: StereoCalibration | None = None,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Nothing is played before both sources are entered and one is read.
+        """Prepare the replay; it starts once both sources are entered and one is read.
 
         Args:
             speed: 1 as recorded, 2 twice as fast; 0 as fast as it is read.
@@ -79,7 +79,7 @@ class ReplayJoints:
         self._pace.close(_JOINTS)
 
     def read(self, timeout_s: float) -> JointReading | None:
-        """The next row's joint angles; see `JointSource.read`."""
+        """Return the next row's joint angles; see `JointSource.read`."""
         row = self._pace.next_row(_JOINTS, timeout_s)
         return None if row is None else JointReading(float(self._t[row]), frozen_array(self._recording.q[row]))
 
@@ -100,7 +100,7 @@ class ReplayMarker:
         self._pace.close(_MARKER)
 
     def read(self, timeout_s: float) -> MarkerFix | None:
-        """The next row's marker position; see `MarkerSource.read`."""
+        """Return the next row's marker position; see `MarkerSource.read`."""
         row = self._pace.next_row(_MARKER, timeout_s)
         if row is None:
             return None
@@ -121,14 +121,14 @@ class ReplayClock(SystemClock):
         self._pace = pace
 
     def now(self) -> float:
-        """Time of the newest fix that was played, or of the first one to come [s]."""
+        """Return the time [s] of the newest fix played, before any that of the first one."""
         return self._pace.played_until(_MARKER)
 
 
 def default_covariances(
     recording: Recording, sigma_m: float | None, calibration: StereoCalibration | None
 ) -> FloatArray:
-    """Covariances of the positions [m²], shape (n, 3, 3), of a recording that has none of its own.
+    """Return covariances of the positions [m²], shape (n, 3, 3), for a recording without its own.
 
     Args:
         sigma_m: 1-sigma per axis [m], or None.
@@ -141,7 +141,7 @@ def default_covariances(
 
 
 def stereo_covariances(x: FloatArray, calibration: StereoCalibration) -> FloatArray:
-    """Covariances [m²], shape (n, 3, 3), of points x (n, 3) in front of a stereo camera, from its pixel noise."""
+    """Return covariances [m²], shape (n, 3, 3), of points x (n, 3) before a stereo camera, from its pixel noise."""
     depth = x[:, 2]
     scale = calibration.focal_px / depth
     J = np.zeros((len(x), 4, 3))  # derivative of (ul, vl, ur, vr) [px/m]
@@ -157,7 +157,7 @@ _JOINTS, _MARKER = 0, 1
 
 
 class _Pace:
-    """Which row comes next for each of two readers, and when."""
+    """Schedule of the next row for each of two readers."""
 
     def __init__(self, t: FloatArray, speed: float, now: Callable[[], float]) -> None:
         self._t, self._speed, self._now = t, speed, now
@@ -176,7 +176,7 @@ class _Pace:
             self._turn.notify_all()
 
     def next_row(self, reader: int, timeout_s: float) -> int | None:
-        """The reader's next row, or None when it is not its turn within `timeout_s`."""
+        """Return the reader's next row; None if its turn does not come within `timeout_s`."""
         with self._turn:
             if not self._is_open[reader]:
                 raise SourceError("the recording is not open; use its sources in with statements")
@@ -190,7 +190,7 @@ class _Pace:
             return row
 
     def played_until(self, reader: int) -> float:
-        """Time of the newest row that the reader was given, or of the first one to come [s]."""
+        """Return the time [s] of the newest row given to the reader, before any that of the first one."""
         with self._turn:
             return float(self._t[max(self._next[reader] - 1, 0)])
 

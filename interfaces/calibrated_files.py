@@ -74,7 +74,7 @@ def write_calibrated(
 
 
 def calibrated_urdf(robot: RobotDescription, geometry: CalibratedGeometry, folder: Path, heading: str) -> bytes:
-    """The URDF of `robot` with another geometry, to be put into `folder`."""
+    """Return the URDF of `robot` with `geometry`, for a file in `folder`."""
     from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False)
@@ -106,14 +106,14 @@ def _set_origin(etree: Any, joint: Any, pose: FloatArray) -> None:
 
 
 def _set_unit_axis(element: Any, unit: FloatArray) -> None:
-    """An axis of another length is an axis to us, but pybullet slides a joint by its length times the way."""
+    """Write a unit axis; pybullet would scale the travel of a prismatic joint by the length of its axis."""
     given = np.array([float(number) for number in element.get("xyz", "1 0 0").split()])
     if np.abs(given - unit).max() > _ROUNDING:
         element.set("xyz", _numbers(unit))
 
 
 def _set_frame(etree: Any, root: Any, name: str, parent: str, pose: FloatArray) -> None:
-    """A link fixed to another; one that an earlier calibration has put there is replaced."""
+    """Add a link fixed to `parent`, in place of one of this name from an earlier calibration."""
     for element in (*root.iterfind("link"), *root.iterfind("joint")):
         if element.get("name") in (name, f"{name}_joint"):
             root.remove(element)
@@ -130,22 +130,22 @@ def _set_frame(etree: Any, root: Any, name: str, parent: str, pose: FloatArray) 
 
 
 def _moved_mesh(name: str, urdf: Path, folder: Path) -> str:
-    """The name by which a mesh that `urdf` names relative to itself is found from `folder`; others as they are."""
+    """Return a mesh name that is relative to `urdf` as one relative to `folder`; keep absolute paths and URLs."""
     if "://" in name or os.path.isabs(name):
         return name
     return _relative(name, urdf.parent, folder)
 
 
 def _relative(path: str | Path, old: Path, new: Path) -> str:
-    """The name by which a file that is called `path` from the folder `old` is found from the folder `new`."""
+    """Return `path`, given relative to the folder `old`, relative to the folder `new`."""
     return Path(os.path.relpath(old.resolve() / path, new.resolve())).as_posix()
 
 
 def tables_elsewhere(robot: RobotDescription, folder: Path) -> dict[str, Any]:
-    """The tables of robot.toml for a robot.toml in `folder`, of the same URDF, with a store of its own.
+    """Return the tables of a robot.toml in `folder` with the same URDF and a store of its own.
 
     Raises:
-        ConfigError: the robot.toml cannot be read any more.
+        ConfigError: the original robot.toml can no longer be read.
     """
     tables, _ = read_toml(robot.file)
     tables["daemon"] = tables.get("daemon", {}) | {"state_dir": STATE_DIR}
@@ -159,7 +159,7 @@ def tables_elsewhere(robot: RobotDescription, folder: Path) -> dict[str, Any]:
 
 
 def _tables(robot: RobotDescription, geometry: CalibratedGeometry, folder: Path) -> dict[str, Any]:
-    """The tables of the nominal robot.toml, with what has been learnt in its place."""
+    """Return the tables of the nominal robot.toml with the calibrated values in place of the nominal ones."""
     tables = tables_elsewhere(robot, folder)
     for added in EXTENSIONS:  # the geometry was learnt without them
         tables.pop(added, None)

@@ -37,16 +37,16 @@ class StereoCalibration:
 
     @property
     def is_stereo(self) -> bool:
-        """Whether there are two eyes."""
+        """True if there are two eyes."""
         return self.baseline_m > 0.0
 
     @property
     def eyes_m(self) -> FloatArray:
-        """Where the eyes stand in the left optical frame (eyes, 3) [m]."""
+        """Positions of the eyes in the left optical frame (eyes, 3) [m]."""
         return np.array([[0.0, 0.0, 0.0], [self.baseline_m, 0.0, 0.0]])[: 2 if self.is_stereo else 1]
 
     def project(self, x: FloatArray) -> FloatArray:
-        """Image coordinates (..., 4) as (ul, vl, ur, vr) [px] of points (..., 3) [m] in the left optical frame."""
+        """Project points (..., 3) [m] in the left optical frame to pixels (..., 4), as (ul, vl, ur, vr) [px]."""
         cx, cy = self.principal_point_px
         scale = self.focal_px / x[..., 2]
         u_left, v = cx + scale * x[..., 0], cy + scale * x[..., 1]

@@ -56,7 +56,7 @@ class LeRobotArm:
         return tuple(name for name in self.models if name != GRIPPER)
 
     def id(self, motor: str) -> int:
-        """The ID that LeRobot gives the motor."""
+        """Return the ID that LeRobot gives the motor."""
         return list(self.models).index(motor) + 1
 
 
@@ -74,7 +74,7 @@ ARMS: Mapping[str, LeRobotArm] = {
 
 
 class MotorCalibration(msgspec.Struct, frozen=True):
-    """What LeRobot knows of one motor; all in ticks but `id` and `drive_mode`."""
+    """LeRobot's calibration of one motor; all in ticks but `id` and `drive_mode`."""
 
     id: int
     drive_mode: int
@@ -170,7 +170,7 @@ def _is_of_old_lerobot(file: Path) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class JointServo:
-    """How the servo of a joint is read, as robot.toml has it: q = direction · (ticks − zero_ticks) · RAD_PER_TICK."""
+    """Conversion of servo ticks to a joint angle by robot.toml: q = direction · (ticks − zero_ticks) · RAD_PER_TICK."""
 
     joint: str
     make: Make

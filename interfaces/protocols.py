@@ -10,14 +10,14 @@ from .records import JointReading, MarkerFix, MarkerMiss, StereoFrame
 
 
 class Clock(Protocol):
-    """Where the time stamps come from."""
+    """Source of the time stamps."""
 
     def now(self) -> float:
-        """Monotonic time [s], the clock of all readings and frames."""
+        """Return the monotonic time [s], the clock of all readings and frames."""
         ...
 
     def utc(self) -> str:
-        """Wall-clock time, ISO 8601 in UTC."""
+        """Return the wall-clock time, ISO 8601 in UTC."""
         ...
 
 
@@ -45,7 +45,7 @@ class JointSource(Source, Protocol):
         ...
 
     def read(self, timeout_s: float) -> JointReading | None:
-        """The next reading, in strictly increasing time; None when none came within `timeout_s`.
+        """Return the next reading, in strictly increasing time; None if none arrives within `timeout_s`.
 
         Raises:
             SourceEnded: there will be no more.
@@ -65,11 +65,11 @@ class StereoEyes(Source, Protocol):
 
     @property
     def serials(self) -> tuple[str, ...]:
-        """What tells each eye's device, the left one's first, from all others: serial number, path or file name."""
+        """Identifiers of the eyes' devices, left first: serial number, path or file name."""
         ...
 
     def read(self, timeout_s: float) -> StereoFrame | None:
-        """The next pair of images, in strictly increasing time; None when none came within `timeout_s`.
+        """Return the next pair of images, in strictly increasing time; None if none arrives within `timeout_s`.
 
         Raises:
             SourceEnded: there will be no more.
@@ -88,7 +88,7 @@ class StereoCamera(Source, Protocol):
         ...
 
     def read(self, timeout_s: float) -> StereoFrame | None:
-        """The next frame, in strictly increasing time; None when none came within `timeout_s`.
+        """Return the next frame, in strictly increasing time; None if none arrives within `timeout_s`.
 
         Raises:
             SourceEnded: there will be no more.
@@ -102,7 +102,7 @@ class MarkerSource(Source, Protocol):
     """The marker's position: a tracked camera, or a recording."""
 
     def read(self, timeout_s: float) -> MarkerFix | MarkerMiss | None:
-        """The next fix or the reason why there is none, in strictly increasing time; None after `timeout_s`.
+        """Return the next fix or the reason for a missing one, in strictly increasing time; None after `timeout_s`.
 
         Raises:
             SourceEnded: there will be no more.

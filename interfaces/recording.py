@@ -107,10 +107,10 @@ class Recording:
 
     @classmethod
     def read(cls, file: Path | str, joints: tuple[str, ...]) -> Self:
-        """The recording in `file`, CSV or Parquet by its ending.
+        """Read the recording in `file`, CSV or Parquet by its suffix.
 
         Args:
-            joints: the robot's joints in the order of q; each has to have its column.
+            joints: the robot's joints in the order of q; each needs a column.
 
         Raises:
             RecordingError: the file cannot be read; the message names line, column and remedy.
@@ -121,7 +121,7 @@ class Recording:
 
     @classmethod
     def from_table(cls, table: Table, joints: tuple[str, ...], file: Path | None = None) -> Self:
-        """The recording that a table with a checked header holds."""
+        """Build the recording from a table with a checked header."""
 
         def optional(names: tuple[str, ...]) -> FloatArray | None:
             return table.columns(names) if table.has(names) else None
@@ -176,7 +176,7 @@ class Recording:
             raise RecordingError(f"cannot be written: {error.strerror or error}", file=file) from error
 
     def write_csv_to(self, out: TextIO) -> None:
-        """Write CSV to an open file; OSError when that fails."""
+        """Write CSV to an open file. Raise OSError if that fails."""
         table = self.to_table()
         integers = frozenset(i for i, name in enumerate(table.names) if name in INTEGER_COLUMNS)
         out.write(",".join(table.names) + "\n")
@@ -194,7 +194,7 @@ class Recording:
             raise RecordingError(f"cannot be written: {error.strerror or error}", file=file) from error
 
     def rows(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> Recording:
-        """The recording of the rows that a mask or indices choose."""
+        """Return a recording of the rows selected by a mask or by indices."""
 
         def pick(values: FloatArray | None) -> FloatArray | None:
             return None if values is None else values[chosen]
@@ -255,7 +255,7 @@ def read_table(file: Path, joints: tuple[str, ...]) -> Table:
 
 
 def joints_in(file: Path) -> tuple[str, ...]:
-    """The joints of a recording, by its columns: all that have no name of another meaning, in their order.
+    """Return the joints of a recording, in column order: all columns whose name has no other meaning.
 
     Raises:
         RecordingError: the file cannot be read.

@@ -42,14 +42,14 @@ _FEW = 200
 
 @dataclass(frozen=True)
 class BagTopics:
-    """What to take from a bag; None where the bag leaves no choice.
+    """Topics and names to read from a bag; None where the bag leaves no choice.
 
     Attributes:
         joints: topic of the joint states.
         marker: topic of the marker's positions.
         frame: the marker's frame, where it comes by TF.
-        names: what the joints are called in the bag, where they have other names.
-        delay_s: how late the marker's positions are stamped [s].
+        names: the joints' names in the bag, where they differ.
+        delay_s: delay of the time stamps of the marker's positions [s].
     """
 
     joints: str | None = None
@@ -60,7 +60,7 @@ class BagTopics:
 
 
 def is_bag(source: Path) -> bool:
-    """Return whether `source` is named like a bag: a folder with metadata.yaml, or a file of one."""
+    """Return True if `source` looks like a bag: a folder with metadata.yaml, or a file with a bag's suffix."""
     return (source / METADATA).is_file() or source.suffix.lower() in BAG_ENDINGS
 
 
@@ -68,11 +68,11 @@ def read_bag(source: Path, joints: tuple[str, ...], topics: BagTopics, marker: M
     """Read joint states and positions of the marker, with the joints interpolated to the marker's times.
 
     Args:
-        joints: the robot's, in the order of q.
+        joints: the robot's joints, in the order of q.
         marker: positions from elsewhere; the bag's are not read then.
 
     Raises:
-        RecordingError: rosbags is not installed, the bag cannot be read, or what to take of it is not clear.
+        RecordingError: rosbags is not installed, the bag cannot be read, or its topics are ambiguous.
     """
     with _opened(source) as bag:
         joint_topic = _joint_topic(bag, joints, topics)
@@ -94,7 +94,7 @@ class _Bag:
 
     @property
     def counts(self) -> Counter[str]:
-        """How many messages each topic has."""
+        """Number of messages of each topic."""
         counts: Counter[str] = Counter()
         for connection in self.reader.connections:
             counts[connection.topic] += connection.msgcount

@@ -29,12 +29,12 @@ BODY_UNITS: tuple[Unit, ...] = ("degrees", "range_m100_100")
 
 @dataclass(frozen=True)
 class LeRobotUnits:
-    """How the readings of a dataset are turned into angles.
+    """Conversion of a dataset's readings to angles.
 
     Attributes:
         motors: LeRobot's calibration of the arm with which the dataset was recorded.
         servos: the joints, in the order of q.
-        unit: of the readings; None: as large readings show it.
+        unit: of the readings; None: inferred from large readings.
     """
 
     motors: Calibrations
@@ -53,7 +53,7 @@ class _Info(msgspec.Struct, frozen=True):
 
 
 def is_lerobot_dataset(source: Path) -> bool:
-    """Return whether `source` is the folder of a LeRobotDataset."""
+    """Return True if `source` is the folder of a LeRobotDataset."""
     return (source / INFO).is_file()
 
 

@@ -1,4 +1,4 @@
-"""What flows: readings, frames, fixes and pairs. Frozen; SI; arrays are float64 and read-only."""
+"""Define readings, frames, fixes and pairs: frozen, in SI units; arrays are float64 and read-only."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LARGEST_Q = 1e6
 
 
 def frozen_array(values: ArrayLike) -> FloatArray:
-    """A read-only float64 copy of `values`."""
+    """Return a read-only float64 copy of `values`."""
     array = np.array(values, dtype=np.float64)
     array.setflags(write=False)
     return array

@@ -126,7 +126,7 @@ class RobotDescription:
 
     @classmethod
     def from_tables(cls, tables: dict[str, Any], text: str, file: Path) -> RobotDescription:
-        """As `load`, from the tables and the text of robot.toml."""
+        """Build the description like `load`, from the tables and the text of robot.toml."""
         for section in ("robot", "camera"):
             if section not in tables:
                 raise ConfigError(
@@ -138,7 +138,7 @@ class RobotDescription:
         return cls._assemble(robot, camera, text, file)
 
     def with_placement(self, T_parent_camera: FloatArray, marker_xyz: FloatArray) -> RobotDescription:
-        """The same robot with its camera at a pose (4, 4) in its parent link, and its marker (3,) [m] elsewhere."""
+        """Return a copy with the camera at a pose (4, 4) in its parent link and the marker at (3,) [m] in its link."""
         x, y, z = T_parent_camera[:3, 3].tolist()
         roll, pitch, yaw = rpy_of(T_parent_camera[:3, :3]).tolist()
         camera = msgspec.structs.replace(self.camera, xyz=(x, y, z), rpy=(roll, pitch, yaw))
@@ -215,7 +215,7 @@ def _check_name(table: Any, text: str, file: Path) -> None:
 
 
 def _check_units(robot: RobotSection, camera: CameraSection, text: str, file: Path) -> None:
-    """ConfigError where a number is one of degrees or millimetres."""
+    """Raise ConfigError if a number looks like degrees or millimetres."""
 
     def refuse(keys: tuple[str, str], value: object, unit: str, remedy: str) -> None:
         what = f"{'.'.join(keys)} = {value}: this looks like {unit}"
@@ -263,7 +263,7 @@ def _moving(tree: UrdfTree, name: str) -> UrdfJoint:
 
 @contextmanager
 def _blamed_on(file: Path, text: str, *keys: str, naming: str | None = None) -> Iterator[None]:
-    """RobotErrors that name no file get this one, and the line of the key; with `naming`, of that name in its value."""
+    """Add `file` and the line of the key, or of `naming` in its value, to RobotErrors that name no file."""
     try:
         yield
     except RobotError as error:
@@ -276,7 +276,7 @@ def _blamed_on(file: Path, text: str, *keys: str, naming: str | None = None) -> 
 
 
 def _line_naming(text: str, name: str, first: int) -> int:
-    """The first line from `first` on that has `name` in quotes; `first` when none has."""
+    """Return the number of the first line from `first` on with `name` in quotes; `first` if no line has it."""
     for number, line in enumerate(text.splitlines()[first - 1 :], first):
         if f'"{name}"' in line or f"'{name}'" in line:
             return number

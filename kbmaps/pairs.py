@@ -35,19 +35,19 @@ class Pairs:
         return len(self.q)
 
     def chosen(self, mask: BoolArray) -> Pairs:
-        """Those of the mask (n,), in the same units."""
+        """Return the pairs selected by the mask (n,), in the same units."""
         shape = None if self.shape is None else self.shape[mask]
         return Pairs(self.q[mask], self.x[mask], self.unit[mask], self.known, shape)
 
     def whitened(self, errors: FloatArray) -> FloatArray:
-        """Errors (n, 3) or (n, 3, k) [m], as large in all directions."""
+        """Return errors (n, 3) or (n, 3, k) [m], scaled to be isotropic."""
         if self.shape is None:
             return errors
         return (self.shape @ errors[..., None])[..., 0] if errors.ndim == 2 else self.shape @ errors
 
 
 def with_units(q: FloatArray, x: FloatArray, sigma: FloatArray, shape: FloatArray | None = None) -> Pairs:
-    """Pairs from their sigma (n,) [m], NaN where it was not told, and the shape of their errors, as `Pairs` has it.
+    """Return pairs from their sigma (n,) [m], NaN where unknown, and the shape of their errors as in `Pairs`.
 
     As soon as one is unknown, the others count relative to their median, which also replaces the missing ones.
     """
@@ -101,7 +101,7 @@ def checked_pairs(
 
 
 def of_covariances(covariances: ArrayLike, pairs: int) -> tuple[FloatArray, FloatArray]:
-    """Sigma (n,) [m] and shape (n, 3, 3), as `Pairs` has them, of errors with covariances (n, 3, 3), or (3, 3), [m²].
+    """Return sigma (n,) [m] and shape (n, 3, 3), as in `Pairs`, of errors with covariances (n, 3, 3), or (3, 3), [m²].
 
     Raises:
         ShapeError, NonFiniteError, SettingError: one is not positive definite.

@@ -42,20 +42,20 @@ def claimed_sigma(variance: FloatArray, pairs: Pairs, noise: float, freedom: flo
 
 
 def unexplained_variance(residuals: FloatArray, covariances: FloatArray, freedom: float) -> float:
-    """The most probable variance [m²], alike in all directions, that residuals have beyond what was told of them.
+    """Estimate the most probable isotropic variance [m²] of residuals beyond their stated covariances.
 
-    An instrument knows its own noise, not that of the arm's encoders and play.
+    An instrument states its own noise, which excludes that of the arm's encoders and backlash.
 
     Args:
         residuals: (n, 3) [m], without outliers.
         covariances: of the instrument's errors (n, 3, 3) [m²].
-        freedom: residual coordinates minus those that a fit has used up, above 0.
+        freedom: degrees of freedom, that is residual coordinates minus fitted parameters; above 0.
     """
     told, axes = np.linalg.eigh(covariances)
     squares = np.square((axes.swapaxes(1, 2) @ residuals[..., None])[..., 0]) * (residuals.size / freedom)
 
     def slope(variance: float) -> float:
-        """Twice the derivative of the log likelihood."""
+        """Return twice the derivative of the log likelihood."""
         return float(((squares - told - variance) / np.square(told + variance)).sum())
 
     low, high = 0.0, float(squares.max())  # where each term is negative

@@ -1,4 +1,4 @@
-"""What commands ask about the calibration board and about images of it; each is one argument of theirs."""
+"""Command-line options for the calibration board and for images of it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class DrawnBoard:
     ] = "charuco"
 
     def board(self) -> Board:
-        """The board; ConfigError where there is no such one."""
+        """Return the board. Raise ConfigError if the options describe no valid one."""
         from bodyschema.daemon.camera_calibration import board_of
 
         return board_of(
@@ -62,7 +62,7 @@ class PrintedBoard(DrawnBoard):
     ] = None
 
     def board(self) -> Board:
-        """The board in its true size; ConfigError where there is no such one."""
+        """Return the board in its printed size. Raise ConfigError if the options describe no valid one."""
         from bodyschema.daemon.camera_calibration import as_printed
 
         return as_printed(super().board(), self.ruler_mm)
@@ -79,7 +79,7 @@ class EyeFiles:
     one: Annotated[bool, flag("All images are of one camera alone; --left may tell which of the folder's.")] = False
 
     def of(self, folder: Path) -> Images:
-        """The images in `folder`."""
+        """Return the images in `folder` that these options select."""
         from bodyschema.daemon.camera_calibration import Images
 
         return Images(folder, self.left, self.right, self.side_by_side, self.one)

@@ -83,7 +83,7 @@ def arm(
         ),
     ] = False,
 ) -> None:
-    """Where camera and tool are and what the joint zeros are, with 95 % intervals; writes a calibrated URDF.
+    """Calibrate camera, tool and joint offsets, with 95 % intervals; writes a calibrated URDF.
 
     Learns a rigid chain from all pairs, around the nominal one. Outliers are left out. All pairs have to be of one
     tool: from a store those are learnt that the learner beside it counts since the tool was last changed. Where

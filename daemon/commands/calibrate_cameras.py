@@ -49,7 +49,7 @@ def cameras(
     ] = None,
     as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
 ) -> None:
-    """Lenses and places of two cameras, or the lens of one, from views of a board: writes cameras.toml and a report.
+    """Calibrate two cameras, or the lens of one, from views of a board: writes cameras.toml and a report.
 
     About 20 pairs of images, or 20 images of one camera alone (--one), the board held still in each: all over the
     images, tilted by 20° to 40° each way, near and far. Without IMAGES the robot's own cameras look: it is said what to
@@ -108,7 +108,7 @@ def check(
     ] = 60.0,
     as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
 ) -> None:
-    """Whether a calibration still holds, from one look at the board.
+    """Check that a camera calibration still holds, from one look at the board.
 
     The last pair of images that shows the board to both eyes is taken; without IMAGES the robot's own cameras look
     until the board is held still. A camera that was turned up or down or about its line of sight moves the rows apart;

@@ -50,7 +50,7 @@ def init(
 
     Needs: your robot's URDF; with --sim nothing at all; with --lerobot also LeRobot's calibration of the arm.
 
-    Next: mend what is marked CHECK, then `bodyschema config check`. With --sim nothing is left to mend:
+    Next: correct what is marked CHECK, then `bodyschema config check`. With --sim nothing is left to correct:
     `bodyschema run --sim`. With --lerobot: `bodyschema joints`.
     """
     from bodyschema.interfaces.errors import ConfigError
@@ -72,7 +72,7 @@ def init(
 
 @config.command(sort_key=2)
 def check(*, robot: RobotFile = HERE) -> None:
-    """Say what was understood, or which line to mend.
+    """Check robot.toml: print what was understood, or the line to correct.
 
     Needs: robot.toml (`bodyschema config init`) and the URDF that it names.
 
@@ -161,7 +161,7 @@ def _of_lerobot(name: str, urdf: Path | None, robot: Path, calibration: Path | N
 
 
 def _effect_line(effect: Effect) -> str:
-    """An effect in one line: name, place, numbers."""
+    """Return an effect as one line: name, place, numbers."""
     place = "" if effect.where is None else f" at {effect.where}"
     source = "" if effect.source is None else f", from {effect.source}"
     numbers = (f"{p.name} = {value:.4g}" for p, value in zip(effect.parameters, effect.values, strict=True))
@@ -181,7 +181,7 @@ def _camera_lines(config: Config) -> list[str]:
 
 
 def _standing_still(description: RobotDescription) -> list[str]:
-    """Moving joints between camera and marker that are not learnt."""
+    """Return the names of the moving joints between camera and marker that are not learnt."""
     from bodyschema.interfaces.urdf import MOVING
 
     path = description.tree.path(description.camera.parent_link, description.robot.marker_link)
@@ -196,7 +196,7 @@ def say(text: str) -> None:
 
 
 def write_new(file: Path, text: str) -> None:
-    """Write a file that is not there yet; ConfigError when it is."""
+    """Write a new file. Raise ConfigError if it exists."""
     from bodyschema.interfaces.errors import ConfigError
 
     try:

@@ -48,7 +48,7 @@ def diagnose(
     as_json: Annotated[bool, flag("Print diagnosis.json.", name="--json")] = False,
     force: Annotated[bool, flag("Go on although the pairs do not seem to be of this robot.")] = False,
 ) -> None:
-    """What the simulation gets wrong of a recording, why, and by how much it gets better.
+    """Find what the simulation gets wrong in a recording, why, and how much correcting it helps.
 
     Every effect that is known is tried at every joint, alone and together, and judged by blocks of rows that were not
     fitted. What remains are causes with their numbers and how sure they are; or that nothing is wrong; or that this

@@ -78,17 +78,17 @@ AS_THEY_ARE = SourceOptions()
 
 
 def flag(text: str, *, name: str | None = None) -> Parameter:
-    """An option without a value, which is off unless it is given."""
+    """Return an option without a value, off by default."""
     return Parameter(name=name, help=text, negative="", show_default=False)
 
 
 def several(text: str) -> Parameter:
-    """An option that may be given more than once; without it there is none."""
+    """Return an option that may be given more than once; the default is no value."""
     return Parameter(help=f"{text}; more than once for several.", negative="", show_default=False)
 
 
 def robot_file(given: Path | None, source: Path | None) -> Path:
-    """The robot.toml that was given; else the one beside `source`, else what the environment or the folder has."""
+    """Return `given`; else the robot.toml beside `source`; else that of the environment or the working directory."""
     if given is not None:
         return given
     if source is not None and (beside := source.parent / HERE).exists():

@@ -101,7 +101,7 @@ def replay(
 
 @contextmanager
 def _ending_on_sigterm() -> Iterator[None]:
-    """SIGTERM unwinds the stack, so that the two processes are ended too."""
+    """Unwind the stack on SIGTERM, so that the two processes are ended too."""
     before = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         yield

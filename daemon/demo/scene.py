@@ -41,7 +41,7 @@ FEETECH = {joint: "STS3250" if joint.startswith("shoulder") else "STS3215" for j
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Where everything of one demo is."""
+    """Paths of the files of one demo."""
 
     folder: Path
 
@@ -52,7 +52,7 @@ class Scene:
 
     @property
     def log_file(self) -> Path:
-        """What the two processes logged."""
+        """Log of the two processes."""
         return self.folder / "daemon.log"
 
     @property
@@ -118,7 +118,7 @@ def prepare(
 
 
 def _described(model: Path, camera: Camera) -> str:
-    """The robot as it ships; its right eye closed where there is one camera alone."""
+    """Return the robot.toml shipped with the model, reduced to one eye if there is only one camera."""
     text = model.read_text(encoding="utf-8")
     return text if camera == "stereo" else re.sub(r"(?m)^baseline_m = .*$", "eyes = 1", text)
 
@@ -140,7 +140,7 @@ seed = {seed}
 
 
 def _marker(marker: Marker, model: Path) -> str:
-    """The table [vision] for what is in the hand."""
+    """Return the [vision] tables for the marker in the hand."""
     towards_hand = -np.array(RobotDescription.load(model).robot.marker_xyz)
     match marker:
         case "ball":
@@ -152,7 +152,7 @@ def _marker(marker: Marker, model: Path) -> str:
 
 
 def _joints(bus: Bus) -> str:
-    """The arm's joints as one would build them."""
+    """Return the [drivers] tables for the arm's joints on this kind of bus."""
     match bus:
         case "dynamixel":
             return _servos("dynamixel", DYNAMIXEL)

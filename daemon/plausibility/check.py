@@ -52,14 +52,14 @@ NAMED = 0.12
 FAR_ZERO_RAD = math.radians(20.0)
 # A known camera pose is not off by this much.
 TURNED_RAD = math.radians(30.0)
-# Share of its tolerance that a zero is given which is to stay as drawn.
+# Share of its tolerance that is left to a joint offset kept at nominal.
 HELD = 1e-3
 # A zero of the last joint this far off is not fitted where the marker is known: its quarter turns are tried instead.
 LAST_ZERO_RAD = math.radians(3.0)
 # ... and named where the known marker comes out so many times nearer to its place: with 3, 2 of 32 markers that were
 # 50 mm off in each direction (1-sigma) came out so by chance.
 NEARER = 5.0
-# So many other readings that fit as well are told.
+# Maximum number of other, equally good readings that are listed.
 LISTED = 2
 # Distances below this share of the reach are not distinguished.
 EXACT = 1e-5
@@ -241,7 +241,7 @@ def _turned(chain: RigidChain, q: FloatArray, x: FloatArray, fit: _Fit) -> Plaus
 
 
 def _turned_last(names: tuple[str, ...], as_it_is: _Fit, reading: Reading, fit: _Fit) -> Plausibility:
-    """The last joint's zero is a quarter turn off: nothing else brings the marker to where it is known to be."""
+    """Report that the last joint's zero is off by quarter turns: only that explains the known marker position."""
     return Plausibility(
         f"it seems that {reading.looks(names, fit.zeros)}: the marker then comes out {_mm(fit.tool_m)} from its place "
         f"in [robot] of robot.toml, and as the columns are {_mm(as_it_is.tool_m)} from it",
@@ -315,14 +315,14 @@ class _Search:
             return np.zeros((1, 3))
 
     def held_error(self) -> float:
-        """RMS distance [m] of the nearest pairs as they are, with all zeros as drawn."""
+        """Return the RMS distance [m] of the nearest pairs with columns unchanged and joint offsets kept at nominal."""
         held = place(self._chain, self._q[None], self._x[None], zeros_std=HELD * self._std, tool_std=TOOL_M)
         return float(held.errors(MEASURED)[0])
 
     def with_marker_known(self, reading: Reading) -> tuple[Reading, _Fit] | None:
-        """The reading with the last joint some quarter turns on, and its fit, where the known marker tells these.
+        """Return the reading with the last joint off by quarter turns, and its fit, if the known marker shows it.
 
-        With a free marker such a turn makes no difference.
+        With a free marker position such a turn makes no difference.
         """
         if self._chain.prismatic[-1]:
             return None

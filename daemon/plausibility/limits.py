@@ -31,7 +31,7 @@ MEASURED = 0.7
 ZEROS_RAD, SLIDES_M, TOOL_M = 0.15, 0.05, 0.3
 # ... and a marker whose place is known, by ruler.
 KNOWN_TOOL_M = 0.01
-# Rows by which a unit of length is told, and the share of the drawn positions' spread that a fit in it leaves at most.
+# Rows used to determine a unit of length; largest residual of a fit in it, as a share of the nominal positions' spread.
 FITTED_ROWS, FITTING = 80, 0.1
 # If none fits, the unit is guessed from the size of the positions: the next one too if it is off by less than a factor.
 ALSO = 2.0

@@ -20,7 +20,7 @@ NonNegative = Annotated[float, Meta(ge=0)]
 
 
 class AnyBus(Protocol):
-    """What is asked of the table of a bus."""
+    """Settings that every table of a bus has."""
 
     @property
     def port(self) -> str:
@@ -34,7 +34,7 @@ class AnyBus(Protocol):
 
     @property
     def latency_ms(self) -> float | None:
-        """How long the adapter keeps bytes back; None: the system is asked."""
+        """Latency of the adapter [ms]; None: read from the system."""
         ...
 
 
@@ -84,11 +84,11 @@ class ServosConfig(msgspec.Struct, Generic[BusT], frozen=True, forbid_unknown_fi
     restore_torque: bool = False
 
     def bus_of(self, servo: ServoConfig) -> str:
-        """The name of the bus that the servo is on."""
+        """Return the name of the servo's bus."""
         return next(iter(self.buses)) if servo.bus is None else servo.bus
 
     def model_of(self, servo: ServoConfig) -> Model:
-        """What it is said to be."""
+        """Return the configured model of the servo."""
         return self.models[servo.model]
 
     def check(self, joints: Sequence[str], file: Path, text: str) -> None:

@@ -64,19 +64,19 @@ class FittedServo:
 
     @property
     def ticks_per_turn(self) -> int | None:
-        """After so many ticks its sensor tells the same again; None where it does not turn on."""
+        """Ticks after which the sensor's position repeats; None if it does not wrap around."""
         return self.model.ticks_per_turn
 
     def angle(self, ticks: int) -> float:
-        """The joint's angle [rad] at a position with its turns [ticks]."""
+        """Return the joint angle [rad] at a multi-turn position [ticks]."""
         return self.direction * (ticks - self.zero_ticks) * self.model.rad_per_tick
 
     def ticks(self, angle: float) -> float:
-        """The position [ticks] at a joint's angle [rad]."""
+        """Return the multi-turn position [ticks] at a joint angle [rad]."""
         return self.zero_ticks + self.direction * angle / self.model.rad_per_tick
 
     def record(self) -> Mapping[str, object]:
-        """Its identity and settings, to be kept with the data."""
+        """Return the servo's identity and settings, to be kept with the data."""
         return {
             "joint": self.joint,
             "bus": self.bus,
@@ -95,7 +95,7 @@ class FittedServo:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What was found in the place of a servo."""
+    """Finding for a configured servo."""
 
     config: ServoConfig
     found: str
@@ -138,7 +138,7 @@ def identify(bus: Bus, config: ServoConfig, model: Model, known: Mapping[int, Mo
 
 
 def require_all(findings: Iterable[Finding], ports: str) -> list[FittedServo]:
-    """The servos; SourceError with a table of all when one is not as it should be."""
+    """Return the servos. Raise SourceError with a table of all servos if any is not as configured."""
     findings = list(findings)
     wrong = [finding for finding in findings if finding.servo is None]
     if not wrong:
@@ -177,7 +177,7 @@ def switch_torque_off(bus: Bus, servo: FittedServo) -> FittedServo:
 
 
 def torque_is_on(bus: Bus, servo: FittedServo) -> bool:
-    """Whether it holds its place; SourceLost when it does not answer."""
+    """Return True if the servo's torque is on. Raise SourceLost if it does not answer."""
     data, trouble = read_register(bus, servo.model, servo.id, servo.model.layout["torque"])
     if data is None:
         raise SourceLost(f"joint {servo.joint!r} (ID {servo.id}): {trouble}", retry_s=RETRY_S)
@@ -198,7 +198,7 @@ def restore_torque(bus: Bus, servo: FittedServo) -> None:
 
 
 def read_register(bus: Bus, model: Model, id: int, register: Register) -> tuple[bytes | None, Trouble | None]:
-    """Its bytes, twice the same where a wrong answer may pass its checksum; else what was wrong the last time."""
+    """Return a register's bytes or the last trouble; repeat until two agree if the checksum is weak."""
     data, trouble = _read_once(bus, model, id, register)
     for _ in range(ATTEMPTS):
         if data is None or not bus.is_weak(bus.read_request(model, id, register)):
@@ -236,7 +236,7 @@ def _absence(bus: Bus, model: Model, id: int, trouble: Trouble | None) -> str:
 
 
 def _is_garbled(bus: Bus, model: Model, id: int) -> bool:
-    """Whether most of what it measures comes garbled: two of one model say the same of themselves, but not of that."""
+    """Return True if most measurements are garbled, as when two servos of one model, set up alike, share an ID."""
     request = bus.read_request(model, id, model.layout.block)
     garbled = sum(bus.ask(request).trouble is Trouble.GARBLED for _ in range(LOOKS))
     return garbled > LOOKS // 2

@@ -29,7 +29,7 @@ OpenAt = Callable[[str, int], tuple[Port, float]]
 
 
 class Outcome(StrEnum):
-    """What came of a change."""
+    """Outcome of a change."""
 
     WRITTEN = "written"
     KEPT = "not written"
@@ -49,11 +49,11 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """What came of a change.
+    """Outcome of a change.
 
     Attributes:
-        found: what stands there now; None when nobody could be asked.
-        said: what to know of it besides; empty when it was written and read back.
+        found: value read back; None if no servo answered.
+        said: explanation; empty if the value was written and read back.
     """
 
     change: Change
@@ -69,7 +69,7 @@ class Workbench:
     """
 
     def __init__(self, make: Make, clock: Clock, open_at: OpenAt) -> None:
-        """Nothing is opened yet."""
+        """Store the arguments; open nothing yet."""
         self.make, self._clock, self._open_at = make, clock, open_at
         self._buses: dict[str, tuple[int, Bus]] = {}
 
@@ -85,7 +85,7 @@ class Workbench:
             self._buses.clear()
 
     def bus(self, port: str, baud: int) -> Bus:
-        """The bus at `port`, opened at this rate; SourceError when it cannot be."""
+        """Return the bus at `port`, opened at this baud rate. Raise SourceError if it cannot be opened."""
         if port in self._buses:
             rate, bus = self._buses[port]
             if rate == baud:
@@ -98,7 +98,7 @@ class Workbench:
         return self._buses[port][1]
 
     def fitted(self, bus: Bus, config: ServoConfig, model: Model) -> FittedServo:
-        """The servo, as it is; SourceError when it is another, or does not answer."""
+        """Return the servo as found on the bus. Raise SourceError if it is another, or does not answer."""
         finding = identify(bus, config, model, self.make.models)
         if finding.servo is None:
             raise SourceError(
@@ -108,7 +108,7 @@ class Workbench:
         return finding.servo
 
     def model_at(self, bus: Bus, id: int) -> Model | None:
-        """What the servo of an ID is, asked in every protocol of the make; None when none understands it."""
+        """Identify the model of the servo with an ID by trying every protocol of the make; None if it stays unknown."""
         by_protocol = {model.protocol: model for model in self.make.models.values()}
         for protocol, any_of_it in by_protocol.items():
             register = any_of_it.layout["model"]
@@ -119,19 +119,19 @@ class Workbench:
         return None
 
     def is_taken(self, bus: Bus, id: int) -> bool:
-        """Whether somebody answers to an ID, in whatever protocol."""
+        """Return True if a servo answers to an ID in any protocol."""
         by_protocol = {model.protocol: model for model in self.make.models.values()}
         return any(bus.ping(model, id).trouble is not Trouble.TIMEOUT for model in by_protocol.values())
 
     def value(self, bus: Bus, servo: FittedServo, setting: Setting) -> int:
-        """What stands in its EEPROM; SourceError when it does not answer."""
+        """Return the setting's value in the servo's EEPROM. Raise SourceError if the servo does not answer."""
         data, trouble = read_register(bus, servo.model, servo.id, setting.register)
         if data is None:
             raise SourceError(f"joint {servo.joint!r} (ID {servo.id}) on {bus.name}: {trouble}. Nothing was written")
         return setting.register.value(data)
 
     def position(self, bus: Bus, servo: FittedServo) -> int:
-        """Where it is [ticks]; SourceError when it does not answer."""
+        """Return the servo's position [ticks]. Raise SourceError if it does not answer."""
         position = servo.model.layout["position"]
         data, trouble = read_register(bus, servo.model, servo.id, position)
         if data is None:
@@ -139,14 +139,14 @@ class Workbench:
         return position.value(data)
 
     def homing_offset(self, bus: Bus, servo: FittedServo) -> int:
-        """The homing offset with which the servo's position here and now would be its `zero_ticks`, or a turn off."""
+        """Return the homing offset that makes the servo's present position its `zero_ticks`, modulo full turns."""
         moved = round(servo.zero_ticks - self.position(bus, servo))
         turn = servo.ticks_per_turn
         wanted = servo.homing_offset + self.make.homing_sign * moved
         return wanted if turn is None else (wanted + turn // 2) % turn - turn // 2
 
     def torque_off(self, bus: Bus, servos: Iterable[FittedServo]) -> None:
-        """Switch the torque of all off, and verify it; SourceError when one's stays on."""
+        """Switch the torque of all servos off, and verify it. Raise SourceError if one stays on."""
         for servo in servos:
             switch_torque_off(bus, servo)
 
@@ -184,7 +184,7 @@ class Workbench:
         return Done(change, Outcome.OTHER, found, f"{change.setting.shown(found)} was read back")
 
     def _still_there(self, bus: Bus, change: Change, trouble: Trouble | None) -> Done:
-        """Nobody answers to the new ID."""
+        """Return the outcome of an ID change when no servo answers to the new ID: read from the old one."""
         data, _ = read_register(bus, change.servo.model, change.servo.id, change.setting.register)
         if data is None:
             return _lost(change, trouble)
@@ -208,12 +208,12 @@ class Workbench:
         bus.listen(self._clock.now() + EEPROM_S)
 
     def _unlock(self, bus: Bus, servo: FittedServo) -> None:
-        """What is written while its EEPROM is locked would be lost with the power."""
+        """Unlock the servo's EEPROM; values written while it is locked are lost at power-off."""
         if LOCK in servo.model.layout:
             self._tell(bus, servo, servo.model.layout[LOCK], 0)
 
     def _locked(self, bus: Bus, done: Done) -> Done:
-        """Lock the EEPROM again, where there is a lock."""
+        """Lock the EEPROM again, if it has a lock."""
         servo = done.change.servo
         if LOCK not in servo.model.layout or done.outcome is Outcome.UNKNOWN:
             return done

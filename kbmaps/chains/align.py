@@ -180,7 +180,7 @@ def rigid_motion(points: FloatArray, targets: FloatArray, weights: FloatArray) -
 
 
 def _start_shift(fit: _Fit, sigma: float, turns: FloatArray | None) -> FloatArray:
-    """Marker shift (3,) whose fit explains a sample of the pairs best, of several starting points.
+    """Return the marker shift (3,) whose fit explains a sample of the pairs best.
 
     Several starting points are tried: pose and marker offset together have local minima, mostly with few joints or
     small ranges.
@@ -203,10 +203,10 @@ def _start_shift(fit: _Fit, sigma: float, turns: FloatArray | None) -> FloatArra
 
 
 def _shift_by_turns(fit: _Fit, turns: FloatArray) -> FloatArray:
-    """Marker shift (3,) that follows from how the marker was turned (n, 3, 3) beside where it was.
+    """Return the marker shift (3,) that follows from the marker's orientations (n, 3, 3) and positions.
 
     With the instrument turned by A and the marker on the last frame N by B, Aᵀ M = N B is linear in A and B; then so is
-    x = A (p + N δ) + t in the shift δ and the place t. As robot-world and hand-eye are solved (Shah 2013).
+    x = A (p + N δ) + t in the shift δ and the place t. Robot-world/hand-eye calibration is solved so (Shah 2013).
     """
     if turns.shape != fit.nominal_rotations.shape:
         raise ShapeError("turns", f"{fit.nominal_rotations.shape} to go with q", turns.shape)

@@ -156,7 +156,7 @@ class RigidLearner:
     def learn(
         self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None, *, cov: ArrayLike | None = None
     ) -> None:
-        """Pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
+        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
 
         Args:
             q: joint values.
@@ -285,7 +285,7 @@ class RigidLearner:
 
     @property
     def _shaped(self) -> bool:
-        """Whether some errors are not as large in all directions."""
+        """True if some errors are anisotropic."""
         return bool((self._shape != np.eye(3)).any())
 
     def _fitted(self) -> RigidFit | None:

@@ -15,7 +15,7 @@ _LONGEST_STEP = 0.1
 
 
 def deviations(belief: ChainBelief, pairs: Pairs, sigma: FloatArray) -> FloatArray:
-    """Root mean square deviation (size,) [rad, m] of each parameter's true value from the mean, to second order.
+    """Return the RMS deviation (size,) [rad, m] of each parameter's true value from the mean, to second order.
 
     Changes that the pairs cannot separate lie along a curve, not along its tangent. An example is another offset of the
     last joint, compensated for by the marker: it takes the marker round the joint's axis. With y standard normal along
@@ -45,9 +45,9 @@ def deviations(belief: ChainBelief, pairs: Pairs, sigma: FloatArray) -> FloatArr
 
 
 def _sides(belief: ChainBelief, pairs: Pairs, sigma: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A root of the belief in two parts, open (size, k) and closed (size, c), and (J W_c)⁺ (c, 3 n) of the latter.
+    """Return a root W of the belief in an open part (size, k) and a closed part W_c (size, c), and (J W_c)⁺ (c, 3 n).
 
-    In units of the posterior, the eigenvalues of (J W)ᵀ J W are the removed shares of the prior's variance.
+    In units of the posterior, the eigenvalues of (J W)ᵀ J W are the shares of the prior's variance that were removed.
     """
     free, triangle = squared(belief.root)
     root = np.zeros((len(belief.mean), len(free)))

@@ -18,12 +18,12 @@ class DrivenShaft:
     """The angle of a servo's shaft: it goes where the servo holds it, and stays where nothing does.
 
     Attributes:
-        servo: that turns it; None: nobody does.
-        jammed: it is held fast, whatever the servo does.
+        servo: the servo that turns it, if any.
+        jammed: the shaft does not move, whatever the servo does.
     """
 
     def __init__(self, angle: float, fastest_rad_s: float = FASTEST_RAD_S) -> None:
-        """At `angle` [rad] from the beginning, 0 in the middle of the servo's range."""
+        """Start at `angle` [rad], 0 in the middle of the servo's range."""
         self.servo: Servo | None = None
         self.jammed = False
         self._fastest = fastest_rad_s
@@ -31,12 +31,12 @@ class DrivenShaft:
         self._lock = threading.RLock()  # its servo moves it in one thread, cameras see it in others
 
     def __call__(self, t: float) -> float:
-        """Where it is at `t` [s], or was, as far back as it remembers [rad]."""
+        """Return the angle [rad] at `t` [s], now or as far back as it is stored."""
         with self._lock:
             return self._at(t)
 
     def turn_by_hand(self, angle: float) -> None:
-        """Somebody turns it by `angle` [rad]."""
+        """Turn the shaft by `angle` [rad], as by hand."""
         with self._lock:
             moved_s, before = self._moves[-1]
             self._moves.append((moved_s, before + angle))
