@@ -10,6 +10,7 @@ from planted_cases import SHOULDER, Motion, desk_arm, seen, walk
 
 from bodyschema.diagnosis.conclusion import conclusion
 from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
+from bodyschema.diagnosis.explanation import Explanation, useful
 from bodyschema.effects import Effect, Simulation
 
 
@@ -48,3 +49,11 @@ def test_a_play_that_runs_hardly_cross_is_told_with_what_to_record() -> None:
     (told,) = [line for line in conclusion(found).limitations if "side of its play" in line]
     assert SHOULDER in told
     assert "Record longer runs" in told
+
+
+def test_a_cause_that_gains_nothing_on_held_out_rows_is_dropped(small) -> None:
+    fit, robot = small.extended, small.extended.simulation.robot
+    impossible = Effect.at(robot, "backlash", SHOULDER, values=[-0.001])
+    begun = Explanation(fit.starting([*fit.causes, impossible]), None, 0.0)
+    kept = useful(begun, small.blocks, lambda _: None).fit.causes
+    assert [cause.key for cause in kept] == [cause.key for cause in fit.causes]
