@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from planted_cases import BASE, SHOULDER, desk_arm, motion_of, seen, surveyed_ar
 
 from bodyschema.diagnosis.conclusion import conclusion
 from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
+from bodyschema.diagnosis.rivals import whole_range
 from bodyschema.effects import Effect, Motion, Simulation
 from bodyschema.interfaces.robot import RobotDescription
 
@@ -146,3 +148,10 @@ def test_a_cause_that_nothing_else_comes_near_has_no_rivals() -> None:
     (standing,) = diagnosed(robot, walk(robot, 2, ROWS), truth, kinds).standings
     assert standing.rivals == ()
     assert standing.probability > 0.999
+
+
+def test_a_slide_without_limits_is_not_sent_three_metres_away() -> None:
+    robot = SimpleNamespace(lower=[-np.pi], upper=[np.pi], chain=SimpleNamespace(prismatic=[True]))
+    motion = SimpleNamespace(q=np.array([[0.1], [0.3]]))
+    fit = SimpleNamespace(simulation=SimpleNamespace(robot=robot), observations=SimpleNamespace(motion=motion))
+    assert whole_range(fit, 0) == pytest.approx((-0.1, 0.5))
