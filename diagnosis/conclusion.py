@@ -29,8 +29,8 @@ from .result import (
 )
 from .rivals import Rival, Standing
 from .scan import Candidate
-from .search import NAMED, nats
 from .words import evidence, is_unsure, sentence
+from .worth import NAMED, nats
 
 _HALF_WIDTH_95 = 1.959964
 # Below this p-value, the report explains why a hypothesis is not a cause.
@@ -176,8 +176,8 @@ def _parameters(diagnosis: Diagnosis, cause: Effect, standing: Standing) -> dict
     halves = _HALF_WIDTH_95 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     fitted = [*cause.amounts, *cause.shapes]
     numbers = {}
-    for k, parameter in enumerate(cause.parameters):
-        value = float(cause.values[k])
+    for k in cause.told:
+        parameter, value = cause.parameters[k], float(cause.values[k])
         if k in fitted:
             half = float(halves[fitted.index(k)])
             # A period, a time constant and a remaining share cannot be negative.

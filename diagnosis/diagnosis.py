@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 
 import numpy as np
@@ -27,7 +27,7 @@ from .leftover import Leftover, leftover
 from .observations import Observations
 from .rivals import Standing, standings
 from .scan import Candidate, Scan
-from .search import Search, describe
+from .search import Search
 from .together import Tolerated, together, tolerated
 from .unknown import Unknowns
 
@@ -244,15 +244,9 @@ def diagnose(
         extended = _searched(start.with_causes(extended.causes).tolerating(scales), search, enough)
     tell("asking whether something without a name is at work")
     blocks = blocks or Blocks.cut(len(recording))
-    explanation = useful(explain(extended, search.path, unknowns, search, tell), blocks, tell)
+    explanation = useful(explain(extended, search.path, unknowns, search, tell), search, blocks, tell)
     tell("asking what else it could be")
     stands = standings(explanation.beside, search, blocks, seed, None if explanation.unknown else unknowns)
-    while not explanation.unknown and any(standing.worth < 0.0 for standing in stands):
-        # Nothing at all in its place is more probable than such a cause.
-        weakest = explanation.fit.causes[int(np.argmin([standing.worth for standing in stands]))]
-        tell(f"dropped {describe(weakest)}")
-        explanation = replace(explanation, fit=explanation.fit.without(weakest))
-        stands = standings(explanation.fit, search, blocks, seed, unknowns)
     while explanation.unknown and any(standing.probability < _HALF for standing in stands):
         weakest = int(np.argmin([standing.probability for standing in stands]))
         fewer = without_one(explanation, explanation.fit.causes[weakest], unknowns, search)

@@ -8,7 +8,7 @@ from bodyschema.effects import Effect
 
 from .fit import Fit
 from .scan import Scan
-from .search import NAMED, nats
+from .worth import NAMED, nats
 
 # Maximum of rounds; each may add one ripple per joint.
 _ROUNDS = 8

@@ -12,9 +12,10 @@ from bodyschema.interfaces.records import FloatArray
 
 from .fit import Fit
 from .held_out import Blocks, held_out_errors, is_marker
-from .search import NAMED, Search, describe, named
-from .together import tolerated
+from .search import Search, describe, named
+from .together import beyond_tolerances, tolerated
 from .unknown import Apart, Unknowns, Way
+from .worth import NAMED
 
 # Unnamed causes are accepted if they are more probable than named ones alone by this [nats].
 _MARGIN = 8.0
@@ -103,6 +104,9 @@ def explain(
         if hope + narrower - cost_of_names(fit.causes, search) < best.worth - (_AS_GOOD if best.unknown else 0.0):
             continue
         other = _with_unknown(fit, unknowns, search, best.worth - (_AS_GOOD if best.unknown else 0.0))
+        if other.apart is not None and not fit.causes:
+            # The scales of a fit without causes are those of an arm without unnamed causes, or a guess.
+            other = _rescaled(other, other.apart, unknowns, search)
         clearly = margin if best.fit is found and not other.is_specific else 0.0
         better = other.worth > best.worth + clearly and not _is_as_good(best, other)
         better = better or _is_as_good(other, best)
@@ -115,21 +119,31 @@ def explain(
     return best
 
 
-def useful(explanation: Explanation, blocks: Blocks, tell: Callable[[str], None]) -> Explanation:
-    """Drop causes that do not reduce the error on data not used in the fit, or whose values cannot be."""
+def useful(explanation: Explanation, search: Search, blocks: Blocks, tell: Callable[[str], None]) -> Explanation:
+    """Drop causes that are not worth naming, do not reduce the error on data not used in the fit, or cannot be.
+
+    Larger tolerances may take the place of a link or a joint offset without any loss on such data. Such a cause stays
+    if it is more probable than these tolerances.
+    """
     fit = explanation.fit
     if explanation.unknown or fit.is_exact:
         return explanation
     while fit.causes:
         markers, error = is_marker(fit), _missed(fit, blocks)
-        fewer = [fit.without(cause) for cause in fit.causes]
+        fewer = [search.beside(fit, cause).without for cause in fit.causes]
         losses = [float((_missed(one, blocks) - error)[markers].sum()) for one in fewer]
-        # Negative backlash or compliance is no cause, whatever it gains.
-        kept = [loss > 0.0 and cause.is_possible for loss, cause in zip(losses, fit.causes, strict=True)]
-        if all(kept):
+        told = [
+            # Negative backlash or compliance is no cause, whatever it gains.
+            cause.is_possible
+            and search.worth(fit, cause) >= 0.0
+            and (loss > 0.0 or beyond_tolerances(fit, cause, search.multiplicity))
+            for cause, loss in zip(fit.causes, losses, strict=True)
+        ]
+        if all(told):
             break
-        least = min((k for k, is_kept in enumerate(kept) if not is_kept), key=losses.__getitem__)
-        tell(f"dropped {describe(fit.causes[least])}: no gain on data not used in the fit")
+        least = min((k for k, is_told in enumerate(told) if not is_told), key=losses.__getitem__)
+        why = "no gain on data not used in the fit" if losses[least] <= 0.0 else "nothing in its place is more probable"
+        tell(f"dropped {describe(fit.causes[least])}: {why}")
         fit = fewer[least]
     return replace(explanation, fit=fit)
 

@@ -87,7 +87,7 @@ class Products:
 
     def kept(self, effect: Effect, made: Callable[[], System]) -> System:
         """Return the system of an effect, built on first use."""
-        key = (*effect.key, effect.values.tobytes())
+        key = (*effect.key, effect.free, effect.values.tobytes())
         if key not in self._kept:
             self._kept[key] = made()
         return self._kept[key]

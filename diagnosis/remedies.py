@@ -265,7 +265,8 @@ class _Workshop:
     @staticmethod
     def _pose(cause: Cause) -> FloatArray:
         names = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
-        return transforms(np.array([[cause.parameters[name].value for name in names]]))[0]
+        told = {name: interval.value for name, interval in cause.parameters.items()}
+        return transforms(np.array([[told.get(name, 0.0) for name in names]]))[0]
 
 
 _BY_EFFECT: dict[str, Callable[[_Workshop, Cause, Mapping[str, float]], str]] = {

@@ -16,9 +16,10 @@ from .held_out import Blocks
 from .nameless import Nameless
 from .scan import Candidate
 from .scatter import beyond_single_rows, remembers
-from .search import Search, describe, nats
+from .search import Search, describe
 from .stability import Instead, named_again
 from .unknown import Unknowns
+from .worth import nats
 
 # Signals that differ by less than this, twice the log-likelihood that the right one is expected to gain, are one.
 SAME = 6.0
@@ -112,9 +113,7 @@ def _standing(
     without = beside.without
     gain = 2.0 * (fit.log_likelihood - without.log_likelihood)
     itself = beside.itself
-    worth = nats(gain, itself.dof) - search.doubt(itself)
-    if remembers(cause):
-        worth = min(worth, search.agreed(without, itself))
+    worth = search.worth(fit, cause)
     nothing = Instead(without, -itself.dof, -search.doubt(itself))
     tried = []
     for candidate in beside.candidates:

@@ -8,8 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bodyschema.effects import Effect, Identity
 from bodyschema.effects.flank import flanks
@@ -18,6 +20,7 @@ from bodyschema.interfaces.records import FloatArray
 
 from .fit import LARGEST, SHORTEST_DRIFT, Fit
 from .products import Products, System
+from .worth import choices, nats, ways_to_choose
 
 # Ripples are searched at every whole number of cycles per turn up to the first limit. Finer ones, up to twice per turn
 # of a strain wave gear of 120, are searched as coarsely as they can be resolved.
@@ -128,11 +131,34 @@ class Scan:
                 return None if found is None else replace(found, trials=_COARSE * len(_WIDTHS))
             case "gravity_backlash":
                 return self._hung(effect)
+            case _ if effect.kind.in_parts and effect.free is None:
+                return self._in_parts(effect)
             case _:
                 gains, amounts, dofs = self._solved(self._linear(effect), effect)
                 if not dofs[0]:
                     return None
-                return Candidate(_with_amounts(effect, amounts[0]), float(gains[0]), int(dofs[0]))
+                return Candidate(_with_amounts(effect, amounts[0]), float(gains[0]), int(dofs[0]), choices(effect))
+
+    def _in_parts(self, effect: Effect) -> Candidate | None:
+        """Return an effect with those of its amounts free that are worth their number; None if none is identifiable."""
+        inner, gradient, raw = self._linear(effect).at(self._state)
+        chosen = _subsets(inner.shape[1])
+        # Amounts that are not free keep no product with the residuals or with the others.
+        both = chosen[:, :, None] & chosen[:, None, :]
+        inners, gradients = np.where(both, inner, 0.0), np.where(chosen, gradient, 0.0)
+        gains, amounts = self._gains(inners, gradients, effect)
+        dofs = self._dofs(inners, np.broadcast_to(raw, chosen.shape), effect)
+        sizes = chosen.sum(axis=1)
+        worths = [
+            nats(float(gain), int(dof)) - np.log(ways_to_choose(int(size), chosen.shape[1])) if dof == size else -np.inf
+            for gain, dof, size in zip(gains, dofs, sizes, strict=True)
+        ]
+        best = int(np.argmax(worths))
+        if not np.isfinite(worths[best]):
+            return None
+        freed = effect.freeing(tuple(np.array(effect.amounts)[chosen[best]].tolist()))
+        found = _with_amounts(freed, amounts[best][chosen[best]])
+        return Candidate(found, float(gains[best]), int(dofs[best]), choices(found))
 
     def in_full(self, candidate: Candidate) -> Candidate:
         """Return the candidate with the gain at its actual amounts, where that exceeds the first-order gain.
@@ -390,6 +416,13 @@ class Scan:
         shares = _eigenvalues(inner / np.sqrt(np.maximum(raw[:, :, None] * raw[:, None, :], 1e-300)))
         told = _eigenvalues(inner * unit[:, None] * unit) > 10.0 * self._fit.noise.sigma**2
         return ((shares > _TOLD_APART) & told).sum(axis=1)
+
+
+@cache
+def _subsets(count: int) -> NDArray[np.bool_]:
+    """Return all sets of some of `count` amounts (m, count)."""
+    chosen = (np.arange(1, 2**count)[:, None] >> np.arange(count)) & 1
+    return np.asarray(chosen, dtype=np.bool_)
 
 
 def _units(effect: Effect) -> FloatArray:

@@ -15,9 +15,8 @@ from .fit import Fit, improved
 from .held_out import Blocks, block_p_value
 from .scan import Candidate, Scan
 from .scatter import beyond_single_rows, instruments, remembers
+from .worth import ANOTHER, NAMED, choices, nats, rise_for
 
-# Smallest evidence gain of a cause [nats].
-NAMED = 3.0
 # Candidates within this share of the best gain are refitted, up to this number.
 _NEAR, _MOST = 0.4, 6
 # Candidates within this share of the best gain are evaluated beyond first order.
@@ -31,8 +30,6 @@ Key = tuple[str, str | None, str | None]
 Named = frozenset[tuple[Key, int]]
 # Maximum of effects at one place that begin at a moment, and of ripples, which differ in their periods.
 _MOST_MOMENTS, _MOST_RIPPLES = 2, 4
-# Minimum cost of a parameter [nats], and the fixed-point rounds of `rise_for`.
-_CHEAPEST, _ROUNDS = 1.5, 30
 # A rival must explain this share of a cause's gain; differences within this count as equal [nats].
 _COMES_NEAR, _EQUAL = 0.8, 0.3
 # Largest part of the evidence between two memory effects of a joint that may lie in a few rows [nats].
@@ -45,31 +42,8 @@ _ASTRAY = 5.0
 _WITH_ONE_MORE = 100.0
 # With fewer blocks of time, p-values are too coarse; a gain above this needs no p-value [nats].
 _FEW_BLOCKS, _BEYOND_DOUBT = 20, 30.0
-# The camera's pose and the marker's position are simpler than the adjacent link.
-_OF_A_LINK = 1
-
-
-def nats(gain: float, dof: int) -> float:
-    """Return the evidence gain of `dof` more parameters that raise twice the log-likelihood by `gain` [nats].
-
-    The prior is Gaussian and scaled by empirical Bayes: the size that best explains the gain (George and Foster 2000,
-        equation 5). It is never so narrow that a parameter costs less than `_CHEAPEST`.
-    """
-    if dof < 0:
-        return -nats(-gain, -dof)
-    if dof == 0:
-        return 0.5 * gain
-    return 0.5 * gain - dof * max(0.5 + 0.5 * float(np.log(max(gain, 1e-300) / dof)), _CHEAPEST)
-
-
-def rise_for(worth: float, dof: int) -> float:
-    """Return the rise of the log-likelihood for which `dof` more parameters are worth `worth` by `nats` [nats]."""
-    if dof < 0:
-        return -rise_for(-worth, -dof)
-    rise = worth + _CHEAPEST * dof
-    for _ in range(_ROUNDS if dof else 0):
-        rise = worth + dof * max(0.5 + 0.5 * float(np.log(max(2.0 * rise, 1e-300) / dof)), _CHEAPEST)
-    return rise
+# The camera's pose and the marker's position are simpler than the adjacent link, and so are two effects of one amount.
+_OF_A_LINK, _OF_A_PAIR = 1, 2
 
 
 class Beside:
@@ -78,17 +52,24 @@ class Beside:
     Attributes:
         itself: the cause with its best first-order fit.
         gain: its present first-order gain, Δχ².
+        in_parts: the cause with the best choice of its amounts; None where there is no choice.
         candidates: hypotheses that are not yet causes, the most probable first.
     """
 
     def __init__(
-        self, fit: Fit, cause: Effect, itself: Candidate | None, gain: float, candidates: list[Candidate]
+        self,
+        fit: Fit,
+        cause: Effect,
+        itself: Candidate | None,
+        gain: float,
+        in_parts: Candidate | None,
+        candidates: list[Candidate],
     ) -> None:
         self._fit = fit
         self._others = [effect for effect in fit.causes if effect is not cause]
         self._tried: dict[Identity, Fit] = {}
         self.itself = itself or Candidate(cause, 0.0, 1)
-        self.gain, self.candidates = gain, candidates
+        self.gain, self.in_parts, self.candidates = gain, in_parts, candidates
 
     @cached_property
     def without(self) -> Fit:
@@ -121,11 +102,14 @@ class Search:
     Args:
         hypotheses: the possible causes.
         tell: called with short messages on progress.
+
+    Attributes:
+        multiplicity: penalty for the number of hypotheses [nats].
     """
 
     def __init__(self, hypotheses: Sequence[Effect], tell: Callable[[str], None]) -> None:
         self._hypotheses, self._tell = hypotheses, tell
-        self._doubt = np.log(max(len(hypotheses), 1))
+        self.multiplicity = float(np.log(max(len(hypotheses), 1)))
         self._trials: dict[Key, int] = {}
         self._known: tuple[Fit | None, Scan | None, dict[Identity, Beside]] = (None, None, {})
         self.path: list[Fit] = []
@@ -190,14 +174,14 @@ class Search:
         """Replace a cause of many parameters by two causes of one parameter each; None if it does not pay."""
         for cause in fit.causes:
             beside = self.beside(fit, cause)
-            if beside.itself.dof <= 2:
+            if simplicity(cause) <= _OF_A_PAIR:
                 continue
             open_ones = [effect for effect in self._open(fit) if effect.key != cause.key]
             pair = self._scan(fit).without(cause).best_pair(open_ones)
             if pair is None or pair[0].gain < _COMES_NEAR * beside.itself.gain:
                 continue
             pair = self._with_moments(beside.without, pair)
-            doubts = self.doubt(beside.itself) - sum(self.doubt(one) for one in pair)
+            doubts = self.doubt(beside.itself) - self._doubt_of_pair(*pair)
             dof = len(pair) - beside.itself.dof
             least = fit.log_likelihood + rise_for(-doubts, dof)
             tried = beside.with_instead(*(one.effect for one in pair), least=least)
@@ -206,6 +190,12 @@ class Search:
                 self._tell(f"exchanged {describe(cause)} for {' and '.join(describe(one.effect) for one in pair)}")
                 return tried
         return None
+
+    def _doubt_of_pair(self, one: Candidate, other: Candidate) -> float:
+        """Return the multiplicity penalty of two causes named together [nats]."""
+        alike = one.effect.name == other.effect.name
+        further = min(self.doubt(other), ANOTHER + float(np.log(other.trials))) if alike else self.doubt(other)
+        return self.doubt(one) + further
 
     def _with_moments(self, fit: Fit, pair: tuple[Candidate, Candidate]) -> tuple[Candidate, Candidate]:
         """Return two candidates; the moment of each is the best one beside the other."""
@@ -262,11 +252,19 @@ class Search:
     def doubt(self, candidate: Candidate) -> float:
         """Return the multiplicity penalty for the number of places searched [nats]."""
         self._trials[candidate.effect.key] = candidate.trials
-        return float(self._doubt + np.log(candidate.trials))
+        return float(self.multiplicity + np.log(candidate.trials))
 
     def doubt_of(self, effect: Effect) -> float:
         """Return the multiplicity penalty of an effect that was a candidate [nats]."""
-        return float(self._doubt + np.log(self._trials.get(effect.key, 1)))
+        trials = choices(effect) if effect.kind.in_parts else self._trials.get(effect.key, 1)
+        return float(self.multiplicity + np.log(trials))
+
+    def worth(self, fit: Fit, cause: Effect) -> float:
+        """Return the evidence gain of a cause of a fit over leaving it out [nats]."""
+        beside = self.beside(fit, cause)
+        gain = 2.0 * (fit.log_likelihood - beside.without.log_likelihood)
+        worth = nats(gain, beside.itself.dof) - self.doubt(beside.itself)
+        return min(worth, self.agreed(beside.without, beside.itself)) if remembers(cause) else worth
 
     def agreed(self, fit: Fit, candidate: Candidate) -> float:
         """Return the worth of a candidate by the agreement of blocks of time, which may be correlated inside [nats]."""
@@ -320,7 +318,8 @@ class Search:
         if cause.identity not in known:
             rivals = [effect for effect in self._open(fit) if effect.key != cause.key]
             itself, candidates = scan.candidate(cause), self.shortlist(scan, rivals)
-            known[cause.identity] = Beside(fit, cause, itself, scan.as_it_is(cause), candidates)
+            in_parts = scan.candidate(cause.freeing(None)) if cause.kind.in_parts else None
+            known[cause.identity] = Beside(fit, cause, itself, scan.as_it_is(cause), in_parts, candidates)
         return known[cause.identity]
 
     def _second_thoughts(self, fit: Fit) -> tuple[Fit, bool]:
@@ -329,6 +328,10 @@ class Search:
             if beside.itself.gain > beside.gain + _ELSEWHERE:
                 tried = beside.with_instead(beside.itself.effect, least=fit.log_likelihood + _ELSEWHERE)
                 if tried.log_likelihood > fit.log_likelihood + _ELSEWHERE:
+                    return self._second_thoughts(tried)
+            if beside.in_parts is not None and beside.in_parts.effect.free != cause.free:
+                tried, worth = self._exchanged(fit, beside, beside.in_parts, _ELSEWHERE)
+                if worth > _ELSEWHERE:
                     return self._second_thoughts(tried)
             counted = self._counted(fit, cause)
             least = NAMED + self.doubt(beside.itself)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from .fit import Fit
 from .held_out import Blocks
-from .search import NAMED, nats
+from .worth import NAMED, nats
 
 RESAMPLED = 50
 # Rivals within this margin count as equally probable [nats].

@@ -9,6 +9,7 @@ rows (MacKay 1992, "Bayesian interpolation"; Tipping and Faul 2003, "Fast margin
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -18,16 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve, get_lapack_funcs
 
-from bodyschema.effects import Effect
+from bodyschema.effects import Effect, Identity
 from bodyschema.interfaces.records import FloatArray
 
 from .background import SPREAD, Scales
 from .fit import Fit
 from .scan import Candidate, Scan
 from .search import Key
+from .worth import ANOTHER, NAMED, ways_to_choose
 
-# Cost of naming a cause beside the multiplicity penalty [nats].
-_NAMED = 3.0
 # Rounds for scales and noise, from afar and beside a similar set; stop when their logarithms change by less.
 _ROUNDS, _ROUNDS_NEAR, _STILL = 25, 8, 0.02
 # Limit of a step in the logarithms.
@@ -46,8 +46,6 @@ _SHOWN = 3.0
 _MOST_MOVES = 60
 # Maximum of refitted sets, and the margin to the best within which a set is refitted [nats].
 _MOST_REFITTED, _COMES_NEAR = 8, 15.0
-# Cost of each further joint with the same kind of error, which is often set in one session [nats].
-_ANOTHER = 2.0
 # To first order it looks like backlash; the search tries it in place of one.
 _LEFT_TO_THE_SEARCH = ("hysteresis",)
 
@@ -113,7 +111,7 @@ class Sets:
         self._target = fit.left.ravel() + columns.reshape(rows, -1) @ now
         parts = [columns[:, :, : amounts - causes], columns[:, :, amounts:]]
         self.effects = [candidate.effect for candidate in candidates]
-        parts += [fit.weighted(fit.run.columns(effect)[:, :, effect.amounts]) for effect in self.effects]
+        parts += [*_columns(fit, self.effects)]
         self._nuisances, self._tolerances = amounts - causes, len(fit.tolerated)
         flat = np.concatenate(parts, axis=2).reshape(rows, -1)
         usual = [effect.parameters[k].usual for effect in self.effects for k in effect.amounts]
@@ -124,10 +122,16 @@ class Sets:
         self._inner, self._toward = flat.T @ flat, flat.T @ self._target
         self._square, self._rows = float(self._target @ self._target), 3.0 * float(fit.noise.weights.sum())
         self._trials = [float(np.log(candidate.trials)) for candidate in candidates]
-        self._first = doubt + _NAMED
+        self._first = doubt + NAMED
         ends = np.cumsum([0, *(len(effect.amounts) for effect in self.effects)])
         first = self._nuisances + self._tolerances
         self._places = [np.arange(first + a, first + b) for a, b in pairwise(ends)]
+        # Numbers of one cause that are added and removed together.
+        groups: dict[tuple[object, ...], list[int]] = {}
+        for k, effect in enumerate(self.effects):
+            for group in (k,), *_parts(effect):
+                groups.setdefault(group, []).append(k)
+        self._groups = [tuple(group) for group in dict.fromkeys(map(tuple, groups.values()))]
 
     @cached_property
     def _scales_now(self) -> FloatArray:
@@ -140,8 +144,12 @@ class Sets:
         reached = {one.chosen: one for one in (self._climbed(start, seen) for start in starts)}
         return list(reached.values())
 
-    def starts(self, own: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
-        """Yield the starting sets: the fit's causes, none, all joint offsets, and all effects of each kind."""
+    def starts(self, own: tuple[int, ...], *, links: bool) -> Iterator[tuple[int, ...]]:
+        """Yield the starting sets: the fit's causes, none, all joint offsets, and all effects of each kind.
+
+        Args:
+            links: also yield each cause that may have only some of its numbers, with all of them.
+        """
         yield own
         yield ()
         kinds = dict.fromkeys(effect.name for effect in self.effects if effect.kind.at_joint and not effect.source)
@@ -149,6 +157,9 @@ class Sets:
         for kind in kinds:
             yield tuple(k for k, effect in enumerate(self.effects) if effect.name == kind)
         yield tuple(dict.fromkeys((*own, *zeros)))
+        whole = dict.fromkeys(effect.key for effect in self.effects if effect.kind.in_parts and links)
+        for key in whole:
+            yield tuple(k for k, effect in enumerate(self.effects) if effect.key == key)
 
     def _climbed(self, start: tuple[int, ...], seen: dict[frozenset[int], Together]) -> Together:
         here = self.of(start)
@@ -163,41 +174,63 @@ class Sets:
         return here
 
     def _without_one(self, here: Together) -> Together | None:
-        """Remove one cause, where that is more probable."""
-        for k in sorted(here.chosen, key=lambda k: self._loss(here, k))[:_TRIED]:
-            if better := _better([self.of(tuple(j for j in here.chosen if j != k), here)], here):
+        """Remove one cause or a part of one, where that is more probable."""
+        present = frozenset(here.chosen)
+        there = [group for group in self._groups if present.issuperset(group)]
+        for group in sorted(there, key=lambda group: self._loss(here, group))[:_TRIED]:
+            if better := _better([self.of(_without(here.chosen, group), here)], here):
                 return better
         return None
 
     def _with_one_more(self, here: Together) -> Together | None:
-        return _better([self.of((*here.chosen, k), here) for k in self._promising(here)[:_TRIED]], here)
+        return _better([self.of((*here.chosen, *group), here) for group in self._promising(here)[:_TRIED]], here)
 
     def _exchanged(self, here: Together) -> Together | None:
         """Exchange one cause for another, where that is more probable."""
         tried = []
-        for k in here.chosen:
-            without = self.of(tuple(j for j in here.chosen if j != k), here)
-            tried += [self.of((*without.chosen, j), without) for j in self._promising(without)[:_TRIED] if j != k]
+        for identity in dict.fromkeys(self.effects[k].identity for k in here.chosen):
+            own = tuple(k for k in here.chosen if self.effects[k].identity == identity)
+            without = self.of(_without(here.chosen, own), here)
+            others = [group for group in self._promising(without) if self.effects[group[0]].identity != identity]
+            tried += [self.of((*without.chosen, *group), without) for group in others[:_TRIED]]
         return _better(tried, here)
 
-    def _loss(self, here: Together, k: int) -> float:
-        """Return the worth of a cause with scales and noise held fixed [nats]."""
-        places = np.searchsorted(here.columns, self._places[k])
+    def _loss(self, here: Together, group: tuple[int, ...]) -> float:
+        """Return the worth of some numbers with scales and noise held fixed [nats]."""
+        places = np.searchsorted(here.columns, np.concatenate([self._places[k] for k in group]))
         unit = np.zeros((len(here.columns), len(places)))
         unit[places, np.arange(len(places))] = 1.0
         covariance = cho_solve(here.factor, unit)[places]
         amounts = here.amounts[places]
         gained = 0.5 * float(amounts @ np.linalg.solve(covariance, amounts))
-        return gained + 0.5 * float(np.linalg.slogdet(covariance)[1]) - self._doubt_beside(k, here.chosen)
+        cost = self._cost(here.chosen) - self._cost(_without(here.chosen, group))
+        return gained + 0.5 * float(np.linalg.slogdet(covariance)[1]) - cost
 
-    def _doubt_beside(self, k: int, others: Sequence[int]) -> float:
-        """Return the cost of naming a cause beside others [nats]."""
-        kinds = {self.effects[j].name for j in others if j != k}
-        return self._trials[k] + (min(self._first, _ANOTHER) if self.effects[k].name in kinds else self._first)
+    def _cost(self, chosen: Sequence[int]) -> float:
+        """Return the cost of naming the causes of a set [nats]."""
+        total, kinds = 0.0, set[str]()
+        numbers: Counter[Key] = Counter()
+        for k in chosen:
+            effect = self.effects[k]
+            if effect.kind.in_parts:
+                numbers[effect.key] += len(effect.amounts)
+                continue
+            total += self._trials[k] + (min(self._first, ANOTHER) if effect.name in kinds else self._first)
+            kinds.add(effect.name)
+        return total + sum(
+            self._first + float(np.log(ways_to_choose(n, self._numbers[key]))) for key, n in numbers.items()
+        )
 
-    def _promising(self, here: Together) -> list[int]:
-        """Return the candidates worth most with scales and noise held fixed, the best first."""
-        open_ones = [k for k in range(len(self._places)) if k not in here.chosen]
+    @cached_property
+    def _numbers(self) -> dict[Key, int]:
+        """Number of all amounts, free or not, of each cause."""
+        return {effect.key: len(effect.freeing(None).amounts) for effect in self.effects}
+
+    def _promising(self, here: Together) -> list[tuple[int, ...]]:
+        """Return the groups of candidates worth most with scales and noise held fixed, the best first."""
+        present = frozenset(here.chosen)
+        groups = list(dict.fromkeys(_without(group, here.chosen) for group in self._groups))
+        open_ones = [k for k in range(len(self._places)) if k not in present]
         if not open_ones:
             return []
         places = np.concatenate([self._places[k] for k in open_ones])
@@ -205,15 +238,15 @@ class Sets:
         solved = cho_solve(here.factor, across)
         inner = self._inner[np.ix_(places, places)] / here.sigma**2 - across.T @ solved
         gradient = self._toward[places] / here.sigma**2 - solved.T @ (self._toward[here.columns] / here.sigma**2)
-        worths, first = [], 0
-        for k in open_ones:
-            own = slice(first, first + len(self._places[k]))
-            first = own.stop
-            precision = inner[own, own] + np.eye(own.stop - own.start)
+        worths, now = [], self._cost(here.chosen)
+        groups = [group for group in groups if group]
+        for group in groups:
+            own = np.searchsorted(places, np.concatenate([self._places[k] for k in group]))
+            precision = inner[np.ix_(own, own)] + np.eye(len(own))
             gained = 0.5 * float(gradient[own] @ np.linalg.solve(precision, gradient[own]))
-            worths.append(gained - 0.5 * float(np.linalg.slogdet(precision)[1]) - self._doubt_beside(k, here.chosen))
-        ranked = np.argsort(worths)[::-1]
-        return [open_ones[k] for k in ranked]
+            cost = self._cost((*here.chosen, *group)) - now
+            worths.append(gained - 0.5 * float(np.linalg.slogdet(precision)[1]) - cost)
+        return [groups[k] for k in np.argsort(worths)[::-1]]
 
     def of(self, chosen: tuple[int, ...], near: Together | None = None) -> Together:
         """Fit the scales and the noise of a set of causes by maximum evidence."""
@@ -247,7 +280,7 @@ class Sets:
             exact = self._worth(inner, toward, group, np.full(3, np.log(_SMALLEST)), sigma)
             if exact[0] > worth:
                 (worth, factor, amounts), scales = exact, Scales(*[_SMALLEST] * 3)
-        worth -= sum(self._doubt_beside(k, chosen[:j]) for j, k in enumerate(chosen))
+        worth -= self._cost(chosen)
         return Together(chosen, worth, scales, sigma, spent, amounts, factor, columns)
 
     def shown(self, here: Together) -> NDArray[np.bool_]:
@@ -292,12 +325,38 @@ class Sets:
             factor = dpotrf(precision, lower=True, clean=False)[0]
         return (factor, True), variances, dpotrs(factor, toward / sigma**2, lower=True)[0]
 
-    def effect(self, here: Together, k: int) -> Effect:
-        """Return one of the causes of a set, with its amounts."""
-        effect, places = self.effects[k], self._places[k]
-        values = effect.values.copy()
-        values[effect.amounts] = here.amounts[np.searchsorted(here.columns, places)] * self._units[places]
-        return effect.with_values(values)
+    def causes(self, here: Together) -> list[Effect]:
+        """Return the causes of a set, with their amounts."""
+        found: dict[Identity, Effect] = {}
+        for k in here.chosen:
+            effect, places = self.effects[k], self._places[k]
+            one = found.get(effect.identity, effect)
+            free = None if effect.free is None else tuple(sorted({*effect.free, *(one.free or ())}))
+            values = one.values.copy()
+            values[effect.amounts] = here.amounts[np.searchsorted(here.columns, places)] * self._units[places]
+            found[effect.identity] = replace(effect, free=free).with_values(values)
+        return [cause.freeing(cause.free) for cause in found.values()]
+
+
+def _columns(fit: Fit, effects: Sequence[Effect]) -> Iterator[FloatArray]:
+    """Yield the weighted derivatives (n, 3, p) by the amounts of each effect."""
+    key, columns = None, np.empty(0)
+    for effect in effects:
+        if effect.key != key:
+            key, columns = effect.key, fit.weighted(fit.run.columns(effect))
+        yield columns[:, :, effect.amounts]
+
+
+def _parts(effect: Effect) -> list[tuple[object, ...]]:
+    """Return the groups in which one number of an effect may come: its shifts or its turns, and all of it."""
+    if not effect.kind.in_parts:
+        return []
+    unit = effect.parameters[effect.amounts[0]].name.rpartition("_")[2]
+    return [(effect.key, unit), (effect.key,)]
+
+
+def _without(chosen: tuple[int, ...], group: Sequence[int]) -> tuple[int, ...]:
+    return tuple(k for k in chosen if k not in group)
 
 
 def _better(tried: Sequence[Together], here: Together) -> Together | None:
@@ -336,6 +395,20 @@ def tolerated(fit: Fit) -> Tolerated:
     return Tolerated(here.scales, 1.0 / np.sqrt(2.0 * here.spent + 1.0 / SPREAD**2), sets.shown(here))
 
 
+def beyond_tolerances(fit: Fit, cause: Effect, doubt: float) -> bool:
+    """Return True if a cause that tolerances can stand for is more probable than larger tolerances.
+
+    Args:
+        doubt: minimum cost of naming it [nats].
+    """
+    if not fit.background.resembles(cause):
+        return False
+    sets = Sets(fit, [Candidate(one, 0.0, 1) for one in fit.causes], doubt)
+    all_causes = tuple(range(len(fit.causes)))
+    whole = sets.of(all_causes)
+    return whole.worth > sets.of(_without(all_causes, [fit.causes.index(cause)]), whole).worth
+
+
 class _Place:
     """A fit with its causes, and the sets of causes reached from it."""
 
@@ -345,10 +418,12 @@ class _Place:
         others = [one for one in hypotheses if one.key not in present and one.name not in _LEFT_TO_THE_SEARCH]
         scanned = Scan(fit).candidates(others)
         candidates = [Candidate(cause, 0.0, 1) for cause in fit.causes] + [_at_rest(one) for one in scanned]
+        candidates = [part for candidate in candidates for part in _in_parts(candidate)]
         self._sets = Sets(fit, candidates, float(np.log(max(len(hypotheses), 1))))
-        own = tuple(range(len(fit.causes)))
+        free = {cause.key: cause.amounts for cause in fit.causes}
+        own = tuple(k for k, one in enumerate(candidates) if one.effect.amounts[0] in free.get(one.effect.key, ()))
         self.here = self._sets.of(own)
-        self.reached = self._sets.climbed(self._sets.starts(own))
+        self.reached = self._sets.climbed(self._sets.starts(own, links=not present))
         self.name = self.name_of(self.here)
         # Drop cached results, which are large for many rows.
         self.fit = replace(fit)
@@ -359,9 +434,17 @@ class _Place:
 
     def refitted(self, one: Together) -> Fit:
         """Refit one of the sets about its own parameters."""
-        causes = [self._sets.effect(one, k) for k in one.chosen]
-        possible = [cause for cause in causes if cause.is_possible]
+        possible = [cause for cause in self._sets.causes(one) if cause.is_possible]
         return self.fit.with_causes(possible).tolerating(one.scales).tolerating(one.scales)
+
+
+def _in_parts(candidate: Candidate) -> list[Candidate]:
+    """Return a candidate for each number of an effect that may have only some of them; else the candidate."""
+    effect = candidate.effect
+    if not effect.kind.in_parts:
+        return [candidate]
+    numbers = effect.freeing(None).amounts
+    return [Candidate(replace(effect, free=(number,)), candidate.gain, 1) for number in numbers]
 
 
 def _at_rest(candidate: Candidate) -> Candidate:

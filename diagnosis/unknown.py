@@ -21,7 +21,7 @@ from .fit import Fit, solved
 from .held_out import FEWEST_ROWS_A_BLOCK, Blocks, held_out_square, scores_p_value
 from .low_rank import low_rank, numbers_of
 from .observations import Observations
-from .search import nats
+from .worth import nats
 
 # Prior penalty of an unnamed family, and of one as specific as a named effect [nats].
 _NO_NAME, SPECIFIC = 8.0, 5.0

@@ -33,6 +33,7 @@ class Effect:
         values: its numbers (p,), in the order of `parameters`.
         prismatic: True for a prismatic joint.
         ordinal: number among several of one kind at one place, counted from 0.
+        free: indices of the amounts that may differ from nominal; None for all.
     """
 
     kind: Kind
@@ -41,6 +42,7 @@ class Effect:
     values: FloatArray
     prismatic: bool = False
     ordinal: int = 0
+    free: tuple[int, ...] | None = None
 
     @classmethod
     def at(
@@ -100,8 +102,15 @@ class Effect:
 
     @property
     def amounts(self) -> list[int]:
-        """Indices of the values that are amounts."""
-        return [k for k, parameter in enumerate(self.parameters) if parameter.is_amount]
+        """Indices of the values that are amounts, and free."""
+        own = [k for k, parameter in enumerate(self.parameters) if parameter.is_amount]
+        return own if self.free is None else [k for k in own if k in self.free]
+
+    @property
+    def told(self) -> list[int]:
+        """Indices of the values that describe it: all but amounts that are not free."""
+        amounts = self.amounts
+        return [k for k, parameter in enumerate(self.parameters) if k in amounts or not parameter.is_amount]
 
     @property
     def shapes(self) -> list[int]:
@@ -117,6 +126,14 @@ class Effect:
         """Return the same effect with other values (p,)."""
         return replace(self, values=frozen_array(values))
 
+    def freeing(self, free: tuple[int, ...] | None) -> Effect:
+        """Return the same effect with these amounts free, all for None, and the others nominal."""
+        freed = replace(self, free=free)
+        fixed = [k for k in range(len(self.values)) if k not in freed.told]
+        values = self.values.copy()
+        values[fixed] = [self.parameters[k].nominal for k in fixed]
+        return freed.with_values(values)
+
     def one_more(self, ordinal: int) -> Effect:
         """Return another effect of the same kind and place, with the same numbers."""
         return replace(self, ordinal=ordinal)
@@ -131,7 +148,7 @@ class Effect:
     def table(self) -> dict[str, Any]:
         """Return the effect as a table of `extended.toml`."""
         head = {"effect": self.name, "where": self.where, "source": self.source}
-        numbers = {p.name: float(value) for p, value in zip(self.parameters, self.values, strict=True)}
+        numbers = {self.parameters[k].name: float(self.values[k]) for k in self.told}
         return {key: value for key, value in head.items() if value is not None} | numbers
 
 

@@ -28,6 +28,7 @@ class Kind:
         needs_times: True if it needs times, not only an order.
         needs_stereo: True if it needs the stereo calibration.
         needs_weight: True if it needs joints that bear the arm's weight, and its masses.
+        in_parts: True if only some of its amounts may differ from nominal, as where a link is too long but straight.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Kind:
     needs_times: bool = False
     needs_stereo: bool = False
     needs_weight: bool = False
+    in_parts: bool = False
 
     def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
         """Return its parameters at a revolute or prismatic joint."""
@@ -115,7 +117,7 @@ KINDS: dict[str, Kind] = {
             needs_weight=True,
         ),
         Kind("payload", "structure", False, _PAYLOAD, _PAYLOAD, needs_weight=True),
-        Kind("link_geometry", "structure", True, _LINK, _LINK),
+        Kind("link_geometry", "structure", True, _LINK, _LINK, in_parts=True),
         _free("tool_offset", "tool", *_SHIFT),
         _free("tool_slip", "tool", *_SHIFT, T0),
         _free("camera_pose", "camera", *_SHIFT, *_TURN),

@@ -15,8 +15,8 @@ from bodyschema.diagnosis.explanation import Explanation, explain
 from bodyschema.diagnosis.families import families
 from bodyschema.diagnosis.fit import Fit
 from bodyschema.diagnosis.observations import Observations
-from bodyschema.diagnosis.search import NAMED
 from bodyschema.diagnosis.unknown import Unknowns, Way
+from bodyschema.diagnosis.worth import NAMED
 from bodyschema.effects import Effect, Simulation
 
 

@@ -11,6 +11,7 @@ from planted_cases import SHOULDER, Motion, desk_arm, seen, walk
 from bodyschema.diagnosis.conclusion import conclusion
 from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
 from bodyschema.diagnosis.explanation import Explanation, useful
+from bodyschema.diagnosis.search import Search
 from bodyschema.effects import Effect, Simulation
 
 
@@ -55,5 +56,6 @@ def test_a_cause_that_gains_nothing_on_held_out_rows_is_dropped(small) -> None:
     fit, robot = small.extended, small.extended.simulation.robot
     impossible = Effect.at(robot, "backlash", SHOULDER, values=[-0.001])
     begun = Explanation(fit.starting([*fit.causes, impossible]), None, 0.0)
-    kept = useful(begun, small.blocks, lambda _: None).fit.causes
+    search = Search(small.hypotheses.effects, lambda _: None)
+    kept = useful(begun, search, small.blocks, lambda _: None).fit.causes
     assert [cause.key for cause in kept] == [cause.key for cause in fit.causes]

@@ -15,7 +15,8 @@ from bodyschema.diagnosis.held_out import Blocks, block_p_value
 from bodyschema.diagnosis.observations import Observations
 from bodyschema.diagnosis.rivals import standings
 from bodyschema.diagnosis.scatter import instruments
-from bodyschema.diagnosis.search import NAMED, Search, nats
+from bodyschema.diagnosis.search import Search
+from bodyschema.diagnosis.worth import NAMED, nats
 from bodyschema.effects import Effect, Motion, Simulation
 from bodyschema.interfaces.robot import RobotDescription
 

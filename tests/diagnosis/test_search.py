@@ -9,7 +9,8 @@ from planted_cases import BASE, ELBOW, INTERVAL_S, SHOULDER, at_rest, desk_arm, 
 
 from bodyschema.diagnosis.fit import Fit
 from bodyschema.diagnosis.scan import Scan
-from bodyschema.diagnosis.search import NAMED, Search, nats, rise_for, simplicity
+from bodyschema.diagnosis.search import Search, simplicity
+from bodyschema.diagnosis.worth import NAMED, nats, rise_for
 from bodyschema.effects import Effect
 from bodyschema.interfaces.robot import RobotDescription
 
