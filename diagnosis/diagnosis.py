@@ -235,7 +235,8 @@ def diagnose(
         extended = _searched(together(start, hypotheses.effects), search, enough)
     factor, rows = instrument_factor(extended), doubtful(extended)
     left_out = rows if rows.mean() <= MOST_DOUBTFUL else np.zeros_like(rows)
-    if not start.is_exact and (abs(np.log(factor)) > _SAME_NOISE or left_out.any()):
+    is_other = abs(np.log(factor)) > _SAME_NOISE or left_out.any()
+    if not start.is_exact and is_other and not search.ended_early:
         observations = observations.with_factor(factor).without(left_out)
         start = aligned(observations, simulation)
         unknowns = Unknowns(start)
@@ -285,7 +286,7 @@ def _searched(begun: Fit, search: Search, enough: Callable[[Sequence[Fit], float
         search.path = [bare.tolerating(before.no_larger), bare, *search.path[1:]]
         scales = tolerated(extended).scales
         small = [cause for cause in extended.causes if extended.background.tolerates(cause)]
-        if not small and np.abs(np.log(scales) - np.log(before)).max() < _SAME_SCALE:
+        if search.ended_early or (not small and np.abs(np.log(scales) - np.log(before)).max() < _SAME_SCALE):
             break
         begun = extended.tolerating(scales, small)
     return extended

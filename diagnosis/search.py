@@ -21,11 +21,12 @@ from .worth import ANOTHER, NAMED, choices, nats, rise_for
 _NEAR, _MOST = 0.4, 6
 # Candidates within this share of the best gain are evaluated beyond first order.
 _WORTH_IN_FULL = 0.2
-_MOST_CAUSES = 20
+# With more causes than this, the error has been described and not explained; maximum of steps of the search.
+_MOST_CAUSES, _MOST_STEPS = 12, 20
 # Check for completeness each time after this many further causes.
 _ASKED_EACH = 3
 # Maximum of sets of causes to examine; none is examined twice.
-_MOST_SETS = 80
+_MOST_SETS = 60
 Key = tuple[str, str | None, str | None]
 Named = frozenset[tuple[Key, int]]
 # Maximum of effects at one place that begin at a moment, and of ripples, which differ in their periods.
@@ -129,7 +130,7 @@ class Search:
         if start.causes:
             fit = self._reviewed(start)
             self.path.append(fit)
-        while len(self.path) <= _MOST_CAUSES:
+        while len(self.path) <= _MOST_STEPS and len(fit.causes) <= _MOST_CAUSES and len(self._seen) < _MOST_SETS:
             added, worth = self._added(fit)
             if added is not None and len(fit.causes) >= asked + _ASKED_EACH:
                 asked = len(fit.causes)
@@ -146,7 +147,8 @@ class Search:
             self._seen.add(causes)
             fit = self._reviewed(better)
             self.path.append(fit)
-        self.ended_early = len(self.path) > _MOST_CAUSES or len(self._seen) >= _MOST_SETS
+        is_long = len(self.path) > _MOST_STEPS or len(self._seen) >= _MOST_SETS
+        self.ended_early = is_long or len(fit.causes) > _MOST_CAUSES
         return fit
 
     def _added(self, fit: Fit) -> tuple[Fit | None, float]:

@@ -42,8 +42,8 @@ _MAY_BE_EXACT = 0.5
 _ROUNDED_OFF, _ONE_BEYOND_ROUNDING = 1e-13, 1e-8
 # Evidence loss without a scale's tolerances from which they show in the data [nats].
 _SHOWN = 3.0
-# Maximum of changes to a set of causes.
-_MOST_MOVES = 60
+# Maximum of changes to a set of causes, and of the causes that one may grow to: with more, the first order is not enough.
+_MOST_MOVES, _MOST_TOGETHER = 60, 8
 # Maximum of refitted sets, and the margin to the best within which a set is refitted [nats].
 _MOST_REFITTED, _COMES_NEAR = 8, 15.0
 # To first order it looks like backlash; the search tries it in place of one.
@@ -132,6 +132,9 @@ class Sets:
             for group in (k,), *_parts(effect):
                 groups.setdefault(group, []).append(k)
         self._groups = [tuple(group) for group in dict.fromkeys(map(tuple, groups.values()))]
+        known = {cause.identity for cause in fit.causes}
+        # The moment of each was sought without the others, so it is right for one of them at most.
+        self._begins = {k for k, one in enumerate(self.effects) if one.kind.begins and one.identity not in known}
 
     @cached_property
     def _scales_now(self) -> FloatArray:
@@ -152,7 +155,8 @@ class Sets:
         """
         yield own
         yield ()
-        kinds = dict.fromkeys(effect.name for effect in self.effects if effect.kind.at_joint and not effect.source)
+        steady = [effect for k, effect in enumerate(self.effects) if k not in self._begins]
+        kinds = dict.fromkeys(effect.name for effect in steady if effect.kind.at_joint and not effect.source)
         zeros = tuple(k for k, effect in enumerate(self.effects) if effect.name == "joint_offset")
         for kind in kinds:
             yield tuple(k for k, effect in enumerate(self.effects) if effect.name == kind)
@@ -167,7 +171,9 @@ class Sets:
             if frozenset(here.chosen) in seen:
                 return seen[frozenset(here.chosen)]
             seen[frozenset(here.chosen)] = here
-            better = self._without_one(here) or self._with_one_more(here) or self._exchanged(here)
+            better = self._without_one(here)
+            if better is None and self._count(here) < _MOST_TOGETHER:
+                better = self._with_one_more(here) or self._exchanged(here)
             if better is None:
                 return here
             here = better
@@ -194,6 +200,10 @@ class Sets:
             others = [group for group in self._promising(without) if self.effects[group[0]].identity != identity]
             tried += [self.of((*without.chosen, *group), without) for group in others[:_TRIED]]
         return _better(tried, here)
+
+    def _count(self, here: Together) -> int:
+        """Return the number of causes of a set."""
+        return len({self.effects[k].identity for k in here.chosen})
 
     def _loss(self, here: Together, group: tuple[int, ...]) -> float:
         """Return the worth of some numbers with scales and noise held fixed [nats]."""
@@ -230,7 +240,8 @@ class Sets:
         """Return the groups of candidates worth most with scales and noise held fixed, the best first."""
         present = frozenset(here.chosen)
         groups = list(dict.fromkeys(_without(group, here.chosen) for group in self._groups))
-        open_ones = [k for k in range(len(self._places)) if k not in present]
+        closed = present | (self._begins if present & self._begins else set())
+        open_ones = [k for k in range(len(self._places)) if k not in closed]
         if not open_ones:
             return []
         places = np.concatenate([self._places[k] for k in open_ones])
@@ -239,7 +250,7 @@ class Sets:
         inner = self._inner[np.ix_(places, places)] / here.sigma**2 - across.T @ solved
         gradient = self._toward[places] / here.sigma**2 - solved.T @ (self._toward[here.columns] / here.sigma**2)
         worths, now = [], self._cost(here.chosen)
-        groups = [group for group in groups if group]
+        groups = [group for group in groups if group and closed.isdisjoint(group)]
         for group in groups:
             own = np.searchsorted(places, np.concatenate([self._places[k] for k in group]))
             precision = inner[np.ix_(own, own)] + np.eye(len(own))

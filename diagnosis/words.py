@@ -53,7 +53,8 @@ def finding(
 
     shift = f"{1e3 * size('x_m', 'y_m', 'z_m'):.3g} mm"
     turn = f"{size('rx_rad', 'ry_rad', 'rz_rad') * _DEG:.2g}°"
-    moved = " and ".join(said for said, end in ((shift, "_m"), (turn, "_rad")) if any(n.endswith(end) for n in numbers))
+    shifts, turns = ([axis for axis in "xyz" if form.format(axis) in numbers] for form in ("{}_m", "r{}_rad"))
+    moved = " and ".join(said for said, axes in ((shift, shifts), (turn, turns)) if axes)
     when = f" at {'t =' if timed else 'row'} {numbers['t0']:.1f}" if "t0" in numbers else ""
     match name:
         case "joint_offset":
@@ -97,7 +98,9 @@ def finding(
                 return f"{at} gives by {numbers['compliance_rad_per_Nm'] * _DEG:.2g}°/N·m under the arm's weight"
             return f"{at} gives by {1e3 * numbers['compliance_m_per_N']:.2g} mm/N under the arm's weight"
         case "link_geometry":
-            return f"the link before {at} is off by {moved}"
+            parts = ((shift, "in", shifts), (turn, "about", turns))
+            said = [f"{amount}{_axes(how, axes)}" for amount, how, axes in parts if axes]
+            return f"the link before {at} is off by {' and '.join(said)}"
         case "tool_offset":
             return f"the marker sits {shift} beside its place on the hand"
         case "tool_slip":
@@ -121,6 +124,11 @@ def finding(
         case _:
             encoder = KINDS[name].encoder
             return name if encoder is None else encoder.finding(at, numbers)
+
+
+def _axes(how: str, axes: Sequence[str]) -> str:
+    """Return along or about which axes of its frame a link is off; empty for all three."""
+    return "" if len(axes) == len("xyz") else f" {how} {' and '.join(axes)}"
 
 
 def sentence(

@@ -20,9 +20,14 @@ def test_a_link_that_only_turns_is_off_by_an_angle_alone():
     assert finding("link_geometry", "elbow", None, TURN) == "the link before joint elbow is off by 0.57°"
 
 
+def test_a_link_that_is_off_in_some_directions_has_them_named():
+    said = finding("link_geometry", "elbow", None, {"x_m": 0.003, "z_m": 0.004, "ry_rad": 0.01})
+    assert said == "the link before joint elbow is off by 5 mm in x and z and 0.57° about y"
+
+
 def test_a_shift_that_the_recording_does_not_tell_is_in_no_sentence():
     errors = Errors(5.0, 5.0, 1.0, 1.0, 0.9)
-    assert "1 mm and 0.57°" in sentence("explained", [_link(1.0)], errors, Gain(80.0, (75.0, 85.0)))
+    assert "1 mm in x and 0.57°" in sentence("explained", [_link(1.0)], errors, Gain(80.0, (75.0, 85.0)))
 
 
 def test_a_gain_on_fitted_pairs_alone_is_called_none():
