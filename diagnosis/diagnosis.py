@@ -28,6 +28,7 @@ from .observations import Observations
 from .rivals import Standing, standings
 from .scan import Candidate, Scan
 from .search import Search
+from .stages import NAMELESS, RIVALS, SEARCH, SETS, Stages
 from .together import Tolerated, together, tolerated
 from .unknown import Unknowns
 
@@ -220,19 +221,20 @@ def diagnose(
         only, without: names of effects to test, all by default, and not to test.
         seed: seed of the resampling.
         blocks: blocks of held-out rows; blocks of time by default.
-        tell: called with short messages on progress.
+        tell: called with the stage and about how much of the work is done.
     """
     observations = Observations.of(recording, simulation)
     start = aligned(observations, simulation)
     hypotheses = Hypotheses.of(simulation, observations, only=only, without=without)
-    tell(f"{len(hypotheses.effects)} hypotheses")
-    search = Search(hypotheses.effects, tell)
+    told = Stages(tell)
+    told.begin(SETS)
+    told(f"{len(hypotheses.effects)} hypotheses")
+    search = Search(hypotheses.effects, told)
     unknowns = Unknowns(start)
     enough = partial(needs_no_more_names, unknowns=unknowns, search=search)
-    if start.is_exact:
-        extended = search.run(start, enough)
-    else:
-        extended = _searched(together(start, hypotheses.effects), search, enough)
+    begun = start if start.is_exact else together(start, hypotheses.effects, told)
+    told.begin(SEARCH, SETS)
+    extended = search.run(begun, enough) if start.is_exact else _searched(begun, search, enough)
     factor, rows = instrument_factor(extended), doubtful(extended)
     left_out = rows if rows.mean() <= MOST_DOUBTFUL else np.zeros_like(rows)
     is_other = abs(np.log(factor)) > _SAME_NOISE or left_out.any()
@@ -243,10 +245,10 @@ def diagnose(
         enough = partial(needs_no_more_names, unknowns=unknowns, search=search)
         scales = extended.background.scales or Scales()
         extended = _searched(start.with_causes(extended.causes).tolerating(scales), search, enough)
-    tell("asking whether something without a name is at work")
+    told.begin(NAMELESS, SEARCH)
     blocks = blocks or Blocks.cut(len(recording))
-    explanation = useful(explain(extended, search.path, unknowns, search, tell), search, blocks, tell)
-    tell("asking what else it could be")
+    explanation = useful(explain(extended, search.path, unknowns, search, told), search, blocks, told)
+    told.begin(RIVALS, NAMELESS)
     stands = standings(explanation.beside, search, blocks, seed, None if explanation.unknown else unknowns)
     while explanation.unknown and any(standing.probability < _HALF for standing in stands):
         weakest = int(np.argmin([standing.probability for standing in stands]))

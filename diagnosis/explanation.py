@@ -235,13 +235,16 @@ def cost_of_names(causes: Iterable[Effect], search: Search) -> float:
 def _pruned(explanation: Explanation, unknowns: Unknowns, search: Search, *, rest: bool) -> Explanation:
     """Remove causes not worth keeping beside unnamed ones; with a remainder, those the unnamed ones can replace."""
     for cause in explanation.fit.causes:
-        fewer = without_one(explanation, cause, unknowns, search)
-        redundant = _is_as_good(fewer, explanation) if rest else fewer.worth > explanation.worth - NAMED
+        least = explanation.worth - (_AS_GOOD if rest else NAMED)
+        fewer = without_one(explanation, cause, unknowns, search, least)
+        redundant = _is_as_good(fewer, explanation) if rest else fewer.worth > least
         if fewer.unknown and redundant:
-            return _pruned(fewer, unknowns, search, rest=rest)
+            explanation = fewer
     return explanation
 
 
-def without_one(explanation: Explanation, cause: Effect, unknowns: Unknowns, search: Search) -> Explanation:
-    """Return the explanation without one of its causes."""
-    return _with_unknown(explanation.fit.without(cause), unknowns, search)
+def without_one(
+    explanation: Explanation, cause: Effect, unknowns: Unknowns, search: Search, least: float = -np.inf
+) -> Explanation:
+    """Return the explanation without one of its causes; it is given up where it will hardly reach `least` [nats]."""
+    return _with_unknown(explanation.fit.without(cause), unknowns, search, least)

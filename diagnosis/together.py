@@ -10,7 +10,7 @@ rows (MacKay 1992, "Bayesian interpolation"; Tipping and Faul 2003, "Fast margin
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -42,7 +42,7 @@ _MAY_BE_EXACT = 0.5
 _ROUNDED_OFF, _ONE_BEYOND_ROUNDING = 1e-13, 1e-8
 # Evidence loss without a scale's tolerances from which they show in the data [nats].
 _SHOWN = 3.0
-# Maximum of changes to a set of causes, and of the causes that one may grow to: with more, the first order is not enough.
+# Maximum of changes to a set of causes, and of its causes for more to be added: beyond, the first order is not enough.
 _MOST_MOVES, _MOST_TOGETHER = 60, 8
 # Maximum of refitted sets, and the margin to the best within which a set is refitted [nats].
 _MOST_REFITTED, _COMES_NEAR = 8, 15.0
@@ -375,13 +375,14 @@ def _better(tried: Sequence[Together], here: Together) -> Together | None:
     return best if best is not None and best.worth > here.worth + _STILL else None
 
 
-def together(start: Fit, hypotheses: Sequence[Effect]) -> Fit:
+def together(start: Fit, hypotheses: Sequence[Effect], tell: Callable[[str], None] = lambda _: None) -> Fit:
     """Fit the set of causes with the most evidence beside tolerances everywhere.
 
     The best sets to first order are refitted and compared again about their own parameters, until no other is near.
 
     Args:
         start: without a background.
+        tell: called with short messages on progress.
     """
     known = [_Place(start.tolerating(Scales()), hypotheses)]
     while len(known) < _MOST_REFITTED:
@@ -393,6 +394,7 @@ def together(start: Fit, hypotheses: Sequence[Effect]) -> Fit:
         if worth < max(place.here.worth for place in known) - _COMES_NEAR:
             break
         known.append(_Place(place.refitted(one), hypotheses))
+        tell(f"{len(known)} fitted")
     return max(known, key=lambda place: place.here.worth).fit
 
 

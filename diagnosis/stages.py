@@ -1,0 +1,53 @@
+"""Tell the stage of a diagnosis and about how much of the work is done."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """A part of the work.
+
+    Attributes:
+        what: short description.
+        ends: share of the work done at its end [%], from times of some hundred pairs.
+    """
+
+    what: str
+    ends: float
+
+
+SETS = Stage("comparing sets of causes", 45.0)
+SEARCH = Stage("searching for further causes", 65.0)
+NAMELESS = Stage("asking whether something without a name is at work", 80.0)
+RIVALS = Stage("asking what else it could be", 95.0)
+# The number of steps of a stage is unknown: each takes this share of what is left of it.
+_OF_THE_REST = 0.25
+
+
+class Stages:
+    """Messages with a percentage that never falls.
+
+    Args:
+        tell: called with each message.
+    """
+
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self._tell = tell
+        self._stage, self._done = SETS, 0.0
+
+    def begin(self, stage: Stage, before: Stage | None = None) -> None:
+        """Tell that a stage begins, which is after another."""
+        self._stage = stage
+        self._done = max(self._done, 0.0 if before is None else before.ends)
+        self._say(stage.what)
+
+    def __call__(self, said: str) -> None:
+        """Tell a step of the present stage."""
+        self._done += max(self._stage.ends - self._done, 0.0) * _OF_THE_REST
+        self._say(f"{self._stage.what}: {said}")
+
+    def _say(self, said: str) -> None:
+        self._tell(f"{self._done:.0f} %, {said}")
