@@ -37,10 +37,12 @@ def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
                 told.append(f"No motion tells {describe(cause)} from {rival.described}: mend whichever is easier.")
             if isinstance(rival.instead, Nameless):
                 told.append(f"Watch whether {rival.described}: {_WATCH[rival.instead.kind]}.")
-    if diagnosis.left.is_there:
+    if diagnosis.left.rattle is not None:
+        told.append(f"Fasten the marker: {diagnosis.left.rattle.what}.")
+    if what := diagnosis.left.nameless:
         joints = [diagnosis.extended.simulation.robot.joints[k] for k in diagnosis.left.joints]
         where = f" Look at {', '.join(joints)} first." if joints else ""
-        told.append(f"None of the known effects fits {'; '.join(diagnosis.left.what)}.{where}{_reach(diagnosis)}")
+        told.append(f"None of the known effects fits {'; '.join(what)}.{where}{_reach(diagnosis)}")
     return tuple(dict.fromkeys(told))
 
 

@@ -276,8 +276,9 @@ def _stability(diagnosis: Diagnosis) -> Stability | None:
 def _unexplained(diagnosis: Diagnosis) -> Unexplained:
     left, joints = diagnosis.left, diagnosis.extended.simulation.robot.joints
     names = [joints[k] for k in left.joints] + (["time"] if left.with_time else [])
+    rattle_mm = 0.0 if left.rattle is None else 1e3 * left.rattle.half_m
     if left.model is None:
-        return Unexplained(0.0, (), left.p_value)
-    rms = 1e3 * float(np.sqrt(np.square(left.model.explained).sum(axis=1).mean()))
+        return Unexplained(rattle_mm, tuple(names), left.p_value, left.what)
+    rms = float(np.hypot(rattle_mm, 1e3 * np.sqrt(np.square(left.model.explained).sum(axis=1).mean())))
     stored = () if left.model.stored is None else tuple(dict.fromkeys(left.model.stored.joints))
     return Unexplained(rms, tuple(names), left.p_value, left.what, stored, left.untold)

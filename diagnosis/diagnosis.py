@@ -25,6 +25,7 @@ from .hypotheses import Hypotheses
 from .instrument import instrument_factor
 from .leftover import Leftover, leftover
 from .observations import Observations
+from .rattle import rattle
 from .rivals import Standing, standings
 from .scan import Candidate, Scan
 from .search import Search
@@ -47,6 +48,8 @@ MOST_DOUBTFUL = 0.25
 _HALF = 0.5
 # Smallest change of the tolerance scales (in logarithms) that triggers a refit, and the maximum of refits.
 _SAME_SCALE, _RESCALED = 0.25, 3
+# Fits with the play of a loose marker; the first tells the noise beside it.
+_RATTLED = 2
 # The fit absorbs at most this share of the noise.
 _MOST_SPENT = 0.9
 # Smallest change of the instrument's noise (in logarithms) that triggers a refit.
@@ -180,7 +183,8 @@ class Diagnosis:
         # Scale the stated noise to the size of the residuals, corrected for what the fit absorbed.
         spent = min(fit.background.spent(fit.noise.sigma) / max(left.size, 1), _MOST_SPENT)
         size = np.square(left).sum() / np.trace(stated[kept], axis1=1, axis2=2).sum() / (1.0 - spent)
-        return float(size) * stated
+        # The play of a loose marker is no noise.
+        return float(size) * fit.observations.own
 
     @cached_property
     def with_tolerances_alone(self) -> FloatArray | None:
@@ -245,6 +249,22 @@ def diagnose(
         enough = partial(needs_no_more_names, unknowns=unknowns, search=search)
         scales = extended.background.scales or Scales()
         extended = _searched(start.with_causes(extended.causes).tolerating(scales), search, enough)
+    loose = None if start.is_exact else rattle(extended)
+    if loose is not None and explain(extended, search.path, unknowns, search, told).unknown:
+        # An error of the last joint moves the marker along one line as well.
+        loose = None
+    for _ in range(_RATTLED if loose is not None else 0):
+        assert loose is not None
+        told(loose.what)
+        # Begin again: causes may have been named for it, and the noise is smaller without it.
+        # What rattles does not slip.
+        search = Search([effect for effect in hypotheses.effects if effect.name != "tool_slip"], told)
+        observations = observations.with_rattle(loose.ratio, loose.ways)
+        start = aligned(observations, simulation)
+        unknowns = Unknowns(start)
+        enough = partial(needs_no_more_names, unknowns=unknowns, search=search)
+        extended = _searched(together(start, hypotheses.effects, told), search, enough)
+        loose = rattle(extended) or loose
     told.begin(NAMELESS, SEARCH)
     blocks = blocks or Blocks.cut(len(recording))
     explanation = useful(explain(extended, search.path, unknowns, search, told), search, blocks, told)
@@ -257,7 +277,7 @@ def diagnose(
             break
         explanation = fewer
         stands = standings(explanation.beside, search, blocks, seed)
-    left = leftover(explanation, unknowns, blocks)
+    left = leftover(explanation, unknowns, blocks, loose)
     fit = (explanation.fit if left.model is None else left.model.fit).settled()
     made = tolerated(fit)
     if left.model is None and not made.seen.any():

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from scipy import stats
 
 from .explanation import Explanation
 from .fit import Fit
 from .held_out import Blocks
+from .rattle import Rattle
 from .sensitivity import joints_of
 from .smooth import SmoothModel, smooth_model
 from .unknown import Apart, Unknowns
@@ -25,6 +26,7 @@ class Leftover:
         p_value: p-value of this structure arising by chance.
         model: the causes beside a smooth model of it; None where no structure is left.
         untold: descriptions of time-dependent parts, which no stored model can contain.
+        rattle: play of a loose marker; None for one that is fixed.
     """
 
     what: tuple[str, ...]
@@ -33,15 +35,31 @@ class Leftover:
     p_value: float
     model: SmoothModel | None = None
     untold: tuple[str, ...] = ()
+    rattle: Rattle | None = None
 
     @property
     def is_there(self) -> bool:
         """True if there is any structure."""
         return bool(self.what)
 
+    @property
+    def nameless(self) -> tuple[str, ...]:
+        """The descriptions but for a loose marker."""
+        return self.what if self.rattle is None else self.what[:-1]
 
-def leftover(explanation: Explanation, unknowns: Unknowns, blocks: Blocks) -> Leftover:
-    """Return the residual structure that the families of an explanation describe."""
+
+def leftover(explanation: Explanation, unknowns: Unknowns, blocks: Blocks, loose: Rattle | None) -> Leftover:
+    """Return the residual structure that the families of an explanation describe, and the play of a loose marker."""
+    left = _of_families(explanation, unknowns, blocks)
+    if loose is None:
+        return left
+    # Look at the joint that carries the marker.
+    carrier = len(explanation.fit.simulation.robot.joints) - 1
+    joints = tuple(sorted({*left.joints, carrier}))
+    return replace(left, what=(*left.what, loose.what), joints=joints, rattle=loose)
+
+
+def _of_families(explanation: Explanation, unknowns: Unknowns, blocks: Blocks) -> Leftover:
     fit, apart = explanation.fit, explanation.apart
     if fit.is_exact:
         return Leftover((), (), False, 1.0)

@@ -38,6 +38,7 @@ class Observations:
         rounding: covariance (n, 3, 3) [m²] from encoder quantisation.
         stated_factor: factor of the instrument's standard deviations over the stated ones.
         doubtful: rows (n,) at which the simulation lacks a state it needs; None for no such rows.
+        rattling: covariance (n, 3, 3) [m²] of a loose marker; None for one that is fixed.
     """
 
     motion: Motion
@@ -46,6 +47,7 @@ class Observations:
     rounding: FloatArray
     stated_factor: float = 1.0
     doubtful: NDArray[np.bool_] | None = None
+    rattling: FloatArray | None = None
 
     @classmethod
     def of(cls, recording: Recording, simulation: Simulation) -> Observations:
@@ -64,8 +66,23 @@ class Observations:
     @cached_property
     def whitening(self) -> FloatArray:
         """W (n, 3, 3) such that W (x - truth) has equal and independent noise in all coordinates, up to one factor."""
-        covariances = self.stated_factor**2 * self.stated + self.rounding
+        covariances = self.own if self.rattling is None else self.own + self.rattling
         return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)), dtype=np.float64)
+
+    @property
+    def own(self) -> FloatArray:
+        """Covariances (n, 3, 3) [m²] of the instrument and of the encoders' quantisation, up to one factor."""
+        return self.stated_factor**2 * self.stated + self.rounding
+
+    def with_rattle(self, ratio: float, ways: FloatArray) -> Observations:
+        """Return the same observations of a loose marker.
+
+        Args:
+            ratio: variance that its play adds, over that of the noise.
+            ways: direction of the play at each row (n, 3).
+        """
+        variances = ratio * np.trace(self.own, axis1=1, axis2=2) / 3.0
+        return replace(self, rattling=variances[:, None, None] * ways[:, :, None] * ways[:, None, :])
 
     def without(self, doubtful: NDArray[np.bool_]) -> Observations:
         """Return the same observations with rows (n,) that are ignored."""
