@@ -32,6 +32,8 @@ _BY_THE_WAY = ("backlash", "settling", "hysteresis", "camera_latency")
 _REST = 0.25
 # Causes that the same unnamed families explain as well, to within this, are dropped [nats].
 _AS_GOOD = 8.0
+# Unnamed causes alone are refitted with scales of their own where they are no further behind [nats].
+_NEAR = 30.0
 # Assumed maximum of further causes after the next.
 _MANY = 10
 # Of the fits along the search, this many first and last ones are tried beside unnamed causes.
@@ -104,7 +106,7 @@ def explain(
         if hope + narrower - cost_of_names(fit.causes, search) < best.worth - (_AS_GOOD if best.unknown else 0.0):
             continue
         other = _with_unknown(fit, unknowns, search, best.worth - (_AS_GOOD if best.unknown else 0.0))
-        if other.apart is not None and not fit.causes:
+        if other.apart is not None and not fit.causes and other.worth > best.worth - _NEAR:
             # The scales of a fit without causes are those of an arm without unnamed causes, or a guess.
             other = _rescaled(other, other.apart, unknowns, search)
         clearly = margin if best.fit is found and not other.is_specific else 0.0

@@ -43,6 +43,8 @@ _MOST_MOMENTS = 1000
 _BESIDE = 8
 # Δχ² at the ends of a 95 % interval.
 _AT_95 = 3.841
+# Share of the noise by which an effect has to differ from its first order to be evaluated beyond it.
+_BENT = 0.1
 # A column with a smaller share left beside the fit is not identifiable.
 _TOLD_APART = 1e-7
 
@@ -165,6 +167,8 @@ class Scan:
 
         A turn of some degrees beside noise of a tenth of a millimetre is not linear.
         """
+        if not self._is_bent(candidate.effect):
+            return candidate
         effects = [effect for effect in self._fit.simulation.effects if effect.identity != self._left_out]
         simulation, motion = self._fit.simulation, self._fit.observations.motion
         if self._state not in self._before:
@@ -176,6 +180,19 @@ class Scan:
         explained = np.clip(toward[0, 0] ** 2 / max(float(inner[0, 0, 0]), 1e-300), 0.0, 0.999999 * square)
         gain = float(-3.0 * self._products.rows * np.log1p(-explained / square))
         return replace(candidate, gain=gain) if gain > candidate.gain else candidate
+
+    def _is_bent(self, effect: Effect) -> bool:
+        """Return True if what an effect does differs from its first order by more than the noise.
+
+        A move by d along an arc of radius r leaves its tangent by d²/2r.
+        """
+        run, observations = self._fit.run, self._fit.observations
+        moved = run.columns(effect)[:, :, effect.amounts] @ effect.values[effect.amounts]
+        radius = float(np.sqrt(np.square(run.x_true - run.frames[:, 0, :3, 3]).sum(axis=1).mean()))
+        off = np.square(moved).sum(axis=1, keepdims=True) / (2.0 * max(radius, 1e-6))
+        # In all directions alike, since it is not known in which.
+        white = observations.whitened(np.broadcast_to(off[:, :, None] * np.eye(3), (len(off), 3, 3)))
+        return bool(np.square(white).sum(axis=(1, 2)).mean() > 3.0 * (_BENT * self._fit.noise.sigma) ** 2)
 
     @property
     def _left_out(self) -> Identity | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from planted_cases import BASE, ELBOW, SHOULDER, desk_arm, start_of, walk
+from planted_cases import BASE, ELBOW, SHOULDER, desk_arm, start_of, surveyed_arm, walk
 from scipy import stats
 
 from bodyschema.diagnosis.scan import Candidate, Scan
@@ -55,6 +55,15 @@ def test_the_gain_of_a_small_effect_is_twice_what_the_likelihood_rises_by_when_i
     refitted = start.with_causes([candidate.effect])
     assert candidate.gain > 20.0
     assert candidate.gain == pytest.approx(2.0 * (refitted.log_likelihood - start.log_likelihood), rel=0.03, abs=0.5)
+
+
+@pytest.mark.parametrize("free", [(0,), (1, 5)])
+def test_a_link_is_off_in_those_of_its_numbers_that_are(free) -> None:
+    arm, values = surveyed_arm(), np.array([3e-3, 2e-3, 0.0, 0.0, 0.0, 0.02])
+    planted = Effect.at(arm, "link_geometry", ELBOW, values=values).freeing(free)
+    found = scanned(arm, planted, 3).effect
+    assert found.free == free
+    assert list(found.table()) == ["effect", "where", *(planted.parameters[k].name for k in free)]
 
 
 @pytest.mark.parametrize("name", ["joint_offset", "encoder_jump", "joint_ripple", "camera_moved"])

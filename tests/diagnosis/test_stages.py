@@ -1,0 +1,18 @@
+"""The progress of a diagnosis."""
+
+from __future__ import annotations
+
+from bodyschema.diagnosis.stages import NAMELESS, RIVALS, SEARCH, SETS, Stages
+
+
+def test_a_percentage_never_falls_and_its_stage_is_told() -> None:
+    lines: list[str] = []
+    stages = Stages(lines.append)
+    for stage, before in ((SETS, None), (SEARCH, SETS), (NAMELESS, SEARCH), (RIVALS, NAMELESS)):
+        stages.begin(stage, before)
+        for _ in range(30):
+            stages("a step")
+        assert stage.what in lines[-1]
+    percentages = [float(line.partition(" %")[0]) for line in lines]
+    assert percentages == sorted(percentages)
+    assert percentages[0] == 0.0 < percentages[-1] < 100.0
