@@ -13,7 +13,7 @@ from bodyschema.interfaces.records import FloatArray
 from .fit import Fit
 from .held_out import Blocks, held_out_errors, is_marker
 from .search import Search, describe, named
-from .together import beyond_tolerances, tolerated
+from .together import beyond_tolerances, is_at_limit, tolerated
 from .unknown import Apart, Unknowns, Way
 from .worth import NAMED
 
@@ -89,6 +89,9 @@ def explain(
     whole = _length(found, found.run.measured - path[0].run.measured)
     best = _with_unknown(found, unknowns, search)
     inexact = max(_OF_THE_CAUSES * whole, _OF_THE_WAY * _length(found, changed_by_the_way(found)))
+    if is_at_limit(found.background.scales):
+        # Causes of an arm that no workshop made have not been found, so what is left is not their shape.
+        inexact = 0.0
     if best.apart is not None and (best.size < inexact or not unknowns.predicts(best.apart, found)):
         best = replace(best, apart=None, size=0.0)
     # Named causes that explain nearly everything are not given up for what explains the rest.

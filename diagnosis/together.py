@@ -408,6 +408,11 @@ def tolerated(fit: Fit) -> Tolerated:
     return Tolerated(here.scales, 1.0 / np.sqrt(2.0 * here.spent + 1.0 / SPREAD**2), sets.shown(here))
 
 
+def is_at_limit(scales: Scales | None) -> bool:
+    """Return True if tolerances of links or axes are as large as they may be."""
+    return scales is not None and max(scales.lengths, scales.angles) > (1.0 - _STILL) * _LARGEST
+
+
 def beyond_tolerances(fit: Fit, cause: Effect, doubt: float) -> bool:
     """Return True if a cause that tolerances can stand for is more probable than larger tolerances.
 
