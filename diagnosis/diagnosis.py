@@ -258,12 +258,13 @@ def diagnose(
         told(loose.what)
         # Begin again: causes may have been named for it, and the noise is smaller without it.
         # What rattles does not slip.
-        search = Search([effect for effect in hypotheses.effects if effect.name != "tool_slip"], told)
+        fixed = [effect for effect in hypotheses.effects if effect.name != "tool_slip"]
+        search = Search(fixed, told)
         observations = observations.with_rattle(loose.ratio, loose.ways)
         start = aligned(observations, simulation)
         unknowns = Unknowns(start)
         enough = partial(needs_no_more_names, unknowns=unknowns, search=search)
-        extended = _searched(together(start, hypotheses.effects, told), search, enough)
+        extended = _searched(together(start, fixed, told), search, enough)
         loose = rattle(extended) or loose
     told.begin(NAMELESS, SEARCH)
     blocks = blocks or Blocks.cut(len(recording))
