@@ -12,7 +12,7 @@ from bodyschema.diagnosis.scan import Scan
 from bodyschema.diagnosis.search import Search, simplicity
 from bodyschema.diagnosis.worth import NAMED, nats, rise_for
 from bodyschema.effects import Effect
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 GAINS = st.floats(0.0, 1e5)
 NUMBERS = st.integers(1, 12)
