@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from bodyschema.drivers.config import DriversConfig
+from bodyschema.drivers.config import MARKER_SOURCE, AnySource, DriversConfig, source_tables
 from bodyschema.effects import Simulation, simulation_of
 from bodyschema.interfaces.calibrated_files import EXTENSIONS
 from bodyschema.interfaces.errors import ConfigError
@@ -118,6 +118,7 @@ class Tables(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     vision: VisionConfig = VisionConfig()
     learner: LearnerConfig = LearnerConfig()
     sim: SimConfig = SimConfig()
+    marker_source: tuple[AnySource, ...] = ()
     effects: tuple[dict[str, Any], ...] = ()
     background: tuple[dict[str, Any], ...] = ()
     unexplained: dict[str, Any] | None = None
@@ -151,9 +152,11 @@ class Config:
             if name not in known:
                 line = line_of(text, (name,))
                 raise ConfigError(f"unknown table [{name}]", file=file, line=line, remedy=did_you_mean(name, known))
-        overridden = _override(raw, [name for name in known if name not in EXTENSIONS], environment)
+        overridden = _override(raw, [name for name in known if name not in (*EXTENSIONS, MARKER_SOURCE)], environment)
         robot = RobotDescription.from_tables(overridden, text, file)
         simulation = simulation_of(robot, overridden, text)
+        if MARKER_SOURCE in raw:
+            overridden[MARKER_SOURCE] = source_tables(raw[MARKER_SOURCE], file, text)
         tables = convert(overridden, Tables, file=file, text=text)
         if tables.daemon.min_step_deg >= tables.daemon.max_step_deg:
             line = line_of(text, ("daemon", "min_step_deg"))

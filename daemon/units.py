@@ -244,7 +244,8 @@ def endpoints_of(config: Config) -> list[str]:
     """Return the endpoints that the two processes listen on or connect to."""
     zenoh, ros2 = config.tables.zenoh, config.tables.drivers.ros2
     routers = [zenoh.router, "" if ros2 is None else ros2.router]
-    return [zenoh.sampler, zenoh.learner, *(router for router in routers if router)]
+    sources = [table.endpoint for table in config.tables.marker_source]
+    return [zenoh.sampler, zenoh.learner, *(router for router in routers if router), *sources]
 
 
 def folders_of(config: Config) -> list[Path]:

@@ -11,8 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from bodyschema.drivers.checks import Check
 from bodyschema.drivers.dynamixel.config import DynamixelConfig
 from bodyschema.drivers.feetech.config import FeetechConfig
+from bodyschema.drivers.markers.checks import stream_checks
+from bodyschema.drivers.markers.opened import stream_of
+from bodyschema.drivers.markers.stream import MarkerStream
 from bodyschema.drivers.ros2.config import Ros2Config
 from bodyschema.drivers.serial_lines.config import SerialLinesConfig
 from bodyschema.drivers.serial_lines.joints import SerialLineJoints
@@ -20,7 +24,7 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, StoreError
 from bodyschema.interfaces.plugins import PluginConfig, load
-from bodyschema.interfaces.protocols import Clock, JointSource
+from bodyschema.interfaces.protocols import Clock, JointSource, MarkerSource
 from bodyschema.interfaces.records import MarkerFix, StereoFrame
 from bodyschema.interfaces.rejections import WORDS
 from kbmaps import RigidChain
@@ -30,7 +34,7 @@ from .config import Config
 from .extras import require_extra
 from .joints_watch import EncoderJoints, ServoJoints
 from .powered_wiring import open_drives
-from .sources import Head, MarkerTopic, Powered, Sources, StampedJoints
+from .sources import Head, MarkerTopic, Powered, Sources, StampedJoints, TellsHealth
 from .store import PairReader
 
 if TYPE_CHECKING:
@@ -164,10 +168,13 @@ def _require_source(config: Config, *, sim: bool) -> None:
             "an arm of your own: docs/hardware.md",
         )
     if config.tables.vision.cameras is None:
+        if config.tables.marker_source:
+            return
         raise ConfigError(
             "the joints have a driver, but nothing tells where the marker is: no cameras are configured",
             file=config.file,
-            remedy="Add the table [vision.cameras] (docs/cameras.md); or give --sim for the simulated robot",
+            remedy="Add the table [vision.cameras] (docs/cameras.md) or [marker_source] (docs/marker_sources.md); or "
+            "give --sim for the simulated robot",
         )
     from .camera_wiring import require_usable
 
@@ -199,26 +206,66 @@ def demonstration_model() -> Path:
 
 
 def _real(config: Config) -> Sources:
+    clock = SystemClock()
+    joints = open_joints(config, clock)
+    marker, health, calibration = _open_marker(config, clock)
+    drives = joints.drives if isinstance(joints, ServoJoints) else ()
+    return Sources(
+        joints,
+        marker,
+        clock,
+        powered=tuple(drive for drive in drives if isinstance(drive, Powered)),
+        head=next((drive for drive in drives if isinstance(drive, Head)), None),
+        cameras=health,
+        seen_by=f"the positions by {marker.name}" if isinstance(marker, MarkerStream) else Sources.seen_by,
+        calibration=calibration,
+        live=True,
+    )
+
+
+def _open_marker(config: Config, clock: Clock) -> tuple[MarkerSource, TellsHealth, StereoCalibration | None]:
+    """Return what sees the marker, not opened yet, what reports its health, and the cameras' calibration."""
+    streams = [stream_of(table, clock) for table in config.tables.marker_source]
+    if config.tables.vision.cameras is None:
+        return streams[0], streams[0], None
     from bodyschema.vision.tracked_camera import TrackedCamera
     from bodyschema.vision.trackers import tracker_of
 
     from .camera_wiring import camera_of, open_eyes
 
-    clock = SystemClock()
-    joints = open_joints(config, clock)
     eyes = open_eyes(config, clock)
     camera = camera_of(config, eyes)
-    drives = joints.drives if isinstance(joints, ServoJoints) else ()
-    return Sources(
-        joints,
-        TrackedCamera(camera, tracker_of(camera.calibration, config.tables.vision)),
-        clock,
-        powered=tuple(drive for drive in drives if isinstance(drive, Powered)),
-        head=next((drive for drive in drives if isinstance(drive, Head)), None),
-        cameras=eyes,
-        calibration=camera.calibration,
-        live=True,
-    )
+    return TrackedCamera(camera, tracker_of(camera.calibration, config.tables.vision)), eyes, camera.calibration
+
+
+def open_streams(config: Config, clock: Clock) -> list[MarkerStream]:
+    """Return the marker sources of robot.toml, not opened yet. Raise ConfigError if it has none."""
+    if not config.tables.marker_source:
+        raise ConfigError(
+            "no marker source is configured",
+            file=config.file,
+            remedy="Add the table [marker_source]: docs/marker_sources.md",
+        )
+    return [stream_of(table, clock) for table in config.tables.marker_source]
+
+
+def marker_source_checks(config: Config) -> Iterator[Check]:
+    """Yield checks of what each marker source of robot.toml sends. Open it for that."""
+    clock = SystemClock()
+    for stream in open_streams(config, clock):
+        yield from stream_checks(stream, clock)
+
+
+def marker_source_lines(config: Config) -> Iterator[str]:
+    """Describe in words where the marker's positions come from."""
+    for table in config.tables.marker_source:
+        body = "" if table.body is None else f", body {table.body}"
+        yield f"marker positions by {table.label} ({table.kind}) at {table.endpoint}{body}, in {table.unit}"
+        known = "" if table.latency_sigma_s is not None else ", not measured"
+        yield (
+            f"measured {1e3 * table.latency_s:.1f} ms before their time stamp ± {1e3 * table.sigma_s:.1f} ms{known}; "
+            f"1-sigma {1e3 * table.sigma_m:.2g} mm where none is sent"
+        )
 
 
 @contextmanager

@@ -15,8 +15,12 @@ from bodyschema.interfaces.toml_file import line_of
 
 from .dynamixel.config import DynamixelConfig
 from .feetech.config import FeetechConfig
+from .markers.config import TABLE as MARKER_SOURCE
+from .markers.config import AnySource, source_tables
 from .ros2.config import Ros2Config
 from .serial_lines.config import SerialLinesConfig
+
+__all__ = ["HARDWARE", "MARKER_SOURCE", "AnySource", "DriversConfig", "source_tables"]
 
 NonNegative = Annotated[float, Meta(ge=0)]
 Positive = Annotated[float, Meta(gt=0)]

@@ -49,7 +49,7 @@ REMEDIES: Mapping[Reason, str] = {
     "`bodyschema doctor` says of latency timer and return delay.",
     Reason.TOO_NEAR: "Move the arm.",
     Reason.PAUSED: "Resume with `bodyschema command resume`.",
-    Reason.NOT_FINITE: "That is a fault of the tracker in [vision.plugin].",
+    Reason.NOT_FINITE: "That is a fault of the tracker in [vision.plugin], or of the program in [marker_source].",
     Reason.NOT_STORED: "Make room on the disk of the store, and see that it can be written.",
     Reason.NOT_BORNE: "Switch it on: `bodyschema command zero_force_on`.",
 }

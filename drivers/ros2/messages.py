@@ -74,7 +74,7 @@ def decode_joint_state(data: bytes) -> JointState:
         Malformed: not such a message. No length field makes it read beyond `data`.
     """
     reader = CdrReader(data)
-    message = JointState(_header(reader), reader.strings(), reader.float64s(), reader.float64s(), reader.float64s())
+    message = JointState(read_header(reader), reader.strings(), reader.float64s(), reader.float64s(), reader.float64s())
     reader.end()
     for values in (message.positions, message.velocities, message.efforts):
         if len(values) not in (0, len(message.names)):
@@ -118,7 +118,8 @@ def encode_pose(
     return writer.to_bytes()
 
 
-def _header(reader: CdrReader) -> Header:
+def read_header(reader: CdrReader) -> Header:
+    """Read std_msgs/Header. Raise Malformed for an invalid stamp."""
     seconds, nanoseconds = reader.int32(), reader.uint32()
     if nanoseconds >= NANO:
         raise Malformed(f"{nanoseconds} nanoseconds in a stamp")
