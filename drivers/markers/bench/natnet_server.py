@@ -12,7 +12,7 @@ from bodyschema.drivers.markers.natnet import packets
 from bodyschema.drivers.markers.natnet.packets import HEADER, Message, Version
 
 TICKS_PER_S = 10_000_000
-POSE = tuple[tuple[float, float, float], tuple[float, float, float, float]]
+Pose = tuple[tuple[float, float, float], tuple[float, float, float, float]]
 UNSEEN_LABEL = 7
 
 
@@ -82,13 +82,13 @@ class NatnetServer:
                 self._socket.sendto(packets.packet(Message.MODEL, self._models()), client)
 
     def send(
-        self, poses: Mapping[int, POSE | None], t: float, *, latency_s: float = 0.004, error: float = 2e-4
+        self, poses: Mapping[int, Pose | None], t: float, *, latency_s: float = 0.004, error: float = 2e-4
     ) -> None:
         """Send a frame, exposed at `t` [s] on the server's clock; a pose of None is a body that was not seen."""
         self.send_packet(self.frame(poses, t, latency_s=latency_s, error=error))
 
     def frame(
-        self, poses: Mapping[int, POSE | None], t: float, *, latency_s: float = 0.004, error: float = 2e-4
+        self, poses: Mapping[int, Pose | None], t: float, *, latency_s: float = 0.004, error: float = 2e-4
     ) -> bytes:
         """Return the packet of the next frame."""
         self._number += 1
