@@ -92,6 +92,18 @@ class TellsHealth(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
+class JoinedHealth:
+    """The health of several devices."""
+
+    devices: Sequence[TellsHealth]
+
+    @property
+    def health(self) -> tuple[str, ...]:
+        """Problems of all devices, with remedies."""
+        return tuple(text for device in self.devices for text in device.health)
+
+
+@dataclass(frozen=True, slots=True)
 class Sources:
     """Encoders and marker, not opened yet, on one clock; and the simulated world if there is one.
 

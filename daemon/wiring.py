@@ -10,11 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
+import numpy as np
 
 from bodyschema.drivers.checks import Check
 from bodyschema.drivers.dynamixel.config import DynamixelConfig
 from bodyschema.drivers.feetech.config import FeetechConfig
 from bodyschema.drivers.markers.checks import stream_checks
+from bodyschema.drivers.markers.fusing import FusedMarkers, Member
 from bodyschema.drivers.markers.opened import stream_of
 from bodyschema.drivers.markers.stream import MarkerStream
 from bodyschema.drivers.ros2.config import Ros2Config
@@ -34,7 +36,8 @@ from .config import Config
 from .extras import require_extra
 from .joints_watch import EncoderJoints, ServoJoints
 from .powered_wiring import open_drives
-from .sources import Head, MarkerTopic, Powered, Sources, StampedJoints, TellsHealth
+from .reopen import Reopening
+from .sources import Head, JoinedHealth, MarkerTopic, Powered, Sources, StampedJoints, TellsHealth
 from .store import PairReader
 
 if TYPE_CHECKING:
@@ -217,7 +220,7 @@ def _real(config: Config) -> Sources:
         powered=tuple(drive for drive in drives if isinstance(drive, Powered)),
         head=next((drive for drive in drives if isinstance(drive, Head)), None),
         cameras=health,
-        seen_by=f"the positions by {marker.name}" if isinstance(marker, MarkerStream) else Sources.seen_by,
+        seen_by=_seen_by(config),
         calibration=calibration,
         live=True,
     )
@@ -225,9 +228,35 @@ def _real(config: Config) -> Sources:
 
 def _open_marker(config: Config, clock: Clock) -> tuple[MarkerSource, TellsHealth, StereoCalibration | None]:
     """Return what sees the marker, not opened yet, what reports its health, and the cameras' calibration."""
-    streams = [stream_of(table, clock) for table in config.tables.marker_source]
-    if config.tables.vision.cameras is None:
+    tables = config.tables.marker_source
+    streams = [stream_of(table, clock) for table in tables]
+    if config.tables.vision.cameras is None and len(streams) == 1:
         return streams[0], streams[0], None
+    members = [Member(table.label, stream, table.pose) for table, stream in zip(tables, streams, strict=True)]
+    calibration = None
+    healths: list[TellsHealth] = [*streams]
+    if config.tables.vision.cameras is not None:
+        cameras, eyes, calibration = _tracked_cameras(config, clock)
+        if not tables:
+            return cameras, eyes, calibration
+        members.insert(0, Member("cameras", cameras, np.eye(4)))
+        healths.insert(0, eyes)
+    for place, member in enumerate(members):
+        member.source = reopening = Reopening(member.source, f"the positions by {member.name}", clock)
+        healths[place] = JoinedHealth([reopening, healths[place]])
+    fused = FusedMarkers(members, clock)
+    return fused, JoinedHealth([fused, *healths]), calibration
+
+
+def _seen_by(config: Config) -> str:
+    """Return the name in messages of what sees the marker."""
+    names = [table.label for table in config.tables.marker_source]
+    if config.tables.vision.cameras is not None:
+        return f"the positions by cameras and {' and '.join(names)}" if names else Sources.seen_by
+    return f"the positions by {' and '.join(names)}"
+
+
+def _tracked_cameras(config: Config, clock: Clock) -> tuple[MarkerSource, TellsHealth, StereoCalibration]:
     from bodyschema.vision.tracked_camera import TrackedCamera
     from bodyschema.vision.trackers import tracker_of
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 from bodyschema.drivers.markers.config import NatnetTable
 from bodyschema.drivers.markers.report import Packet, Report, Unusable
-from bodyschema.drivers.markers.udp import RETRY_S, await_any, listening, received
+from bodyschema.drivers.markers.udp import await_any, listening, received
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.protocols import Clock
 
@@ -18,6 +18,7 @@ from .packets import Message, ServerInfo
 
 NANO = 1_000_000_000
 ANSWER_S, ASK_EVERY_S = 2.0, 0.4
+RETRY_S = 10.0  # opening takes ANSWER_S where no server is
 ALIVE_EVERY_S = 1.0  # a server forgets clients that are silent for seconds
 GONE_AFTER_S = 4.0
 
