@@ -249,15 +249,18 @@ def state_home() -> Path:
 
 
 def _check_router(tables: Tables, file: Path, text: str) -> None:
-    """ConfigError when the ROS 2 robot's router, whose port is 7447 too, is where one of ours listens."""
-    ours = (tables.zenoh.sampler, tables.zenoh.learner)
-    if tables.drivers.ros2 is not None and tables.drivers.ros2.router in ours:
-        raise ConfigError(
-            f"the ROS 2 router and a process of ours have the same endpoint {tables.drivers.ros2.router}",
-            file=file,
-            line=line_of(text, ("drivers", "ros2")),
-            remedy='Write in [zenoh]: sampler = "tcp/127.0.0.1:7457" and learner = "tcp/127.0.0.1:7458"',
-        )
+    """ConfigError when another router, whose port is usually 7447 too, is where one of our processes listens."""
+    ros2 = tables.drivers.ros2
+    routers = {} if ros2 is None else {("drivers", "ros2"): ros2.router}
+    routers |= {(MARKER_SOURCE, table.label): table.endpoint for table in tables.marker_source}
+    for keys, router in routers.items():
+        if router in (tables.zenoh.sampler, tables.zenoh.learner):
+            raise ConfigError(
+                f"the {'ROS 2 ' if keys[0] == 'drivers' else ''}router and a process of ours have the same endpoint {router}",
+                file=file,
+                line=line_of(text, keys),
+                remedy='Write in [zenoh]: sampler = "tcp/127.0.0.1:7457" and learner = "tcp/127.0.0.1:7458"',
+            )
 
 
 def _require_size(robot: RobotDescription, tables: Tables, vision: Mapping[str, Any], file: Path, text: str) -> None:

@@ -125,9 +125,7 @@ def test_disagreement_names_the_frame_that_would_end_it() -> None:
     [said] = scene.fused.health
     assert said.startswith("cameras and mocap disagree in ")
     numbers = said.partition("xyz = [")[2].partition("]")[0].split(", ")
-    assert [float(value) for value in numbers] == pytest.approx(
-        [0.02, 0.0, 0.0], abs=6e-3
-    )  # 300 positions of 5 mm over 6 s of path
+    assert [float(value) for value in numbers] == pytest.approx([0.02, 0.0, 0.0], abs=6e-3)
 
 
 def test_another_marker_is_told_from_another_frame() -> None:
