@@ -14,12 +14,13 @@ from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import BodyschemaError, ConfigError
 from bodyschema.interfaces.protocols import Clock, StereoCamera
 from bodyschema.interfaces.toml_file import line_of, read_toml
-from bodyschema.vision.cameras.config import CamerasConfig, ImagesConfig, UvcSettings, VideosConfig
+from bodyschema.vision.cameras.config import CamerasConfig, ImagesConfig, RealsenseConfig, UvcSettings, VideosConfig
 from bodyschema.vision.cameras.controls import left_to_the_camera
 from bodyschema.vision.cameras.film import Film
 from bodyschema.vision.cameras.ideal import IdealCamera
 from bodyschema.vision.cameras.live import CameraFigures, LiveEyes
 from bodyschema.vision.cameras.opened import eyes_of
+from bodyschema.vision.cameras.realsense import RealsenseCamera
 from bodyschema.vision.cameras.serials import connected
 from bodyschema.vision.cameras.watched import PlainEyes, WatchedCamera
 from bodyschema.vision.rectified import RectifiedCamera
@@ -27,10 +28,13 @@ from bodyschema.vision.rig import OneEyeRig, Rig
 from bodyschema.vision.rig_file import read_rig
 
 from .config import Config
+from .extras import require_extra
 
 LOOK_S = 2.0  # `doctor` looks at the images
 READ_S = 0.5
 PAGE = "docs/cameras.md"
+
+Eyes = LiveEyes | RealsenseCamera | Film
 
 
 def cameras_of(config: Config) -> CamerasConfig | None:
@@ -48,7 +52,7 @@ def require_cameras(config: Config) -> CamerasConfig:
     return cameras
 
 
-def open_eyes(config: Config, clock: Clock) -> LiveEyes | Film:
+def open_eyes(config: Config, clock: Clock) -> Eyes:
     """Return the cameras of robot.toml with unprocessed images, not opened yet.
 
     Raises:
@@ -68,7 +72,7 @@ def names_calibration(config: Config) -> bool:
     return require_cameras(config).calibration is not None
 
 
-def camera_of(config: Config, eyes: LiveEyes | Film) -> StereoCamera:
+def camera_of(config: Config, eyes: Eyes) -> StereoCamera:
     """Return `eyes` with rectified images, not opened yet: by the calibration file, else by [camera].
 
     Raises:
@@ -78,6 +82,8 @@ def camera_of(config: Config, eyes: LiveEyes | Film) -> StereoCamera:
     if cameras.calibration is not None:
         rig = read_rig(calibration_file(config))
         return RectifiedCamera(eyes, _of_files(rig, cameras) if isinstance(eyes, Film) else rig)
+    if isinstance(eyes, RealsenseCamera):
+        return eyes
     if config.robot.calibration is None:
         raise ConfigError(
             "nothing says how the cameras see",
@@ -100,6 +106,9 @@ def _of_files(rig: Rig, cameras: CamerasConfig) -> Rig:
 
 def require_usable(config: Config) -> None:
     """ConfigError when pairs cannot be made of the cameras' images and the encoders' readings."""
+    cameras = require_cameras(config)
+    if cameras.realsense is not None:
+        require_extra("realsense", "a RealSense camera")
     camera_of(config, open_eyes(config, SystemClock()))
     layout = require_cameras(config).layout
     if isinstance(layout, ImagesConfig | VideosConfig) and not layout.speed:
@@ -121,14 +130,15 @@ class Watched:
     """
 
     camera: WatchedCamera | PlainEyes
-    eyes: LiveEyes | Film
+    eyes: Eyes
     is_calibrated: bool
 
 
 def open_watched(config: Config) -> Watched:
     """Return the cameras of robot.toml, not opened yet; once calibrated, detections are drawn into their images."""
     eyes = open_eyes(config, SystemClock())
-    is_calibrated = require_cameras(config).calibration is not None or config.robot.calibration is not None
+    is_described = config.robot.calibration is not None or isinstance(eyes, RealsenseCamera)
+    is_calibrated = require_cameras(config).calibration is not None or is_described
     if not is_calibrated:
         return Watched(PlainEyes(eyes), eyes, is_calibrated)
     return Watched(WatchedCamera(camera_of(config, eyes), config.tables.vision), eyes, is_calibrated)
@@ -171,7 +181,7 @@ def _where(device: str) -> str:
     return f"plug it in; {known}"
 
 
-def _open_checks(eyes: LiveEyes | Film, cameras: CamerasConfig) -> Iterator[Check]:
+def _open_checks(eyes: Eyes, cameras: CamerasConfig) -> Iterator[Check]:
     """Open the cameras together for a while and yield checks of what they send."""
     with ExitStack() as stack:
         stack.enter_context(eyes)
@@ -223,6 +233,9 @@ def camera_lines(config: Config) -> Iterator[str]:
                 yield f"{name} {device}"
             width, height = layout.image_size_px
             yield f"images of {width}x{height} pixels for each eye, {layout.fps:g} a second, as {layout.fourcc}"
+        case RealsenseConfig(image_size_px=(width, height), serial=serial) as layout:
+            which = "the only RealSense" if serial is None else f"RealSense {serial}"
+            yield f"{which}: infra-red images of {width}x{height} pixels, {layout.fps:g} a second"
         case ImagesConfig(left=left, right=right) as images:
             yield f"images {left if right is None else f'{left} and {right}'}, {_speed(images.speed)}"
         case VideosConfig() as films:

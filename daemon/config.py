@@ -166,6 +166,7 @@ class Config:
         _check_router(tables, file, text)
         if tables.vision.cameras is not None:
             tables.vision.cameras.check(file, text)
+            _require_colour(tables, file, text)
         if tables.vision.radius_m > LARGEST_BALL_M:
             raise ConfigError(
                 f"vision.radius_m = {tables.vision.radius_m:g}: this looks like millimetres",
@@ -255,12 +256,25 @@ def _check_router(tables: Tables, file: Path, text: str) -> None:
     routers |= {(MARKER_SOURCE, table.label): table.endpoint for table in tables.marker_source}
     for keys, router in routers.items():
         if router in (tables.zenoh.sampler, tables.zenoh.learner):
+            whose = "ROS 2" if keys[0] == "drivers" else "marker source's"
             raise ConfigError(
-                f"the {'ROS 2 ' if keys[0] == 'drivers' else ''}router and a process of ours have the same endpoint {router}",
+                f"the {whose} router and a process of ours have the same endpoint {router}",
                 file=file,
                 line=line_of(text, keys),
                 remedy='Write in [zenoh]: sampler = "tcp/127.0.0.1:7457" and learner = "tcp/127.0.0.1:7458"',
             )
+
+
+def _require_colour(tables: Tables, file: Path, text: str) -> None:
+    """Raise ConfigError if infra-red eyes would have to look for a colour."""
+    cameras = tables.vision.cameras
+    if cameras is not None and cameras.realsense is not None and tables.vision.marker == "ball":
+        raise ConfigError(
+            "the infra-red eyes of a RealSense see no colours, and the marker is a coloured ball",
+            file=file,
+            line=line_of(text, ("vision", "cameras", "realsense")),
+            remedy='Write marker = "tag", "cluster" or "bright_ball" in [vision]',
+        )
 
 
 def _require_size(robot: RobotDescription, tables: Tables, vision: Mapping[str, Any], file: Path, text: str) -> None:

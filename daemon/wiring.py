@@ -257,14 +257,20 @@ def _seen_by(config: Config) -> str:
 
 
 def _tracked_cameras(config: Config, clock: Clock) -> tuple[MarkerSource, TellsHealth, StereoCalibration]:
+    from bodyschema.vision.cameras.realsense import RealsenseCamera
+    from bodyschema.vision.depth_check import DepthChecked
     from bodyschema.vision.tracked_camera import TrackedCamera
     from bodyschema.vision.trackers import tracker_of
 
     from .camera_wiring import camera_of, open_eyes
 
     eyes = open_eyes(config, clock)
-    camera = camera_of(config, eyes)
-    return TrackedCamera(camera, tracker_of(camera.calibration, config.tables.vision)), eyes, camera.calibration
+    camera, vision = camera_of(config, eyes), config.tables.vision
+    tracked = TrackedCamera(camera, tracker_of(camera.calibration, vision))
+    if eyes is not camera or not isinstance(eyes, RealsenseCamera):
+        return tracked, eyes, camera.calibration
+    checked = DepthChecked(tracked, eyes, vision.radius_m if vision.marker == "bright_ball" else 0.0)
+    return checked, JoinedHealth([eyes, checked]), camera.calibration
 
 
 def open_streams(config: Config, clock: Clock) -> list[MarkerStream]:
