@@ -44,6 +44,7 @@ JOINTS = ("base_yaw", "shoulder_pitch", "elbow_pitch", "wrist_roll")
 CLOCK_AHEAD_S = 4321.0  # the sender's clock
 LATENCY_S, JITTER_S = 0.004, 0.002  # from the measurement to the datagram, known to the sender; of the network
 POSES = 400
+LEVEL = (0.0, 0.0, 0.0, 1.0)
 COMMAND = (sys.executable, "-m", "bodyschema")
 ROBOT = """[robot]
 name = "desk_arm"
@@ -159,9 +160,8 @@ class Sender:
         stamp, is_lost = t + CLOCK_AHEAD_S, self._rng.random() < self._arguments.lost
         if self._motive is not None:
             self._motive.answer()
-            packet = self._motive.frame(
-                {1: ((0.0,) * 3, (0.0, 0.0, 0.0, 1.0)), 2: (tuple(x), (0.0, 0.0, 0.0, 1.0))}, stamp, latency_s=LATENCY_S
-            )
+            poses = {1: ((0.0, 0.0, 0.0), LEVEL), 2: ((x[0], x[1], x[2]), LEVEL)}
+            packet = self._motive.frame(poses, stamp, latency_s=LATENCY_S)
             if not is_lost:
                 self._motive.send_packet(packet)
             return
