@@ -149,7 +149,13 @@ def open_watched(config: Config) -> Watched:
 
 def camera_checks(config: Config) -> Iterator[Check]:
     """Yield checks that the cameras of robot.toml are present and send images when both are open at once."""
-    cameras = require_cameras(config)
+    yield from _checks_of(require_cameras(config), config.file.parent)
+    for further in config.tables.vision.further_cameras:
+        for check in _checks_of(further, config.file.parent):
+            yield replace(check, subject=f"{further.name}: {check.subject}")
+
+
+def _checks_of(cameras: CamerasConfig, folder: Path) -> Iterator[Check]:
     missing = False
     for name, device in cameras.devices.items():
         for check in _device_checks(name, device):
@@ -157,7 +163,7 @@ def camera_checks(config: Config) -> Iterator[Check]:
             yield check
     if missing:
         return
-    eyes = open_eyes(config, SystemClock())
+    eyes = eyes_of(cameras, folder, SystemClock())
     try:
         yield from _open_checks(eyes, cameras)
     except BodyschemaError as error:
@@ -226,7 +232,13 @@ def _told(figures: CameraFigures) -> str:
 
 def camera_lines(config: Config) -> Iterator[str]:
     """Describe in words where images come from. Raise ConfigError if the calibration cannot be read."""
-    cameras = require_cameras(config)
+    yield from _lines_of(require_cameras(config), config.file.parent)
+    for further in config.tables.vision.further_cameras:
+        for line in _lines_of(further, config.file.parent):
+            yield f"{further.name}: {line}"
+
+
+def _lines_of(cameras: CamerasConfig, folder: Path) -> Iterator[str]:
     match cameras.layout:
         case UvcSettings() as layout:
             for name, device in cameras.devices.items():
@@ -244,7 +256,7 @@ def camera_lines(config: Config) -> Iterator[str]:
     known = "" if cameras.latency_sigma_s is not None or not cameras.devices else ", not measured"
     yield f"taken {1e3 * cameras.latency_s:.1f} ms before their time stamp ± {1e3 * cameras.sigma_s:.1f} ms{known}"
     if cameras.calibration is not None:
-        yield _calibrated_by(cameras.calibration, calibration_file(config))
+        yield _calibrated_by(cameras.calibration, folder / cameras.calibration)
 
 
 def _calibrated_by(name: str, file: Path) -> str:

@@ -167,6 +167,7 @@ class Config:
         if tables.vision.cameras is not None:
             tables.vision.cameras.check(file, text)
             _require_colour(tables, file, text)
+        _check_further_cameras(tables, file, text)
         if tables.vision.radius_m > LARGEST_BALL_M:
             raise ConfigError(
                 f"vision.radius_m = {tables.vision.radius_m:g}: this looks like millimetres",
@@ -263,6 +264,24 @@ def _check_router(tables: Tables, file: Path, text: str) -> None:
                 line=line_of(text, keys),
                 remedy='Write in [zenoh]: sampler = "tcp/127.0.0.1:7457" and learner = "tcp/127.0.0.1:7458"',
             )
+
+
+def _check_further_cameras(tables: Tables, file: Path, text: str) -> None:
+    """Raise ConfigError if further cameras are incomplete, uncalibrated, or the only ones."""
+    names = ["cameras", *(source.label for source in tables.marker_source)]
+    for cameras in tables.vision.further_cameras:
+        cameras.check(file, text, ("vision", "further_cameras"))
+        what = remedy = ""
+        if tables.vision.cameras is None:
+            what, remedy = "there are no first ones", "Name one of them as [vision.cameras]"
+        elif cameras.calibration is None and cameras.realsense is None:
+            what, remedy = "nothing says how they see", "Name the file of `bodyschema calibrate cameras` as calibration"
+        elif cameras.name in names:
+            what, remedy = f"the name {cameras.name!r} is taken", "Give each its own name"
+        if what:
+            line = line_of(text, ("vision", "further_cameras"))
+            raise ConfigError(f"vision.further_cameras: {what}", file=file, line=line, remedy=remedy)
+        names.append(cameras.name)
 
 
 def _require_colour(tables: Tables, file: Path, text: str) -> None:

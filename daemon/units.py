@@ -231,6 +231,7 @@ def devices_of(config: Config) -> list[str]:
     """Return the ports and cameras that robot.toml names, each once, and those of plug-in drivers and trackers."""
     cameras = config.tables.vision.cameras
     named = [*configured_ports(config).values(), *({} if cameras is None else cameras.devices).values()]
+    named += [device for further in config.tables.vision.further_cameras for device in further.devices.values()]
     named += [device for plugin in _plugins(config) for device in plugin.devices]
     return list(dict.fromkeys(name for name in named if name.startswith("/dev/")))
 

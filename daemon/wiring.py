@@ -43,6 +43,7 @@ from .store import PairReader
 if TYPE_CHECKING:
     from bodyschema.drivers.ros2.joints import Ros2Joints
     from bodyschema.sim_backend.config import CameraConfig, SimConfig, SimTag
+    from bodyschema.vision.cameras.config import CamerasConfig
     from bodyschema.vision.config import VisionConfig
 
 log = logging.getLogger(__name__)
@@ -237,10 +238,15 @@ def _open_marker(config: Config, clock: Clock) -> tuple[MarkerSource, TellsHealt
     healths: list[TellsHealth] = [*streams]
     if config.tables.vision.cameras is not None:
         cameras, eyes, calibration = _tracked_cameras(config, clock)
-        if not tables:
+        further = config.tables.vision.further_cameras
+        if not tables and not further:
             return cameras, eyes, calibration
         members.insert(0, Member("cameras", cameras, np.eye(4)))
         healths.insert(0, eyes)
+        for place, table in enumerate(further, 1):
+            others, health, _ = _tracked_cameras(_seen_through(config, table), clock)
+            members.insert(place, Member(table.name, others, table.pose))
+            healths.insert(place, health)
     for place, member in enumerate(members):
         member.source = reopening = Reopening(member.source, f"the positions by {member.name}", clock)
         healths[place] = JoinedHealth([reopening, healths[place]])
@@ -248,15 +254,25 @@ def _open_marker(config: Config, clock: Clock) -> tuple[MarkerSource, TellsHealt
     return fused, JoinedHealth([fused, *healths]), calibration
 
 
+def _seen_through(config: Config, cameras: CamerasConfig) -> Config:
+    """Return the configuration with `cameras` as the only ones."""
+    vision = msgspec.structs.replace(config.tables.vision, cameras=cameras, further_cameras=())
+    return config.with_tables(msgspec.structs.replace(config.tables, vision=vision))
+
+
 def _seen_by(config: Config) -> str:
     """Return the name in messages of what sees the marker."""
-    names = [table.label for table in config.tables.marker_source]
-    if config.tables.vision.cameras is not None:
-        return f"the positions by cameras and {' and '.join(names)}" if names else Sources.seen_by
+    tables = config.tables
+    names = [*(table.name for table in tables.vision.further_cameras), *(table.label for table in tables.marker_source)]
+    if tables.vision.cameras is not None:
+        if not names:
+            return Sources.seen_by
+        names.insert(0, "cameras")
     return f"the positions by {' and '.join(names)}"
 
 
 def _tracked_cameras(config: Config, clock: Clock) -> tuple[MarkerSource, TellsHealth, StereoCalibration]:
+    """Return the cameras of robot.toml with their tracker, not opened yet, their health and their calibration."""
     from bodyschema.vision.cameras.realsense import RealsenseCamera
     from bodyschema.vision.depth_check import DepthChecked
     from bodyschema.vision.tracked_camera import TrackedCamera

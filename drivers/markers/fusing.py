@@ -58,17 +58,15 @@ class Member:
 
     Attributes:
         name: in messages.
+        source: gives the positions.
+        pose: of the source's frame in the measurement frame, (4, 4).
         newest_t: time of its newest position or miss [s].
         common: its positions beside the leading source's.
     """
 
     def __init__(self, name: str, source: MarkerSource, pose: FloatArray) -> None:
-        """Store the settings.
-
-        Args:
-            pose: of the source's frame in the measurement frame, (4, 4).
-        """
-        self.name, self.source, self._pose = name, source, pose
+        """Store the settings."""
+        self.name, self.source, self.pose = name, source, pose
         self.common: deque[Common] = deque(maxlen=JUDGED)
         self.forget()
 
@@ -82,7 +80,7 @@ class Member:
         """Take a position or a miss that came at `now` [s]."""
         self.newest_t = seen.t
         if isinstance(seen, MarkerFix):
-            fix = _moved(seen, self._pose)
+            fix = _moved(seen, self.pose)
             self.fixes.append(fix)
             self.waiting.append((fix, now))
             self.fixed_at = now
@@ -129,7 +127,7 @@ class Member:
                 "one of them follows another marker, or its latency_s or sigma_m is wrong; look at each alone, with "
                 "`bodyschema watch marker` and `bodyschema calibrate latency`"
             )
-        pose = T @ self._pose
+        pose = T @ self.pose
         xyz = ", ".join(f"{value:.4f}" for value in pose[:3, 3])
         rpy = ", ".join(f"{value:.4f}" for value in rpy_of(pose[:3, :3]))
         return (
@@ -143,23 +141,26 @@ class FusedMarkers:
 
     The first source that sees the marker leads. The others' positions are interpolated to its times, and all are
     averaged with their full covariances as weights. Where they contradict each other, there is no position.
+
+    Attributes:
+        members: the sources, in the order of preference.
     """
 
     def __init__(self, members: Sequence[Member], clock: Clock) -> None:
-        """Prepare without opening anything; the order of `members` is that of preference."""
-        self._members, self._clock = list(members), clock
+        """Prepare without opening anything."""
+        self.members, self._clock = list(members), clock
         self._opened = ExitStack()
         self._last_t = -math.inf
 
     @property
     def health(self) -> tuple[str, ...]:
         """What sources disagree, with the remedy."""
-        verdicts = (member.verdict(self._members[0].name) for member in self._members[1:])
+        verdicts = (member.verdict(self.members[0].name) for member in self.members[1:])
         return tuple(verdict for verdict in verdicts if verdict is not None)
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            for member in self._members:
+            for member in self.members:
                 stack.enter_context(member.source)
                 member.forget()
             self._opened = stack.pop_all()
@@ -186,7 +187,7 @@ class FusedMarkers:
         """Read each source once; return a miss if none has seen the marker for a while."""
         missed: MarkerMiss | None = None
         ended = 0
-        for member in self._members:
+        for member in self.members:
             try:
                 seen = member.source.read(SLICE_S)
             except SourceEnded:
@@ -196,14 +197,14 @@ class FusedMarkers:
                 member.take(seen, self._clock.now())
             if isinstance(seen, MarkerMiss):
                 missed = seen
-        if ended == len(self._members):
+        if ended == len(self.members):
             raise SourceEnded
-        is_seen = any(self._clock.now() - member.fixed_at < LEADS_FOR_S for member in self._members)
+        is_seen = any(self._clock.now() - member.fixed_at < LEADS_FOR_S for member in self.members)
         return None if is_seen else missed
 
     def _next(self) -> MarkerFix | MarkerMiss | None:
         now = self._clock.now()
-        seeing = [member for member in self._members if now - member.fixed_at < LEADS_FOR_S]
+        seeing = [member for member in self.members if now - member.fixed_at < LEADS_FOR_S]
         if not seeing:
             return None
         leader, *others = seeing
@@ -225,7 +226,7 @@ class FusedMarkers:
             at = other.at(fix.t, fix.t_sigma)
             if at is None:
                 continue
-            if leader is self._members[0]:
+            if leader is self.members[0]:
                 other.common.append(Common(fix.x, at[0], fix.cov + at[1]))
             found.append(at)
         agreeing = _agreeing(found)

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from small_arm import write_small_arm
 
+from bodyschema.daemon.camera_wiring import camera_lines
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.units import endpoints_of
+from bodyschema.daemon.units import devices_of, endpoints_of
 from bodyschema.daemon.wiring import marker_source_lines, open_sources
 from bodyschema.drivers.markers.config import NatnetTable, UdpTable
+from bodyschema.drivers.markers.fusing import FusedMarkers
 from bodyschema.interfaces.errors import ConfigError
+from bodyschema.vision.lens import Lens
+from bodyschema.vision.rig import Made, StereoRig
+from bodyschema.vision.rig_file import write_rig
 
 JOINTS = '[drivers.ros2]\nrouter = "tcp/127.0.0.1:7461"\n'
 
@@ -61,6 +67,49 @@ def test_arm_with_a_marker_source_needs_no_cameras(tmp_path) -> None:
     with open_sources(config, sim=False) as sources:
         assert sources.calibration is None
         assert sources.seen_by == "the positions by udp"
+
+
+CAMERAS = """
+focal_px = 600.0
+principal_point_px = [319.5, 239.5]
+baseline_m = 0.1
+image_size_px = [640, 480]
+[vision.cameras.two]
+left = "/dev/v4l/by-id/a"
+right = "/dev/v4l/by-id/b"
+image_size_px = [640, 480]
+[[vision.further_cameras]]
+name = "side"
+xyz = [1.0, 0.0, 0.5]
+{calibration}
+[vision.further_cameras.two]
+left = "/dev/v4l/by-id/c"
+right = "/dev/v4l/by-id/d"
+image_size_px = [640, 480]
+"""
+
+
+def test_further_cameras_and_mocap_are_fused(tmp_path) -> None:
+    lens = Lens("pinhole", (600.0, 600.0), (319.5, 239.5), (0.0,) * 5)
+    made = Made("2026-01-01T00:00:00Z", "none", 1, 0, 0.1, 0.1, 0.0)
+    place = np.array([-0.1, 0.0, 0.0])
+    write_rig(
+        StereoRig(lens, lens, np.zeros(3), place, (640, 480), ("C", "D"), np.eye(24), made), tmp_path / "side.toml"
+    )
+    text = CAMERAS.format(calibration='calibration = "side.toml"') + JOINTS + f'{TWO}kind = "udp"\n'
+    config = load(tmp_path, text)
+    with open_sources(config, sim=False) as sources:
+        assert sources.seen_by == "the positions by cameras and side and udp"
+        assert isinstance(sources.marker, FusedMarkers)
+        assert [member.name for member in sources.marker.members] == ["cameras", "side", "udp"]
+        np.testing.assert_allclose(sources.marker.members[1].pose[:3, 3], [1.0, 0.0, 0.5])
+    assert "side: calibrated by side.toml: pinhole lenses, baseline 100.0 mm" in list(camera_lines(config))
+    assert "/dev/v4l/by-id/c" in devices_of(config)
+
+
+def test_further_cameras_need_a_calibration(tmp_path) -> None:
+    with pytest.raises(ConfigError, match=r"vision\.further_cameras: nothing says how they see"):
+        load(tmp_path, CAMERAS.format(calibration=""))
 
 
 def test_service_is_granted_the_network_of_the_source(tmp_path) -> None:

@@ -120,7 +120,7 @@ def test_disagreement_names_the_frame_that_would_end_it() -> None:
     wrong = np.eye(4)
     wrong[:3, :3], wrong[:3, 3] = rotation_of(np.array([0.0, 0.0, 0.1])), [0.02, 0.0, 0.0]
     scene = Scene(STEREO, MOCAP, pose=wrong)
-    scene.members[1]._pose = np.eye(4)  # robot.toml says nothing of the pose
+    scene.members[1].pose = np.eye(4)  # robot.toml says nothing of the pose
     scene.run(300)
     [said] = scene.fused.health
     assert said.startswith("cameras and mocap disagree in ")

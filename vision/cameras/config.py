@@ -7,10 +7,13 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import msgspec
+import numpy as np
 from msgspec import Meta
 
 from bodyschema.interfaces.camera import LARGEST_SIDE_PX
 from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.rpy import rotation_of
 from bodyschema.interfaces.toml_file import line_of
 
 Positive = Annotated[float, Meta(gt=0)]
@@ -198,12 +201,12 @@ class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
             return self.latency_sigma_s
         return UNKNOWN_LATENCY_SIGMA_S if self.devices or self.realsense is not None else 0.0
 
-    def check(self, file: Path, text: str) -> None:
-        """Raise ConfigError if there is not exactly one layout, or if it is incomplete."""
+    def check(self, file: Path, text: str, table: tuple[str, ...] = ("vision", "cameras")) -> None:
+        """Raise ConfigError if there is not exactly one layout, or if it is incomplete; `table` is where it stands."""
         given = [name for name in LAYOUTS if getattr(self, name) is not None]
 
         def refuse(what: str, remedy: str, *keys: str) -> None:
-            place = ("vision", "cameras", *keys)
+            place = (*table, *keys)
             raise ConfigError(f"{'.'.join(place)}: {what}", file=file, line=line_of(text, place), remedy=remedy)
 
         if not given:
@@ -232,6 +235,27 @@ class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
                 refuse("which films?", "Give left and right, side_by_side, or left alone for one camera", "videos")
             if _count(self.videos, "times", "fps") > 1:
                 refuse("the times have to come from one thing", "Give times or fps", "videos")
+
+
+class FurtherCameras(CamerasConfig, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A table [[vision.further_cameras]]: cameras that see the same marker from elsewhere.
+
+    Attributes:
+        name: in messages.
+        xyz, rpy: pose of their left optical frame in the measurement frame, that of [vision.cameras] [m], [rad].
+    """
+
+    name: str
+    xyz: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def pose(self) -> FloatArray:
+        """The pose, shape (4, 4)."""
+        T = np.eye(4)
+        T[:3, :3] = rotation_of(np.array(self.rpy))
+        T[:3, 3] = self.xyz
+        return T
 
 
 def _count(table: msgspec.Struct, *keys: str) -> int:
