@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import math
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from bodyschema.drivers.markers.config import NatnetTable
 from bodyschema.drivers.markers.report import Packet, Report, Unusable
@@ -130,12 +130,7 @@ class NatnetReceiver:
                     "switch on its Data Streaming on that network interface, and let its firewall pass UDP",
                     retry_s=RETRY_S,
                 )
-            self._send(packets.connect())
-            until = now + ASK_EVERY_S
-            while self.server is None and await_any([self._commands], until, self._clock):
-                got = received(self._commands, self._clock)
-                if got is not None:
-                    self._sorted(*got)
+            self._ask(packets.connect(), lambda: self.server is not None)
         if self.server is not None and not packets.OLDEST <= self.server.version[0] <= packets.NEWEST:
             major, minor = self.server.version
             raise SourceError(
@@ -145,13 +140,20 @@ class NatnetReceiver:
 
     def _await_names(self) -> None:
         """Ask for the rigid bodies' names; without an answer they go by their IDs."""
-        self._asked_names = -math.inf
-        self._ask_names()
         until = self._clock.now() + ANSWER_S
-        while not self.names and self._commands is not None and await_any([self._commands], until, self._clock):
-            got = received(self._commands, self._clock)
-            if got is not None:
-                self._sorted(*got)
+        while not self.names and self._clock.now() < until:
+            self._ask(packets.packet(Message.REQUEST_MODEL), lambda: bool(self.names))
+
+    def _ask(self, question: bytes, is_answered: Callable[[], bool]) -> None:
+        """Send a question and take what comes until it is answered, for `ASK_EVERY_S` at most."""
+        self._send(question)
+        until = self._clock.now() + ASK_EVERY_S
+        # Frames may come all the time, so the time is looked at, too.
+        while not is_answered() and self._commands is not None and self._clock.now() < until:
+            if await_any([self._commands], until, self._clock):
+                got = received(self._commands, self._clock)
+                if got is not None:
+                    self._sorted(*got)
 
     def _ask_names(self) -> None:
         now = self._clock.now()
