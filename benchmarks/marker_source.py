@@ -154,7 +154,7 @@ class Sender:
             time.sleep(LATENCY_S + self._rng.exponential(JITTER_S))
             self.sent += 1
             self._send(due, x.tolist())
-            due = max(due + 1 / self._arguments.rate, time.monotonic() - 0.1)
+            due = max(due + 1 / self._arguments.rate, time.monotonic() - 0.02)
 
     def _send(self, t: float, x: list[float]) -> None:
         stamp, is_lost = t + CLOCK_AHEAD_S, self._rng.random() < self._arguments.lost

@@ -95,6 +95,8 @@ class UdpReceiver:
                 if self._table.sender in (None, sender[0]):
                     return Packet(payload, f"{sender[0]}:{sender[1]}", arrived)
                 self._strangers += 1
+                if self._clock.now() >= until:
+                    return None
             elif not await_any([self._socket], until, self._clock):
                 return None
         return None

@@ -73,17 +73,14 @@ class NatnetReceiver:
         while True:
             self._keep_alive()
             sockets = [found for found in (self._data, self._commands) if found is not None]
-            for found in sockets:
-                got = received(found, self._clock)
-                if got is not None:
-                    packet = self._sorted(*got)
-                    if packet is not None:
-                        return packet
-                    break
-            else:
-                now = self._clock.now()
-                if now >= until:
-                    return None
+            got = next(filter(None, (received(found, self._clock) for found in sockets)), None)
+            packet = None if got is None else self._sorted(*got)
+            if packet is not None:
+                return packet
+            now = self._clock.now()
+            if now >= until:
+                return None
+            if got is None:
                 await_any(sockets, min(until, now + ALIVE_EVERY_S), self._clock)
 
     def silence(self) -> str:
