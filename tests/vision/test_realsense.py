@@ -7,21 +7,27 @@ import time
 from importlib.util import find_spec
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import SourceError, SourceLost
-from bodyschema.interfaces.records import MarkerFix, StereoFrame, frozen_array
+from bodyschema.interfaces.records import MarkerFix, frozen_array
 from bodyschema.vision.cameras.config import CamerasConfig, RealsenseConfig
 from bodyschema.vision.cameras.realsense import RealsenseCamera, connected_device
+from bodyschema.vision.config import VisionConfig
 from bodyschema.vision.depth_check import DepthChecked
+from bodyschema.vision.tracked_camera import TrackedCamera
+from bodyschema.vision.trackers import tracker_of
 
 SDK = pytest.mark.skipif(
     find_spec("pyrealsense2") is None, reason="no pyrealsense2; to run it: pip install pyrealsense2"
 )
-WIDTH, HEIGHT, FOCAL_PX, BASELINE_M = 64, 48, 40.0, 0.05
+WIDTH, HEIGHT, FOCAL_PX, BASELINE_M = 320, 240, 200.0, 0.05
+CENTRE_PX = (159.5, 119.5)
 SETTINGS = RealsenseConfig(image_size_px=(WIDTH, HEIGHT))
+BALL, RADIUS_M = (0.03, -0.02, 0.4), 0.02
 LIMIT_S = 20.0
 
 
@@ -45,20 +51,20 @@ class Device:
     def _stream(self, kind: Any, form: Any, size: int, index: int, distortion: float) -> Any:
         rs, stream = self.rs, self.rs.video_stream()
         eye = rs.intrinsics()
-        eye.width, eye.height, eye.fx, eye.fy, eye.ppx, eye.ppy = WIDTH, HEIGHT, FOCAL_PX, FOCAL_PX, 31.5, 23.5
+        eye.width, eye.height, eye.fx, eye.fy, eye.ppx, eye.ppy = WIDTH, HEIGHT, FOCAL_PX, FOCAL_PX, *CENTRE_PX
         eye.model, eye.coeffs = rs.distortion.brown_conrady, [distortion, 0, 0, 0, 0]
         stream.type, stream.index, stream.uid, stream.fmt, stream.bpp = kind, index, index, form, size
         stream.width, stream.height, stream.fps, stream.intrinsics = WIDTH, HEIGHT, 30, eye
         return self.sensor.add_video_stream(stream)
 
-    def show(self, depth_mm: int, left: int, right: int, *, domain: str = "global_time") -> None:
+    def show(self, depth_mm: Any, left: Any, right: Any, *, domain: str = "global_time") -> None:
         """Send one image of each stream, taken 20 ms ago."""
         self.number += 1
         for stream, value, kind in zip(
             self.streams, (depth_mm, left, right), (np.uint16, *[np.uint8] * 2), strict=True
         ):
             image = self.rs.software_video_frame()
-            image.pixels = np.full((HEIGHT, WIDTH), value, kind)
+            image.pixels = np.array(np.broadcast_to(value, (HEIGHT, WIDTH)), kind)
             image.bpp = np.dtype(kind).itemsize
             image.stride, image.frame_number = WIDTH * image.bpp, self.number
             image.timestamp, image.domain = 1e3 * (time.time() - 0.02), getattr(self.rs.timestamp_domain, domain)
@@ -75,21 +81,30 @@ def device() -> Device:
     return Device()
 
 
-def shown(device: Device, camera: RealsenseCamera, **keys) -> StereoFrame:
-    """Return the first frame; the first images only settle how they are dated."""
+def shown(device: Device, source: Any, images: tuple[Any, Any, Any] = (850, 10, 200), **keys) -> Any:
+    """Return the first frame or fix; the first images only settle how they are dated."""
     end = time.monotonic() + LIMIT_S
     while time.monotonic() < end:
-        device.show(850, 10, 200, **keys)
-        frame = camera.read(0.05)
+        device.show(*images, **keys)
+        frame = source.read(0.05)
         if frame is not None:
             return frame
     raise AssertionError("no frame")
 
 
+def ball_seen_from(eye_m: float) -> np.ndarray:
+    """Return the grey image of a bright ball in an eye that stands at (eye_m, 0, 0)."""
+    x, y, z = BALL
+    image = np.full((HEIGHT, WIDTH), 20, np.uint8)
+    at = [round(16 * (c + FOCAL_PX * v / z)) for c, v in zip(CENTRE_PX, (x - eye_m, y), strict=True)]
+    cv2.circle(image, (at[0], at[1]), round(16 * FOCAL_PX * RADIUS_M / z), 240, -1, cv2.LINE_AA, 4)
+    return cv2.GaussianBlur(image, (0, 0), 0.7)
+
+
 @SDK
 def test_intrinsics_come_from_the_device(device) -> None:
     found = device.camera().calibration
-    assert (found.focal_px, found.principal_point_px) == (FOCAL_PX, (31.5, 23.5))
+    assert (found.focal_px, found.principal_point_px) == (FOCAL_PX, CENTRE_PX)
     assert found.baseline_m == pytest.approx(BASELINE_M)
 
 
@@ -109,6 +124,21 @@ def test_both_eyes_and_depth_are_of_one_frame(device) -> None:
 
 
 @SDK
+@pytest.mark.parametrize(("depth_mm", "complaints"), [(380, 0), (500, 1)])
+def test_bright_ball_is_measured_and_checked_by_depth(device, depth_mm, complaints) -> None:
+    images = (depth_mm, ball_seen_from(0.0), ball_seen_from(BASELINE_M))
+    camera = device.camera()
+    vision = VisionConfig(marker="bright_ball", radius_m=RADIUS_M)
+    tracked = TrackedCamera(camera, tracker_of(camera.calibration, vision))
+    with DepthChecked(tracked, camera, RADIUS_M) as checked:
+        for _ in range(25):
+            fix = shown(device, checked, images)
+    assert isinstance(fix, MarkerFix)
+    assert fix.x == pytest.approx(BALL, abs=0.006)
+    assert len(checked.health) == complaints
+
+
+@SDK
 def test_stamps_of_a_clock_of_its_own_are_not_used(device) -> None:
     with device.camera() as camera:
         assert shown(device, camera, domain="hardware_clock").t_sigma > 0.01
@@ -123,7 +153,7 @@ def test_unrectified_images_need_a_calibration() -> None:
 
 @SDK
 def test_missing_size_is_named_with_those_there(device) -> None:
-    with pytest.raises(SourceError, match=r"no pair of infra-red images of 848x480 .* Choose among 64x48 at 30"):
+    with pytest.raises(SourceError, match=r"no pair of infra-red images of 848x480 .* Choose among 320x240 at 30"):
         device.camera(RealsenseConfig()).__enter__()
 
 
