@@ -47,7 +47,7 @@ GROUPS = {
     "Hardware": {
         "scan": "Find servos on all ports, rates and protocols.",
         "joints": "Show joint angles live: signs, ranges, health.",
-        "watch": "Show what the cameras and the tracker see, or what other marker sources send.",
+        "watch": "Show what cameras and other marker sources see.",
         "servos": "Read and write servo EEPROM settings, with undo.",
         "bench": "Emulate the servos of robot.toml on a port.",
     },
