@@ -13,6 +13,7 @@ class Fault(StrEnum):
     MALFORMED = "malformed"
     NOT_FINITE = "not_finite"
     UNIT = "unit"
+    SMALL_UNIT = "small_unit"
     COVARIANCE = "covariance"
     TURN = "turn"
     NO_STAMP = "no_stamp"
@@ -32,6 +33,10 @@ ADVICE: dict[Fault, tuple[str, str]] = {
     Fault.MALFORMED: ("are not what they should be", "compare the sender with docs/marker_sources.md"),
     Fault.NOT_FINITE: ("have a number that is not finite", "let the sender leave such positions out, or send tracked"),
     Fault.UNIT: ("are tens of metres away, as if in millimetres", 'send metres, or write unit = "mm"'),
+    Fault.SMALL_UNIT: (
+        "are within millimetres of the origin, as if they were in metres",
+        'send millimetres, or take out unit = "mm"',
+    ),
     Fault.COVARIANCE: (
         "have a covariance that is none, or that is not in the positions' unit squared",
         'send a symmetric, positive definite matrix in m² (mm² with unit = "mm"), or none',

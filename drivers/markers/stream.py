@@ -27,6 +27,7 @@ SILENT_AFTER_S = 2.0
 RIVAL_AFTER_S = 1.0  # after this silence of a sender another one is accepted
 ARRIVAL_SIGMA_S = 0.005  # of a position without a stamp: the sender's computation and the network
 FARTHEST_M = 50.0  # no arm is measured over a larger distance: such a number is in millimetres
+NEAREST_M = 0.005  # with unit = "mm": metres, divided by 1000, are all nearer to the origin
 WIDEST_SIGMA_M = 0.2  # a wider covariance is in mm², or useless
 ASYMMETRY = 1e-6
 UNIT_LENGTH = 0.01  # quaternions of single precision, and those written with three digits
@@ -247,6 +248,8 @@ class MarkerStream:
         x = self._table.metres * np.array(sent)
         if float(np.linalg.norm(x)) > FARTHEST_M:
             raise Unusable(Fault.UNIT, f"{float(np.linalg.norm(x)):.4g} m")
+        if self._table.unit == "mm" and float(np.linalg.norm(x)) < NEAREST_M:
+            raise Unusable(Fault.SMALL_UNIT, f"{1e3 * float(np.linalg.norm(x)):.2g} mm")
         return frozen_array(x)
 
     def _covariances(self, report: Report) -> tuple[FloatArray, FloatArray | None]:

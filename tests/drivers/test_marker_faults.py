@@ -128,6 +128,12 @@ def test_millimetres_are_converted_where_declared() -> None:
     np.testing.assert_allclose(fix.cov, 0.25e-6 * np.eye(3))
 
 
+def test_metres_declared_as_millimetres_are_named() -> None:
+    sent = Sent(unit="mm")
+    assert sent.send(30, position=[0.4, 0.2, 0.3]) == []
+    assert 'as if they were in metres (0.54 mm): send millimetres, or take out unit = "mm"' in sent.stream.health[0]
+
+
 def test_constant_rotation_is_no_orientation() -> None:
     sent = Sent()
     assert sent.send(quaternion=[0, 0, 0, 1])[0].R is None
