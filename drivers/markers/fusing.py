@@ -103,25 +103,26 @@ class Member:
 
     def verdict(self, leader: str) -> str | None:
         """Return what its positions disagree in with the leader's, with the remedy; None if they agree."""
-        if len(self.common) < FEWEST_JUDGED:
+        common = list(self.common)  # another thread may add to it
+        if len(common) < FEWEST_JUDGED:
             return None
-        chi2 = np.array([pair.chi2 for pair in self.common])
+        chi2 = np.array([pair.chi2 for pair in common])
         share = float((chi2 > CHI2_999).mean())
         if share < MANY:
             return None
-        apart = float(np.median([np.linalg.norm(pair.other - pair.lead) for pair in self.common]))
+        apart = float(np.median([np.linalg.norm(pair.other - pair.lead) for pair in common]))
         return (
             f"{leader} and {self.name} disagree in {100 * share:.0f} % of {len(chi2)} common positions, by "
             f"{1e3 * apart:.1f} mm in the median, which is {math.sqrt(float(np.median(chi2)) / CHI2_MEDIAN):.1f} times "
-            f"what their uncertainties allow: {self._remedy()}"
+            f"what their uncertainties allow: {self._remedy(common)}"
         )
 
-    def _remedy(self) -> str:
-        lead, other = (np.array([getattr(pair, side) for pair in self.common]) for side in ("lead", "other"))
+    def _remedy(self, common: Sequence[Common]) -> str:
+        lead, other = (np.array([getattr(pair, side) for pair in common]) for side in ("lead", "other"))
         T, spread = _rigid(other, lead)
         if spread < SPREAD_M:
             return "move the marker through the whole workspace; then this message says what would make them agree"
-        fitted = [replace(pair, other=T[:3, :3] @ pair.other + T[:3, 3]).chi2 for pair in self.common]
+        fitted = [replace(pair, other=T[:3, :3] @ pair.other + T[:3, 3]).chi2 for pair in common]
         if float(np.median(fitted)) > WELL_FITTED * CHI2_MEDIAN:
             return (
                 "one of them follows another marker, or its latency_s or sigma_m is wrong; look at each alone, with "

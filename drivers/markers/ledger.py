@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import Counter, deque
 from collections.abc import Iterator
 
@@ -17,7 +18,7 @@ USED = "used"
 
 
 class Ledger:
-    """Counters of used and unused messages, in total and of the last `LATELY_S`.
+    """Counters of used and unused messages, in total and of the last `LATELY_S`; for any thread.
 
     Attributes:
         total: number of messages by fault, and the used ones.
@@ -27,25 +28,28 @@ class Ledger:
         self.total: Counter[str] = Counter()
         self._buckets: deque[tuple[float, Counter[str]]] = deque()
         self._details: dict[Fault, str] = {}
+        self._lock = threading.Lock()
 
     def note(self, t: float, what: Fault | str, detail: str = "", count: int = 1) -> bool:
         """Count messages at time `t` [s]; return True once there are enough of this fault to tell a person."""
-        if not self._buckets or t - self._buckets[-1][0] >= BUCKET_S:
-            self._buckets.append((t, Counter()))
-            while t - self._buckets[0][0] > LATELY_S:
-                self._buckets.popleft()
-        self._buckets[-1][1][what] += count
-        self.total[what] += count
-        if isinstance(what, Fault) and detail:
-            self._details[what] = detail
-        return self.total[what] - count < WORTH_A_WORD <= self.total[what]
+        with self._lock:
+            if not self._buckets or t - self._buckets[-1][0] >= BUCKET_S:
+                self._buckets.append((t, Counter()))
+                while t - self._buckets[0][0] > LATELY_S:
+                    self._buckets.popleft()
+            self._buckets[-1][1][what] += count
+            self.total[what] += count
+            if isinstance(what, Fault) and detail:
+                self._details[what] = detail
+            return self.total[what] - count < WORTH_A_WORD <= self.total[what]
 
     def lately(self, now: float) -> Counter[str]:
         """Return the counts of the last seconds."""
         counts: Counter[str] = Counter()
-        for t, bucket in self._buckets:
-            if now - t <= LATELY_S:
-                counts += bucket
+        with self._lock:
+            for t, bucket in self._buckets:
+                if now - t <= LATELY_S:
+                    counts += bucket
         return counts
 
     def complaints(self, now: float, name: str) -> Iterator[str]:

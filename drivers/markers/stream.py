@@ -95,9 +95,9 @@ class MarkerStream:
     def health(self) -> tuple[str, ...]:
         """Current problems, each with its remedy."""
         now = self._clock.now()
-        said = list(self.ledger.complaints(now, self.name))
-        if self._is_open and now - self._heard > SILENT_AFTER_S:
-            said.append(f"{self.name}: no message for {now - self._heard:.0f} s: {self._receiver.silence()}")
+        said, silence = list(self.ledger.complaints(now, self.name)), self._silence
+        if self._is_open and silence is not None:
+            said.append(f"{self.name}: no message for {now - self._heard:.0f} s: {silence}")
         return tuple(said)
 
     def __enter__(self) -> Self:
@@ -120,6 +120,7 @@ class MarkerStream:
         while not self._waiting:
             packet = self._receiver.receive(deadline)
             if packet is None:
+                self._note_silence()
                 return None
             self._take(packet)
             if not self._waiting and self._clock.now() >= deadline:
@@ -130,6 +131,7 @@ class MarkerStream:
         """Reset everything that was learnt from earlier messages."""
         self._waiting: deque[MarkerFix | MarkerMiss] = deque()
         self._heard = self._clock.now()
+        self._silence: str | None = None
         self._sender: Hashable = None
         self._sender_heard = -math.inf
         self._clock_of: Sender = Sender(self._table.max_delay_s)
@@ -139,8 +141,13 @@ class MarkerStream:
         self._first_turn: tuple[float, ...] | None = None
         self._turns = False
 
+    def _note_silence(self) -> None:
+        """Ask once why nothing comes: the answer may take a second."""
+        if self._silence is None and self._clock.now() - self._heard > SILENT_AFTER_S:
+            self._silence = self._receiver.silence()
+
     def _take(self, packet: Packet) -> None:
-        self._heard = packet.arrived
+        self._heard, self._silence = packet.arrived, None
         try:
             for report in self._decode(packet.payload, packet.attached):
                 self._take_report(report, packet)

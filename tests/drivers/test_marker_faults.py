@@ -144,6 +144,7 @@ def test_constant_rotation_is_no_orientation() -> None:
 def test_silent_source_is_reported() -> None:
     sent = faulty()
     sent.clock.wait_until(sent.clock.now() + 3.0)
+    assert sent.stream.read(0.0) is None
     assert sent.stream.health == ("udp: no message for 3 s: start it",)
 
 
