@@ -47,7 +47,3 @@ def test_sender_of_the_page_is_understood(tmp_path) -> None:
             assert stream.health == ()
         finally:
             running.kill()
-
-
-def test_page_is_short() -> None:
-    assert len(TEXT.split()) <= 900
