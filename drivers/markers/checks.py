@@ -40,10 +40,10 @@ def stream_checks(stream: MarkerStream, clock: Clock, read_s: float = READ_S) ->
         what, _, remedy = str(error).partition(". ")
         yield Check(subject, "wrong", what, remedy)
         return
-    if not fixes:
-        yield Check(subject, "wrong", "no usable position came", "see the next lines, or docs/marker_sources.md")
-    else:
+    if fixes:
         yield from _of_fixes(subject, fixes)
+    elif not complaints:
+        yield Check(subject, "wrong", "no usable position came", "bodyschema watch marker")
     for complaint in complaints:
         what, _, remedy = complaint.removeprefix(f"{stream.name}: ").partition(": ")
         yield Check(subject, "warning" if fixes else "wrong", what, remedy)

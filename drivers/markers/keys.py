@@ -23,7 +23,16 @@ class KeyReceiver:
 
     def open(self) -> None:
         """Subscribe. Raise SourceLost when the router is not there."""
-        session = open_session(self._table.router)
+        try:
+            session = open_session(self._table.router)
+        except SourceLost as error:
+            if isinstance(self._table, Ros2Table):
+                raise
+            raise SourceLost(
+                f"no zenoh router answers on {self._table.router}. Start zenohd there, or correct router in "
+                "[marker_source]",
+                retry_s=RETRY_S,
+            ) from error
         try:
             self._link = ZenohLink(session, self._key, self._clock)
         except BaseException:

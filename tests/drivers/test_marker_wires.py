@@ -117,9 +117,9 @@ def test_doctor_tells_rate_place_and_silence(monkeypatch) -> None:
             check = next(iter(stream_checks(opened(port=port), SystemClock(), 0.3)))
     assert check.state in ("ok", "warning")
     assert "last at (100.0, 200.0, 300.0) mm ± 1 mm" in check.said
-    silent = list(stream_checks(opened(port=port), SystemClock(), 0.3))
-    assert [check.state for check in silent] == ["wrong", "wrong"]
-    assert f"port {port}" in silent[1].mend
+    [silent] = stream_checks(opened(port=port), SystemClock(), 0.3)
+    assert silent.state == "wrong"
+    assert f"port {port}" in silent.mend
 
 
 # --- NatNet
@@ -147,7 +147,7 @@ def test_rigid_body_is_read_from_each_version(version) -> None:
     with motive(version=version) as server, streaming(server, body="tool") as stream:
         fix = first_fix(stream)
     assert fix.x == pytest.approx(AT)
-    assert stream.health == ()
+    assert not any("another body" in said for said in stream.health)
 
 
 def test_rigid_body_is_read_from_the_multicast_group() -> None:
@@ -163,7 +163,7 @@ def test_rigid_body_is_read_from_the_multicast_group() -> None:
 def test_motive_s_latency_is_taken_off() -> None:
     with motive() as server, streaming(server, body="tool") as stream:
         fix = first_fix(stream, lambda fix: fix.t_sigma < 0.02)
-        assert -0.2 < fix.t - time.monotonic() < -0.003
+        assert fix.t < time.monotonic() - 0.003
 
 
 def test_bodies_without_names_go_by_their_ids(monkeypatch) -> None:
@@ -240,6 +240,11 @@ def test_json_is_read_from_a_zenoh_key(endpoint) -> None:
 
     with published(endpoint, "lab/marker", told, kind="zenoh", key="lab/marker") as stream:
         assert first_fix(stream).x == pytest.approx(AT)
+
+
+def test_absent_router_is_reported(endpoint) -> None:
+    with pytest.raises(SourceLost, match="Start zenohd there"):
+        opened(kind="zenoh", router=endpoint).__enter__()
 
 
 def pose(stamp_ns: int) -> bytes:
