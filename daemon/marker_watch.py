@@ -13,8 +13,8 @@ from bodyschema.interfaces.protocols import Clock, MarkerSource
 from bodyschema.interfaces.records import MarkerFix, MarkerMiss
 from bodyschema.interfaces.rejections import WORDS
 
-from .reopen import Reopening
-from .sources import TellsHealth
+from .sampler.reconnect import Reopening
+from .sampler.sources import TellsHealth
 
 
 class MarkerWatch:

@@ -15,9 +15,9 @@ from msgspec import Meta
 from bodyschema.drivers.ros2.config import ENDPOINT, TOPIC
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.rpy import rotation_of
-from bodyschema.interfaces.suggest import did_you_mean
-from bodyschema.interfaces.toml_file import convert, line_in_entry, line_of
+from bodyschema.robot.rpy import rotation_of
+from bodyschema.robot.suggest import did_you_mean
+from bodyschema.robot.toml_file import convert, line_in_entry, line_of
 
 TABLE = "marker_source"
 PAGE = "docs/marker_sources.md"

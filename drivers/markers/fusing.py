@@ -16,7 +16,7 @@ import numpy as np
 from bodyschema.interfaces.errors import SourceEnded
 from bodyschema.interfaces.protocols import Clock, MarkerSource
 from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, frozen_array
-from bodyschema.interfaces.rpy import rpy_of
+from bodyschema.robot.rpy import rpy_of
 
 log = logging.getLogger(__name__)
 

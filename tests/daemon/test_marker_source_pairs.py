@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from test_sampler import sampling, small_arm
 
-from bodyschema.daemon.sources import Sources
+from bodyschema.daemon.sampler.sources import Sources
 from bodyschema.drivers.markers.config import source_tables
 from bodyschema.drivers.markers.datagram import SCHEMA
 from bodyschema.drivers.markers.opened import stream_of

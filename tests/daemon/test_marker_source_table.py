@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from small_arm import write_small_arm
 
-from bodyschema.daemon.camera_wiring import camera_lines
+from bodyschema.cli.install.units import devices_of, endpoints_of
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.units import devices_of, endpoints_of
-from bodyschema.daemon.wiring import marker_source_lines, open_sources
+from bodyschema.daemon.wiring.cameras import camera_lines
+from bodyschema.daemon.wiring.wiring import marker_source_lines, open_sources
 from bodyschema.drivers.markers.config import NatnetTable, UdpTable
 from bodyschema.drivers.markers.fusing import FusedMarkers
 from bodyschema.interfaces.errors import ConfigError

@@ -12,7 +12,7 @@ import pytest
 from bodyschema.drivers.bench.virtual_port import VirtualClock
 from bodyschema.drivers.markers.fusing import FusedMarkers, Member
 from bodyschema.interfaces.records import MarkerFix, MarkerMiss, Reason, frozen_array
-from bodyschema.interfaces.rpy import rotation_of
+from bodyschema.robot.rpy import rotation_of
 
 STEREO = np.diag([1e-6, 1e-6, 25e-6])  # depth is five times less certain
 MOCAP = np.diag([1e-6, 25e-6, 1e-6])

@@ -12,7 +12,7 @@ from test_marker_wires import first_fix, free_udp_port, opened
 
 from bodyschema.drivers.markers.config import TABLE, source_tables
 from bodyschema.drivers.markers.report import Fault
-from bodyschema.interfaces.toml_file import read_toml
+from bodyschema.robot.toml_file import read_toml
 
 PAGE = Path(__file__).parents[2] / "docs" / "marker_sources.md"
 TEXT = PAGE.read_text(encoding="utf-8")

@@ -171,7 +171,7 @@ def test_absent_device_is_named() -> None:
 
 
 def test_missing_sdk_is_a_missing_extra(monkeypatch) -> None:
-    from bodyschema.daemon.extras import missing_module
+    from bodyschema.interfaces.extras import missing_module
 
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
     with pytest.raises(ModuleNotFoundError) as error:

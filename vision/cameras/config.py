@@ -13,8 +13,8 @@ from msgspec import Meta
 from bodyschema.interfaces.camera import LARGEST_SIDE_PX
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.rpy import rotation_of
-from bodyschema.interfaces.toml_file import line_of
+from bodyschema.robot.rpy import rotation_of
+from bodyschema.robot.toml_file import line_of
 
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
