@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from bodyschema.daemon.config import Config
@@ -80,6 +81,20 @@ def pairs(
     change[parameters.base_shift] = rng.uniform(-2.0, 2.0, 3)
     q = np.array([0.3, -0.8, 1.2, 0.4, 0.9, 0.0]) + rng.uniform(-1.2, 1.2, (count, 6))
     return Pairs(q, parameters.positions(change, q) + noise * rng.normal(size=(count, 3)))
+
+
+def guided(seed: int, *, steps: int) -> Pairs:
+    """Return pairs of an arm made to 0.6° and 5 mm, guided in steps of 1.7°, all joints at once."""
+    rng = np.random.default_rng(seed)
+    parameters = ChainParameters(arm())
+    made = ChainTolerances(axes=0.01, points=0.005, tool=0.02)
+    change = parameters.standard_deviations(made) * rng.normal(size=parameters.size)
+    change[parameters.zeros] = np.radians(3.0) * rng.normal(size=6)
+    waypoints = np.array([0.3, -0.8, 1.2, 0.4, 0.9, 0.0]) + rng.uniform(-1.2, 1.2, (4, 6))
+    path = CubicSpline(range(4), waypoints)(np.linspace(0.0, 3.0, 2000))
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    q = path[np.searchsorted(way, np.radians(1.7) * np.arange(steps))]
+    return Pairs(q, parameters.positions(change, q) + 0.0003 * rng.normal(size=(steps, 3)))
 
 
 PLAIN = Reading.plain(6)
@@ -155,6 +170,17 @@ def test_a_refusal_gives_both_errors_and_the_remedy() -> None:
 def test_a_right_recording_is_not_doubted(seed) -> None:
     noise, zeros, tool = ((0.00003, 10.0, 0.02), (0.01, 3.0, 0.02), (0.0005, 10.0, 0.2))[seed % 3]
     assert pairs(seed, noise=noise, zeros_deg=zeros, tool=tool, count=40 + 100 * seed).seen().sentences == ()
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_right_recording_of_a_short_path_is_not_doubted(seed) -> None:
+    """Along a path the errors of neighbouring pairs are alike, and a wrong reading may fit them by chance."""
+    assert guided(seed, steps=120).seen().sentences == ()
+
+
+def test_a_wrong_reading_of_a_short_path_is_named() -> None:
+    found = guided(0, steps=90).read(MISREAD["q3 counts the other way"]).seen()
+    assert "q3 counts the other way" in (found.refusal or "")
 
 
 def test_outliers_are_no_reason_to_doubt() -> None:
