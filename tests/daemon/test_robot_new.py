@@ -133,6 +133,7 @@ def test_the_zero_of_a_model_is_told(tmp_path) -> None:
     assert "# zero_ticks = 512 " in (tmp_path / "robot.toml").read_text()
 
 
+@pytest.mark.usefixtures("patient_host")
 @pytest.mark.parametrize(
     ("file", "models"),
     [

@@ -131,6 +131,7 @@ def test_json_has_ports_joints_and_strangers(config, arm, port) -> None:
     assert told["strangers"] == []
 
 
+@pytest.mark.usefixtures("patient_host")
 def test_a_bench_is_found_by_the_command(tmp_path, capsys) -> None:
     with BenchRun(Config.load(EXAMPLE, {}), tmp_path / "bus") as run:
         arguments = ["scan", "--port", tmp_path / "bus", "--baud", 1000000, "--robot", run.robot_file, "--json"]
