@@ -91,7 +91,7 @@ def test_the_solver_is_given_the_pairs_that_waited() -> None:
     assert learning.at_rest
 
 
-@pytest.mark.parametrize("moved_m", [0.025, 0.3])
+@pytest.mark.parametrize("moved_m", [0.025, pytest.param(0.3, marks=pytest.mark.soak)])
 def test_a_change_is_followed_as_soon_as_the_pairs_with_it_are_judged(moved_m: float) -> None:
     rng, before = np.random.default_rng(5), 150
     chain, q = built_chain(rng), path(rng, 200)

@@ -6,6 +6,7 @@ import dataclasses
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -101,6 +102,11 @@ MISREAD = {
 }
 
 
+def rarely(seeds: range) -> list[Any]:
+    """Return seeds for `make soak` alone."""
+    return [pytest.param(seed, marks=pytest.mark.soak) for seed in seeds]
+
+
 # `make soak` tests two columns misread alike, and more than two.
 RARELY = (
     "q2 and q5 count the other way",
@@ -151,7 +157,7 @@ def test_a_refusal_gives_both_errors_and_the_remedy() -> None:
     assert found.remedy.startswith("Add -90° to the readings of q2")
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [0, 1, 2, *rarely(range(3, 6))])
 def test_a_right_recording_is_not_doubted(seed) -> None:
     noise, zeros, tool = ((0.00003, 10.0, 0.02), (0.01, 3.0, 0.02), (0.0005, 10.0, 0.2))[seed % 3]
     assert pairs(seed, noise=noise, zeros_deg=zeros, tool=tool, count=40 + 100 * seed).seen().sentences == ()
@@ -209,7 +215,7 @@ def test_exchanged_positions_are_named_where_the_pose_is_known() -> None:
 LAST = PLAIN.turned((0, 0, 0, 0, 0, 1))
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *rarely(range(1, 4))])
 def test_a_zero_of_the_last_joint_is_named_where_the_marker_is_known(seed) -> None:
     right = replace(pairs(seed, tool=0.003), marker_known=True)
     assert right.seen().sentences == ()
@@ -225,11 +231,12 @@ def test_a_zero_of_the_last_joint_is_named_beside_another_fault() -> None:
     assert "q3 counts the other way and the zero of q6 is about 90° off" in (found.refusal or "")
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *rarely(range(1, 4))])
 def test_a_marker_elsewhere_is_no_zero_of_the_last_joint(seed) -> None:
     assert replace(pairs(seed, tool=0.05), marker_known=True).seen().sentences == ()
 
 
+@pytest.mark.soak
 def test_what_no_simple_reading_explains_gets_no_name() -> None:
     many = replace(PLAIN, order=(2, 0, 1, 4, 3, 5), signs=(1, -1, 1, 1, -1, 1), quarters=(0, 1, -1, 0, 1, 0))
     found = pairs().read(many).seen()
@@ -242,7 +249,7 @@ def test_a_reading_that_fits_as_well_is_told_too() -> None:
     assert "These pairs fit as well if " in found.remedy
 
 
-@pytest.mark.parametrize("off", [45, -45])
+@pytest.mark.parametrize("off", [45, pytest.param(-45, marks=pytest.mark.soak)])
 def test_a_zero_half_a_quarter_turn_off_is_told(off) -> None:
     right = pairs()
     found = replace(right, q=right.q - np.radians([0.0, 0.0, off, 0.0, 0.0, 0.0])).seen()
@@ -268,6 +275,9 @@ CASES = {
     "the zero of q2 is about 90° off": (range(6), [1] * 6, np.pi / 2, [0, 1, 2]),
 }
 
+# On simulated arms `make test` names these, too.
+ALSO_PLANTED = ("the columns q5 and q6 are exchanged", "the positions are mirrored")
+
 
 def misread_ur5(case: str | None) -> tuple[Config, Recording]:
     config = Config.load(UR5 / "robot.toml", {})
@@ -278,7 +288,9 @@ def misread_ur5(case: str | None) -> tuple[Config, Recording]:
 
 
 @real
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=[pytest.mark.soak] if case in ALSO_PLANTED else []) for case in CASES]
+)
 def test_a_misread_recording_of_a_real_arm_is_named(case) -> None:
     config, recording = misread_ur5(case)
     assert case in (plausibility(config.robot, recording.q, recording.x).refusal or "")
