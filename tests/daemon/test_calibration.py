@@ -348,14 +348,17 @@ def retooled(seed: int, at: int, move_m: float, *, walk: bool = False) -> Plante
     return dataclasses.replace(arm, recording=Recording(joints=arm.robot.joints, q=q, x=x))
 
 
-@pytest.mark.parametrize(("at", "walk"), [(50, False), (20, False), (82, False), (50, True)])
+@pytest.mark.parametrize(
+    ("at", "walk"),
+    [(20, False), (50, True), *(pytest.param(at, False, marks=pytest.mark.soak) for at in (50, 82))],
+)
 def test_the_row_from_which_on_there_is_another_tool_is_found(at: int, walk: bool) -> None:
     report = report_on(retooled(5, at, 0.05, walk=walk))
     assert report.other_tool_from == at + 1
     assert report.other_tool_mm == pytest.approx(50.0, rel=0.35)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, 3, *(pytest.param(seed, marks=pytest.mark.soak) for seed in (1, 2))])
 def test_one_tool_is_not_taken_for_two(seed: int) -> None:
     assert report_on(planted(seed, pairs=24 + 30 * seed, outliers=2 * seed)).other_tool_from is None
 
