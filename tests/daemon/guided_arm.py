@@ -83,7 +83,7 @@ def new_learning(nominal: NominalModel | None = None, settings: LearnerConfig | 
     return Learning(nominal or nominal_model(), settings or LearnerConfig(), DirectSolver())
 
 
-def teach(learning: Learning, pairs: Iterable[Pair], *, background: bool = True, every: int = 5) -> None:
+def teach(learning: Learning, pairs: Iterable[Pair], *, background: bool = True, every: int = 10) -> None:
     """Learn pairs, with all background work done after each `every` pairs and at the end."""
     for number, pair in enumerate(pairs, 1):
         learning.learn(pair, pair.t)
