@@ -9,9 +9,9 @@ import pytest
 from lerobot_datasets import write_dataset
 
 from bodyschema.interfaces.errors import RecordingError
-from bodyschema.interfaces.lerobot import ARMS, JointServo, MotorCalibration, Unit
-from bodyschema.interfaces.recording_lerobot import LeRobotUnits, read_lerobot_dataset
-from bodyschema.interfaces.tracks import MarkerTrack
+from bodyschema.recordings.lerobot_dataset import LeRobotUnits, read_lerobot_dataset
+from bodyschema.recordings.tracks import MarkerTrack
+from bodyschema.robot.lerobot import ARMS, JointServo, MotorCalibration, Unit
 
 pytest.importorskip("pyarrow")
 

@@ -1,0 +1,161 @@
+"""The command `bodyschema`. Commands are imported when they run, so that `--help` is fast."""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+import sys
+from typing import NoReturn
+
+import cyclopts
+
+from bodyschema.daemon.service.remedies import as_typed, printable
+from bodyschema.daemon.service.signals import end_with_parent
+from bodyschema.interfaces.errors import BodyschemaError, ConfigError
+from bodyschema.interfaces.extras import missing_module
+
+GROUPS = {
+    "Start": {
+        "demo": "Learn a simulated arm from scratch, in about a minute.",
+        "config": "Write, check or show robot.toml: begin here.",
+        "robot": "Write robot.toml for the servos that a scan found.",
+        "doctor": "Check ports, servos, disk, clock and network.",
+    },
+    "Calibrate and diagnose": {
+        "calibrate": "Calibrate arm, hand-eye and tool, or stereo cameras.",
+        "diagnose": "Find what the simulation gets wrong, and the causes.",
+        "replay": "Learn from a recording; report the held-out error.",
+        "simulate": "Predict the marker for recorded joint angles.",
+        "compare": "Compare two recordings row by row.",
+        "board": "Print a board for camera calibration.",
+        "marker": "Print tags, measure a cluster, learn a ball's colour.",
+        "reproduce": "Run the paper's experiments again.",
+    },
+    "Run": {
+        "run": "Start sampler and learner, and keep them running.",
+        "sampler": "Run the sampler: encoders and cameras in, pairs out.",
+        "learner": "Run the learner: pairs in, predictions out.",
+        "status": "Show the state of sampler and learner.",
+        "view": "Serve a live page: errors, next poses, controls.",
+        "predict": "Predict the marker position at given joint angles.",
+        "ik": "Find joint angles that bring the marker to a position.",
+        "command": "Pause, resume, report a tool change, reset.",
+        "install": "Install systemd services, or udev rules.",
+        "router": "Run the zenoh router that connects several machines.",
+    },
+    "Hardware": {
+        "scan": "Find servos on all ports, rates and protocols.",
+        "joints": "Show joint angles live: signs, ranges, health.",
+        "watch": "Show what the cameras and the tracker see.",
+        "servos": "Read and write servo EEPROM settings, with undo.",
+        "bench": "Emulate the servos of robot.toml on a port.",
+    },
+    "Data and fleet": {
+        "record": "Save the running sampler's pairs to a file.",
+        "export": "Convert pairs or a robot: CSV, Parquet, MCAP, MJCF, URDF.",
+        "backup": "Save pairs, checkpoint and robot.toml to one file.",
+        "restore": "Restore a backup; nothing is overwritten unasked.",
+        "fleet": "Monitor and diagnose many robots.",
+    },
+}
+COMMANDS = {name: summary for group in GROUPS.values() for name, summary in group.items()}
+# One object each: commands that are apps keep theirs, and two of the same name are refused.
+_SECTIONS = {title: cyclopts.Group(title, sort_key=place) for place, title in enumerate(GROUPS)}
+
+
+# Each paragraph is one line: the terminal's width wraps it.
+_HELP = """Calibrate a robot arm by moving it by hand in front of a camera.
+
+Joint encoders and a stereo camera give samples. A learner turns them into the forward kinematics that the camera \
+sees, hand-eye and tool included.
+
+New here? Type: bodyschema demo. Each command's --help says what it needs and what comes next."""
+
+
+def command_line(called: str | None = None) -> cyclopts.App:
+    """Return the command line.
+
+    Args:
+        called: the command whose own help page may be requested. A summary given here would replace that page, so this
+            command is registered without one and shows its function's docstring.
+    """
+    line = cyclopts.App(
+        name="bodyschema",
+        help=_HELP,
+        version=_version,
+        help_format="markdown" if called in COMMANDS else "plaintext",  # rendering markdown takes 0.1 s of CPU
+    )
+    line["--help"].group = line["--version"].group = cyclopts.Group("Options", sort_key=len(GROUPS))
+    for title, commands in GROUPS.items():
+        group = _SECTIONS[title]
+        for order, (name, summary) in enumerate(commands.items()):
+            own = None if name == called else summary
+            line.command(f"bodyschema.cli.commands.{name}:{name}", name=name, help=own, group=group, sort_key=order)
+    return line
+
+
+def _version() -> str:
+    from importlib.metadata import version
+
+    return version("bodyschema")
+
+
+app = command_line()
+
+# A learner with two neighbours opens 26 files, one of fifty robots 200. Libraries abort when they cannot open more.
+FEWEST_FILES, ENOUGH_FILES = 64, 1024
+RAISE_LIMIT = "`ulimit -n 1024` in the shell, or LimitNOFILE=1024 in the unit, allows more"
+
+
+def allow_enough_files() -> None:
+    """Raise this process's limit of open files to `ENOUGH_FILES`, as far as the system permits.
+
+    Raises:
+        ConfigError: the process may open fewer than `FEWEST_FILES`.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    allowed = ENOUGH_FILES if hard == resource.RLIM_INFINITY else min(hard, ENOUGH_FILES)
+    if allowed < FEWEST_FILES:
+        raise ConfigError(f"this process may open {hard} files and needs {FEWEST_FILES}", remedy=RAISE_LIMIT)
+    if soft != resource.RLIM_INFINITY and soft < allowed:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
+
+
+def _fail(error: BodyschemaError) -> NoReturn:
+    print(f"bodyschema: {as_typed(printable(str(error)))}", file=sys.stderr)  # noqa: T201
+    sys.exit(1)
+
+
+def main() -> None:
+    """Run the command line; known errors become one line and exit code 1."""
+    # BLAS threads spin on the small matrices of tracker and learner and double the time.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # OpenCV would allocate 3 GiB for a malicious PNG of a few kilobytes; the largest cameras have 100 megapixels.
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**27))
+    end_with_parent()
+    arguments = sys.argv[1:]
+    try:
+        allow_enough_files()
+        command_line(arguments[0] if arguments else None)(arguments)
+    except BodyschemaError as error:
+        _fail(error)
+    except ModuleNotFoundError as error:
+        missing = missing_module(error)
+        if missing is None:
+            raise
+        _fail(missing)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except BrokenPipeError:  # the reader of our output has closed it, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    except OSError as error:
+        if error.errno not in (errno.EMFILE, errno.ENFILE):
+            raise
+        print(f"bodyschema: too many files and connections are open. {RAISE_LIMIT}", file=sys.stderr)  # noqa: T201
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()
