@@ -23,9 +23,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.rough_arm import rough_arm
-from bodyschema.daemon.config import LearnerConfig
 from bodyschema.interfaces.records import Pair, frozen_array
 from bodyschema.learning import DirectSolver, Learning, NominalModel
+from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.nominal import chain_tolerances
 from kbmaps import RigidChain
 from kbmaps.arrays import FloatArray

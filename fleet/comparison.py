@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
 from bodyschema.calibration.comparison import Distances, laid_on
-from bodyschema.daemon.transport.status import ChainCalibration, JointRange
+from bodyschema.daemon.transport.status import JointRange
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning.status import ChainCalibration
 
 POSES = 400
 # With two robots, an outlier cannot be attributed to either.

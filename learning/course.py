@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bodyschema.daemon.config import LearnerConfig
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import Pair
+from bodyschema.learning.config import LearnerConfig
 
 from .change import ChangeRecord
 from .curve import Curve

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bodyschema.daemon.transport.status import CurvePoint
+from bodyschema.learning.status import CurvePoint
 
 LARGEST = 400
 

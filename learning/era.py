@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyschema.daemon.config import LearnerConfig
 from bodyschema.interfaces.records import FloatArray, Pair
+from bodyschema.learning.config import LearnerConfig
 from kbmaps import ChainBelief, KBMap, Recent, follow_a_path
 
 from .arm import KnownArm

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 import msgspec
 import numpy as np
 
-from bodyschema.daemon.config import LearnerConfig
 from bodyschema.interfaces.records import FloatArray, Pair
+from bodyschema.learning.config import LearnerConfig
 from kbmaps import ChainBelief, ChainTolerances, Explanation, KBMap, RigidChain
 
 from .adaptation import Adapted, Origin

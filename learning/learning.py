@@ -11,9 +11,9 @@ import threading
 
 import numpy as np
 
-from bodyschema.daemon.config import LearnerConfig
-from bodyschema.daemon.transport.status import CurvePoint, OrientationStatus
 from bodyschema.interfaces.records import FloatArray, Pair
+from bodyschema.learning.config import LearnerConfig
+from bodyschema.learning.status import CurvePoint, OrientationStatus
 from kbmaps import ChainBelief, Recent
 
 from .change import ChangeRecord

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodyschema.daemon.transport.status import Outlook
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning.status import Outlook
 from kbmaps import ChainBelief, ChainPosterior, ChainTolerances, candidate_motions, expected_gain, shared_by
 from kbmaps.planning.expected_gain import ALL, SAME
 from kbmaps.robust import OUTLIER_SIGMAS

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from bodyschema.daemon.transport.status import CurvePoint
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.records import FARTHEST_M, LARGEST_Q, FloatArray
+from bodyschema.learning.status import CurvePoint
 
 from .change import ChangeRecord
 from .claims import ClaimsState

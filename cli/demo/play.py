@@ -14,9 +14,10 @@ from bodyschema.cli.terminal.screen import rejected
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.transport.bus import Bus
 from bodyschema.daemon.transport.keys import Keys
-from bodyschema.daemon.transport.status import LearnerStatus, Outlook, SamplerStatus
+from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import CommandRequest, decode, encode
 from bodyschema.interfaces.errors import BusError
+from bodyschema.learning.status import Outlook
 
 from .judge import Judge, Verdict
 from .plot import CurveRow

@@ -11,8 +11,8 @@ import numpy as np
 from bodyschema.calibration.evaluate import BLOCKS, ErrorFigures
 from bodyschema.cli.terminal.findings_view import outlook_sentence
 from bodyschema.cli.terminal.screen import mm
-from bodyschema.daemon.transport.status import Outlook
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning.status import Outlook
 
 
 class Figures(msgspec.Struct, frozen=True):

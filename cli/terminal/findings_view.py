@@ -9,7 +9,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from bodyschema.daemon.transport.status import ChainCalibration, JointZero, LearntFigure, Outlook
+from bodyschema.learning.status import ChainCalibration, JointZero, LearntFigure, Outlook
 
 from .screen import mm
 

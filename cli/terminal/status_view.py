@@ -19,10 +19,11 @@ from bodyschema.daemon.service.remedies import as_typed
 from bodyschema.daemon.transport.bus import Bus
 from bodyschema.daemon.transport.identity import Route
 from bodyschema.daemon.transport.keys import Keys
-from bodyschema.daemon.transport.status import UNDECIDED, BusStatus, LearnerStatus, OrientationStatus, SamplerStatus
+from bodyschema.daemon.transport.status import UNDECIDED, BusStatus, LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import decode
 from bodyschema.daemon.transport.zenoh_config import PROCESSES
 from bodyschema.interfaces.errors import BusError, RequestError
+from bodyschema.learning.status import OrientationStatus
 
 from .findings_view import calibration_table, outlook_lines
 from .screen import coverage_table, degrees, mm, rejected

@@ -10,11 +10,11 @@ import numpy as np
 
 from bodyschema.calibration.chain_figures import ChainFigures, is_told, no_surer_than_possible
 from bodyschema.calibration.plausibility.check import FEWEST_ROWS, ROWS, plausibility
-from bodyschema.daemon.transport.status import ChainCalibration, JointZero, LearntFigure, Outlook
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.learning import Learning
 from bodyschema.learning.members import SOLVED
 from bodyschema.learning.outlook import Known, Scatter, foreseen
+from bodyschema.learning.status import ChainCalibration, JointZero, LearntFigure, Outlook
 from bodyschema.learning.workmanship import WORKMANSHIP, probable
 from bodyschema.robot.description import RobotDescription
 from kbmaps import ChainBelief, KBMapsError

@@ -11,10 +11,9 @@ import cv2
 import msgspec
 import numpy as np
 
-from bodyschema.cli.cameras.calibration import Images
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import ImageArray, Reason
-from bodyschema.vision.calibration.images import read_pairs
+from bodyschema.vision.calibration.images import Images, read_pairs
 from bodyschema.vision.cluster.measure import ClusterView, MeasuredCluster, measure_cluster
 from bodyschema.vision.cluster.tables import cluster_tables
 from bodyschema.vision.rectified import Rectification

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from bodyschema.cli.hardware.joints_watch import EncoderJoints, ServoJoints
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler.sources import Head, MarkerTopic, Powered, Sources, StampedJoints
 from bodyschema.drivers.dynamixel.config import DynamixelConfig
@@ -26,6 +25,7 @@ from bodyschema.interfaces.extras import require_extra
 from bodyschema.interfaces.protocols import Clock, JointSource
 from bodyschema.interfaces.records import MarkerFix, StereoFrame
 from bodyschema.interfaces.rejections import WORDS
+from bodyschema.interfaces.servos import EncoderJoints, ServoJoints
 from bodyschema.recordings.store.store import PairReader
 from bodyschema.robot.plugins import PluginConfig, load
 from kbmaps import RigidChain

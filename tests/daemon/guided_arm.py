@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bodyschema.daemon.config import LearnerConfig
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
 from bodyschema.learning import DirectSolver, Learning, NominalModel
+from bodyschema.learning.config import LearnerConfig
 from kbmaps import RigidChain
 
 JOINTS = 4

@@ -10,13 +10,13 @@ import pytest
 from guided_arm import NOW_AND_THEN, Scene, built_chain, measured, new_learning, path, teach
 from scipy.spatial.transform import Rotation
 
-from bodyschema.daemon.config import LearnerConfig
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning import Learning, LearningState
 from bodyschema.learning.adaptation import Origin
 from bodyschema.learning.arm import KnownArm
 from bodyschema.learning.claims import Claim
+from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.nominal import chain_tolerances
 from bodyschema.learning.state import LearningHeader
 from bodyschema.learning.watch import Noticed, Reference

@@ -5,9 +5,9 @@ import itertools
 import numpy as np
 from guided_arm import Scene, nominal_model
 
-from bodyschema.daemon.config import LearnerConfig
 from bodyschema.learning.arm import KnownArm
 from bodyschema.learning.claims import Claims
+from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.doubts import Doubts
 from bodyschema.learning.era import Era
 from bodyschema.learning.gate import CHANGE

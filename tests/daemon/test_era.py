@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from guided_arm import Scene, make_pair, nominal_model
 
-from bodyschema.daemon.config import LearnerConfig
 from bodyschema.learning import Solved
 from bodyschema.learning.arm import KnownArm
 from bodyschema.learning.claims import Claims
+from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.era import Era
 from bodyschema.learning.learnt import LearntModel
 from bodyschema.learning.members import EXACT, PRIOR, RESIDUAL, RIGID

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from walked import DESK_ARM
 
-from bodyschema.daemon.config import Config, LearnerConfig
+from bodyschema.daemon.config import Config
 from bodyschema.effects import Effect, Motion, Simulation, write_extended
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning import DirectSolver, Learning, NominalModel
+from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.nominal import chain_tolerances
 from bodyschema.robot.description import RobotDescription
 

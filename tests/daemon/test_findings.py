@@ -13,12 +13,12 @@ from test_calibration import DESK_ARM, figures_of
 import bodyschema.daemon.learner.findings
 from bodyschema.calibration.chain_figures import is_told, no_surer_than_possible
 from bodyschema.calibration.plausibility.check import FEWEST_ROWS
-from bodyschema.daemon.config import LearnerConfig
 from bodyschema.daemon.learner.findings import EVERY_S, SHARE, Findings, FindingTurns, figures
-from bodyschema.daemon.transport.status import Outlook
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning import DirectSolver, Learning, NominalModel
+from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.outlook import Known, Scatter, foreseen
+from bodyschema.learning.status import Outlook
 from bodyschema.robot.description import RobotDescription
 from kbmaps import ChainParameters, ChainTolerances
 

@@ -18,20 +18,14 @@ from told_statuses import LEARNER, SAMPLER
 from bodyschema.cli.main import app
 from bodyschema.daemon.transport.bus import Bus, Request
 from bodyschema.daemon.transport.keys import Keys
-from bodyschema.daemon.transport.status import (
-    ChainCalibration,
-    JointRange,
-    JointZero,
-    LearnerStatus,
-    LearntFigure,
-    SamplerStatus,
-)
+from bodyschema.daemon.transport.status import JointRange, LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode
 from bodyschema.fleet.comparison import Model, common_poses, compared
 from bodyschema.fleet.comparison_view import sentences
 from bodyschema.fleet.roster import Fleet, places
 from bodyschema.interfaces.errors import BusError, RequestError
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning.status import ChainCalibration, JointZero, LearntFigure
 
 JOINTS = ("waist", "shoulder")
 

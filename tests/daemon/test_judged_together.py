@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from guided_arm import JOINTS, NOW_AND_THEN, Scene, built_chain, make_pair, measured, nominal_model, path, teach
 
-from bodyschema.daemon.config import LearnerConfig
 from bodyschema.interfaces.records import Pair
 from bodyschema.learning import DirectSolver, Learning, NominalModel
 from bodyschema.learning.arm import KnownArm
 from bodyschema.learning.claims import Claims
+from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.course import MOST_TOGETHER
 from bodyschema.learning.era import Era
 from bodyschema.learning.members import INSTANT

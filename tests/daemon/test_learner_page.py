@@ -8,7 +8,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from bodyschema.daemon.config import LARGEST_MAP, DaemonConfig, LearnerConfig
+from bodyschema.daemon.config import LARGEST_MAP, DaemonConfig
+from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.gate import CHANGE, DOUBT, FEWEST_FOR_CHANGE
 from bodyschema.learning.learning import REGION_RAD
 from bodyschema.learning.members import TRUSTED

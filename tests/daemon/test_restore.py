@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from guided_arm import NOW_AND_THEN, Scene, make_pair, measured, new_learning, nominal_model, teach
 
-from bodyschema.daemon.config import LearnerConfig
 from bodyschema.interfaces.records import FloatArray, Pair
 from bodyschema.learning import DirectSolver, Learning, Solved, StateError
+from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.memory import Permutations
 from bodyschema.learning.snapshot import Prediction
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from guided_arm import Scene, nominal_model
 
-from bodyschema.daemon.config import LearnerConfig
 from bodyschema.learning import Solved
+from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.eras import Eras
 from bodyschema.learning.members import RIGID
 from bodyschema.learning.workmanship import Made, best_made
