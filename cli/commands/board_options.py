@@ -12,8 +12,7 @@ from cyclopts.validators import Number
 from bodyschema.cli.commands.options import flag
 
 if TYPE_CHECKING:
-    from bodyschema.cli.cameras.calibration import Board
-    from bodyschema.cli.cameras.calibration import Images
+    from bodyschema.cli.cameras.calibration import Board, Images
 
 
 @Parameter(name="*")
