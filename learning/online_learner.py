@@ -36,7 +36,7 @@ REGION_SAMPLES = 256
 class OnlineLearner:
     """Learns the forward kinematics of one robot from pairs.
 
-    The models are in its `Eras`. This class counts, synchronises the two threads, and publishes.
+    The models are in its `Regimes`. This class counts, synchronises the two threads, and publishes.
     """
 
     def __init__(

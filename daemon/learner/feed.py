@@ -45,7 +45,7 @@ class _Stored:
 
 
 class PairFeed:
-    """Feeds a `Learning`. `offer` and `wake` may be called from any thread, `step` from one only."""
+    """Feeds a `OnlineLearner`. `offer` and `wake` may be called from any thread, `step` from one only."""
 
     def __init__(
         self, learning: OnlineLearner, history: History, clock: Clock, beat: Callable[[], None] = lambda: None

@@ -7,8 +7,7 @@ from guided_arm import Scene, nominal_model
 
 from bodyschema.learning.changes.known_arm import KnownArm
 from bodyschema.learning.config import LearnerConfig
-from bodyschema.learning.outlier_gate import OutlierGate
-from bodyschema.learning.outlier_limits import CHANGE
+from bodyschema.learning.outlier_gate import CHANGE, OutlierGate
 from bodyschema.learning.regime import Regime
 from bodyschema.learning.uncertainty import UncertaintyTracker
 from kbmaps import ChainTolerances

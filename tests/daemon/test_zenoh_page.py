@@ -33,7 +33,7 @@ from bodyschema.daemon.transport.wire import MSGPACK, IkReply, IkRequest, Joints
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import FARTHEST_M, Reason
-from bodyschema.learning import curve
+from bodyschema.learning.state import MOST_POINTS
 from bodyschema.recordings.store.store import PairStore
 
 ROOT = Path(__file__).parents[2]
@@ -90,7 +90,7 @@ def test_the_page_s_limits_are_the_code_s() -> None:
     limits = section("Limits")
     assert f"| rows in a request | {wire.LARGEST_BATCH:,} |" in limits
     assert f"| pairs in a reply | {history.LARGEST_REPLY} |" in limits
-    assert f"| points of the learning curve | {curve.LARGEST} |" in limits
+    assert f"| points of the learning curve | {MOST_POINTS} |" in limits
     assert f"| within {FARTHEST_M:.0f} m, else" in limits
 
 
