@@ -55,7 +55,7 @@ GROUPS = {
         "record": "Save the running sampler's pairs to a file.",
         "export": "Convert pairs or a robot: CSV, Parquet, MCAP, MJCF, URDF.",
         "backup": "Save pairs, checkpoint and robot.toml to one file.",
-        "restore": "Restore a backup; nothing is overwritten unasked.",
+        "restore": "Restore a backup; existing files are kept.",
         "fleet": "Monitor and diagnose many robots.",
     },
 }

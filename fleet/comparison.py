@@ -114,7 +114,7 @@ def common_poses(coverages: Sequence[Mapping[str, JointRange]], joints: tuple[st
     """
     ranges = [[(each[joint].low, each[joint].high) for joint in joints] for each in coverages]
     if not ranges:
-        raise RequestError("no sampler of these robots answers, so nobody knows where their joints have been")
+        raise RequestError("no sampler of these robots answers, so the ranges of their joints are unknown")
     low, high = np.sort(np.median(np.array(ranges), axis=0), axis=1).T
     return np.random.default_rng(seed).uniform(low, high, (POSES, len(joints)))
 

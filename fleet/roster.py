@@ -78,7 +78,7 @@ class Member:
             if process in self.alive and status is None:
                 said.append(f"the {process} is alive and does not answer")
         if "learner" not in self.alive:
-            said.append("its learner is not alive: nobody learns or answers")
+            said.append("its learner is not alive: nothing learns or answers")
         return said
 
 

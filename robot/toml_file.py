@@ -52,7 +52,7 @@ def read_toml(
     except UnfitFile as error:
         raise ConfigError(str(error.strerror), file=file, remedy=damaged or "Name a robot.toml") from error
     except OSError as error:
-        raise ConfigError(f"cannot be read: {error.strerror}", file=file, remedy="Mend its permissions") from error
+        raise ConfigError(f"cannot be read: {error.strerror}", file=file, remedy="Fix its permissions") from error
     text = _decoded(data, file, damaged or "Name a robot.toml, or save it as UTF-8")
     if (line := line_of_endless_key(text)) is not None:
         raise ConfigError(f"a key has more than {MOST_PARTS} parts", file=file, line=line, remedy="Delete it")

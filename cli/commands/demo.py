@@ -30,7 +30,7 @@ def demo(
     marker: Annotated[
         Literal["ball", "tag", "cluster"] | None,
         Parameter(
-            help="In the hand: a red ball, one AprilTag (which --camera mono has unless told), or a cube of six, which "
+            help="In the hand: a red ball, one AprilTag (which --camera mono has by default), or a cube of six, which "
             "the cameras see from all sides.",
             show_default=False,
         ),

@@ -37,7 +37,7 @@ def _patient_client(endpoint: str) -> Bus:
                 return Bus(connect=endpoint, client=True)
         except BusError:
             time.sleep(0.2)
-    raise BusError(f"nobody listens on {endpoint}")
+    raise BusError(f"nothing listens on {endpoint}")
 
 
 def _one_second(bus: Bus, config: Config, rng: np.random.Generator) -> dict[str, float | int]:

@@ -190,9 +190,9 @@ def unit_checks(root: Path = Path("/")) -> Iterator[Check]:
     files = [*(root / FOLDER).glob("bodyschema-*.service"), *(root / FOLDER).glob("bodyschema-*.service.d/*.conf")]
     for file in sorted(files):
         if OLD_UNIT.search(file.read_text(encoding="utf-8", errors="replace")):
-            mend = "install router" if "router" in file.name else "install service"
+            fix = "install router" if "router" in file.name else "install service"
             said = f"{file} starts `python -m daemon`, which this bodyschema does not have"
-            yield Check("service", "wrong", said, f'sudo "$(command -v bodyschema)" {mend}')
+            yield Check("service", "wrong", said, f'sudo "$(command -v bodyschema)" {fix}')
 
 
 def _is_synchronised() -> bool | None:
@@ -219,9 +219,7 @@ def router_check(route: Route) -> Check:
             return Check("zenoh", "ok", f"the router {route} takes our connection")
     except BusError as error:
         first, _, rest = str(error).partition(". ")
-        return Check(
-            "zenoh", "wrong", f"{first}: nobody on other machines sees this robot", rest or "see the router's log"
-        )
+        return Check("zenoh", "wrong", f"{first}: other machines do not see this robot", rest or "see the router's log")
 
 
 def zenoh_check(process: str, route: Route, token: str) -> Check:
@@ -251,7 +249,7 @@ def _is_listening(endpoint: str) -> bool:
 
 def _named(check: Check, file: Path) -> Check:
     """Return the check with the actual name of robot.toml in its command."""
-    return replace(check, mend=check.mend.replace("robot.toml", str(file)))
+    return replace(check, fix=check.fix.replace("robot.toml", str(file)))
 
 
 def run(config: Config, tell: Callable[[str], None]) -> list[Check]:

@@ -24,7 +24,7 @@ class Guess(NamedTuple):
 EXAMPLE = Guess("my_robot", "my_robot.urdf", ["joint_1", "joint_2"], "hand", "base_link")
 
 _TEMPLATE = """\
-# A robot for bodyschema. Mend what is marked CHECK, then type `bodyschema config check`.
+# A robot for bodyschema. Fix what is marked CHECK, then type `bodyschema config check`.
 
 [robot]
 # Part of the zenoh keys: letters, digits, _ . -

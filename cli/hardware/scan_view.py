@@ -22,7 +22,7 @@ def show(console: Console, report: ScanReport) -> None:
         if port.servos:
             console.print(_table(port.servos, joints, named=report.joints is not None))
         elif port.trouble is None:
-            console.print("  nobody answers, at no rate")
+            console.print("  no answer at any rate")
         if port.trouble is not None:
             console.print(Text(f"  {port.trouble}", style="red"), soft_wrap=True)
     for camera in report.cameras:
@@ -66,7 +66,7 @@ def _troubles(report: ScanReport) -> Iterator[str]:
             yield f"ID {servo.id}: {trouble}"
     for joint in report.joints or ():
         if joint.state not in ("ok", "double"):
-            yield f"joint {joint.joint} (ID {joint.id}, {joint.model}): {joint.state}: {joint.mend}"
+            yield f"joint {joint.joint} (ID {joint.id}, {joint.model}): {joint.state}: {joint.fix}"
     for servo in report.strangers:
         yield f"ID {servo.id} ({servo.model or '?'}) is on a port of robot.toml, but not in it"
 

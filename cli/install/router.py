@@ -79,9 +79,9 @@ class RouterConfig:
             if robot != EVERY_ROBOT and not re.match(NAME, robot):
                 refuse(f"access: {robot!r} is no robot's name", 'Write one, or "*" for every robot', "access", robot)
             if not any(getattr(names, role) for role in ROLES):
-                refuse(f"access.{robot}: nobody has a role", f"Known are: {', '.join(ROLES)}", "access", robot)
+                refuse(f"access.{robot}: no one has a role", f"Known are: {', '.join(ROLES)}", "access", robot)
         if not tables.access:
-            refuse("access: nobody may do anything", 'Begin with [access."*"] and viewer = ["a name"]', "access")
+            refuse("access: no one may do anything", 'Begin with [access."*"] and viewer = ["a name"]', "access")
         try:
             identity = Identity.of(tables.tls, None, tables.users_file, file.parent)
         except ConfigError as error:

@@ -169,7 +169,7 @@ def _change(status: LearnerStatus) -> Iterator[str]:
     since, change = f"{status.pairs_since_change} pairs since", status.last_change
     if change is None:
         # Rolled back, or learning was restarted.
-        yield f"none in force of {status.changes} told or found; {status.pairs_since_change} pairs count"
+        yield f"none in force of {status.changes} reported or detected; {status.pairs_since_change} pairs count"
         return
     when = f"at pair {change.first_seq}"
     if change.earliest_seq < change.latest_seq:

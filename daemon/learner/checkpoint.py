@@ -182,13 +182,13 @@ def _checksum(body: bytes) -> bytes:
 
 def _unwritable(file: Path, error: OSError) -> str:
     if error.errno == errno.ENOSPC:
-        return f"the checkpoint {file} could not be written: the disk is full. Free some space; learning goes on"
+        return f"the checkpoint {file} could not be written: the disk is full. Free some space; learning continues"
     if isinstance(error, (FileExistsError, NotADirectoryError)):
         return (
-            f"the checkpoint {file} could not be written: {file.parent} is not a folder. Learning goes on; "
+            f"the checkpoint {file} could not be written: {file.parent} is not a folder. Learning continues; "
             "give a folder as state_dir in the table [daemon] of robot.toml, or with --state-dir"
         )
     return (
-        f"the checkpoint {file} could not be written: {error.strerror}. Learning goes on; "
+        f"the checkpoint {file} could not be written: {error.strerror}. Learning continues; "
         "give a --state-dir that can be written"
     )

@@ -248,7 +248,7 @@ class PairFeed:
         if missing > 0:
             log.warning(
                 "the sampler has no pairs %d to %d any more: they were deleted ([daemon] keep_days, keep_mb) or its "
-                "disk changed them (its health tells); learning goes on with the next",
+                "disk changed them (see its health); learning continues with the next",
                 self._cursor + 1,
                 self._cursor + missing,
             )

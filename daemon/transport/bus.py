@@ -202,11 +202,11 @@ class Bus:
             process = "sampler" if key.split("/")[-1].startswith(("sampler", "pairs", "simulation")) else "learner"
             if self._route is not None and self._route.secured:
                 raise BusError(
-                    f"nobody answers under {key}: the {process} does not run, or your certificate or name has no role "
+                    f"nothing answers under {key}: the {process} does not run, or your certificate or name has no role "
                     "that may ask this (docs/security.md)"
                 )
             raise BusError(
-                f"nobody answers under {key}. Is the {process} running? Start it with `bodyschema {process}`"
+                f"nothing answers under {key}. Is the {process} running? Start it with `bodyschema {process}`"
             )
         if replies[0].error is not None:
             raise RequestError(replies[0].error)
@@ -253,7 +253,7 @@ class Bus:
                 f"the port of {listen} is in use. Stop the other bodyschema, "
                 "or give another endpoint in the table [zenoh] of robot.toml"
             )
-        return f"cannot open zenoh on {listen}: {message.split(' at /')[0]}. Mend the table [zenoh] of robot.toml"
+        return f"cannot open zenoh on {listen}: {message.split(' at /')[0]}. Fix the table [zenoh] of robot.toml"
 
     def _start(self, work: Callable[[], None]) -> None:
         thread = threading.Thread(target=work, name="answers")

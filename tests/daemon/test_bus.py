@@ -116,7 +116,7 @@ def test_an_answer_that_does_not_come_in_time_is_an_error(server, asking) -> Non
 
 
 def test_a_client_without_a_server_is_told_at_once(endpoint) -> None:
-    with pytest.raises(BusError, match=f"nobody listens on {endpoint}. Start the daemon"), client(endpoint):
+    with pytest.raises(BusError, match=f"nothing listens on {endpoint}. Start the daemon"), client(endpoint):
         pass
 
 
@@ -127,7 +127,7 @@ def test_a_port_in_use_is_named_with_the_remedy(server, endpoint) -> None:
 
 
 def test_an_endpoint_that_cannot_be_is_named() -> None:
-    with pytest.raises(BusError, match=r"cannot open zenoh on carrier/pigeon.*Mend the table \[zenoh\]"):
+    with pytest.raises(BusError, match=r"cannot open zenoh on carrier/pigeon.*Fix the table \[zenoh\]"):
         Bus(listen="carrier/pigeon").__enter__()
 
 

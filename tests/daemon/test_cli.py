@@ -143,7 +143,7 @@ def test_the_written_example_explains_every_key_in_place(tmp_path) -> None:
 
 def test_a_command_to_nobody_says_what_to_start(robot) -> None:
     with pytest.raises(
-        BusError, match=r"nobody listens on tcp/127\.0\.0\.1:[0-9]+\. Start the daemon with `bodyschema run`"
+        BusError, match=r"nothing listens on tcp/127\.0\.0\.1:[0-9]+\. Start the daemon with `bodyschema run`"
     ):
         called("command", "pause", "--robot", robot)
 

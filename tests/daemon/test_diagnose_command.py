@@ -265,7 +265,7 @@ def test_a_sampler_without_pairs_is_said_to_have_none(live_robot, endpoint, reco
 
 
 def test_a_sampler_that_does_not_run_is_said_not_to(live_robot) -> None:
-    assert "nobody listens on" in refused("--live", "--robot", live_robot)
+    assert "nothing listens on" in refused("--live", "--robot", live_robot)
 
 
 # --- refusals

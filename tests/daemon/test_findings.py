@@ -255,7 +255,7 @@ def test_of_an_arm_that_moved_few_joints_other_motions_gain_more() -> None:
     x = scene.chain.positions(q) + 0.002 * rng.normal(size=(80, 3))
     teach(learning, [make_pair(k + 1, q[k], x[k]) for k in range(80)], every=NOW_AND_THEN)
     outlook = outlook_of(learning)
-    assert outlook.best_motion != "going on as so far"
+    assert outlook.best_motion != "moving as so far"
     assert outlook.best_motion_m[-1] < outlook.like_so_far_m[-1]
 
 

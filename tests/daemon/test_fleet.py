@@ -127,13 +127,13 @@ def test_a_described_robot_that_is_absent_is_in_the_list(tmp_path: Path, free_en
     file = write_small_arm(tmp_path, f'[zenoh]\nsampler = "{elsewhere}"\nlearner = "{here}"\n')
     with robots(here, {"left": 0.0}), Fleet(places([], [file])) as found:
         members = {member.name: member for member in found.look()}
-        assert f"nobody listens on {elsewhere}" in found.unreached[0]
+        assert f"nothing listens on {elsewhere}" in found.unreached[0]
     assert members["arm"].health == ["neither its sampler nor its learner is alive"]
     assert members["left"].alive == {"sampler", "learner"}
 
 
 def test_a_place_where_nobody_listens_is_an_error_with_its_address(endpoint: str) -> None:
-    with pytest.raises(BusError, match=f"nobody listens on {endpoint}"):
+    with pytest.raises(BusError, match=f"nothing listens on {endpoint}"):
         fleet("list", "--connect", endpoint)
 
 

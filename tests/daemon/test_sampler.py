@@ -411,7 +411,7 @@ def test_a_tool_that_cannot_be_is_refused(config, request_) -> None:
 
 
 def test_nobody_tells_the_truth_where_there_is_no_simulation(ended) -> None:
-    with pytest.raises(BusError, match="nobody answers under bodyschema/arm/simulation"):
+    with pytest.raises(BusError, match="nothing answers under bodyschema/arm/simulation"):
         ended.ask_one(KEYS.simulation)
 
 

@@ -361,7 +361,7 @@ OWN = TLS + 'certificate = "anna.pem"\nkey = "anna.key"\n'
     [
         ('[zenoh]\nsampler = "tls/0.0.0.0:7447"\n', r"zenoh.sampler: tls/0.0.0.0:7447 needs certificates"),
         (f'[zenoh]\nsampler = "tls/0.0.0.0:7447"\n{TLS}', r"to listen on tls/0.0.0.0:7447 takes a certificate"),
-        (f'[zenoh]\nsampler = "tls/0.0.0.0:7447"\n{OWN}', r"nobody may do anything on tls/0.0.0.0:7447"),
+        (f'[zenoh]\nsampler = "tls/0.0.0.0:7447"\n{OWN}', r"no one may do anything on tls/0.0.0.0:7447"),
         ('[zenoh]\nrouter = "tcp/hub.lan:7450"\n', r"zenoh.router: tcp/hub.lan:7450 is open.*Write tls/hub.lan:7450"),
         ('[zenoh]\nrouter = "tls/hub.lan:7450"\n', r"zenoh.router: tls/hub.lan:7450 needs certificates"),
         ('[zenoh.login]\nuser = "anna"\npassword_file = "p"\n', r"zenoh.login: passwords go over TLS only"),
@@ -398,7 +398,7 @@ def test_a_key_that_everybody_can_read_is_refused(pki: Path, tmp_path: Path) -> 
     [
         ("tls/192.0.2.10", "tcp/192.0.2.10", r"line 2: listen: 'tcp/192.0.2.10:7450' is no endpoint with TLS"),
         ('[access."*"]', '[access."a/**"]', r"'a/\*\*' is no robot's name"),
-        ('viewer = ["anna"]', "", r"access.\*: nobody has a role. Known are: viewer, operator, sampler, learner"),
+        ('viewer = ["anna"]', "", r"access.\*: no one has a role. Known are: viewer, operator, sampler, learner"),
         ("operator", "admin", r"unknown key.*admin"),
     ],
 )
