@@ -15,7 +15,7 @@ import msgspec
 
 from bodyschema.cli.install.units import FOLDER
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import Bus, is_alive
+from bodyschema.daemon.transport.bus import ZenohSession, is_alive
 from bodyschema.daemon.transport.identity import Route
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import SamplerStatus
@@ -104,7 +104,7 @@ def _cameras(config: Config) -> Iterator[Check]:
 
         yield from camera_checks(config)
         return
-    with Bus(connect=config.route("sampler"), client=True) as bus:
+    with ZenohSession(connect=config.route("sampler"), client=True) as bus:
         status = decode(bus.ask_one(Keys(config.robot.name).status("sampler")), SamplerStatus)
     yield Check("cameras", "ok", f"the running sampler takes {status.frames_per_s:.1f} stereo frames/s")
 
@@ -131,7 +131,7 @@ def _of_the_sampler(config: Config) -> Iterator[Check]:
     if not is_alive(route, keys.alive("sampler"), open_timeout_s=OPEN_S):
         yield Check("servos", "warning", "not looked at: another program has the port")
         return
-    with Bus(connect=route, client=True) as bus:
+    with ZenohSession(connect=route, client=True) as bus:
         status = decode(bus.ask_one(keys.status("sampler")), SamplerStatus)
     yield Check("rate", "ok", f"the running sampler takes {status.readings_per_s:.0f} readings/s")
     for complaint in status.health:
@@ -215,7 +215,7 @@ def _zenoh(config: Config) -> Iterator[Check]:
 def router_check(route: Route) -> Check:
     """Check that the router accepts our connection."""
     try:
-        with Bus(connect=route, client=True, open_timeout_s=OPEN_S):
+        with ZenohSession(connect=route, client=True, open_timeout_s=OPEN_S):
             return Check("zenoh", "ok", f"the router {route} takes our connection")
     except BusError as error:
         first, _, rest = str(error).partition(". ")

@@ -21,7 +21,7 @@ from small_arm import ROBOT, URDF, write_long_arm, write_small_arm
 
 from bodyschema.cli.main import main
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import Bus, client
+from bodyschema.daemon.transport.bus import ZenohSession, client
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import LearnerStatus
 from bodyschema.daemon.transport.wire import decode
@@ -194,7 +194,7 @@ def test_a_letter_among_the_joint_angles_is_named(robot) -> None:
 @pytest.mark.parametrize("process", ["sampler", "learner"])
 def test_a_port_in_use_is_named_and_leaves_no_trace(robot, process) -> None:
     endpoint = getattr(Config.load(robot, {}).tables.zenoh, process)
-    with Bus(listen=endpoint):
+    with ZenohSession(listen=endpoint):
         said = refused(process, cwd=robot.parent)
     assert said == (
         f"the port of {endpoint} is in use. Stop the other bodyschema, "
@@ -225,7 +225,7 @@ def test_a_folder_that_cannot_be_written_ends_the_sampler(robot, state_dir, said
 def process_running(config: Config, process: str, by: tuple[str, ...] = DAEMON) -> Iterator[None]:
     """Run a process and stop it when the context ends."""
     up = threading.Event()
-    with tempfile.TemporaryFile() as log, Bus(connect=getattr(config.tables.zenoh, process)) as bus:
+    with tempfile.TemporaryFile() as log, ZenohSession(connect=getattr(config.tables.zenoh, process)) as bus:
         words = (*by, process, "--robot", config.file)
         child = (
             warm.Child(*words, stderr=log) if by == DAEMON else subprocess.Popen([sys.executable, *words], stderr=log)

@@ -20,7 +20,7 @@ from bodyschema.cli.hardware.doctor_view import show
 from bodyschema.cli.install.units import FOLDER
 from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.identity import Route
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import SamplerStatus
@@ -125,7 +125,7 @@ def test_the_running_sampler_tells_of_the_servos_itself(tmp_path, monkeypatch, c
         config = Config.load(run.robot_file)
         holder = Holder(4711, "/usr/bin/python -m bodyschema sampler --robot robot.toml")
         monkeypatch.setattr(checks, "holders", lambda *_: [holder])
-        with Bus(listen=config.tables.zenoh.sampler) as bus:
+        with ZenohSession(listen=config.tables.zenoh.sampler) as bus:
             keys = Keys(config.robot.name)
             bus.token(keys.alive("sampler"))
             bus.answer(keys.status("sampler"), lambda request: encode(status("joint 'elbow' is hot"), request.encoding))
@@ -185,7 +185,7 @@ def test_a_free_endpoint_is_ok(endpoint) -> None:
 
 
 def test_a_process_that_answers_is_ok(endpoint) -> None:
-    with Bus(listen=endpoint) as bus:
+    with ZenohSession(listen=endpoint) as bus:
         bus.token("x/alive")
         assert f"answers on {endpoint}" in doctor.zenoh_check("sampler", Route((endpoint,)), "x/alive").said
 

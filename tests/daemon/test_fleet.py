@@ -16,7 +16,7 @@ from small_arm import write_small_arm
 from told_statuses import LEARNER, SAMPLER
 
 from bodyschema.cli.main import app
-from bodyschema.daemon.transport.bus import Bus, Request
+from bodyschema.daemon.transport.bus import Request, ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import JointRange, LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode
@@ -71,7 +71,7 @@ def positions(q: FloatArray, waist: float) -> FloatArray:
 @contextmanager
 def robots(endpoint: str, waists: dict[str, float], *, learners: bool = True) -> Iterator[None]:
     """Serve robots at one endpoint, each with its own waist offset."""
-    with Bus(listen=endpoint) as bus:
+    with ZenohSession(listen=endpoint) as bus:
 
         def stand(name: str, waist: float) -> None:
             def predict(request: Request) -> bytes:
@@ -138,7 +138,7 @@ def test_a_place_where_nobody_listens_is_an_error_with_its_address(endpoint: str
 
 
 def test_a_place_without_robots_is_an_error(endpoint: str) -> None:
-    with Bus(listen=endpoint), pytest.raises(BusError, match=f"no robot is alive on {endpoint}"):
+    with ZenohSession(listen=endpoint), pytest.raises(BusError, match=f"no robot is alive on {endpoint}"):
         fleet("list", "--connect", endpoint)
 
 

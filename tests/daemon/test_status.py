@@ -19,7 +19,7 @@ from bodyschema.cli.terminal.status_view import Seen, Watcher, as_json, screen
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler.sampler import Sampler
 from bodyschema.daemon.sampler.session import session_of
-from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.recordings.store.store import PairStore
@@ -43,12 +43,12 @@ def shown(seen: Seen, config: Config) -> str:
 def sampler_running(config: Config) -> Iterator[None]:
     with (
         PairStore(config.store_file, session_of(config, SystemClock())) as store,
-        Bus(listen=config.tables.zenoh.sampler) as bus,
+        ZenohSession(listen=config.tables.zenoh.sampler) as bus,
     ):
         sampler = Sampler(config, Walk(config.robot, 20).sources(), bus, store)
         thread = threading.Thread(target=sampler.run)
         thread.start()
-        with Bus(connect=config.tables.zenoh.sampler, client=True) as waiting:
+        with ZenohSession(connect=config.tables.zenoh.sampler, client=True) as waiting:
             up = threading.Event()
             waiting.watch(Keys("arm").alive("sampler"), lambda _alive: up.set())
             assert up.wait(LIMIT_S)
