@@ -28,8 +28,7 @@ import numpy as np
 
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning import LearningState
-from bodyschema.learning.state import LearningHeader
+from bodyschema.learning.state import LearningHeader, LearningState
 from bodyschema.recordings.kept_files import sync_folder, unused_name
 from bodyschema.robot.limited import read_at_most
 

@@ -15,7 +15,7 @@ from bodyschema.daemon.sampler.history import Page, Unreadable
 from bodyschema.daemon.transport.wire import PairMessage, decode, pair_from_wire
 from bodyschema.interfaces.errors import BusError, RequestError
 from bodyschema.interfaces.protocols import Clock
-from bodyschema.learning import OnlineLearner
+from bodyschema.learning.online_learner import OnlineLearner
 
 log = logging.getLogger(__name__)
 

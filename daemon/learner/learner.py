@@ -32,7 +32,8 @@ from bodyschema.daemon.transport.wire import OCTETS, CommandReply, CommandReques
 from bodyschema.daemon.wiring.wiring import open_marker_topic
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.protocols import Clock
-from bodyschema.learning import NominalModel, OnlineLearner
+from bodyschema.learning.nominal import NominalModel
+from bodyschema.learning.online_learner import OnlineLearner
 from bodyschema.learning.solvers.solver import LARGEST_NET, Solver
 
 log = logging.getLogger(__name__)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from bodyschema.daemon.learner.solver_process import SolverLostError, SolverProcess
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning import Solved, Task
+from bodyschema.learning.solvers.solver import Solved, Task
 
 
 class SolverPool:

@@ -9,8 +9,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
-from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner
 from bodyschema.learning.config import LearnerConfig
+from bodyschema.learning.nominal import NominalModel
+from bodyschema.learning.online_learner import OnlineLearner
+from bodyschema.learning.solvers.solver import DirectSolver
 from kbmaps import RigidChain
 
 JOINTS = 4

@@ -32,7 +32,7 @@ from bodyschema.daemon.transport.keys import Keys
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import StoreError
 from bodyschema.interfaces.records import MarkerFix, frozen_array
-from bodyschema.learning import LearningState
+from bodyschema.learning.state import LearningState
 from bodyschema.recordings.store.store import PairReader, PairStore
 
 UTC = "2026-11-21T12:00:00.000+00:00"

@@ -23,7 +23,9 @@ from bodyschema.daemon.sampler.session import session_of
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import RecordingError
 from bodyschema.interfaces.records import MarkerFix
-from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner
+from bodyschema.learning.nominal import NominalModel
+from bodyschema.learning.online_learner import OnlineLearner
+from bodyschema.learning.solvers.solver import DirectSolver
 from bodyschema.recordings.files import of_robot
 from bodyschema.recordings.recording import Recording
 from bodyschema.recordings.store.store import PairStore

@@ -20,7 +20,7 @@ from bodyschema.daemon.learner.checkpoint import (
     write_checkpoint,
 )
 from bodyschema.daemon.learner.resume import go_on
-from bodyschema.learning import LearningState
+from bodyschema.learning.state import LearningState
 
 UTC = "2026-11-21T12:00:00.000+00:00"
 

@@ -15,9 +15,11 @@ from bodyschema.calibration.chain_figures import is_told, no_surer_than_possible
 from bodyschema.calibration.plausibility.check import FEWEST_ROWS
 from bodyschema.daemon.learner.findings import EVERY_S, SHARE, Findings, FindingTurns, figures
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.data_outlook import LearnerEvidence, Scatter, forecast
+from bodyschema.learning.nominal import NominalModel
+from bodyschema.learning.online_learner import OnlineLearner
+from bodyschema.learning.solvers.solver import DirectSolver
 from bodyschema.learning.status import Outlook
 from bodyschema.robot.description import RobotDescription
 from kbmaps import ChainParameters, ChainTolerances

@@ -28,7 +28,7 @@ from bodyschema.daemon.transport.wire import (
 )
 from bodyschema.interfaces.errors import BusError
 from bodyschema.interfaces.records import Pair
-from bodyschema.learning import DirectSolver
+from bodyschema.learning.solvers.solver import DirectSolver
 
 KEYS = Keys("arm")
 

@@ -30,7 +30,7 @@ from bodyschema.daemon.transport.wire import decode
 from bodyschema.fleet.hosting import configs_of, descriptions, shares
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import BusError, ConfigError
-from bodyschema.learning import Solved, Task
+from bodyschema.learning.solvers.solver import Solved, Task
 from kbmaps import ChainTolerances
 
 NOMINAL = nominal_model()
