@@ -34,7 +34,7 @@ _PLACE = re.compile(r"(?P<what>.*?) - at `\$(?P<path>[^`]*)`$", re.DOTALL)
 
 
 def read_toml(
-    file: Path, *, written_by: str = "`bodyschema config init` writes one", damaged: str = ""
+    file: Path, *, written_by: str = "`bodyschema init` writes one", damaged: str = ""
 ) -> tuple[dict[str, Any], str]:
     """Return the tables of `file` and its text. Raise ConfigError with the line when it cannot be read.
 

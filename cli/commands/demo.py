@@ -55,7 +55,7 @@ def demo(
 
     Needs: the extra `sim` (`pip install 'bodyschema[sim]'`), and no hardware.
 
-    Next: `bodyschema replay` on the recording of the first tool; `bodyschema config init` for a robot of your own.
+    Next: `bodyschema replay` on the recording of the first tool; `bodyschema init` for a robot of your own.
     """
     import numpy as np
     from rich.console import Console

@@ -32,7 +32,7 @@ def learner(
     learnt. With several robots, each pair is learnt as it arrives, and less urgent work is done in turns
     (docs/fleet.md).
 
-    Needs: robot.toml (`bodyschema config init`), and for new pairs `bodyschema sampler`.
+    Needs: robot.toml (`bodyschema init`), and for new pairs `bodyschema sampler`.
 
     Next: `bodyschema predict`, `bodyschema status`; for several robots `bodyschema fleet list`.
     """

@@ -23,7 +23,7 @@ def sampler(
     Each pair is stored before it is published. While the store cannot be written (the disk is full), the status reports
     it and no pairs are taken.
 
-    Needs: robot.toml (`bodyschema config init`) with joints and cameras or a recording; or --sim.
+    Needs: robot.toml (`bodyschema init`) with joints and cameras or a recording; or --sim.
 
     Next: `bodyschema learner`, `bodyschema status --watch`.
     """

@@ -83,7 +83,7 @@ def _description(config: Config) -> Iterator[Check]:
     )
     if config.tables.drivers.hardware is None:
         said = "no servos are configured, so none were looked at"
-        yield Check("robot.toml", "warning", said, "bodyschema robot new --from scan")
+        yield Check("robot.toml", "warning", said, "bodyschema init --urdf YOUR.urdf --from scan")
     cameras = config.tables.vision.cameras
     if cameras is not None and cameras.calibration is not None:
         return

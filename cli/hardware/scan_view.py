@@ -77,7 +77,7 @@ def _verdict(report: ScanReport, troubles: Sequence[str]) -> str:
     if not count:
         return "No servo answers. Look at the supply, the cable, and whether another program holds the port."
     if report.joints is None:
-        return f"{servos} found. `bodyschema robot new --from scan` writes a robot.toml with them."
+        return f"{servos} found. `bodyschema init --urdf YOUR.urdf --from scan` writes a robot.toml with them."
     if report.is_well:
         return f"{servos}: those of robot.toml, all of them{', with troubles' if troubles else ''}."
     right = sum(joint.state == "ok" for joint in report.joints)

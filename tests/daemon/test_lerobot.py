@@ -45,7 +45,7 @@ READ_BY_LEROBOT = [
 
 
 def config(*arguments: object) -> None:
-    words = ["config", "init", "--lerobot", "so101", *arguments]
+    words = ["init", "--lerobot", "so101", *arguments]
     if "--urdf" not in words:
         words += ["--urdf", SO101 / "so101.urdf"]
     command_line("config")(list(map(str, words)), exit_on_error=False, result_action="return_value")
