@@ -12,9 +12,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bodyschema.calibration.comparison import Distances, laid_on
-from bodyschema.daemon.transport.status import ChainCalibration, JointRange
+from bodyschema.daemon.transport.status import JointRange
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning.status import ChainCalibration
 
 POSES = 400
 # With two robots, an outlier cannot be attributed to either.
@@ -115,7 +116,7 @@ def common_poses(coverages: Sequence[Mapping[str, JointRange]], joints: tuple[st
     """
     ranges = [[(each[joint].low, each[joint].high) for joint in joints] for each in coverages]
     if not ranges:
-        raise RequestError("no sampler of these robots answers, so nobody knows where their joints have been")
+        raise RequestError("no sampler of these robots answers, so the ranges of their joints are unknown")
     low, high = np.sort(np.median(np.array(ranges), axis=0), axis=1).T
     return np.random.default_rng(seed).uniform(low, high, (POSES, len(joints)))
 

@@ -23,7 +23,9 @@ from bodyschema.daemon.sampler.session import session_of
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import RecordingError
 from bodyschema.interfaces.records import MarkerFix
-from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner
+from bodyschema.learning.nominal import NominalModel
+from bodyschema.learning.online_learner import OnlineLearner
+from bodyschema.learning.solvers.solver import DirectSolver
 from bodyschema.recordings.files import of_robot
 from bodyschema.recordings.recording import Recording
 from bodyschema.recordings.store.store import PairStore
@@ -149,7 +151,7 @@ def said(arm: Planted, **changed) -> str:
 
 
 def test_zeros_that_nothing_shows_are_said_to_be_left_as_drawn() -> None:
-    assert "Left as drawn: base_yaw, wrist_roll. Nothing that was measured tells their zeros" in said(planted(1))
+    assert "Kept at nominal: base_yaw, wrist_roll. Nothing that was measured tells their zeros" in said(planted(1))
 
 
 def test_a_joint_that_hardly_moved_is_named() -> None:

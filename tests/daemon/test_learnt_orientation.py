@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from bodyschema.daemon.learner.checkpoint import read_checkpoint, write_checkpoint
 from bodyschema.daemon.learner.solver_process import SolverProcess
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
-from bodyschema.learning import OnlineLearner
+from bodyschema.learning.online_learner import OnlineLearner
 from kbmaps import RigidChain, rotation_vectors
 
 SIGMA_RAD = 0.01

@@ -21,7 +21,9 @@ from bodyschema.daemon.learner.findings import Findings
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import RecordingError
 from bodyschema.interfaces.records import Pair
-from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner
+from bodyschema.learning.nominal import NominalModel
+from bodyschema.learning.online_learner import OnlineLearner
+from bodyschema.learning.solvers.solver import DirectSolver
 from bodyschema.recordings.recording import Recording
 from kbmaps import ChainParameters, ChainTolerances, RigidChain
 
