@@ -186,7 +186,7 @@ def plausibility(
             found = Plausibility(warnings=(f"perhaps {text.removeprefix('it seems that ')}{either}",))
     else:
         far = [
-            f"with the links as drawn, the zero of {name} comes out {math.degrees(zero):+.0f}°: it is wrong, or the "
+            f"with the nominal links, the zero of {name} comes out {math.degrees(zero):+.0f}°: it is wrong, or the "
             "URDF is of another arm"
             for joint, (name, zero, slides) in enumerate(zip(names, fit.zeros, chain.prismatic, strict=True))
             if not slides and abs(zero) > FAR_ZERO_RAD and search.nearer_is_worse(joint, fit)
@@ -221,7 +221,7 @@ def _hardly(before: str, after: str, nearest: str) -> Plausibility:
 
 
 def _drawn_arm_misses(before: str) -> str:
-    return f"placed as well as it can be, the drawn arm misses the pairs by {before}"
+    return f"placed as well as it can be, the nominal arm misses the pairs by {before}"
 
 
 def _nameable(reading: Reading, fit: _Fit, spread: float) -> bool:
