@@ -13,7 +13,7 @@ from bodyschema.interfaces.protocols import Clock, MarkerSource
 from bodyschema.interfaces.records import MarkerFix, MarkerMiss
 from bodyschema.interfaces.rejections import WORDS
 
-from .sampler.reconnect import Reopening
+from .sampler.reconnect import ReconnectingSource
 from .sampler.sources import TellsHealth
 
 
@@ -28,7 +28,7 @@ class MarkerWatch:
             health: reports its problems.
         """
         self._name, self._health, self._clock = name, health, clock
-        self._source = Reopening(source, f"the positions by {name}", clock)
+        self._source = ReconnectingSource(source, f"the positions by {name}", clock)
         self._forget()
 
     def __enter__(self) -> Self:

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from small_arm import JOINTS, URDF, write_small_arm
 
 from bodyschema.cli.install.router import RouterConfig
-from bodyschema.daemon.config import Config, LearnerConfig
+from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner import checkpoint
 from bodyschema.daemon.learner.answers import Answers
 from bodyschema.daemon.learner.checkpoint import CheckpointError
@@ -33,7 +33,11 @@ from bodyschema.daemon.transport.bus import Request
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.effects import Simulation
 from bodyschema.interfaces.errors import BodyschemaError, ConfigError, RecordingError, RequestError
-from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner, StateError
+from bodyschema.learning.config import LearnerConfig
+from bodyschema.learning.nominal import NominalModel
+from bodyschema.learning.online_learner import OnlineLearner
+from bodyschema.learning.solvers.solver import DirectSolver
+from bodyschema.learning.state import StateError
 from bodyschema.recordings.recording import Recording, joints_in
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.urdf import UrdfTree

@@ -15,9 +15,8 @@ from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.rpy import rotation_of
 from bodyschema.robot.toml_file import line_of
+from bodyschema.robot.toml_types import NonNegative, Positive
 
-Positive = Annotated[float, Meta(gt=0)]
-NonNegative = Annotated[float, Meta(ge=0)]
 Side = Annotated[int, Meta(ge=16, le=LARGEST_SIDE_PX)]
 
 LAYOUTS = ("one", "two", "side_by_side", "realsense", "images", "videos")
