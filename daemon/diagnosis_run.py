@@ -29,6 +29,7 @@ from bodyschema.interfaces.recording import Recording
 from bodyschema.interfaces.records import Pair
 from bodyschema.interfaces.robot import RobotDescription
 from bodyschema.interfaces.suggest import did_you_mean
+from bodyschema.interfaces.whole_files import write_whole
 
 from . import recordings
 from .bus import client
@@ -253,7 +254,7 @@ def written(found: Found, folder: Path) -> None:
     write_corrected(bare, folder, heading)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / DIAGNOSIS).write_text(found.json + "\n", encoding="utf-8")
-        (folder / REPORT).write_text(page(found.diagnosis, found.file, found.remedies, about), encoding="utf-8")
+        report = page(found.diagnosis, found.file, found.remedies, about)
+        write_whole({folder / DIAGNOSIS: f"{found.json}\n".encode(), folder / REPORT: report.encode()})
     except OSError as error:
         raise RecordingError(f"cannot be written: {error.strerror or error}", file=folder) from error

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.interfaces.rpy import rotation_of
+from bodyschema.interfaces.whole_files import write_whole
 
 LAUNCH = "hand_eye.launch.py"
 _STEP = 1e-6  # of the numerical derivative by roll, pitch and yaw [rad]
@@ -86,7 +87,7 @@ def write_launch_file(pose: HandEye, folder: Path) -> Path:
     arguments = _arguments(np.array(pose.translation_m), np.array(pose.quaternion_xyzw), pose.parent, pose.child)
     text = _LAUNCH_FILE.format(package="tf2_ros", executable=_PUBLISHER, arguments=arguments)
     try:
-        file.write_text(text, encoding="utf-8")
+        write_whole({file: text.encode()})
     except OSError as error:
         raise ConfigError(f"cannot be written: {error.strerror}", file=file, remedy="Give another folder") from error
     return file

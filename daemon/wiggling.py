@@ -16,6 +16,7 @@ from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import RecordingError, SourceEnded, SourceLost
 from bodyschema.interfaces.limited import read_at_most
 from bodyschema.interfaces.records import JointReading, MarkerFix, MarkerMiss
+from bodyschema.interfaces.whole_files import write_whole
 
 from .latency import LATEST_S, LatencyError, Wiggle
 from .sources import Sources
@@ -143,11 +144,12 @@ def write_wiggle(wiggle: Wiggle, joints: Sequence[str], file: Path) -> None:
         rows.append((t, [repr(t), *map(repr, q), *blank_position]))
     for t, x in zip(wiggle.t_marker.tolist(), wiggle.x.tolist(), strict=True):
         rows.append((t, [repr(t), *blank_joints, *map(repr, x)]))
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(["t", *joints, *POSITION])
+    writer.writerows(row for _, row in sorted(rows, key=lambda each: each[0]))
     try:
-        with file.open("w", newline="", encoding="utf-8") as stream:
-            writer = csv.writer(stream)
-            writer.writerow(["t", *joints, *POSITION])
-            writer.writerows(row for _, row in sorted(rows, key=lambda each: each[0]))
+        write_whole({file: text.getvalue().encode()})
     except OSError as error:
         raise RecordingError(f"cannot be written: {error.strerror}", file=file) from error
 

@@ -21,6 +21,7 @@ from .robot import RobotDescription
 from .rpy import rpy_of
 from .toml_file import read_toml
 from .toml_text import toml_text
+from .whole_files import write_whole
 
 CAMERA_LINK = "calibrated_camera"
 MARKER_LINK = "calibrated_marker"
@@ -66,8 +67,7 @@ def write_calibrated(
             if own or (file.exists() and not replace):
                 remedy = "Give another folder" if own else "Give another folder, or --force"
                 raise ConfigError("is there already", file=file, remedy=remedy)
-        for file, text in texts.items():
-            file.write_bytes(text)
+        write_whole(texts)
     except OSError as error:
         raise ConfigError(f"cannot be written: {error.strerror}", file=folder, remedy="Give another folder") from error
     return toml
