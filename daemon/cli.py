@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import errno
 import io
-import logging
 import os
-import resource
-import shutil
 import sys
-from typing import NoReturn
 
-import cyclopts
+try:
+    import resource
+    import shutil
+    from typing import NoReturn
 
-from bodyschema.daemon.extras import missing_module
-from bodyschema.daemon.remedies import as_typed, printable
-from bodyschema.daemon.signals import end_with_parent
-from bodyschema.interfaces.errors import BodyschemaError, ConfigError
+    import cyclopts
 
-log = logging.getLogger(__name__)
+    from bodyschema.daemon.extras import missing_module
+    from bodyschema.daemon.remedies import as_typed, printable
+    from bodyschema.daemon.signals import end_with_parent
+    from bodyschema.interfaces.errors import BodyschemaError, ConfigError
+except KeyboardInterrupt:  # loading takes a quarter of a second, in which no `main` can catch it
+    sys.exit(130)
 
 GROUPS = {
     "Start": {
@@ -178,10 +179,10 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # OpenCV would allocate 3 GiB for a malicious PNG of a few kilobytes; the largest cameras have 100 megapixels.
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**27))
-    end_with_parent()
-    prepare_streams()
     arguments = sys.argv[1:]
     try:
+        end_with_parent()
+        prepare_streams()
         allow_enough_files()
         try:
             command_line(arguments[0] if arguments else None)(arguments)
@@ -200,7 +201,6 @@ def main() -> None:
         _drop_output()
         sys.exit(1)
     except OSError as error:
-        log.debug("an error of the system ends the command", exc_info=True)
         _drop_output()
         _fail(_told(error))
 
