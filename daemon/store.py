@@ -224,7 +224,7 @@ class PairReader:
                 Devices(session, seq, utc.decode(), tuple(msgspec.json.decode(record, type=list[dict[str, Any]])))
                 for session, seq, utc, record in rows
             ]
-        except (msgspec.DecodeError, UnicodeDecodeError, AttributeError, TypeError) as error:
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, AttributeError, TypeError) as error:
             raise StoreError(damaged(self.file, f"what the joints were read with is not a record: {error}")) from error
 
     def _pair(self, row: tuple[Any, ...]) -> Pair:

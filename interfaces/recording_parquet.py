@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .errors import RecordingError
-from .limited import opened
+from .limited import MOST_MEMORY_BYTES, bounded_memory, opened
 from .recording_columns import MOST_NUMBERS, Fault, Table, check_finite, check_header, check_width
 
 MOST_BYTES = 2**30  # the largest number of values takes 0.8 GB
@@ -72,7 +72,7 @@ def _check_rows(rows: int, most: int) -> None:
 def _opened(file: Path) -> Iterator[Any]:
     """Open the Parquet file. Raise Fault where the content read inside the with block is damaged."""
     arrow, parquet = _modules(file)
-    with opened(file, MOST_BYTES) as stream:
+    with bounded_memory(MOST_MEMORY_BYTES), opened(file, MOST_BYTES) as stream:
         try:
             yield parquet.ParquetFile(stream)
         except (arrow.ArrowException, OSError, ValueError) as error:
