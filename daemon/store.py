@@ -23,7 +23,17 @@ from bodyschema.interfaces.records import FloatArray, MarkerFix, Pair, frozen_ar
 from . import store_schema
 from .retention import Keep, delete_until
 from .store_damage import Damage, count_pairs, oldest, rebuild, records, scan, scan_back
-from .store_file import NOTHING_CHANGED, damaged, explained, is_damage, lock, unwritable
+from .store_file import (
+    NOTHING_CHANGED,
+    FileIdentities,
+    damaged,
+    explained,
+    file_identities,
+    gone,
+    is_damage,
+    lock,
+    unwritable,
+)
 from .store_log import commits
 from .store_rows import Checked, as_json, checked, decoded, pair_of, require_sound, row_of, sealed
 
@@ -275,6 +285,7 @@ class PairStore:
         self._session_id = self._newest_session = 0
         self._audit: Audit | None = None
         self._rebuilt: str | None = None
+        self._identities: FileIdentities = (None, None)
 
     @property
     def identity(self) -> str:
@@ -312,9 +323,10 @@ class PairStore:
         """Assign the next number to a pair and commit it.
 
         Raises:
-            StoreError: the disk is full or broken; the pair is not in the store.
+            StoreError: the disk is full or broken, or the file is gone; the pair is not in the store.
         """
         connection = self._require_open()
+        self._require_in_place()
         measured = (fix.x, fix.cov, fix.centres_px, fix.R, fix.cov_R)
         pair = Pair(self.identity, self._seq + 1, segment, fix.t, utc, q, *measured)
         with explained(self.file), store_schema.transaction(connection):
@@ -396,8 +408,16 @@ class PairStore:
             self._audit = self.reader.audit(self._working)
             self._seq, self._newest_session = self._audit.newest, self._audit.session
             self._begin_session(self._connection)
+        self._identities = file_identities(self.file)
         for said in self.complaints:
             log.error("%s", said)
+
+    def _require_in_place(self) -> None:
+        """Raise StoreUnwritable if the file was deleted, moved or replaced: SQLite would go on writing where it was."""
+        now = file_identities(self.file)
+        if any(before not in (None, here) for before, here in zip(self._identities, now, strict=True)):
+            raise StoreUnwritable(gone(self.file))
+        self._identities = now
 
     def _give_up(self, connection: sqlite3.Connection, written: Sequence[bool]) -> None:
         """Never reuse the numbers of pairs that were committed after a damaged place in the log.
