@@ -14,7 +14,7 @@ import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from bodyschema.interfaces.recording_bag import BagTopics, read_bag
+from bodyschema.recordings.ros_bag import BagTopics, read_bag
 
 JOINTS = tuple(f"joint_{k}" for k in range(1, 7))
 SECONDS, JOINTS_HZ, POSES_HZ = 600, 100, 30

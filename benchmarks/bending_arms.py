@@ -20,7 +20,7 @@ from benchmarks.changes import TOLERANCES, pair_of, walk
 from benchmarks.rough_arm import rough_arm
 from benchmarks.rough_truths import JOINTS, TRUTHS
 from bodyschema.daemon.config import LearnerConfig
-from bodyschema.daemon.learning import DirectSolver, Learning, NominalModel
+from bodyschema.learning import DirectSolver, Learning, NominalModel
 
 
 def stream(truth: str, seed: int, pairs: int, sigma: float, every: int) -> tuple[int, Counter[str]]:

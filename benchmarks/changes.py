@@ -32,13 +32,13 @@ import numpy as np
 
 from benchmarks.first_pairs import REACH
 from benchmarks.rough_arm import RoughArm, rough_arm
-from bodyschema.daemon.learning.adaptation import Origin
-from bodyschema.daemon.learning.arm import KnownArm
-from bodyschema.daemon.learning.change import ChangeRecord, KindOfChange
-from bodyschema.daemon.learning.claims import Claim
-from bodyschema.daemon.learning.solver import fitted_belief
-from bodyschema.daemon.learning.watch import LOOKED_BACK, Reference, Watch
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
+from bodyschema.learning.adaptation import Origin
+from bodyschema.learning.arm import KnownArm
+from bodyschema.learning.change import ChangeRecord, KindOfChange
+from bodyschema.learning.claims import Claim
+from bodyschema.learning.solver import fitted_belief
+from bodyschema.learning.watch import LOOKED_BACK, Reference, Watch
 from kbmaps import ChainBelief, ChainParameters, ChainTolerances, Explanation, learning_bases
 from kbmaps.changes.mixture import log_ratios
 from kbmaps.robust import OUTLIER_SIGMAS

@@ -18,7 +18,7 @@ import numpy as np
 
 from bodyschema.effects import Effect, Simulation
 from bodyschema.effects.exports import write_correction
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 READERS = Path(__file__).resolve().parents[1] / "examples" / "correction"
 JOINTS = tuple(f"q{k}" for k in range(1, 7))

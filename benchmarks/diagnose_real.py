@@ -22,8 +22,8 @@ from bodyschema.diagnosis.fit import Fit
 from bodyschema.diagnosis.held_out import Blocks, held_out_errors
 from bodyschema.diagnosis.observations import Observations
 from bodyschema.effects import Simulation, load_simulation
-from bodyschema.interfaces.recording import Recording
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.recordings.recording import Recording
 from kbmaps.arrays import BoolArray
 
 SETS = ("ur5_laser", "wam_laser", "ur10_laser_a", "ur10_laser_b", "panda_eyeinhand")

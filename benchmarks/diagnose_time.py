@@ -17,16 +17,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodyschema.daemon.synthesis import simulated, with_noise
+from bodyschema.cli.recordings.synthesis import simulated, with_noise
 from bodyschema.diagnosis.conclusion import conclusion
 from bodyschema.diagnosis.diagnosis import diagnose
 from bodyschema.diagnosis.remedies import remedies
 from bodyschema.diagnosis.report import About, page
 from bodyschema.effects import Effect, Motion, Simulation
-from bodyschema.interfaces.recording import Recording
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
-from bodyschema.interfaces.toml_file import read_toml
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.toml_file import read_toml
 from bodyschema.sim_backend import model_file
 from kbmaps.arrays import BoolArray
 

@@ -24,8 +24,8 @@ from bodyschema.diagnosis.diagnosis import diagnose
 from bodyschema.diagnosis.observations import Observations
 from bodyschema.effects import Motion, load_simulation
 from bodyschema.effects.exports import replayed, write_correction, write_mjcf
-from bodyschema.interfaces.recording import Recording
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.recordings.recording import Recording
 
 READERS = Path(__file__).resolve().parents[1] / "examples" / "correction"
 ROBOTS = ("ur5_laser", "wam_laser")

@@ -24,9 +24,9 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.rough_arm import rough_arm
 from bodyschema.daemon.config import LearnerConfig
-from bodyschema.daemon.learning import DirectSolver, Learning, NominalModel
-from bodyschema.daemon.learning.nominal import chain_tolerances
 from bodyschema.interfaces.records import Pair, frozen_array
+from bodyschema.learning import DirectSolver, Learning, NominalModel
+from bodyschema.learning.nominal import chain_tolerances
 from kbmaps import RigidChain
 from kbmaps.arrays import FloatArray
 

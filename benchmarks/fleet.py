@@ -32,10 +32,10 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyschema.daemon.bus import Bus, Request, client
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.keys import Keys
-from bodyschema.daemon.wire import JointsRequest, PairMessage, PairsReply, PredictReply, decode, encode
+from bodyschema.daemon.transport.bus import Bus, Request, client
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.wire import JointsRequest, PairMessage, PairsReply, PredictReply, decode, encode
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.interpreter import module_command
 

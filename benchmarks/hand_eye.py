@@ -22,8 +22,8 @@ from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
-from bodyschema.interfaces.toml_file import read_toml
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.toml_file import read_toml
 from bodyschema.vision.one_eye import first_pose
 from bodyschema.vision.pose import Pose, PoseEstimator, Sighting, mirrored
 from bodyschema.vision.tag_body import TAG_CORNERS

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, ImageArray, MarkerFix, StereoFrame
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 from bodyschema.sim_backend.config import CameraConfig, SimTag
 from bodyschema.sim_backend.eye import StereoEyes
 from bodyschema.sim_backend.raster import EmptyWorld

@@ -20,11 +20,11 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyschema.daemon.bus import Bus, Request, client
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.keys import Keys
-from bodyschema.daemon.status import LearnerStatus
-from bodyschema.daemon.wire import JointsRequest, PairMessage, PairsReply, decode, encode
+from bodyschema.daemon.transport.bus import Bus, Request, client
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.status import LearnerStatus
+from bodyschema.daemon.transport.wire import JointsRequest, PairMessage, PairsReply, decode, encode
 from bodyschema.interfaces.errors import BusError
 from bodyschema.interfaces.interpreter import module_command
 from bodyschema.interfaces.records import FloatArray

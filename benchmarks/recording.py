@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 from kbmaps import ChainTolerances, RigidChain
 from kbmaps.arrays import FloatArray, IntArray
 

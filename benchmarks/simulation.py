@@ -14,7 +14,7 @@ import numpy as np
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 from bodyschema.sim_backend import SimConfig, SimWorld, model_file, true_chain
 from bodyschema.sim_backend.physics import Physics
 from bodyschema.sim_backend.truth import TrueRobot

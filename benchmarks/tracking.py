@@ -22,16 +22,16 @@ from typing import Any, Generic, Self, TypeVar
 
 import cv2
 
-from bodyschema.daemon.bus import Bus
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.sampler import Sampler
-from bodyschema.daemon.session import session_of
-from bodyschema.daemon.sources import Sources
-from bodyschema.daemon.store import PairStore
+from bodyschema.daemon.sampler.sampler import Sampler
+from bodyschema.daemon.sampler.session import session_of
+from bodyschema.daemon.sampler.sources import Sources
+from bodyschema.daemon.transport.bus import Bus
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import SourceEnded
 from bodyschema.interfaces.records import JointReading, MarkerMiss, StereoFrame
+from bodyschema.recordings.store.store import PairStore
 from bodyschema.sim_backend import SimWorld, model_file
 from bodyschema.vision.config import VisionConfig
 from bodyschema.vision.tracked_camera import TrackedCamera

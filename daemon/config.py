@@ -19,16 +19,16 @@ from msgspec import Meta
 
 from bodyschema.drivers.config import DriversConfig
 from bodyschema.effects import Simulation, simulation_of
-from bodyschema.interfaces.calibrated_files import EXTENSIONS
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.robot import CameraSection, RobotDescription, RobotSection
-from bodyschema.interfaces.suggest import did_you_mean, hint_at, with_choices
-from bodyschema.interfaces.toml_file import convert, line_of, line_of_endless_key, read_toml
+from bodyschema.robot.calibrated_files import EXTENSIONS
+from bodyschema.robot.description import CameraSection, RobotDescription, RobotSection
+from bodyschema.robot.suggest import did_you_mean, hint_at, with_choices
+from bodyschema.robot.toml_file import convert, line_of, line_of_endless_key, read_toml
 from bodyschema.sim_backend.config import SimConfig
 from bodyschema.vision.config import VisionConfig
 
-from .identity import Route
-from .zenoh_config import ZenohConfig
+from .transport.identity import Route
+from .transport.zenoh_config import ZenohConfig
 
 NonNegative = Annotated[float, Meta(ge=0)]
 Positive = Annotated[float, Meta(gt=0)]

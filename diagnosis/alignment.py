@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from bodyschema.effects import Effect, Simulation
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 from .fit import Fit, fitted
 from .observations import Observations

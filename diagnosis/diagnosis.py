@@ -10,8 +10,8 @@ import numpy as np
 from scipy import stats
 
 from bodyschema.effects import Effect, Identity, Simulation
-from bodyschema.interfaces.recording import Recording
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.recordings.recording import Recording
 
 from .alignment import aligned
 from .alike import Alike, alike

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from bodyschema.effects import Motion, Simulation
 from bodyschema.interfaces.camera import StereoCalibration
-from bodyschema.interfaces.recording import Recording
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.recordings.recording import Recording
 
 IntArray = NDArray[np.intp]
 

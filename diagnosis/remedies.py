@@ -11,8 +11,8 @@ import numpy as np
 from bodyschema.effects import KINDS, corrected_file
 from bodyschema.effects.poses import transforms
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
-from bodyschema.interfaces.rpy import rpy_of
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.rpy import rpy_of
 
 from .numbers import named, rival_named
 from .result import Cause, DiagnosisFile

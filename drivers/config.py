@@ -10,8 +10,8 @@ import msgspec
 from msgspec import Meta
 
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.plugins import PluginConfig
-from bodyschema.interfaces.toml_file import line_of
+from bodyschema.robot.plugins import PluginConfig
+from bodyschema.robot.toml_file import line_of
 
 from .dynamixel.config import DynamixelConfig
 from .feetech.config import FeetechConfig

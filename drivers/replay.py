@@ -13,8 +13,8 @@ import numpy as np
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import SourceEnded, SourceError
-from bodyschema.interfaces.recording import Recording
 from bodyschema.interfaces.records import FloatArray, JointReading, MarkerFix, frozen_array
+from bodyschema.recordings.recording import Recording
 
 DEFAULT_SIGMA_M = 1e-3
 AHEAD = 8  # rows by which one source may lead the other

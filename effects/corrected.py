@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyschema.interfaces.calibrated import CalibratedGeometry
-from bodyschema.interfaces.calibrated_files import calibrated_urdf
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
 from bodyschema.interfaces.whole_files import write_whole
+from bodyschema.robot.calibrated import CalibratedGeometry
+from bodyschema.robot.calibrated_files import calibrated_urdf
+from bodyschema.robot.description import RobotDescription
 
 from .effect import Effect
 from .poses import transforms

@@ -10,8 +10,8 @@ import numpy as np
 
 from bodyschema.interfaces.errors import RobotError
 from bodyschema.interfaces.records import FloatArray, frozen_array
-from bodyschema.interfaces.robot import RobotDescription
-from bodyschema.interfaces.suggest import did_you_mean
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.suggest import did_you_mean
 
 from .kinds import KINDS, Kind
 from .parameter import Parameter

@@ -26,14 +26,14 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from bodyschema.interfaces.calibrated_files import tables_elsewhere
 from bodyschema.interfaces.errors import ConfigError, RobotError
-from bodyschema.interfaces.limited import read_at_most
-from bodyschema.interfaces.robot import FARTHEST_CAMERA_M, LONGEST_TOOL_M, RobotDescription, Vector3
-from bodyschema.interfaces.suggest import did_you_mean
-from bodyschema.interfaces.toml_file import convert, line_in_entry, line_of, read_toml
-from bodyschema.interfaces.toml_text import toml_text
 from bodyschema.interfaces.whole_files import write_whole
+from bodyschema.robot.calibrated_files import tables_elsewhere
+from bodyschema.robot.description import FARTHEST_CAMERA_M, LONGEST_TOOL_M, RobotDescription, Vector3
+from bodyschema.robot.limited import read_at_most
+from bodyschema.robot.suggest import did_you_mean
+from bodyschema.robot.toml_file import convert, line_in_entry, line_of, read_toml
+from bodyschema.robot.toml_text import toml_text
 from kbmaps import ModelFormatError
 
 from .effect import Effect

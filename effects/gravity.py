@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray, frozen_array
-from bodyschema.interfaces.robot import RobotDescription
-from bodyschema.interfaces.urdf import REVOLUTE, PointMass, UrdfJoint, UrdfTree, standing
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.urdf import REVOLUTE, PointMass, UrdfJoint, UrdfTree, standing
 from kbmaps.rotations import cross_matrix
 
 GRAVITY_M_S2 = 9.80665  # down the root link's z axis, as simulators load a URDF

@@ -6,7 +6,7 @@ import warnings
 from dataclasses import dataclass
 from typing import Literal
 
-from bodyschema.interfaces.plugins import installed
+from bodyschema.robot.plugins import installed
 
 from .encoder import ENCODER_EFFECTS, EncoderEffect
 from .parameter import Parameter

@@ -8,8 +8,8 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyschema.interfaces.recording import Recording
 from bodyschema.interfaces.records import FloatArray, frozen_array
+from bodyschema.recordings.recording import Recording
 
 _EARLIER_KEPT = 16
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.urdf import inverse
+from bodyschema.robot.urdf import inverse
 from kbmaps import RigidChain
 
 from .effect import Effect

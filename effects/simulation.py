@@ -13,8 +13,8 @@ from typing import Protocol
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
-from bodyschema.interfaces.urdf import inverse
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.urdf import inverse
 from kbmaps import RigidChain
 
 from .effect import Effect, Identity

@@ -13,7 +13,7 @@ from functools import reduce
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 from kbmaps import JointBasis, KBMap
 
 from .unexplained import PLACE, Unexplained

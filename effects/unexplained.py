@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from bodyschema.interfaces.errors import RobotError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
-from bodyschema.interfaces.suggest import did_you_mean
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.suggest import did_you_mean
 from kbmaps import KBMap, KBMapsError, KernelLearner, ModelFormatError, ResidualModel, TensorTrain
 
 # Coordinates of the marker, in place of a joint.

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyschema.interfaces.calibrated import CalibratedGeometry
-from bodyschema.interfaces.calibrated_files import write_calibrated
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.calibrated import CalibratedGeometry
+from bodyschema.robot.calibrated_files import write_calibrated
+from bodyschema.robot.description import RobotDescription
 from kbmaps import ChainParameters, ChainPosterior, ChainTolerances, InverseKinematics, RigidLearner, next_pose
 
 SIGMA = 0.001  # of the camera, each coordinate [m]

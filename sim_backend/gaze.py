@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from bodyschema.interfaces.camera import StereoCalibration
-from bodyschema.interfaces.pointing import Pointing
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.pointing import Pointing
 from kbmaps import RigidChain
 
 _SOLVE_STEPS = 12

@@ -9,7 +9,7 @@ import numpy as np
 
 from bodyschema.effects import Simulation
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 from .config import EncoderConfig, SimConfig
 from .physics import Physics

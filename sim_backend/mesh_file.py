@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from bodyschema.interfaces.limited import read_at_most
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.robot.limited import read_at_most
 
 from .geometry import transform
 

@@ -15,10 +15,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.errors import RobotError
-from bodyschema.interfaces.limited import read_at_most
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.rpy import rpy_of
-from bodyschema.interfaces.urdf import MOVING, UrdfJoint, UrdfTree
+from bodyschema.robot.limited import read_at_most
+from bodyschema.robot.rpy import rpy_of
+from bodyschema.robot.urdf import MOVING, UrdfJoint, UrdfTree
 
 from .meshes import LARGEST_M, Meshes
 from .roles import root_link

@@ -14,7 +14,7 @@ from bodyschema.effects import Motion, Simulation
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import SourceEnded
 from bodyschema.interfaces.records import FloatArray, JointReading, StereoFrame, frozen_array
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 from kbmaps import RigidChain
 
 from .bullet import Body

@@ -7,7 +7,7 @@ import numpy as np
 from bodyschema.effects import Simulation
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 from .bullet import Body
 from .config import SimConfig

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
-from bodyschema.interfaces.urdf import UrdfTree, chain_between
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.urdf import UrdfTree, chain_between
 from kbmaps import RigidChain
 
 from .truth import TrueRobot, with_offsets

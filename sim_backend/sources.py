@@ -10,7 +10,7 @@ from typing import Protocol, Self
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import JointReading, StereoFrame
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 
 class World(Protocol):

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from bodyschema.effects import Effect, Simulation
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, frozen_array
-from bodyschema.interfaces.robot import RobotDescription
-from bodyschema.interfaces.urdf import MOVING, UrdfJoint, UrdfTree, chain_between
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.urdf import MOVING, UrdfJoint, UrdfTree, chain_between
 from kbmaps import RigidChain
 
 from .config import ErrorConfig, SimConfig

@@ -19,7 +19,7 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, SourceEnded, SourceError
 from bodyschema.interfaces.records import FloatArray, ImageArray, JointReading, StereoFrame, frozen_array
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 from kbmaps import RigidChain
 
 from .config import SimConfig

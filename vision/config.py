@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from bodyschema.interfaces.plugins import PluginConfig
+from bodyschema.robot.plugins import PluginConfig
 
 from .cameras.config import CamerasConfig
 from .tag_config import ClusterConfig, TagConfig

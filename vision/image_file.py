@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from bodyschema.interfaces.limited import read_at_most
 from bodyschema.interfaces.records import ImageArray
+from bodyschema.robot.limited import read_at_most
 
 # The largest camera images, uncompressed, have half of it.
 MOST_BYTES = 2**28

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.plugins import load
+from bodyschema.robot.plugins import load
 
 from .config import VisionConfig
 from .one_eye_ball import OneEyeBallTracker

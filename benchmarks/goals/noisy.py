@@ -21,9 +21,9 @@ from benchmarks.rigid_learner import (
     noisy_fit,
     spoilt_fit,
 )
-from bodyschema.daemon.reproduce.arm import JOINTS, arm, longer_tool
-from bodyschema.daemon.reproduce.fig6 import MOVED_M
-from bodyschema.daemon.reproduce.walk import WALK_SIGMA, walk
+from bodyschema.reproduce.arm import JOINTS, arm, longer_tool
+from bodyschema.reproduce.fig6 import MOVED_M
+from bodyschema.reproduce.walk import WALK_SIGMA, walk
 from kbmaps import ToolLayer
 from kbmaps.arrays import FloatArray
 

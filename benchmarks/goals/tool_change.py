@@ -17,8 +17,8 @@ from benchmarks.peers.tasks import Trial
 from benchmarks.rigid_learner import new_tool_error
 from benchmarks.rough_arm import ROUGH, RoughArm, rough_arm
 from bodyschema.daemon.config import LearnerConfig
-from bodyschema.daemon.learning import DirectSolver, Learning, NominalModel
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
+from bodyschema.learning import DirectSolver, Learning, NominalModel
 from kbmaps import ChainTolerances
 
 _JOINTS = 6

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from random import Random
 
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.suggest import did_you_mean
+from bodyschema.robot.suggest import did_you_mean
 
 from .device import Fault, Reply
 from .faults import corrupt, garbage, half, late, mute, wrong_checksum

@@ -11,7 +11,7 @@ from msgspec import Meta
 
 from bodyschema.drivers.servos.config import Positive, ServoConfig
 from bodyschema.drivers.servos.model import Model
-from bodyschema.interfaces.suggest import did_you_mean
+from bodyschema.robot.suggest import did_you_mean
 
 from .torque_constants import torque_constant
 

@@ -11,8 +11,8 @@ import msgspec
 from msgspec import Meta
 
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.suggest import did_you_mean
-from bodyschema.interfaces.toml_file import line_of
+from bodyschema.robot.suggest import did_you_mean
+from bodyschema.robot.toml_file import line_of
 
 Positive = Annotated[float, Meta(gt=0)]
 

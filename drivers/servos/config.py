@@ -10,8 +10,8 @@ import msgspec
 from msgspec import Meta
 
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.suggest import did_you_mean
-from bodyschema.interfaces.toml_file import line_in_entry, line_of
+from bodyschema.robot.suggest import did_you_mean
+from bodyschema.robot.toml_file import line_in_entry, line_of
 
 from .model import Model, no_driver
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.suggest import did_you_mean
+from bodyschema.robot.suggest import did_you_mean
 
 from .model import Register
 

@@ -15,7 +15,7 @@ from bodyschema.effects.effect import Effect
 from bodyschema.effects.gravity import GRAVITY_M_S2, carried
 from bodyschema.effects.simulation import RIGID, Simulation
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.urdf import inverse
+from bodyschema.robot.urdf import inverse
 
 from .geometry import geometry_without_zeros
 from .joint_errors import LeftOut, moment_notes, residual_note, sentences, why_not

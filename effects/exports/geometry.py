@@ -6,7 +6,7 @@ import numpy as np
 
 from bodyschema.effects.corrected import corrected_geometry
 from bodyschema.effects.simulation import Simulation
-from bodyschema.interfaces.calibrated import CalibratedGeometry
+from bodyschema.robot.calibrated import CalibratedGeometry
 
 
 def geometry_of(simulation: Simulation) -> CalibratedGeometry:

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from bodyschema.interfaces.errors import RobotError
-from bodyschema.interfaces.limited import read_at_most
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.rpy import rotation_of
+from bodyschema.robot.limited import read_at_most
+from bodyschema.robot.rpy import rotation_of
 from kbmaps.rotations import quaternions
 
 # Mesh formats that MuJoCo reads, and its limit of triangles in an STL file.

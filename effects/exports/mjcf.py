@@ -22,7 +22,7 @@ from bodyschema.effects.gravity import GRAVITY_M_S2
 from bodyschema.effects.simulation import Simulation
 from bodyschema.interfaces.errors import RobotError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.urdf import MOVING, UrdfJoint, standing
+from bodyschema.robot.urdf import MOVING, UrdfJoint, standing
 
 from .geometry import geometry_without_zeros
 from .joint_errors import ArmErrors, JointErrors, Wave, numbers

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from bodyschema.effects.simulation import RIGID, Simulation
-from bodyschema.interfaces.calibrated_files import calibrated_urdf
+from bodyschema.robot.calibrated_files import calibrated_urdf
 
 from .geometry import geometry_of
 from .joint_errors import LeftOut, moment_notes, residual_note, sentences

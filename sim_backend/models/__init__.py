@@ -6,7 +6,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.suggest import did_you_mean
+from bodyschema.robot.suggest import did_you_mean
 
 
 def model_file(name: str) -> Path:

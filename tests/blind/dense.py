@@ -26,7 +26,7 @@ from .dense_judge import DenseJudgement, inside, line, name, outcome, placed, rm
 
 HERE = Path(__file__).resolve().parent
 LIMIT_S = 300.0
-DIAGNOSE = "import sys; from bodyschema.daemon.cli import main; sys.exit(main())"
+DIAGNOSE = "import sys; from bodyschema.cli.main import main; sys.exit(main())"
 RUN_FILE = "import runpy, sys; sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"
 
 

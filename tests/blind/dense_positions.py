@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from bodyschema.effects import Motion, load_simulation
-from bodyschema.interfaces.recording import Recording
+from bodyschema.recordings.recording import Recording
 
 
 def main(extended: Path, recording: Path, out: Path) -> None:

@@ -14,8 +14,8 @@ from bodyschema.diagnosis.conclusion import conclusion
 from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
 from bodyschema.diagnosis.result import Cause, DiagnosisFile, Indistinguishable, Interval
 from bodyschema.effects import Effect, Motion, Simulation
-from bodyschema.interfaces.recording import Recording
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.description import RobotDescription
 
 from .arrays import FloatArray
 from .cases import HiddenCase

@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 
 from bodyschema.effects import Effect
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 from .hidden import Hidden, Parameters
 from .kinds import SHIFT, SIX

@@ -12,8 +12,8 @@ import pytest
 
 pytest.importorskip("pybullet")
 
-from bodyschema.interfaces.recording import Recording
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.description import RobotDescription
 
 from .arms import ARMS
 from .bullet import bullet

@@ -20,8 +20,8 @@ from bodyschema.diagnosis.result import (
     Unexplained,
 )
 from bodyschema.effects import Motion
-from bodyschema.interfaces.recording import Recording
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.description import RobotDescription
 
 from .cases import HiddenCase, hide
 from .figures import Rate, calibration, confusion, coverage, error_of_probability, failures, goals

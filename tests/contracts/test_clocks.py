@@ -11,7 +11,7 @@ import pytest
 
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.protocols import Clock
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 from bodyschema.sim_backend import SimConfig, SimWorld, model_file
 
 

@@ -21,10 +21,10 @@ import pytest
 from fake_capture import SIZE_PX, FakeCapture
 from scripted_sources import COV, Scripted
 
-from bodyschema.daemon.bench_wiring import through_bench
+from bodyschema.cli.demo.tags import cube_tables
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.demo.tags import cube_tables
-from bodyschema.daemon.wiring import driver_of
+from bodyschema.daemon.wiring.bench import through_bench
+from bodyschema.daemon.wiring.wiring import driver_of
 from bodyschema.drivers.bench.device import Faults
 from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
 from bodyschema.drivers.dynamixel.bench.chain import Chain, no_faults
@@ -51,9 +51,9 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import SourceEnded, SourceError
 from bodyschema.interfaces.protocols import JointSource, MarkerSource, StereoCamera, StereoEyes
-from bodyschema.interfaces.recording import Recording
 from bodyschema.interfaces.records import JointReading, MarkerFix, MarkerMiss, StereoFrame, frozen_array
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.description import RobotDescription
 from bodyschema.sim_backend import CameraConfig, SimConfig, SimWorld, model_file
 from bodyschema.sim_backend.config import SimTag
 from bodyschema.vision.cameras.config import CamerasConfig

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bodyschema.daemon.config import LearnerConfig
-from bodyschema.daemon.learning import DirectSolver, Learning, NominalModel
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
+from bodyschema.learning import DirectSolver, Learning, NominalModel
 from kbmaps import RigidChain
 
 JOINTS = 4

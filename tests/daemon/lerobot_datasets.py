@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyschema.interfaces.lerobot import RAD_PER_TICK, Calibrations, Unit
+from bodyschema.robot.lerobot import RAD_PER_TICK, Calibrations, Unit
 
 FPS = 30
 

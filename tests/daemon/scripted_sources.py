@@ -8,11 +8,11 @@ from typing import Any, Self
 
 import numpy as np
 
-from bodyschema.daemon.sources import Simulation, Sources
+from bodyschema.daemon.sampler.sources import Simulation, Sources
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import SourceEnded, SourceError
 from bodyschema.interfaces.records import FloatArray, JointReading, MarkerFix, MarkerMiss, frozen_array
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 from kbmaps import RigidChain
 
 FRAME_S = 1 / 30

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bodyschema.daemon.align import JointBuffer, joint_difference
+from bodyschema.daemon.sampler.align import JointBuffer, joint_difference
 from bodyschema.interfaces.records import JointReading, Reason, frozen_array
 
 LIMIT_S = 500.0

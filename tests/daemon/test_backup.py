@@ -21,19 +21,19 @@ import warm
 from guided_arm import Scene, new_learning, teach
 from small_arm import URDF, write_small_arm
 
-from bodyschema.daemon.backup import MANIFEST, ROBOT_TOML, STORE, Backup, BackupError, write_backup
-from bodyschema.daemon.bus import Bus
-from bodyschema.daemon.checkpoint import read_checkpoint, write_checkpoint
-from bodyschema.daemon.cli import command_line
+from bodyschema.cli.install.backup import MANIFEST, ROBOT_TOML, STORE, Backup, BackupError, write_backup
+from bodyschema.cli.install.restore import restore
+from bodyschema.cli.main import command_line
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.keys import Keys
-from bodyschema.daemon.learning import LearningState
-from bodyschema.daemon.restoring import restore
-from bodyschema.daemon.session import session_of
-from bodyschema.daemon.store import PairReader, PairStore
+from bodyschema.daemon.learner.checkpoint import read_checkpoint, write_checkpoint
+from bodyschema.daemon.sampler.session import session_of
+from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.keys import Keys
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import StoreError
 from bodyschema.interfaces.records import MarkerFix, frozen_array
+from bodyschema.learning import LearningState
+from bodyschema.recordings.store.store import PairReader, PairStore
 
 UTC = "2026-11-21T12:00:00.000+00:00"
 COV = frozen_array(np.eye(3) * 1e-6)
@@ -451,7 +451,7 @@ def test_a_restore_that_fails_midway_is_undone(config, backed_up, monkeypatch, n
         return once
 
     monkeypatch.setattr("os.replace", failing(os.replace))
-    monkeypatch.setattr("bodyschema.daemon.restoring.sync_folder", failing(lambda folder: None))
+    monkeypatch.setattr("bodyschema.cli.install.restore.sync_folder", failing(lambda folder: None))
     with pytest.raises(BackupError, match=r"Input/output error\. Nothing was changed"):
         put_back(backed_up, config.file, force=True)
     assert contents(config.file.parent) == before
@@ -499,7 +499,7 @@ def flip_each(bits: Iterable[int], archive: Path, robot: Path) -> Counter[str]:
 @pytest.fixture
 def at_rest(monkeypatch) -> None:
     """Skip the check for running processes: there are none."""
-    monkeypatch.setattr("bodyschema.daemon.restoring.is_alive", lambda *_: False)
+    monkeypatch.setattr("bodyschema.cli.install.restore.is_alive", lambda *_: False)
 
 
 @pytest.mark.usefixtures("at_rest")

@@ -19,12 +19,12 @@ import pytest
 import warm
 from small_arm import ROBOT, URDF, write_long_arm, write_small_arm
 
-from bodyschema.daemon.bus import Bus, client
-from bodyschema.daemon.cli import main
+from bodyschema.cli.main import main
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.keys import Keys
-from bodyschema.daemon.status import LearnerStatus
-from bodyschema.daemon.wire import decode
+from bodyschema.daemon.transport.bus import Bus, client
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.status import LearnerStatus
+from bodyschema.daemon.transport.wire import decode
 from bodyschema.interfaces.errors import BusError, RequestError
 
 LIMIT_S = 500.0

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodyschema.daemon.bench_run import FAULTS, BenchRun
-from bodyschema.daemon.cli import app
+from bodyschema.cli.hardware.bench_run import FAULTS, BenchRun
+from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.wiring import open_joints
+from bodyschema.daemon.wiring.wiring import open_joints
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError
 

@@ -8,9 +8,9 @@ from queue import Queue
 
 import pytest
 
-from bodyschema.daemon.bus import Bus, Request, client
-from bodyschema.daemon.identity import Route
-from bodyschema.daemon.wire import JSON, MSGPACK, ErrorReply, decode
+from bodyschema.daemon.transport.bus import Bus, Request, client
+from bodyschema.daemon.transport.identity import Route
+from bodyschema.daemon.transport.wire import JSON, MSGPACK, ErrorReply, decode
 from bodyschema.interfaces.errors import BusError, RequestError
 
 LIMIT_S = 500.0
@@ -184,7 +184,7 @@ def test_a_closed_session_says_so(endpoint) -> None:
 
 def test_a_process_ends_although_its_handlers_are_still_declared(endpoint) -> None:
     code = (
-        "import sys; from bodyschema.daemon.bus import Bus\n"
+        "import sys; from bodyschema.daemon.transport.bus import Bus\n"
         "with Bus(listen=sys.argv[1]) as bus:\n"
         "    bus.answer('a/b', lambda r: b''); bus.subscribe('a/c', print); bus.watch('a/d', print)\n"
         "    raise SystemExit(7)"

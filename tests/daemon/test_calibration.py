@@ -12,25 +12,25 @@ import msgspec
 import numpy as np
 import pytest
 
-from bodyschema.daemon.calibration import Calibration, CalibrationError
-from bodyschema.daemon.calibration_report import CalibrationReport
-from bodyschema.daemon.calibration_view import sentences
-from bodyschema.daemon.checkpoint import write_checkpoint
-from bodyschema.daemon.cli import app
+from bodyschema.calibration.plausibility.check import Plausibility
+from bodyschema.calibration.report import CalibrationReport
+from bodyschema.calibration.rigid_chain import Calibration, CalibrationError
+from bodyschema.cli.main import app
+from bodyschema.cli.terminal.calibration_view import sentences
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.learning import DirectSolver, Learning, NominalModel
-from bodyschema.daemon.plausibility.check import Plausibility
-from bodyschema.daemon.recordings import of_robot
-from bodyschema.daemon.session import session_of
-from bodyschema.daemon.store import PairStore
-from bodyschema.interfaces.calibrated import CalibratedGeometry
-from bodyschema.interfaces.calibrated_files import write_calibrated
+from bodyschema.daemon.learner.checkpoint import write_checkpoint
+from bodyschema.daemon.sampler.session import session_of
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import RecordingError
-from bodyschema.interfaces.recording import Recording
 from bodyschema.interfaces.records import MarkerFix
-from bodyschema.interfaces.robot import RobotDescription
-from bodyschema.interfaces.rpy import rpy_of
+from bodyschema.learning import DirectSolver, Learning, NominalModel
+from bodyschema.recordings.files import of_robot
+from bodyschema.recordings.recording import Recording
+from bodyschema.recordings.store.store import PairStore
+from bodyschema.robot.calibrated import CalibratedGeometry
+from bodyschema.robot.calibrated_files import write_calibrated
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.rpy import rpy_of
 from bodyschema.sim_backend import SimConfig, model_file
 from bodyschema.sim_backend.config import ErrorConfig
 from bodyschema.sim_backend.physics import Physics

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bodyschema.daemon.calibration import Calibration
-from bodyschema.daemon.calibration_report import CalibrationReport
-from bodyschema.daemon.calibration_view import sentences
-from bodyschema.daemon.chain_figures import HALF_WIDTH_95
-from bodyschema.daemon.cli import command_line
-from bodyschema.daemon.hand_eye import HandEye, write_launch_file
-from bodyschema.daemon.plausibility.check import Plausibility
-from bodyschema.interfaces.recording import Recording
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.calibration.chain_figures import HALF_WIDTH_95
+from bodyschema.calibration.hand_eye import HandEye, write_launch_file
+from bodyschema.calibration.plausibility.check import Plausibility
+from bodyschema.calibration.report import CalibrationReport
+from bodyschema.calibration.rigid_chain import Calibration
+from bodyschema.cli.main import command_line
+from bodyschema.cli.terminal.calibration_view import sentences
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.description import RobotDescription
 from kbmaps import ChainParameters, ChainTolerances
 
 DESK_ARM = Path(__file__).parents[2] / "examples" / "desk_arm"

@@ -13,10 +13,10 @@ import pytest
 from board_renderer import Photographer, Printed, Taken
 from shown_board import photographed
 
-from bodyschema.daemon.camera_calibration import CamerasFile, CheckFile
-from bodyschema.daemon.cli import app
+from bodyschema.cli.cameras.calibration import CamerasFile, CheckFile
+from bodyschema.cli.main import app
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.interval import to_its_interval
+from bodyschema.robot.interval import to_its_interval
 from bodyschema.vision.rig import CalibrationError
 from bodyschema.vision.rig_file import read_rig
 

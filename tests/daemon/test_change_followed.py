@@ -11,15 +11,15 @@ from guided_arm import NOW_AND_THEN, Scene, built_chain, measured, new_learning,
 from scipy.spatial.transform import Rotation
 
 from bodyschema.daemon.config import LearnerConfig
-from bodyschema.daemon.learning import Learning, LearningState
-from bodyschema.daemon.learning.adaptation import Origin
-from bodyschema.daemon.learning.arm import KnownArm
-from bodyschema.daemon.learning.claims import Claim
-from bodyschema.daemon.learning.nominal import chain_tolerances
-from bodyschema.daemon.learning.state import LearningHeader
-from bodyschema.daemon.learning.watch import Noticed, Reference
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning import Learning, LearningState
+from bodyschema.learning.adaptation import Origin
+from bodyschema.learning.arm import KnownArm
+from bodyschema.learning.claims import Claim
+from bodyschema.learning.nominal import chain_tolerances
+from bodyschema.learning.state import LearningHeader
+from bodyschema.learning.watch import Noticed, Reference
 from kbmaps import ChainBelief, ChainParameters, RigidChain, change_kinds, learning_bases
 
 SIGMA, TAUGHT, SINCE = 0.002, 180, 40

@@ -7,8 +7,8 @@ import logging
 import msgspec
 import pytest
 
-from bodyschema.daemon.changes import Changes
-from bodyschema.daemon.learning.change import ChangeRecord, KindOfChange
+from bodyschema.daemon.learner.changes import Changes
+from bodyschema.learning.change import ChangeRecord, KindOfChange
 
 JOINTS = ("waist", "shoulder", "elbow")
 UNDECIDED = ChangeRecord(

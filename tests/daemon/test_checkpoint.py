@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from guided_arm import Scene, new_learning, teach
 
-from bodyschema.daemon.checkpoint import (
+from bodyschema.daemon.learner.checkpoint import (
     LARGEST_BYTES,
     CheckpointError,
     generations,
@@ -19,8 +19,8 @@ from bodyschema.daemon.checkpoint import (
     set_aside,
     write_checkpoint,
 )
-from bodyschema.daemon.going_on import go_on
-from bodyschema.daemon.learning import LearningState
+from bodyschema.daemon.learner.resume import go_on
+from bodyschema.learning import LearningState
 
 UTC = "2026-11-21T12:00:00.000+00:00"
 

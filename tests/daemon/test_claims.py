@@ -6,11 +6,11 @@ import pytest
 from guided_arm import JOINTS, REACH, built_chain, make_pair, measured, new_learning, nominal_model, path, teach
 
 from bodyschema.daemon.config import LearnerConfig
-from bodyschema.daemon.learning.claims import Claims, ClaimsState
-from bodyschema.daemon.learning.members import INSTANT, PRIOR, RESIDUAL, RIGID
-from bodyschema.daemon.learning.nominal import chain_tolerances
-from bodyschema.daemon.learning.unknowns import Where
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning.claims import Claims, ClaimsState
+from bodyschema.learning.members import INSTANT, PRIOR, RESIDUAL, RIGID
+from bodyschema.learning.nominal import chain_tolerances
+from bodyschema.learning.unknowns import Where
 from kbmaps import ChainBelief, ChainParameters, ChainTolerances
 
 NOISE = np.full(3, 1e-6)

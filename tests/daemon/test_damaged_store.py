@@ -14,19 +14,19 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from bodyschema.daemon import store_schema
-from bodyschema.daemon.bus import Request
-from bodyschema.daemon.doctor import store_checks
-from bodyschema.daemon.history import answer_pairs
-from bodyschema.daemon.recordings import from_store
-from bodyschema.daemon.retention import Keep
-from bodyschema.daemon.store import PairReader, PairStore, Session, leave_out_damage
-from bodyschema.daemon.store_damage import LEFT_FREE, Damage
-from bodyschema.daemon.store_log import commits
-from bodyschema.daemon.store_rows import COLUMNS, checksum
-from bodyschema.daemon.wire import JSON, PairsReply, decode, pair_to_wire
+from bodyschema.cli.hardware.doctor import store_checks
+from bodyschema.daemon.sampler.history import answer_pairs
+from bodyschema.daemon.transport.bus import Request
+from bodyschema.daemon.transport.wire import JSON, PairsReply, decode, pair_to_wire
 from bodyschema.interfaces.errors import RecordingError, StoreError
 from bodyschema.interfaces.records import MarkerFix, frozen_array
+from bodyschema.recordings.files import from_store
+from bodyschema.recordings.store import schema as store_schema
+from bodyschema.recordings.store.damage import LEFT_FREE, Damage
+from bodyschema.recordings.store.log import commits
+from bodyschema.recordings.store.retention import Keep
+from bodyschema.recordings.store.rows import COLUMNS, checksum
+from bodyschema.recordings.store.store import PairReader, PairStore, Session, leave_out_damage
 
 JOINTS = ("waist", "shoulder")
 SESSION = Session(JOINTS, "2026-01-01T00:00:00+00:00", "[robot]", "<robot/>", "{}", "0", "host")

@@ -7,9 +7,9 @@ from typing import cast
 import pytest
 from rich.console import Console
 
-from bodyschema.daemon.demo import view
-from bodyschema.daemon.demo.play import Snapshot, stalled
-from bodyschema.daemon.status import SamplerStatus
+from bodyschema.cli.demo import view
+from bodyschema.cli.demo.play import Snapshot, stalled
+from bodyschema.daemon.transport.status import SamplerStatus
 
 
 def snapshot(pairs: int, angle_rad: float | None = None) -> Snapshot:

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from bodyschema.daemon.devices import DeviceWatch, differences
-from bodyschema.daemon.mcap_export import write_mcap
-from bodyschema.daemon.servos_view import servos_table
-from bodyschema.daemon.status import ServoStatus
-from bodyschema.daemon.store import PairReader, PairStore, Session
+from bodyschema.cli.servos.servos_view import servos_table
+from bodyschema.daemon.sampler.devices import DeviceWatch, differences
+from bodyschema.daemon.transport.status import ServoStatus
 from bodyschema.interfaces.clock import SystemClock
-from bodyschema.interfaces.recording import Recording
 from bodyschema.interfaces.records import MarkerFix, frozen_array
+from bodyschema.recordings.mcap_export import write_mcap
+from bodyschema.recordings.recording import Recording
+from bodyschema.recordings.store.store import PairReader, PairStore, Session
 
 SESSION = Session(("elbow",), "2026-01-01T00:00:00+00:00", "[robot]", "<robot/>", "{}", "0", "host")
 ELBOW = {

@@ -17,18 +17,18 @@ import pytest
 from rich.console import Console
 from walked import DESK_ARM, walked
 
-from bodyschema.daemon.bus import Bus, Request
-from bodyschema.daemon.cli import main
+from bodyschema.cli.main import main
+from bodyschema.cli.terminal.diagnosis_run import Asked, Source, run
+from bodyschema.cli.terminal.diagnosis_view import view
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.diagnosis_run import Asked, Source, run
-from bodyschema.daemon.diagnosis_view import view
-from bodyschema.daemon.keys import Keys
-from bodyschema.daemon.wire import PairsReply, encode, pair_to_wire
+from bodyschema.daemon.transport.bus import Bus, Request
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.wire import PairsReply, encode, pair_to_wire
 from bodyschema.diagnosis.result import DiagnosisFile, Indistinguishable, Unexplained
 from bodyschema.effects import Effect
-from bodyschema.interfaces.recording import Recording
 from bodyschema.interfaces.records import Pair
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.description import RobotDescription
 
 FEW = ("--effects", "joint_scale,backlash")
 KEYS = {

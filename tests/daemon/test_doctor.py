@@ -15,22 +15,22 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from bodyschema.daemon import doctor
-from bodyschema.daemon.bench_run import BenchRun
-from bodyschema.daemon.bus import Bus
-from bodyschema.daemon.cli import app
+from bodyschema.cli.hardware import doctor
+from bodyschema.cli.hardware.bench_run import BenchRun
+from bodyschema.cli.hardware.doctor_view import show
+from bodyschema.cli.install.units import FOLDER
+from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.doctor_view import show
-from bodyschema.daemon.identity import Route
-from bodyschema.daemon.keys import Keys
-from bodyschema.daemon.servo_wiring import Check
-from bodyschema.daemon.status import SamplerStatus
-from bodyschema.daemon.store import PairStore, Session
-from bodyschema.daemon.units import FOLDER
-from bodyschema.daemon.wire import encode
+from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.identity import Route
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.status import SamplerStatus
+from bodyschema.daemon.transport.wire import encode
+from bodyschema.daemon.wiring.servos import Check
 from bodyschema.drivers import checks
 from bodyschema.drivers.checks import Holder
 from bodyschema.interfaces.records import MarkerFix
+from bodyschema.recordings.store.store import PairStore, Session
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "desk_arm" / "servos.toml"
 LONGEST_S = 5.0

@@ -6,11 +6,11 @@ import numpy as np
 from guided_arm import Scene, nominal_model
 
 from bodyschema.daemon.config import LearnerConfig
-from bodyschema.daemon.learning.arm import KnownArm
-from bodyschema.daemon.learning.claims import Claims
-from bodyschema.daemon.learning.doubts import Doubts
-from bodyschema.daemon.learning.era import Era
-from bodyschema.daemon.learning.gate import CHANGE
+from bodyschema.learning.arm import KnownArm
+from bodyschema.learning.claims import Claims
+from bodyschema.learning.doubts import Doubts
+from bodyschema.learning.era import Era
+from bodyschema.learning.gate import CHANGE
 from kbmaps import ChainTolerances
 
 NEAR, LIMIT, FAR = 0.001, 0.01, 0.1

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodyschema.daemon.driver_snippets import write_snippets
+from bodyschema.cli.hardware.driver_snippets import write_snippets
 from bodyschema.effects import Effect, Simulation
-from bodyschema.interfaces.robot import RobotDescription
-from bodyschema.interfaces.rpy import rotation_of
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.rpy import rotation_of
 
 DESK_ARM = Path(__file__).parents[2] / "examples" / "desk_arm"
 UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")

@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 from small_arm import write_small_arm
 
-from bodyschema.daemon import store_schema
-from bodyschema.daemon.backup import Backup
+from bodyschema.cli.hardware.wiggling import read_wiggle
+from bodyschema.cli.install.backup import Backup
+from bodyschema.cli.servos.fitting import read_scan
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.identity import Identity, TlsConfig
-from bodyschema.daemon.servo_fitting import read_scan
-from bodyschema.daemon.store import PairReader
-from bodyschema.daemon.wiggling import read_wiggle
+from bodyschema.daemon.transport.identity import Identity, TlsConfig
 from bodyschema.effects.files import load_simulation
-from bodyschema.interfaces import recording_csv
 from bodyschema.interfaces.errors import BodyschemaError, ConfigError, RecordingError, StoreError
-from bodyschema.interfaces.limited import UnfitFile, read_at_most
-from bodyschema.interfaces.recording import Recording
-from bodyschema.interfaces.toml_file import read_toml
-from bodyschema.interfaces.urdf import UrdfTree
+from bodyschema.recordings import csv_file as recording_csv
+from bodyschema.recordings.recording import Recording
+from bodyschema.recordings.store import schema as store_schema
+from bodyschema.recordings.store.store import PairReader
+from bodyschema.robot.limited import UnfitFile, read_at_most
+from bodyschema.robot.toml_file import read_toml
+from bodyschema.robot.urdf import UrdfTree
 from bodyschema.vision.cameras.film import read_times
 from bodyschema.vision.image_file import read_image
 

@@ -9,13 +9,13 @@ import pytest
 from guided_arm import Scene, make_pair, nominal_model
 
 from bodyschema.daemon.config import LearnerConfig
-from bodyschema.daemon.learning import Solved
-from bodyschema.daemon.learning.arm import KnownArm
-from bodyschema.daemon.learning.claims import Claims
-from bodyschema.daemon.learning.era import Era
-from bodyschema.daemon.learning.learnt import LearntModel
-from bodyschema.daemon.learning.members import EXACT, PRIOR, RESIDUAL, RIGID
-from bodyschema.daemon.learning.solver import fitted_residual
+from bodyschema.learning import Solved
+from bodyschema.learning.arm import KnownArm
+from bodyschema.learning.claims import Claims
+from bodyschema.learning.era import Era
+from bodyschema.learning.learnt import LearntModel
+from bodyschema.learning.members import EXACT, PRIOR, RESIDUAL, RIGID
+from bodyschema.learning.solver import fitted_residual
 from kbmaps import ChainTolerances, KBMap
 
 NOMINAL = nominal_model()

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bodyschema.daemon.evaluate import BLOCKS, ErrorFigures, EvaluationError, coverage, split_blocks
+from bodyschema.calibration.evaluate import BLOCKS, ErrorFigures, EvaluationError, coverage, split_blocks
 
 
 def runs(mask: np.ndarray) -> int:

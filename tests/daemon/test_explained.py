@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodyschema.daemon.learning.gate import explained
+from bodyschema.learning.gate import explained
 
 
 @pytest.mark.parametrize(

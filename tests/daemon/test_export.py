@@ -11,12 +11,12 @@ import pytest
 import warm
 from small_arm import JOINTS, ROBOT, URDF, write_small_arm
 
-from bodyschema.daemon.cli import app
-from bodyschema.daemon.mcap_export import write_mcap
-from bodyschema.daemon.store import PairStore, Session
+from bodyschema.cli.main import app
 from bodyschema.interfaces.errors import ConfigError, RecordingError, StoreError
-from bodyschema.interfaces.recording import Recording
 from bodyschema.interfaces.records import MarkerFix
+from bodyschema.recordings.mcap_export import write_mcap
+from bodyschema.recordings.recording import Recording
+from bodyschema.recordings.store.store import PairStore, Session
 
 
 @pytest.fixture

@@ -10,11 +10,11 @@ import pytest
 from walked import DESK_ARM
 
 from bodyschema.daemon.config import Config, LearnerConfig
-from bodyschema.daemon.learning import DirectSolver, Learning, NominalModel
-from bodyschema.daemon.learning.nominal import chain_tolerances
 from bodyschema.effects import Effect, Motion, Simulation, write_extended
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.learning import DirectSolver, Learning, NominalModel
+from bodyschema.learning.nominal import chain_tolerances
+from bodyschema.robot.description import RobotDescription
 
 LINK, TURN = [0.005, 0.003, -0.004, 0.02, 0.01, -0.02], [0.03, 0.02]
 RIGID: Mapping[str, list[float]] = {"link_geometry": LINK, "joint_offset": [0.03]}

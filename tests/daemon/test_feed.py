@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from guided_arm import STORE, Scene, make_pair, new_learning
 
-from bodyschema.daemon.feed import RETRY_S, WAITING, PairFeed
-from bodyschema.daemon.history import Page, read_page
-from bodyschema.daemon.learning import Learning
-from bodyschema.daemon.wire import PairMessage, PairsReply, encode, pair_to_wire
+from bodyschema.daemon.learner.feed import RETRY_S, WAITING, PairFeed
+from bodyschema.daemon.sampler.history import Page, read_page
+from bodyschema.daemon.transport.wire import PairMessage, PairsReply, encode, pair_to_wire
 from bodyschema.interfaces.errors import BusError, RequestError
 from bodyschema.interfaces.records import Pair
+from bodyschema.learning import Learning
 
 PAGE = 7
 PAIRS = Scene.draw(0, 40).pairs

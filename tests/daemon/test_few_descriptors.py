@@ -11,11 +11,11 @@ import sys
 import pytest
 from guided_arm import nominal_model
 
-from bodyschema.daemon import cli
-from bodyschema.daemon.cli import allow_enough_files
-from bodyschema.daemon.learning import Task
-from bodyschema.daemon.solver_process import SolverLostError, SolverProcess
+from bodyschema.cli import main as cli
+from bodyschema.cli.main import allow_enough_files
+from bodyschema.daemon.learner.solver_process import SolverLostError, SolverProcess
 from bodyschema.interfaces.errors import ConfigError
+from bodyschema.learning import Task
 from kbmaps import ChainTolerances
 
 NOMINAL = nominal_model()

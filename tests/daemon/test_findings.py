@@ -10,16 +10,16 @@ import pytest
 from guided_arm import NOW_AND_THEN, Scene, make_pair, near, new_learning, teach
 from test_calibration import DESK_ARM, figures_of
 
-import bodyschema.daemon.findings
-from bodyschema.daemon.chain_figures import is_told, no_surer_than_possible
+import bodyschema.daemon.learner.findings
+from bodyschema.calibration.chain_figures import is_told, no_surer_than_possible
+from bodyschema.calibration.plausibility.check import FEWEST_ROWS
 from bodyschema.daemon.config import LearnerConfig
-from bodyschema.daemon.findings import EVERY_S, SHARE, Findings, FindingTurns, figures
-from bodyschema.daemon.learning import DirectSolver, Learning, NominalModel
-from bodyschema.daemon.learning.outlook import Known, Scatter, foreseen
-from bodyschema.daemon.plausibility.check import FEWEST_ROWS
-from bodyschema.daemon.status import Outlook
+from bodyschema.daemon.learner.findings import EVERY_S, SHARE, Findings, FindingTurns, figures
+from bodyschema.daemon.transport.status import Outlook
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.learning import DirectSolver, Learning, NominalModel
+from bodyschema.learning.outlook import Known, Scatter, foreseen
+from bodyschema.robot.description import RobotDescription
 from kbmaps import ChainParameters, ChainTolerances
 
 SIGMA_M = 0.0005
@@ -348,7 +348,7 @@ def test_a_failure_to_find_them_does_not_stop_the_learner(monkeypatch, caplog) -
     def failing(*_: object) -> None:
         raise np.linalg.LinAlgError("Eigenvalues did not converge")
 
-    monkeypatch.setattr(bodyschema.daemon.findings, "figures", failing)
+    monkeypatch.setattr(bodyschema.daemon.learner.findings, "figures", failing)
     findings = findings_of(shared(1, 40))
     findings.renew()
     assert findings.calibration is None

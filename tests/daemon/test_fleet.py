@@ -15,14 +15,21 @@ from scipy.spatial.transform import Rotation
 from small_arm import write_small_arm
 from told_statuses import LEARNER, SAMPLER
 
-from bodyschema.daemon.bus import Bus, Request
-from bodyschema.daemon.cli import app
-from bodyschema.daemon.fleet.comparison import Model, common_poses, compared
-from bodyschema.daemon.fleet.comparison_view import sentences
-from bodyschema.daemon.fleet.roster import Fleet, places
-from bodyschema.daemon.keys import Keys
-from bodyschema.daemon.status import ChainCalibration, JointRange, JointZero, LearnerStatus, LearntFigure, SamplerStatus
-from bodyschema.daemon.wire import JointsRequest, PredictReply, decode, encode
+from bodyschema.cli.main import app
+from bodyschema.daemon.transport.bus import Bus, Request
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.status import (
+    ChainCalibration,
+    JointRange,
+    JointZero,
+    LearnerStatus,
+    LearntFigure,
+    SamplerStatus,
+)
+from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode
+from bodyschema.fleet.comparison import Model, common_poses, compared
+from bodyschema.fleet.comparison_view import sentences
+from bodyschema.fleet.roster import Fleet, places
 from bodyschema.interfaces.errors import BusError, RequestError
 from bodyschema.interfaces.records import FloatArray
 

@@ -12,14 +12,14 @@ from unittest import mock
 import pytest
 from hidden_units import DESK_ARM, unit
 
-from bodyschema.daemon.cli import main
-from bodyschema.daemon.fleet.diagnosing import Diagnosed
-from bodyschema.daemon.fleet.recordings import Job, jobs
-from bodyschema.daemon.fleet.summary import summary
-from bodyschema.daemon.fleet.summary_view import sentences
+from bodyschema.cli.main import main
 from bodyschema.diagnosis.result import Cause, DiagnosisFile, Errors, Gain, Interval, Pairs, Unexplained
+from bodyschema.fleet.diagnosing import Diagnosed
+from bodyschema.fleet.recordings import Job, jobs
+from bodyschema.fleet.summary import summary
+from bodyschema.fleet.summary_view import sentences
 from bodyschema.interfaces.errors import RecordingError, RequestError
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 pytest.importorskip("distributed")
 
@@ -95,7 +95,7 @@ def test_progress_is_a_line_for_each_that_is_done(told: tuple[object, str, str])
 
 def test_a_scheduler_that_does_not_answer_is_told_with_its_address(folder: Path, endpoint: str) -> None:
     address = endpoint.replace("tcp/", "tcp://")
-    with mock.patch("bodyschema.daemon.fleet.diagnosing.CONNECT_LIMIT_S", 0.5):
+    with mock.patch("bodyschema.fleet.diagnosing.CONNECT_LIMIT_S", 0.5):
         code, _, err = fleet("diagnose", folder / "left.csv", "--robot", DESK_ARM, "--scheduler", address)
     assert code == 1
     assert f"no Dask scheduler answers on {address}" in err

@@ -10,7 +10,7 @@ import pytest
 from hostile_folder import HostileFolder
 
 LIMIT_S = 400.0
-AT_WORK = """from bodyschema.daemon.fleet.diagnosing import workers
+AT_WORK = """from bodyschema.fleet.diagnosing import workers
 if __name__ == "__main__":
     with workers(None, 1, 1) as client:
         assert client.submit(len, [1]).result() == 1

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bodyschema.daemon.config import DaemonConfig
-from bodyschema.daemon.gate import Accepted, Gate
+from bodyschema.daemon.sampler.gate import Accepted, Gate
 from bodyschema.interfaces.records import Pair, Reason, frozen_array
 
 FRAME_S = 1 / 30

@@ -22,24 +22,25 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from small_arm import JOINTS, URDF, write_small_arm
 
-from bodyschema.daemon import checkpoint, wire
-from bodyschema.daemon.answers import Answers
-from bodyschema.daemon.bus import Request
-from bodyschema.daemon.checkpoint import CheckpointError
+from bodyschema.cli.install.router import RouterConfig
+from bodyschema.cli.servos.fitting import first_of, fit, read_scan, servo_tables
+from bodyschema.cli.servos.log import LoggedWrite, ServoLog
 from bodyschema.daemon.config import Config, LearnerConfig
-from bodyschema.daemon.going_on import DOES_NOT_FIT
-from bodyschema.daemon.history import answer_pairs
-from bodyschema.daemon.learning import DirectSolver, Learning, NominalModel, StateError
-from bodyschema.daemon.router import RouterConfig
-from bodyschema.daemon.servo_fitting import first_of, fit, read_scan, servo_tables
-from bodyschema.daemon.servo_log import LoggedWrite, ServoLog
-from bodyschema.daemon.status import LearnerStatus, SamplerStatus
+from bodyschema.daemon.learner import checkpoint
+from bodyschema.daemon.learner.answers import Answers
+from bodyschema.daemon.learner.checkpoint import CheckpointError
+from bodyschema.daemon.learner.resume import DOES_NOT_FIT
+from bodyschema.daemon.sampler.history import answer_pairs
+from bodyschema.daemon.transport import wire
+from bodyschema.daemon.transport.bus import Request
+from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.effects import Simulation
 from bodyschema.interfaces.errors import BodyschemaError, ConfigError, RecordingError, RequestError
-from bodyschema.interfaces.lerobot import MotorCalibration, calibration_json, read_calibration
-from bodyschema.interfaces.recording import Recording, joints_in
-from bodyschema.interfaces.robot import RobotDescription
-from bodyschema.interfaces.urdf import UrdfTree
+from bodyschema.learning import DirectSolver, Learning, NominalModel, StateError
+from bodyschema.recordings.recording import Recording, joints_in
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.lerobot import MotorCalibration, calibration_json, read_calibration
+from bodyschema.robot.urdf import UrdfTree
 from bodyschema.vision.rig_file import read_rig
 from kbmaps import KBMapsError
 
@@ -442,7 +443,7 @@ def test_a_forged_checkpoint_is_restored_or_refused(tmp_path: Path, stored, plac
 @quick
 @given(st.lists(st.binary(max_size=60) | st.just(b"{}"), max_size=5))
 def test_published_bytes_that_are_no_pair_are_counted_and_learning_goes_on(payloads: list[bytes]) -> None:
-    from bodyschema.daemon.feed import PairFeed
+    from bodyschema.daemon.learner.feed import PairFeed
     from bodyschema.interfaces.clock import SystemClock
 
     def no_history(_begin: int) -> wire.PairsReply:

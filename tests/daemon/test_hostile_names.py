@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 from small_arm import URDF, write_small_arm
 
+from bodyschema.cli.install.router import RouterConfig
+from bodyschema.cli.install.service_files import ServiceFiles, UnitFolder
+from bodyschema.cli.install.units import Installed, of_host, of_robot
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.router import RouterConfig
-from bodyschema.daemon.service_files import ServiceFiles, UnitFolder
-from bodyschema.daemon.units import Installed, of_host, of_robot
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.urdf import UrdfTree
+from bodyschema.robot.urdf import UrdfTree
 
 HERE = Installed(("/opt/a b/python", "-P", "-m", "bodyschema"), (Path("/usr"),), 252)
 STEREO = "focal_px = 600.0\nprincipal_point_px = [319.5, 239.5]\nbaseline_m = 0.2\nimage_size_px = [640, 480]\n"

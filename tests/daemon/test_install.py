@@ -7,9 +7,9 @@ import re
 
 import pytest
 
-from bodyschema.daemon import udev
-from bodyschema.daemon.cli import command_line
-from bodyschema.daemon.udev import ADAPTERS, FILE, Rules, rules
+from bodyschema.cli.install import udev
+from bodyschema.cli.install.udev import ADAPTERS, FILE, Rules, rules
+from bodyschema.cli.main import command_line
 from bodyschema.interfaces.errors import ConfigError
 
 # One key, operator and value of a rule; see udev(7).

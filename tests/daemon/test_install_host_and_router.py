@@ -12,10 +12,10 @@ import pytest
 from security_recipe import ROOT, SEVERAL, carried_out
 from small_arm import write_small_arm
 
-from bodyschema.daemon.cli import command_line
-from bodyschema.daemon.identity import Identity
-from bodyschema.daemon.router import RouterConfig
-from bodyschema.daemon.units import FOLDER, Installed, of_router
+from bodyschema.cli.install.router import RouterConfig
+from bodyschema.cli.install.units import FOLDER, Installed, of_router
+from bodyschema.cli.main import command_line
+from bodyschema.daemon.transport.identity import Identity
 from bodyschema.interfaces.errors import ConfigError
 
 EXPOSURE = 2.0

@@ -12,15 +12,15 @@ from pathlib import Path
 import pytest
 from small_arm import write_small_arm
 
-from bodyschema.daemon import service_files
-from bodyschema.daemon.cli import command_line
+from bodyschema.cli.install import service_files
+from bodyschema.cli.install.service_files import ServiceFiles, UnitFolder, user_for
+from bodyschema.cli.install.units import FOLDER, PROCESSES, Installed, devices_of, hidden, of_robot, template
+from bodyschema.cli.main import command_line
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.identity import TlsConfig
-from bodyschema.daemon.service_files import ServiceFiles, UnitFolder, user_for
-from bodyschema.daemon.units import FOLDER, PROCESSES, Installed, devices_of, hidden, of_robot, template
-from bodyschema.daemon.zenoh_config import ZenohConfig
+from bodyschema.daemon.transport.identity import TlsConfig
+from bodyschema.daemon.transport.zenoh_config import ZenohConfig
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.plugins import PluginConfig
+from bodyschema.robot.plugins import PluginConfig
 
 ROOT = Path(__file__).parents[2]
 EXPOSURE = 2.0

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from bodyschema.daemon.bench_run import BenchRun
-from bodyschema.daemon.cli import app
+from bodyschema.cli.hardware.bench_run import BenchRun
+from bodyschema.cli.hardware.joints_view import screen
+from bodyschema.cli.hardware.joints_watch import JointState, JointsWatch, Seen, SignCheck, Speeds, signs_in
+from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.joints_view import screen
-from bodyschema.daemon.joints_watch import JointState, JointsWatch, Seen, SignCheck, Speeds, signs_in
-from bodyschema.daemon.wiring import open_joints
+from bodyschema.daemon.wiring.wiring import open_joints
 from bodyschema.drivers.bench.dry_run import DryRun
 from bodyschema.drivers.dynamixel.bench.arm import DynamixelArm
 from bodyschema.interfaces.clock import SystemClock

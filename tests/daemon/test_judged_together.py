@@ -9,14 +9,14 @@ import pytest
 from guided_arm import JOINTS, NOW_AND_THEN, Scene, built_chain, make_pair, measured, nominal_model, path, teach
 
 from bodyschema.daemon.config import LearnerConfig
-from bodyschema.daemon.learning import DirectSolver, Learning, NominalModel
-from bodyschema.daemon.learning.arm import KnownArm
-from bodyschema.daemon.learning.claims import Claims
-from bodyschema.daemon.learning.course import MOST_TOGETHER
-from bodyschema.daemon.learning.era import Era
-from bodyschema.daemon.learning.members import INSTANT
-from bodyschema.daemon.learning.scores import ErrorMemory
 from bodyschema.interfaces.records import Pair
+from bodyschema.learning import DirectSolver, Learning, NominalModel
+from bodyschema.learning.arm import KnownArm
+from bodyschema.learning.claims import Claims
+from bodyschema.learning.course import MOST_TOGETHER
+from bodyschema.learning.era import Era
+from bodyschema.learning.members import INSTANT
+from bodyschema.learning.scores import ErrorMemory
 from kbmaps import NLMS, ChainTolerances
 
 TOGETHER_S = 1.0

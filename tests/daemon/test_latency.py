@@ -10,10 +10,10 @@ import pytest
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import minimize_scalar
 
-from bodyschema.daemon.latency import EARLIEST_S, LATEST_S, STEP_S, Latency, LatencyError, Wiggle, latency_of
-from bodyschema.daemon.wiggling import read_wiggle, wiggle_of, write_wiggle
+from bodyschema.calibration.latency import EARLIEST_S, LATEST_S, STEP_S, Latency, LatencyError, Wiggle, latency_of
+from bodyschema.cli.hardware.wiggling import read_wiggle, wiggle_of, write_wiggle
 from bodyschema.interfaces.errors import RecordingError
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 from kbmaps import ChainParameters, ChainTolerances, RigidChain
 
 ARM = RobotDescription.load(Path(__file__).parents[2] / "examples" / "desk_arm" / "robot.toml")

@@ -10,13 +10,13 @@ import pytest
 from scripted_sources import Walk
 from small_arm import write_small_arm
 
-from bodyschema.daemon.cli import app
-from bodyschema.daemon.latency import LatencyError
-from bodyschema.daemon.sources import Sources
-from bodyschema.daemon.wiggling import collected
+from bodyschema.calibration.latency import LatencyError
+from bodyschema.cli.hardware.wiggling import collected
+from bodyschema.cli.main import app
+from bodyschema.daemon.sampler.sources import Sources
 from bodyschema.interfaces.errors import BodyschemaError, SourceLost
 from bodyschema.interfaces.records import MarkerFix, MarkerMiss
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 
 def seen(folder: Path, every: int) -> Sources:

@@ -11,13 +11,12 @@ import pytest
 from guided_arm import make_pair
 from small_arm import write_small_arm
 
-from bodyschema.daemon.bus import Bus, Request
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.keys import Keys
-from bodyschema.daemon.learner import Learner
-from bodyschema.daemon.learning import DirectSolver
-from bodyschema.daemon.status import LearnerStatus
-from bodyschema.daemon.wire import (
+from bodyschema.daemon.learner.learner import Learner
+from bodyschema.daemon.transport.bus import Bus, Request
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.status import LearnerStatus
+from bodyschema.daemon.transport.wire import (
     JSON,
     CommandReply,
     CommandRequest,
@@ -29,6 +28,7 @@ from bodyschema.daemon.wire import (
 )
 from bodyschema.interfaces.errors import BusError
 from bodyschema.interfaces.records import Pair
+from bodyschema.learning import DirectSolver
 
 KEYS = Keys("arm")
 

@@ -14,23 +14,23 @@ from guided_arm import JOINTS, nominal_model
 from small_arm import write_small_arm
 from told_statuses import LEARNER
 
-from bodyschema.daemon.background import Background
-from bodyschema.daemon.bus import client
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.fleet.hosting import configs_of, descriptions, shares
-from bodyschema.daemon.keys import Keys
-from bodyschema.daemon.learner import Learner
-from bodyschema.daemon.learner_host import attend, run_learners, session_settings
-from bodyschema.daemon.learning import Solved, Task
-from bodyschema.daemon.notify import Notifier
-from bodyschema.daemon.service import Service
-from bodyschema.daemon.signals import Wishes
-from bodyschema.daemon.solver_process import SolverLostError
-from bodyschema.daemon.solver_seats import SharedSolver
-from bodyschema.daemon.status import LearnerStatus
-from bodyschema.daemon.wire import decode
+from bodyschema.daemon.learner.background import Background
+from bodyschema.daemon.learner.host import attend, run_learners, session_settings
+from bodyschema.daemon.learner.learner import Learner
+from bodyschema.daemon.learner.solver_pool import SharedSolver
+from bodyschema.daemon.learner.solver_process import SolverLostError
+from bodyschema.daemon.service.notify import Notifier
+from bodyschema.daemon.service.service import Service
+from bodyschema.daemon.service.signals import Wishes
+from bodyschema.daemon.transport.bus import client
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.status import LearnerStatus
+from bodyschema.daemon.transport.wire import decode
+from bodyschema.fleet.hosting import configs_of, descriptions, shares
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import BusError, ConfigError
+from bodyschema.learning import Solved, Task
 from kbmaps import ChainTolerances
 
 NOMINAL = nominal_model()

@@ -9,12 +9,12 @@ import msgspec
 import pytest
 
 from bodyschema.daemon.config import LARGEST_MAP, DaemonConfig, LearnerConfig
-from bodyschema.daemon.learning.gate import CHANGE, DOUBT, FEWEST_FOR_CHANGE
-from bodyschema.daemon.learning.learning import REGION_RAD
-from bodyschema.daemon.learning.members import TRUSTED
-from bodyschema.daemon.learning.nominal import PAIRS_TO_REFIT
-from bodyschema.daemon.learning.snapshot import IN_SUPPORT
-from bodyschema.daemon.learning.solver import KEPT, LARGEST_NET, WINDOW
+from bodyschema.learning.gate import CHANGE, DOUBT, FEWEST_FOR_CHANGE
+from bodyschema.learning.learning import REGION_RAD
+from bodyschema.learning.members import TRUSTED
+from bodyschema.learning.nominal import PAIRS_TO_REFIT
+from bodyschema.learning.snapshot import IN_SUPPORT
+from bodyschema.learning.solver import KEPT, LARGEST_NET, WINDOW
 from kbmaps.contest import CLEARLY, SHORTEST
 
 PAGE = (Path(__file__).parents[2] / "docs" / "learner.md").read_text(encoding="utf-8")

@@ -23,10 +23,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bodyschema.daemon.config import LearnerConfig
-from bodyschema.daemon.learning import DirectSolver, Learning, Solved
-from bodyschema.daemon.learning.members import SOLVED
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import Pair
+from bodyschema.learning import DirectSolver, Learning, Solved
+from bodyschema.learning.members import SOLVED
 from kbmaps import NLMS
 from kbmaps.contest import LISTED
 

@@ -9,10 +9,10 @@ import pytest
 from guided_arm import NOW_AND_THEN, Scene, built_chain, measured, near, new_learning, nominal_model, path, teach
 from scipy.spatial.transform import Rotation
 
-from bodyschema.daemon.checkpoint import read_checkpoint, write_checkpoint
-from bodyschema.daemon.learning import Learning
-from bodyschema.daemon.solver_process import SolverProcess
+from bodyschema.daemon.learner.checkpoint import read_checkpoint, write_checkpoint
+from bodyschema.daemon.learner.solver_process import SolverProcess
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
+from bodyschema.learning import Learning
 from kbmaps import RigidChain, rotation_vectors
 
 SIGMA_RAD = 0.01

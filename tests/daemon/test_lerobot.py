@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodyschema.daemon.cli import command_line
+from bodyschema.cli.hardware.lerobot_offsets import CorrectedCalibration
+from bodyschema.cli.main import command_line
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.lerobot_offsets import CorrectedCalibration
-from bodyschema.daemon.reopen import Reopening
-from bodyschema.daemon.wiring import open_joints
+from bodyschema.daemon.sampler.reconnect import Reopening
+from bodyschema.daemon.wiring.wiring import open_joints
 from bodyschema.drivers.bench.pty_shell import PtyShell
 from bodyschema.drivers.dynamixel.bench.servo import Servo as DynamixelServo
 from bodyschema.drivers.dynamixel.models import BY_NAME as DYNAMIXEL
@@ -25,8 +25,8 @@ from bodyschema.drivers.feetech.bench.servo import Servo
 from bodyschema.drivers.feetech.models import BY_NAME
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.lerobot import ARMS, JointServo, MotorCalibration, corrections, read_calibration
-from bodyschema.interfaces.recording import Recording
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.lerobot import ARMS, JointServo, MotorCalibration, corrections, read_calibration
 
 SO101 = Path(__file__).parents[2] / "examples" / "so101"
 JOINTS = ARMS["so101"].joints

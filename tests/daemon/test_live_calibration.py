@@ -15,10 +15,10 @@ from rich.console import Console
 from shown_board import BOARD, SIZE, KnownCorners, corner_views, known_rig, photographed, shot
 from small_arm import write_small_arm
 
-from bodyschema.daemon.camera_calibration import CheckFile, Wanted, kept_in, of_cameras
-from bodyschema.daemon.cli import app
-from bodyschema.daemon.live_calibration import LiveCalibration, Shown, checked_live
-from bodyschema.daemon.live_calibration_view import Lines, guidance_on, screen
+from bodyschema.cli.cameras.calibration import CheckFile, Wanted, kept_in, of_cameras
+from bodyschema.cli.cameras.live_calibration import LiveCalibration, Shown, checked_live
+from bodyschema.cli.cameras.live_calibration_view import Lines, guidance_on, screen
+from bodyschema.cli.main import app
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, SourceEnded, SourceLost
 from bodyschema.interfaces.records import StereoFrame
@@ -68,7 +68,7 @@ def views() -> list[View]:
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bodyschema.daemon.reopen.FIRST_WAIT_S", 0.0)
+    monkeypatch.setattr("bodyschema.daemon.sampler.reconnect.FIRST_WAIT_S", 0.0)
 
 
 def held(views: list[View], places: Iterable[int] | None = None) -> tuple[LiveViews, list[StereoFrame]]:

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from bodyschema.daemon import logs
-from bodyschema.daemon.signals import on_termination
+from bodyschema.daemon.service import logs
+from bodyschema.daemon.service.signals import on_termination
 
 
 @pytest.fixture(autouse=True)
@@ -27,7 +27,7 @@ def logged(file: Path, environment: Callable[[os.stat_result], dict[str, str]]) 
     """Return the lines of a log whose stream is a file, as the journal's is a socket."""
     with file.open("w") as stream:
         logs.set_up(environment=environment(os.fstat(stream.fileno())), stream=stream)
-        log = logging.getLogger("bodyschema.daemon.sampler")
+        log = logging.getLogger("bodyschema.daemon.sampler.sampler")
         log.warning("the disk\nis nearly full")
         log.info("all is well")
         log.debug("details")
@@ -41,8 +41,8 @@ def of_journal(status: os.stat_result) -> dict[str, str]:
 
 def test_the_journal_gets_one_line_an_event_with_its_priority(tmp_path) -> None:
     assert logged(tmp_path / "log", of_journal) == [
-        "<4>bodyschema.daemon.sampler: the disk | is nearly full",
-        "<6>bodyschema.daemon.sampler: all is well",
+        "<4>bodyschema.daemon.sampler.sampler: the disk | is nearly full",
+        "<6>bodyschema.daemon.sampler.sampler: all is well",
     ]
 
 
@@ -50,7 +50,9 @@ def test_the_journal_gets_one_line_an_event_with_its_priority(tmp_path) -> None:
 def test_a_person_gets_time_and_level_also_in_a_terminal_that_the_journal_s_session_started(
     tmp_path, inherited
 ) -> None:
-    assert logged(tmp_path / "log", lambda _: inherited)[-1].endswith("INFO    bodyschema.daemon.sampler: all is well")
+    assert logged(tmp_path / "log", lambda _: inherited)[-1].endswith(
+        "INFO    bodyschema.daemon.sampler.sampler: all is well"
+    )
 
 
 class HandClock:

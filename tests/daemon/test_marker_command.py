@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from small_arm import write_small_arm
 
-from bodyschema.daemon.cli import app
+from bodyschema.cli.main import app
 from bodyschema.interfaces.errors import BodyschemaError, ConfigError
 from bodyschema.vision.config import VisionConfig
 from bodyschema.vision.tag_body import TagBody

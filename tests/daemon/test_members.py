@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from guided_arm import Scene, nominal_model
 
-from bodyschema.daemon.learning.members import INSTANT, Members
+from bodyschema.learning.members import INSTANT, Members
 
 SCENE = Scene.draw(0, 20)
 X = np.array([pair.x for pair in SCENE.pairs])

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodyschema.daemon.learning.misfit import misfit
+from bodyschema.learning.misfit import misfit
 
 NONE = np.zeros(3)
 

@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from bodyschema.calibration.plausibility.check import Plausibility, plausibility
+from bodyschema.calibration.plausibility.limits import UNITS_PER_METRE, require_units
+from bodyschema.calibration.plausibility.reading import Reading
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.findings import Findings
-from bodyschema.daemon.learning import DirectSolver, Learning, NominalModel
-from bodyschema.daemon.plausibility.check import Plausibility, plausibility
-from bodyschema.daemon.plausibility.limits import UNITS_PER_METRE, require_units
-from bodyschema.daemon.plausibility.reading import Reading
+from bodyschema.daemon.learner.findings import Findings
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import RecordingError
-from bodyschema.interfaces.recording import Recording
 from bodyschema.interfaces.records import Pair
+from bodyschema.learning import DirectSolver, Learning, NominalModel
+from bodyschema.recordings.recording import Recording
 from kbmaps import ChainParameters, ChainTolerances, RigidChain
 
 REAL_DATA = Path(__file__).resolve().parents[3] / "shared" / "data"

@@ -10,9 +10,9 @@ import pytest
 from guided_arm import NOW_AND_THEN, Scene, new_learning, nominal_model, teach
 
 from bodyschema.daemon.config import LearnerConfig
-from bodyschema.daemon.learning import DirectSolver, Learning, LearningState, StateError
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import Pair, frozen_array
+from bodyschema.learning import DirectSolver, Learning, LearningState, StateError
 
 TAUGHT = 40
 Spoil = Callable[[Pair], Pair]

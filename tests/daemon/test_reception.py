@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from bodyschema.daemon.reception import EVERYBODYS, LIMITS, Limits, Reception
+from bodyschema.daemon.transport.query_limiter import EVERYBODYS, LIMITS, Limits, Reception
 from bodyschema.interfaces.errors import RequestError
 
 

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from small_arm import JOINTS, write_small_arm
 
-from bodyschema.daemon.bus import Bus, Request, client
-from bodyschema.daemon.cli import app
-from bodyschema.daemon.keys import Keys
-from bodyschema.daemon.recorder import History, follow_history
-from bodyschema.daemon.wire import PairsReply, encode, pair_to_wire
+from bodyschema.cli.main import app
+from bodyschema.cli.recordings.recorder import History, follow_history
+from bodyschema.daemon.transport.bus import Bus, Request, client
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.wire import PairsReply, encode, pair_to_wire
 from bodyschema.interfaces.errors import BusError, RecordingError
-from bodyschema.interfaces.recording import Recording
 from bodyschema.interfaces.records import Pair
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.description import RobotDescription
 
 PAGE = 2
 

@@ -8,7 +8,7 @@ from board_renderer import webcams
 from scripted_sources import Scripted
 from shown_board import SIZE, known_rig
 
-from bodyschema.daemon.reopen import Reopening
+from bodyschema.daemon.sampler.reconnect import Reopening
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.records import JointReading, StereoFrame, frozen_array
 from bodyschema.vision.rectified import RectifiedCamera

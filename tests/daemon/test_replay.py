@@ -12,15 +12,15 @@ import pytest
 import warm
 from small_arm import JOINTS, write_small_arm
 
-from bodyschema.daemon.cli import app
+from bodyschema.calibration.evaluate import EvaluationError, split_blocks
+from bodyschema.cli.main import app
+from bodyschema.cli.replay.report import AngleFigures, Figures, ReplayReport, as_text
+from bodyschema.cli.replay.run import Job
+from bodyschema.cli.replay.steps import Steps, require_path
 from bodyschema.daemon.config import Config, DaemonConfig
-from bodyschema.daemon.evaluate import EvaluationError, split_blocks
-from bodyschema.daemon.replay.report import AngleFigures, Figures, ReplayReport, as_text
-from bodyschema.daemon.replay.run import Job
-from bodyschema.daemon.replay.steps import Steps, require_path
 from bodyschema.interfaces.errors import ConfigError, RecordingError
-from bodyschema.interfaces.recording import Recording
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.description import RobotDescription
 
 # The limit only ends a replay that would never end; on a busy machine it takes longer, and passes.
 LIMIT_S = 300

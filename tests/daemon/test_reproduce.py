@@ -14,21 +14,21 @@ from rich.console import Console
 
 pytest.importorskip("matplotlib")
 
-from bodyschema.daemon.cli import app
-from bodyschema.daemon.reproduce import EXPERIMENTS, Column, Comparison, Curve, Experiment, Panel, Reading, Run
-from bodyschema.daemon.reproduce.arm import JOINTS, OTHER_SIX, arm, longer_tool
-from bodyschema.daemon.reproduce.exactness import exactness
-from bodyschema.daemon.reproduce.experiment import MEAN_NOISE
-from bodyschema.daemon.reproduce.fig4 import fig4
-from bodyschema.daemon.reproduce.fig5 import fig5
-from bodyschema.daemon.reproduce.fig6 import fig6
-from bodyschema.daemon.reproduce.fig7 import fig7
-from bodyschema.daemon.reproduce.measured import Measured, guided_walk, postures
-from bodyschema.daemon.reproduce.models import WITH_DRAWING, Contender, Knowledge, learn_all
-from bodyschema.daemon.reproduce.show import show
-from bodyschema.daemon.reproduce.stream import in_stages
-from bodyschema.daemon.reproduce.walk import walk
+from bodyschema.cli.main import app
 from bodyschema.interfaces.errors import ConfigError
+from bodyschema.reproduce import EXPERIMENTS, Column, Comparison, Curve, Experiment, Panel, Reading, Run
+from bodyschema.reproduce.arm import JOINTS, OTHER_SIX, arm, longer_tool
+from bodyschema.reproduce.exactness import exactness
+from bodyschema.reproduce.experiment import MEAN_NOISE
+from bodyschema.reproduce.fig4 import fig4
+from bodyschema.reproduce.fig5 import fig5
+from bodyschema.reproduce.fig6 import fig6
+from bodyschema.reproduce.fig7 import fig7
+from bodyschema.reproduce.measured import Measured, guided_walk, postures
+from bodyschema.reproduce.models import WITH_DRAWING, Contender, Knowledge, learn_all
+from bodyschema.reproduce.show import show
+from bodyschema.reproduce.stream import in_stages
+from bodyschema.reproduce.walk import walk
 from kbmaps import ChainTolerances, NonFiniteError
 
 PAGE = Path(__file__).parents[2] / "docs" / "reproduced.md"
@@ -223,13 +223,13 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path) -> None:
 
 
 def test_measured_curves_without_pybullet_name_what_to_install(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("bodyschema.daemon.extras.find_spec", lambda name: None if name == "pybullet" else object())
+    monkeypatch.setattr("bodyschema.interfaces.extras.find_spec", lambda name: None if name == "pybullet" else object())
     with pytest.raises(ConfigError, match="no-real"):
         app(["reproduce", "fig7", "--out", str(tmp_path)], result_action="return_value")
 
 
 def test_figure_5_simulates_in_the_very_postures_that_were_measured(monkeypatch) -> None:
-    monkeypatch.setattr("bodyschema.daemon.reproduce.fig5.postures", planted)
+    monkeypatch.setattr("bodyschema.reproduce.fig5.postures", planted)
     found = fig5(a_run(real=True), train=300, test=30)
     assert [curve.name for curve in found.panels[0].curves] == ["measured", "simulated, σ = 20 mm"]
     # The tracker's noise planted is a twentieth of the simulated one.
@@ -238,7 +238,7 @@ def test_figure_5_simulates_in_the_very_postures_that_were_measured(monkeypatch)
 
 
 def test_figure_7_tests_on_measured_points_and_on_the_truth(monkeypatch) -> None:
-    monkeypatch.setattr("bodyschema.daemon.reproduce.fig7.guided_walk", planted)
+    monkeypatch.setattr("bodyschema.reproduce.fig7.guided_walk", planted)
     found = fig7(a_run(real=True), online=32, cycles=64, held_out=20, onward=20)
     of_truth = error(found, "rigid chain", "measured", "held out, true", "at 32")
     assert of_truth < error(found, "rigid chain", "measured", "held out, as measured", "at 32")

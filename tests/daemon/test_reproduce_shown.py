@@ -13,9 +13,9 @@ pytest.importorskip("matplotlib")
 
 from matplotlib.figure import Figure
 
-from bodyschema.daemon import progress
-from bodyschema.daemon.reproduce import Column, Comparison, Curve, Experiment, Panel, Reading, plot
-from bodyschema.daemon.reproduce.show import show
+from bodyschema.cli.terminal import progress
+from bodyschema.reproduce import Column, Comparison, Curve, Experiment, Panel, Reading, plot
+from bodyschema.reproduce.show import show
 
 LONG = "without noise; steps of 1° to 3° a joint; near the walk"
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from small_arm import JOINTS
 
-from bodyschema.daemon import recordings
-from bodyschema.daemon.rerun_export import runs
 from bodyschema.interfaces.errors import RecordingError
-from bodyschema.interfaces.recording import Recording
+from bodyschema.recordings import files as recordings
+from bodyschema.recordings.recording import Recording
+from bodyschema.recordings.rerun_export import runs
 
 
 @pytest.fixture

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from guided_arm import built_chain, make_pair, near, new_learning, nominal_model, path, teach
 
-from bodyschema.daemon.learning import DirectSolver, Learning, LearntModel, Task
-from bodyschema.daemon.learning.members import RESIDUAL
-from bodyschema.daemon.solver_process import SolverProcess
+from bodyschema.daemon.learner.solver_process import SolverProcess
 from bodyschema.interfaces.records import FloatArray, Pair
+from bodyschema.learning import DirectSolver, Learning, LearntModel, Task
+from bodyschema.learning.members import RESIDUAL
 from kbmaps import ChainTolerances, KBMap, ResidualModel, RigidChain
 
 SIGMA_M = 0.002

@@ -8,10 +8,10 @@ import pytest
 from guided_arm import NOW_AND_THEN, Scene, make_pair, measured, new_learning, nominal_model, teach
 
 from bodyschema.daemon.config import LearnerConfig
-from bodyschema.daemon.learning import DirectSolver, Learning, Solved, StateError
-from bodyschema.daemon.learning.memory import Permutations
-from bodyschema.daemon.learning.snapshot import Prediction
 from bodyschema.interfaces.records import FloatArray, Pair
+from bodyschema.learning import DirectSolver, Learning, Solved, StateError
+from bodyschema.learning.memory import Permutations
+from bodyschema.learning.snapshot import Prediction
 
 TAUGHT, LATER = 100, 40
 

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodyschema.daemon.bus import Request
-from bodyschema.daemon.history import answer_pairs
-from bodyschema.daemon.retention import AT_ONCE, Keep, used_bytes
-from bodyschema.daemon.store import PairReader, PairStore, Session
-from bodyschema.daemon.wire import JSON, PairsReply, decode
+from bodyschema.daemon.sampler.history import answer_pairs
+from bodyschema.daemon.transport.bus import Request
+from bodyschema.daemon.transport.wire import JSON, PairsReply, decode
 from bodyschema.interfaces.records import MarkerFix, frozen_array
+from bodyschema.recordings.store.retention import AT_ONCE, Keep, used_bytes
+from bodyschema.recordings.store.store import PairReader, PairStore, Session
 
 NOW = "2026-11-21T12:00:00.000+00:00"
 SESSION = Session(("waist", "shoulder"), NOW, "[robot]", "<robot/>", "{}", "0", "host")

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from small_arm import write_small_arm
 
-from bodyschema.daemon.cli import app
-from bodyschema.daemon.synthesis import simulated
+from bodyschema.cli.main import app
+from bodyschema.cli.recordings.synthesis import simulated
 from bodyschema.effects import Effect, Simulation, load_simulation, write_extended
 from bodyschema.interfaces.errors import ConfigError, RequestError
-from bodyschema.interfaces.recording import Recording
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.description import RobotDescription
 
 
 @pytest.fixture

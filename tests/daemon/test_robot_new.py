@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from bodyschema.daemon.bench_run import BenchRun
-from bodyschema.daemon.cli import command_line
+from bodyschema.cli.hardware.bench_run import BenchRun
+from bodyschema.cli.main import command_line
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.servo_wiring import servos_of
+from bodyschema.daemon.wiring.servos import servos_of
 from bodyschema.interfaces.errors import ConfigError
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "desk_arm"

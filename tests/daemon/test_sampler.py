@@ -16,19 +16,19 @@ import pytest
 from scripted_sources import COV, FRAME_S, Scripted, Walk, World, simulated
 from small_arm import write_small_arm
 
-from bodyschema.daemon.bus import Bus, client
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.keys import Keys
-from bodyschema.daemon.sampler import Sampler
-from bodyschema.daemon.session import session_of
-from bodyschema.daemon.sources import Sources
-from bodyschema.daemon.status import SamplerStatus
-from bodyschema.daemon.store import PairStore
-from bodyschema.daemon.wire import MSGPACK, CommandRequest, PairMessage, PairsReply, decode, encode
+from bodyschema.daemon.sampler.sampler import Sampler
+from bodyschema.daemon.sampler.session import session_of
+from bodyschema.daemon.sampler.sources import Sources
+from bodyschema.daemon.transport.bus import Bus, client
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.status import SamplerStatus
+from bodyschema.daemon.transport.wire import MSGPACK, CommandRequest, PairMessage, PairsReply, decode, encode
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import BusError, ConfigError, RequestError, SourceError, SourceLost, StoreError
 from bodyschema.interfaces.records import JointReading, MarkerFix, MarkerMiss, Pair, Reason, frozen_array
 from bodyschema.interfaces.rejections import REMEDIES
+from bodyschema.recordings.store.store import PairStore
 
 LIMIT_S = 500.0
 KEYS = Keys("arm")
@@ -177,7 +177,7 @@ def test_encoders_of_other_joints_are_refused(config) -> None:
 @pytest.fixture
 def impatient(monkeypatch) -> None:
     """Reopen lost sources at once."""
-    monkeypatch.setattr("bodyschema.daemon.reopen.FIRST_WAIT_S", 0.0)
+    monkeypatch.setattr("bodyschema.daemon.sampler.reconnect.FIRST_WAIT_S", 0.0)
 
 
 def test_a_lost_camera_is_opened_again_and_the_segment_ends(config, impatient) -> None:
@@ -416,7 +416,7 @@ def test_nobody_tells_the_truth_where_there_is_no_simulation(ended) -> None:
 
 
 def test_silent_sources_are_reported(config, monkeypatch) -> None:
-    monkeypatch.setattr("bodyschema.daemon.sampler.SILENT_AFTER_S", 0.0)
+    monkeypatch.setattr("bodyschema.daemon.sampler.sampler.SILENT_AFTER_S", 0.0)
     held = threading.Event()
     sources = Sources(Scripted([held], config.robot.joints), Scripted([held]), SystemClock())
     with running(config, sources) as bus:

@@ -15,10 +15,10 @@ from scripted_sources import Scripted, Walk
 from small_arm import write_small_arm
 from test_sampler import command, running, sample, status_when
 
-from bodyschema.daemon import powered
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.sources import Sources
-from bodyschema.daemon.wiring import demonstration_model
+from bodyschema.daemon.sampler import powered
+from bodyschema.daemon.sampler.sources import Sources
+from bodyschema.daemon.wiring.wiring import demonstration_model
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, RequestError
 from bodyschema.interfaces.records import frozen_array

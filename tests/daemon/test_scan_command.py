@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from bodyschema.daemon.bench_run import BenchRun
-from bodyschema.daemon.cli import app
+from bodyschema.cli.hardware.bench_run import BenchRun
+from bodyschema.cli.hardware.scan_report import ScanReport, as_json, report_of
+from bodyschema.cli.hardware.scan_view import show
+from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.scan_report import ScanReport, as_json, report_of
-from bodyschema.daemon.scan_view import show
 from bodyschema.drivers.scan import FoundServo, ScannedBus
 from bodyschema.interfaces.errors import ConfigError
 

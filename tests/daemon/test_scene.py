@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bodyschema.cli.demo.scene import prepare
+from bodyschema.cli.demo.tags import CUBE_M
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.demo.scene import prepare
-from bodyschema.daemon.demo.tags import CUBE_M
-from bodyschema.daemon.wiring import open_sources
+from bodyschema.daemon.wiring.wiring import open_sources
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.vision.tag_body import TagBody
 

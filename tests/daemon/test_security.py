@@ -17,13 +17,13 @@ import zenoh
 from security_recipe import PAGE, SEVERAL, TWO, blocks, carried_out
 from small_arm import write_small_arm
 
-from bodyschema.daemon.access import ROLES
-from bodyschema.daemon.bus import Bus, Request, client
+from bodyschema.cli.install.router import RouterConfig
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.identity import Identity, Route, TlsConfig
-from bodyschema.daemon.keys import Keys
-from bodyschema.daemon.reception import LIMITS
-from bodyschema.daemon.router import RouterConfig
+from bodyschema.daemon.transport.access import ROLES
+from bodyschema.daemon.transport.bus import Bus, Request, client
+from bodyschema.daemon.transport.identity import Identity, Route, TlsConfig
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.query_limiter import LIMITS
 from bodyschema.interfaces.errors import BusError, ConfigError, RequestError
 
 LIMIT_S = 500.0

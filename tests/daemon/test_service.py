@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from bodyschema.daemon.notify import START_LIMIT_S, Notifier
-from bodyschema.daemon.service import SETTLED_S, SIGNS_PER_WATCHDOG, Service, with_health
+from bodyschema.daemon.service.notify import START_LIMIT_S, Notifier
+from bodyschema.daemon.service.service import SETTLED_S, SIGNS_PER_WATCHDOG, Service, with_health
 from bodyschema.interfaces.clock import SystemClock
 
 WATCHDOG_S = 8.0

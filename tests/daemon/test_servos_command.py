@@ -11,10 +11,10 @@ import dynamixel_sdk as sdk
 import msgspec
 import pytest
 
-from bodyschema.daemon.bench_wiring import Motion, bench_robot_file, open_bench
-from bodyschema.daemon.cli import command_line
+from bodyschema.cli.main import command_line
+from bodyschema.cli.servos.log import FILE, LoggedWrite, ServoLog
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.servo_log import FILE, LoggedWrite, ServoLog
+from bodyschema.daemon.wiring.bench import Motion, bench_robot_file, open_bench
 from bodyschema.drivers.bench.dry_run import DryRun
 from bodyschema.interfaces.errors import BodyschemaError, ConfigError, SourceError
 

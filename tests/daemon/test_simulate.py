@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from small_arm import JOINTS, write_small_arm
 
-from bodyschema.daemon.cli import app
+from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config
 from bodyschema.effects import load_simulation
 from bodyschema.interfaces.errors import ConfigError, RecordingError
-from bodyschema.interfaces.recording import Recording, joints_in
-from bodyschema.interfaces.toml_file import read_toml
+from bodyschema.recordings.recording import Recording, joints_in
+from bodyschema.robot.toml_file import read_toml
 
 ROWS = 50
 EFFECT = '[[effects]]\neffect = "joint_offset"\nwhere = "waist"\noffset_rad = 0.05\n'
@@ -140,8 +140,8 @@ def test_the_environment_changes_no_effects(tmp_path) -> None:
 
 
 def test_a_calibrated_robot_has_no_effects_since_it_was_learnt_without_them(tmp_path) -> None:
-    from bodyschema.interfaces.calibrated import CalibratedGeometry
-    from bodyschema.interfaces.calibrated_files import write_calibrated
+    from bodyschema.robot.calibrated import CalibratedGeometry
+    from bodyschema.robot.calibrated_files import write_calibrated
 
     robot = load_simulation(write_small_arm(tmp_path, EFFECT)).robot
     geometry = CalibratedGeometry.of(robot, robot.chain, T_measured_nominal=np.eye(4), zeros=np.zeros(2))

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from guided_arm import Scene, built_chain, near, nominal_model, path
 
-import bodyschema.daemon.learning.solver as solver_module
-from bodyschema.daemon.learning import DirectSolver, LearntModel, Task
-from bodyschema.daemon.learning.members import EXACT, RESIDUAL, RIGID
-from bodyschema.daemon.learning.solver import FOLDED, KEPT, fitted_belief
+import bodyschema.learning.solver as solver_module
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning import DirectSolver, LearntModel, Task
+from bodyschema.learning.members import EXACT, RESIDUAL, RIGID
+from bodyschema.learning.solver import FOLDED, KEPT, fitted_belief
 from kbmaps import ChainTolerances, RigidChain
 
 NOMINAL = nominal_model()

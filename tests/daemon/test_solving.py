@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from guided_arm import JOINTS, nominal_model
 
-from bodyschema.daemon.learning.members import RIGID
-from bodyschema.daemon.learning.solver import Solved, Task
-from bodyschema.daemon.learning.solving import Solving
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning.members import RIGID
+from bodyschema.learning.solver import Solved, Task
+from bodyschema.learning.solving import Solving
 from kbmaps import ChainTolerances
 
 NOMINAL = nominal_model()

@@ -14,15 +14,15 @@ from scripted_sources import Walk
 from small_arm import write_small_arm
 from told_statuses import LEARNER, SAMPLER
 
-from bodyschema.daemon.bus import Bus
-from bodyschema.daemon.cli import app
+from bodyschema.cli.main import app
+from bodyschema.cli.terminal.status_view import Seen, Watcher, as_json, screen
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.keys import Keys
-from bodyschema.daemon.sampler import Sampler
-from bodyschema.daemon.session import session_of
-from bodyschema.daemon.status_view import Seen, Watcher, as_json, screen
-from bodyschema.daemon.store import PairStore
+from bodyschema.daemon.sampler.sampler import Sampler
+from bodyschema.daemon.sampler.session import session_of
+from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.keys import Keys
 from bodyschema.interfaces.clock import SystemClock
+from bodyschema.recordings.store.store import PairStore
 
 LIMIT_S = 500.0
 

@@ -14,12 +14,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bodyschema.daemon import store_schema
-from bodyschema.daemon.store import PairReader, PairStore, Session
-from bodyschema.daemon.store_rows import pair_of, row_of
-from bodyschema.daemon.store_schema import APPLICATION_ID
 from bodyschema.interfaces.errors import StoreError, StoreUnwritable
 from bodyschema.interfaces.records import MarkerFix, Pair, frozen_array
+from bodyschema.recordings.store import schema as store_schema
+from bodyschema.recordings.store.rows import pair_of, row_of
+from bodyschema.recordings.store.schema import APPLICATION_ID
+from bodyschema.recordings.store.store import PairReader, PairStore, Session
 
 JOINTS = ("waist", "shoulder")
 SESSION = Session(JOINTS, "2026-01-01T00:00:00+00:00", "[robot]", "<robot/>", "{}", "0", "host")
@@ -205,7 +205,7 @@ def test_each_pair_is_committed_with_a_flush_to_the_disk(store, monkeypatch) -> 
 
 def test_a_second_sampler_on_the_store_is_refused(file, store) -> None:
     code = (
-        "import sys; from pathlib import Path; from bodyschema.daemon.store import PairStore, Session\n"
+        "import sys; from pathlib import Path; from bodyschema.recordings.store.store import PairStore, Session\n"
         "with PairStore(Path(sys.argv[1]), Session(('waist', 'shoulder'), '', '', '', '', '', '')): pass"
     )
     done = subprocess.run([sys.executable, "-c", code, file], capture_output=True, text=True, check=False)
@@ -245,7 +245,7 @@ def closed(file: Path) -> Path:
 
 
 def test_opening_a_store_tells_that_it_works(closed, monkeypatch) -> None:
-    monkeypatch.setattr("bodyschema.daemon.store_schema.STEPS_UNTIL_TOLD", 100)
+    monkeypatch.setattr("bodyschema.recordings.store.schema.STEPS_UNTIL_TOLD", 100)
     told: list[int] = []
     with PairStore(closed, SESSION, working=lambda: told.append(1)) as store:
         opened = len(told)

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import warm
 
-from bodyschema.daemon.supervise import Child, Supervisor
+from bodyschema.daemon.service.supervise import Child, Supervisor
 from bodyschema.interfaces.errors import BodyschemaError
 
 LIMIT_S = 500.0
@@ -81,7 +81,7 @@ def test_stopping_ends_every_child(tmp_path) -> None:
 
 
 def test_a_child_that_does_not_end_is_killed(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("bodyschema.daemon.supervise.END_LIMIT_S", 0.1)
+    monkeypatch.setattr("bodyschema.daemon.service.supervise.END_LIMIT_S", 0.1)
     supervisor = Supervisor([child(STUBBORN, tmp_path / "pids")])
     thread = threading.Thread(target=supervisor.run)
     thread.start()
@@ -99,7 +99,7 @@ def test_a_child_that_refuses_to_start_ends_the_others(tmp_path) -> None:
 
 
 def test_a_child_that_fails_after_it_had_settled_is_started_again(tmp_path, monkeypatch, supervise) -> None:
-    monkeypatch.setattr("bodyschema.daemon.supervise.SETTLED_AFTER_S", 0.0)
+    monkeypatch.setattr("bodyschema.daemon.service.supervise.SETTLED_AFTER_S", 0.0)
     code = WAITING.replace("signal.pause()", "sys.stdin.read(); __import__('time').sleep(0.3); raise SystemExit(1)")
     supervise(child(code, tmp_path / "pids"))
     wait_until(lambda: len(started(tmp_path / "pids")) == 2)

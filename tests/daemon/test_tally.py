@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from small_arm import write_small_arm
 
-from bodyschema.daemon.tally import FEWEST_FRAMES, NEWEST_FRAMES, Tally
+from bodyschema.daemon.sampler.counters import FEWEST_FRAMES, NEWEST_FRAMES, Tally
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.records import Reason
 from bodyschema.interfaces.rejections import REMEDIES, WORDS
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 Q = np.zeros(2)
 

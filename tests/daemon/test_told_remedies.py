@@ -8,10 +8,10 @@ import sys
 import pytest
 from rich.console import Console
 
-from bodyschema.daemon.doctor_view import show
-from bodyschema.daemon.logs import PlainFormatter
-from bodyschema.daemon.remedies import WITH_ROBOT, as_typed, given_robot, printable
-from bodyschema.daemon.servo_wiring import Check
+from bodyschema.cli.hardware.doctor_view import show
+from bodyschema.daemon.service.logs import PlainFormatter
+from bodyschema.daemon.service.remedies import WITH_ROBOT, as_typed, given_robot, printable
+from bodyschema.daemon.wiring.servos import Check
 
 GIVEN = ["doctor", "--robot", "arm/left.toml"]
 
@@ -60,7 +60,7 @@ def test_a_name_with_blanks_can_be_typed() -> None:
 
 @pytest.mark.parametrize("command", sorted(WITH_ROBOT))
 def test_each_of_these_commands_takes_it(command, capsys) -> None:
-    from bodyschema.daemon.cli import command_line
+    from bodyschema.cli.main import command_line
 
     words = command.split()
     pages = {"servos": ["servos", "show"]}.get(command, words)

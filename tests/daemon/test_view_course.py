@@ -8,10 +8,10 @@ import msgspec
 import numpy as np
 from told_statuses import LEARNER
 
-from bodyschema.daemon.status import Change, LearnerStatus
-from bodyschema.daemon.view.course import LARGEST_SERIES, Course, Series
-from bodyschema.daemon.view.recent import KEPT, LARGEST_CLOUD, RecentPairs, cloud
-from bodyschema.daemon.wire import PredictReply
+from bodyschema.daemon.transport.status import Change, LearnerStatus
+from bodyschema.daemon.transport.wire import PredictReply
+from bodyschema.dashboard.course import LARGEST_SERIES, Course, Series
+from bodyschema.dashboard.recent import KEPT, LARGEST_CLOUD, RecentPairs, cloud
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import Pair, frozen_array
 

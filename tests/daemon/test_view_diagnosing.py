@@ -11,8 +11,8 @@ import pytest
 from small_arm import write_small_arm
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.view.diagnosing import Diagnoses
-from bodyschema.daemon.view.documents import DiagnosisDocument
+from bodyschema.dashboard.diagnosing import Diagnoses
+from bodyschema.dashboard.documents import DiagnosisDocument
 from bodyschema.interfaces.errors import BusError, RequestError
 from bodyschema.interfaces.records import Pair, frozen_array
 

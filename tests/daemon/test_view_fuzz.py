@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 pytest.importorskip("starlette")
 
-from bodyschema.daemon.view.app import application
-from bodyschema.daemon.view.hub import Hub
+from bodyschema.dashboard.app import application
+from bodyschema.dashboard.hub import Hub
 from bodyschema.interfaces.errors import BusError, RequestError
 
 LIMIT_S = 5.0
@@ -33,7 +33,7 @@ bodies = st.sampled_from([b'{"process": "sampler", "command": "pause"}', b"[" * 
 @pytest.fixture(scope="module", autouse=True)
 def short_heartbeat() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bodyschema.daemon.view.app.HEARTBEAT_S", 0.01)
+        patch.setattr("bodyschema.dashboard.app.HEARTBEAT_S", 0.01)
         yield
 
 

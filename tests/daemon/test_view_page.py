@@ -12,8 +12,8 @@ import pytest
 httpx = pytest.importorskip("httpx")
 pytest.importorskip("starlette")
 
-from bodyschema.daemon.view.app import LARGEST_BODY, STATIC, application  # noqa: E402
-from bodyschema.daemon.view.hub import MOST_FOLLOWERS, Hub  # noqa: E402
+from bodyschema.dashboard.app import LARGEST_BODY, STATIC, application  # noqa: E402
+from bodyschema.dashboard.hub import MOST_FOLLOWERS, Hub  # noqa: E402
 from bodyschema.interfaces.errors import BusError, RequestError  # noqa: E402
 
 HERE = "http://127.0.0.1:8420"

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from small_arm import write_small_arm
 
-from bodyschema.daemon import extras
-from bodyschema.daemon.cli import app
-from bodyschema.daemon.view_process import shown
+from bodyschema.cli.main import app
+from bodyschema.cli.terminal.view_process import shown
+from bodyschema.interfaces import extras
 from bodyschema.interfaces.errors import ConfigError
 
 pytest.importorskip("uvicorn")

@@ -15,12 +15,20 @@ import pytest
 from small_arm import write_small_arm
 from told_statuses import LEARNER, SAMPLER
 
-from bodyschema.daemon.bus import Bus
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.keys import Keys
-from bodyschema.daemon.view.hub import Hub
-from bodyschema.daemon.view.watch import Watch
-from bodyschema.daemon.wire import CommandReply, CommandRequest, PairMessage, PairsReply, PredictReply, decode, encode
+from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.wire import (
+    CommandReply,
+    CommandRequest,
+    PairMessage,
+    PairsReply,
+    PredictReply,
+    decode,
+    encode,
+)
+from bodyschema.dashboard.hub import Hub
+from bodyschema.dashboard.watch import Watch
 from bodyschema.interfaces.errors import BusError, RequestError
 
 LIMIT_S = 500.0

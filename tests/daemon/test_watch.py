@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from guided_arm import NOW_AND_THEN, built_chain, measured, new_learning, path, teach
 
-from bodyschema.daemon.learning.watch import MOST_WATCHED, Watch
 from bodyschema.interfaces.records import Pair, frozen_array
+from bodyschema.learning.watch import MOST_WATCHED, Watch
 
 COARSE_RAD = np.radians(1.0)
 

@@ -13,12 +13,12 @@ from board_renderer import webcams
 from shown_board import known_rig
 from small_arm import write_small_arm
 
-from bodyschema.daemon.camera_wiring import camera_checks
-from bodyschema.daemon.cli import app
+from bodyschema.cli.cameras.mjpeg import MOST_VIEWERS, MjpegServer
+from bodyschema.cli.hardware.robot_template import EXAMPLE, robot_toml
+from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.mjpeg import MOST_VIEWERS, MjpegServer
-from bodyschema.daemon.robot_template import EXAMPLE, robot_toml
-from bodyschema.daemon.wiring import check_sources
+from bodyschema.daemon.wiring.cameras import camera_checks
+from bodyschema.daemon.wiring.wiring import check_sources
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.vision.rig_file import write_rig
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bodyschema.daemon.wire import (
+from bodyschema.daemon.transport.wire import (
     JSON,
     LARGEST_BATCH,
     MSGPACK,

@@ -7,7 +7,7 @@ import pytest
 from small_arm import write_small_arm
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.wiring import (
+from bodyschema.daemon.wiring.wiring import (
     check_sources,
     demonstration_model,
     open_joints,
@@ -135,7 +135,7 @@ def test_small_green_balls_make_fixes_in_the_simulation(tmp_path) -> None:
 
 
 def test_without_pybullet_the_simulation_names_the_extra(monkeypatch) -> None:
-    monkeypatch.setattr("bodyschema.daemon.extras.find_spec", lambda _name: None)
+    monkeypatch.setattr("bodyschema.interfaces.extras.find_spec", lambda _name: None)
     with pytest.raises(ConfigError, match=r"Type: pip install 'bodyschema\[sim\]'"):
         require_simulation()
 

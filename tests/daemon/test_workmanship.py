@@ -9,10 +9,10 @@ import numpy as np
 from guided_arm import Scene, nominal_model
 
 from bodyschema.daemon.config import LearnerConfig
-from bodyschema.daemon.learning import Solved
-from bodyschema.daemon.learning.eras import Eras
-from bodyschema.daemon.learning.members import RIGID
-from bodyschema.daemon.learning.workmanship import Made, best_made
+from bodyschema.learning import Solved
+from bodyschema.learning.eras import Eras
+from bodyschema.learning.members import RIGID
+from bodyschema.learning.workmanship import Made, best_made
 from kbmaps import ChainTolerances, RigidLearner
 
 NOMINAL, SCENE = nominal_model(), Scene.draw(0, 40)

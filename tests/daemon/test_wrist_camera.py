@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bodyschema.daemon.calibration import Calibration
-from bodyschema.interfaces.recording import Recording
+from bodyschema.calibration.rigid_chain import Calibration
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
-from bodyschema.interfaces.toml_file import read_toml
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.toml_file import read_toml
 
 DESK_ARM = Path(__file__).parents[2] / "examples" / "desk_arm" / "robot.toml"
 SIGMA = np.diag([0.05e-3, 0.05e-3, 0.5e-3])

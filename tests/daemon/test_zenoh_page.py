@@ -20,20 +20,21 @@ import warm
 from scripted_sources import Walk
 from small_arm import write_small_arm
 
-from bodyschema.daemon import history, simulation, status, wire
-from bodyschema.daemon.bus import Bus, client
-from bodyschema.daemon.cli import app
+from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.keys import Keys
-from bodyschema.daemon.learning import curve
-from bodyschema.daemon.sampler import Sampler
-from bodyschema.daemon.session import session_of
-from bodyschema.daemon.sources import Sources
-from bodyschema.daemon.store import PairStore
-from bodyschema.daemon.wire import MSGPACK, IkReply, IkRequest, JointsRequest, PredictReply, decode, encode
+from bodyschema.daemon.sampler import history, simulation
+from bodyschema.daemon.sampler.sampler import Sampler
+from bodyschema.daemon.sampler.session import session_of
+from bodyschema.daemon.sampler.sources import Sources
+from bodyschema.daemon.transport import status, wire
+from bodyschema.daemon.transport.bus import Bus, client
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.wire import MSGPACK, IkReply, IkRequest, JointsRequest, PredictReply, decode, encode
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import FARTHEST_M, Reason
+from bodyschema.learning import curve
+from bodyschema.recordings.store.store import PairStore
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "zenoh.md").read_text(encoding="utf-8")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bodyschema.daemon.status import (
+from bodyschema.daemon.transport.status import (
     ChainCalibration,
     Change,
     JointRange,

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from bodyschema.effects import Effect, Motion, Simulation
-from bodyschema.interfaces.recording import Recording
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.description import RobotDescription
 
 DESK_ARM = Path(__file__).parents[2] / "examples" / "desk_arm" / "robot.toml"
 PAIRS, SIGMA_M = 300, 3e-4

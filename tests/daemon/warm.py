@@ -29,9 +29,9 @@ from pathlib import Path
 from typing import IO
 
 RARELY_NEEDED = (
-    "bodyschema.daemon.view",
-    "bodyschema.daemon.fleet",
-    "bodyschema.daemon.reproduce",
+    "bodyschema.dashboard",
+    "bodyschema.fleet",
+    "bodyschema.reproduce",
     "bodyschema.daemon.rerun",
 )
 PR_SET_PDEATHSIG = 1

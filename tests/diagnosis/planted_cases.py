@@ -12,9 +12,9 @@ from bodyschema.diagnosis.alignment import aligned
 from bodyschema.diagnosis.fit import Fit
 from bodyschema.diagnosis.observations import Observations
 from bodyschema.effects import Effect, Motion, Simulation
-from bodyschema.interfaces.recording import Recording
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.description import RobotDescription
 
 SIGMA_M = 3e-4
 INTERVAL_S = 0.25

@@ -14,7 +14,7 @@ from bodyschema.diagnosis.contact import before_contact, before_rest, between_fl
 from bodyschema.diagnosis.fit import Fit
 from bodyschema.diagnosis.observations import Observations
 from bodyschema.effects import Effect, Motion, Simulation
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 RUN, UNSEEN = 20, 4
 

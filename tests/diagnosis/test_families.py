@@ -9,7 +9,7 @@ from planted_cases import desk_arm, start_of, walk
 from bodyschema.diagnosis.families import Family, families
 from bodyschema.diagnosis.fit import Fit
 from bodyschema.diagnosis.unknown import Way
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 from bodyschema.sim_backend import model_file
 
 

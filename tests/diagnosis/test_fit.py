@@ -16,7 +16,7 @@ from bodyschema.diagnosis.scan import Scan
 from bodyschema.effects import Effect, Simulation
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 SEEDS = range(40)
 # Of a bound that a right build breaks by chance.

@@ -28,7 +28,7 @@ from bodyschema.diagnosis.observations import Observations
 from bodyschema.diagnosis.scan import Scan
 from bodyschema.effects import Effect, Motion, Simulation
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 CHANCE = 1e-4
 SEEDS, MANY_SEEDS = range(100), range(300)

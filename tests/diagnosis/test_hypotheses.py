@@ -11,7 +11,7 @@ from planted_cases import ELBOW, SHOULDER, desk_arm, motion_of, observed, survey
 from bodyschema.diagnosis.hypotheses import Hypotheses
 from bodyschema.diagnosis.observations import Observations
 from bodyschema.effects import KINDS, Motion, Simulation
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 STEREO = """focal_px = 600.0                # from the stereo calibration
 principal_point_px = [319.5, 239.5]

@@ -25,7 +25,7 @@ from bodyschema.diagnosis.result import (
 from bodyschema.diagnosis.words import finding
 from bodyschema.effects import Effect, Motion, Simulation
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 ERRORS = Errors(1.0, 1.0, 1.0, 1.0, 1.0)
 SIX = {"x_m": 0.004, "y_m": -0.003, "z_m": 0.002, "rx_rad": 0.01, "ry_rad": -0.02, "rz_rad": 0.015}

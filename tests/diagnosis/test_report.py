@@ -23,7 +23,7 @@ from bodyschema.diagnosis.report.plot import ticks as axis_ticks
 from bodyschema.diagnosis.report.residuals import Residuals, binned, structure
 from bodyschema.diagnosis.result import DiagnosisFile, Interval
 from bodyschema.effects import KINDS, Effect, Simulation
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 ABOUT = About("<pairs> & more.csv", "desk", "1.2.3")
 VOID = {"meta", "br", "rect", "path", "line", "polyline", "polygon", "circle"}

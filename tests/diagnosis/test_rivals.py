@@ -13,7 +13,7 @@ from bodyschema.diagnosis.conclusion import conclusion
 from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
 from bodyschema.diagnosis.rivals import whole_range
 from bodyschema.effects import Effect, Motion, Simulation
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 ROWS = 200
 ADVISED = re.compile(r"move joint (\w+) through its whole range \((-?\d+)° to (-?\d+)°\)")

@@ -9,7 +9,7 @@ from scipy import stats
 
 from bodyschema.diagnosis.scan import Candidate, Scan
 from bodyschema.effects import Effect
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 CHANCE = 1e-4
 SEEDS = range(20)

@@ -17,7 +17,7 @@ from bodyschema.diagnosis.rivals import standings
 from bodyschema.diagnosis.scatter import instruments
 from bodyschema.diagnosis.search import NAMED, Search, nats
 from bodyschema.effects import Effect, Motion, Simulation
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 ROWS, SIGMA_M, SCATTER_RAD = 1200, 5e-5, np.radians(0.04)
 # Probabilities of no memory at all.

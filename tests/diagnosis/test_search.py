@@ -11,7 +11,7 @@ from bodyschema.diagnosis.fit import Fit
 from bodyschema.diagnosis.scan import Scan
 from bodyschema.diagnosis.search import NAMED, Search, nats, rise_for, simplicity
 from bodyschema.effects import Effect
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 GAINS = st.floats(0.0, 1e5)
 NUMBERS = st.integers(1, 12)

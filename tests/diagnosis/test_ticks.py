@@ -13,7 +13,7 @@ from bodyschema.diagnosis.instrument import instrument_factor
 from bodyschema.diagnosis.observations import Observations, ticks
 from bodyschema.effects import Simulation
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 TICK_RAD = 2.0 * np.pi / 4096
 # A coarser encoder: its readings add about as much noise as the instrument has.

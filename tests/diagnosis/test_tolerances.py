@@ -16,7 +16,7 @@ from bodyschema.diagnosis.observations import Observations
 from bodyschema.diagnosis.result import DiagnosisFile
 from bodyschema.effects import Effect, Simulation, load_simulation, write_extended
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 NOISE_M, ROWS = 1e-4, 150
 LENGTH_M, ANGLE_RAD, DRIVE_RAD = 4e-4, 1.2e-3, 2e-4

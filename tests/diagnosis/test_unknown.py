@@ -13,9 +13,9 @@ from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
 from bodyschema.diagnosis.result import DiagnosisFile
 from bodyschema.diagnosis.words import modelled
 from bodyschema.effects import Effect, Motion, Simulation, load_simulation, write_extended
-from bodyschema.interfaces.recording import Recording
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.description import RobotDescription
 
 PER_RAD = 0.03
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from bench_arm import HeardPort
 
-from bodyschema.daemon.gaze_loop import GazeLoop, HandModel
-from bodyschema.daemon.wiring import demonstration_model
+from bodyschema.daemon.sampler.gaze_loop import GazeLoop, HandModel
+from bodyschema.daemon.wiring.wiring import demonstration_model
 from bodyschema.drivers.bench.faults import Planned
 from bodyschema.drivers.bench.virtual_port import VirtualClock
 from bodyschema.drivers.dynamixel.bench.chain import Chain
@@ -20,8 +20,8 @@ from bodyschema.drivers.dynamixel.joints import DynamixelJoints
 from bodyschema.drivers.dynamixel.models import BY_NAME
 from bodyschema.drivers.dynamixel.powered_config import GazeConfig
 from bodyschema.interfaces.errors import BusError
-from bodyschema.interfaces.pointing import Pointing
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.pointing import Pointing
 from kbmaps import RigidChain
 
 MODEL = "XM430-W350"

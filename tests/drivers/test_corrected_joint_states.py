@@ -18,7 +18,7 @@ from bodyschema.drivers.ros2.link import open_session
 from bodyschema.drivers.ros2.messages import JOINT_STATE, decode_joint_state
 from bodyschema.effects import Effect, Simulation
 from bodyschema.effects.exports import write_correction
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 READERS = Path(__file__).parents[2] / "examples" / "correction"
 NAMES = tuple(PATHS)

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from gazing_robot import HEAD, GazingRobot
 
-from bodyschema.daemon.wire import JointsRequest, PredictReply, decode, encode
+from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode
 from bodyschema.drivers.dynamixel.bench.driven_shaft import DrivenShaft
 from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE
 from bodyschema.interfaces.errors import RequestError
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 TORQUE = 64
 PATH_S = 8.0

@@ -9,8 +9,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from bodyschema.daemon.bench_run import FAULTS
-from bodyschema.daemon.cli import command_line
+from bodyschema.cli.hardware.bench_run import FAULTS
+from bodyschema.cli.main import command_line
 from bodyschema.drivers.config import DriversConfig
 from bodyschema.drivers.dynamixel.bench.arm import KINDS as DYNAMIXEL_KINDS
 from bodyschema.drivers.dynamixel.models import BY_NAME, Register

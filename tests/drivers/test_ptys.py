@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from servo_arm import swing
 
-from bodyschema.daemon.reopen import Reopening
+from bodyschema.daemon.sampler.reconnect import Reopening
 from bodyschema.drivers.bench.pty_shell import PtyShell
 from bodyschema.drivers.dynamixel.bench.chain import Chain as DynamixelChain
 from bodyschema.drivers.dynamixel.bench.servo import Servo as DynamixelServo

@@ -10,8 +10,8 @@ from bodyschema.drivers.replay import AHEAD, Replay
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import SourceEnded, SourceError
 from bodyschema.interfaces.protocols import JointSource, MarkerSource
-from bodyschema.interfaces.recording import RESET_GAP_S, Recording
 from bodyschema.interfaces.records import JointReading, MarkerFix
+from bodyschema.recordings.recording import RESET_GAP_S, Recording
 
 STEREO = StereoCalibration(
     focal_px=700.0, principal_point_px=(320.0, 240.0), baseline_m=0.2, image_size_px=(640, 480), pixel_sigma=0.2

@@ -26,7 +26,7 @@ from bodyschema.drivers.ros2.joints import Ros2Joints
 from bodyschema.drivers.ros2.link import Link, Sample, open_zenoh
 from bodyschema.interfaces.protocols import JointSource
 from bodyschema.interfaces.records import FloatArray, JointReading
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 from bodyschema.sim_backend import SimConfig, SimWorld
 from bodyschema.sim_backend.guided_path import guided_path
 from kbmaps import ExactLearner, JointBasis, KBMap

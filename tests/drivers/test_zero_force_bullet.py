@@ -11,7 +11,7 @@ import pytest
 from test_zero_force_process import write_robot
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.powered_wiring import open_drives
+from bodyschema.daemon.wiring.powered import open_drives
 from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE, Servo

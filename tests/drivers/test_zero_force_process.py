@@ -16,7 +16,7 @@ import pytest
 import warm
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.wiring import open_joints
+from bodyschema.daemon.wiring.wiring import open_joints
 from bodyschema.drivers.bench.dry_run import DryRun
 from bodyschema.drivers.dynamixel.bench.arm import DynamixelArm
 from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE, POSITION_MODE

@@ -8,7 +8,7 @@ import numpy as np
 
 from bodyschema.effects import KINDS, Effect, Motion
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 LINKS = {
     "base": (20.0, "0 0 0.2"),

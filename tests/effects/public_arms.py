@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bodyschema.effects import Motion
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 # folder and file in pybullet_data, joints, marker link, camera's parent
 ARMS = {

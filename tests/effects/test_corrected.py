@@ -8,9 +8,9 @@ from effect_arms import ALL, SLIDE, arm, everywhere, sized, walk
 
 from bodyschema.effects import Effect, Simulation, corrected_file, write_corrected
 from bodyschema.effects.simulation import RIGID
-from bodyschema.interfaces.calibrated_files import CAMERA_LINK, MARKER_LINK
-from bodyschema.interfaces.robot import RobotDescription
-from bodyschema.interfaces.urdf import UrdfTree, chain_between
+from bodyschema.robot.calibrated_files import CAMERA_LINK, MARKER_LINK
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.urdf import UrdfTree, chain_between
 
 HEADING = "made by a test"
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from bodyschema.effects import Effect, Simulation, Unexplained, load_simulation, write_extended
 from bodyschema.effects.files import MODEL_FILE
 from bodyschema.interfaces.errors import ConfigError, RobotError
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 from kbmaps import JointBasis, KernelLearner, RigidChain, TensorTrain
 
 HEADING = "Extended by a test"

@@ -10,7 +10,7 @@ import pytest
 from effect_arms import arm, walk
 
 from bodyschema.effects import KINDS, Simulation, Unexplained, load_simulation
-from bodyschema.interfaces.recording import Recording
+from bodyschema.recordings.recording import Recording
 from kbmaps import JointBasis, RigidChain
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "effects.md").read_text(encoding="utf-8")

@@ -15,7 +15,7 @@ from effect_arms import arm, everywhere, sized, walk
 from bodyschema.effects import KINDS, Effect, LiveEncoders, Motion, Simulation
 from bodyschema.effects.exports import write_correction
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 READERS = Path(__file__).resolve().parents[2] / "examples" / "correction"
 NOT_OF_THE_ARM = {"camera_scale", "camera_focal", "lens_distortion", "camera_latency", "thermal_drift"}

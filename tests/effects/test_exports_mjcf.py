@@ -13,7 +13,7 @@ from bodyschema.effects import KINDS, Effect, Kind, Motion, Parameter, Simulatio
 from bodyschema.effects.exports import replayed, write_correction, write_mjcf
 from bodyschema.interfaces.errors import RobotError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 mujoco = pytest.importorskip("mujoco")
 

@@ -9,7 +9,7 @@ import pytest
 from effect_arms import STEREO, arm, walk
 
 from bodyschema.effects import Effect, Simulation, load_simulation, place_map, write_extended
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 POSE, SHIFT = [0.03, -0.02, 0.05, 0.2, -0.1, 0.3], [0.01, 0.02, -0.03]
 

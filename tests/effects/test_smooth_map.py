@@ -8,7 +8,7 @@ from effect_arms import ALL, arm, walk
 
 from bodyschema.effects import Effect, Motion, Simulation, load_simulation, place_map, smooth_map, write_extended
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 TOLERANCE_M = 1e-6
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 ROOT = Path(__file__).parents[2]
 POSES = np.random.default_rng(7).uniform(-1.0, 1.0, (300, 4))

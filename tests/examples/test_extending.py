@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.wiring import open_joints
+from bodyschema.daemon.wiring.wiring import open_joints
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, SourceLost
-from bodyschema.interfaces.plugins import PluginConfig
-from bodyschema.interfaces.recording import Recording
 from bodyschema.interfaces.records import MarkerFix, MarkerMiss, Reason, StereoFrame
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.plugins import PluginConfig
 from bodyschema.vision.config import VisionConfig
 from bodyschema.vision.tracked_camera import MarkerTracker
 from bodyschema.vision.trackers import tracker_of

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 MESH = '<visual><geometry><mesh filename="meshes/{}.stl" scale="1 1 1"/></geometry></visual>'
 INERTIAL = '<inertial><mass value="0.7"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'

@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 from random_robots import random_robot
 from scipy.spatial.transform import Rotation
 
-from bodyschema.interfaces.calibrated import CalibratedGeometry
-from bodyschema.interfaces.calibrated_files import CAMERA_LINK, MARKER_LINK, write_calibrated
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.robot import RobotDescription
-from bodyschema.interfaces.rpy import rpy_of
-from bodyschema.interfaces.toml_file import read_toml
-from bodyschema.interfaces.toml_text import toml_text
+from bodyschema.robot.calibrated import CalibratedGeometry
+from bodyschema.robot.calibrated_files import CAMERA_LINK, MARKER_LINK, write_calibrated
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.rpy import rpy_of
+from bodyschema.robot.toml_file import read_toml
+from bodyschema.robot.toml_text import toml_text
 from kbmaps import ChainParameters, RigidChain
 
 CLOSE_M = 1e-9

@@ -13,7 +13,7 @@ from hostile_folder import FIRST_PARTY, HostileFolder
 from small_arm import write_small_arm
 
 from bodyschema.interfaces.interpreter import module_command, safe_children
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 ROOT = Path(__file__).parents[2]
 LIMIT_S = 300.0

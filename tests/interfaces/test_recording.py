@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bodyschema.interfaces.errors import RecordingError
-from bodyschema.interfaces.recording import Recording
+from bodyschema.recordings.recording import Recording
 
 JOINTS = ("waist", "shoulder")
 GOOD = "waist,shoulder,x,y,z\n0.1,0.2,1,2,3\n0.3,0.4,4,5,6\n"

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodyschema.interfaces import recording_bag
 from bodyschema.interfaces.errors import RecordingError
-from bodyschema.interfaces.recording_bag import BagTopics, read_bag
-from bodyschema.interfaces.tracks import JointTrack, MarkerTrack, joined
+from bodyschema.recordings import ros_bag as recording_bag
+from bodyschema.recordings.ros_bag import BagTopics, read_bag
+from bodyschema.recordings.tracks import JointTrack, MarkerTrack, joined
 
 pytest.importorskip("rosbags")
 from written_bags import (

@@ -9,9 +9,9 @@ import pytest
 from lerobot_datasets import write_dataset
 
 from bodyschema.interfaces.errors import RecordingError
-from bodyschema.interfaces.lerobot import ARMS, JointServo, MotorCalibration, Unit
-from bodyschema.interfaces.recording_lerobot import LeRobotUnits, read_lerobot_dataset
-from bodyschema.interfaces.tracks import MarkerTrack
+from bodyschema.recordings.lerobot_dataset import LeRobotUnits, read_lerobot_dataset
+from bodyschema.recordings.tracks import MarkerTrack
+from bodyschema.robot.lerobot import ARMS, JointServo, MotorCalibration, Unit
 
 pytest.importorskip("pyarrow")
 
@@ -106,7 +106,7 @@ def test_data_that_are_none_are_refused(columns, told, tmp_path) -> None:
 
 
 def test_more_rows_than_are_read_are_refused_unread(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("bodyschema.interfaces.recording_lerobot.MOST_NUMBERS", 100)
+    monkeypatch.setattr("bodyschema.recordings.lerobot_dataset.MOST_NUMBERS", 100)
     source = dataset(tmp_path / "set", "v3.0", "degrees")
     with pytest.raises(RecordingError, match="there are more than 12 rows with the files before it"):
         read_lerobot_dataset(source, LeRobotUnits(CALIBRATION, SERVOS, "degrees"), marker())

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bodyschema.interfaces.errors import RecordingError
-from bodyschema.interfaces.recording import Recording
+from bodyschema.recordings.recording import Recording
 
 JOINTS = ("waist", "shoulder")
 GOOD = {"waist": [0.1, 0.3], "shoulder": [0.2, 0.4], "x": [1.0, 4.0], "y": [2.0, 5.0], "z": [3.0, 6.0]}

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bodyschema.interfaces.errors import RecordingError
-from bodyschema.interfaces.recording import Recording
+from bodyschema.recordings.recording import Recording
 
 JOINTS = ("waist", "shoulder")
 numbers = st.floats(allow_nan=False, allow_infinity=False, width=64)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from bodyschema.interfaces.errors import ConfigError, RobotError
-from bodyschema.interfaces.robot import RobotDescription
-from bodyschema.interfaces.urdf import UrdfTree
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.urdf import UrdfTree
 
 URDF = """<robot name="arm">
   <link name="base"/><link name="upper"/><link name="hand"/><link name="tip"/>

@@ -8,7 +8,7 @@ import numpy as np
 from written_bags import joint_topic, point_stamped, pose_stamped, write_bag
 
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 from kbmaps import ChainParameters, ChainTolerances
 
 NOISE_M = 5e-4

@@ -14,10 +14,10 @@ from bodyschema.drivers.feetech.bench.chain import Chain
 from bodyschema.drivers.feetech.bench.servo import Servo
 from bodyschema.drivers.feetech.joints import FeetechJoints
 from bodyschema.drivers.feetech.models import BY_NAME
-from bodyschema.interfaces.lerobot import RAD_PER_TICK, Calibrations
-from bodyschema.interfaces.recording import Recording
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.lerobot import RAD_PER_TICK, Calibrations
 from kbmaps import ChainParameters, ChainTolerances
 
 SPEED_RAD_S = math.radians(30.0)

@@ -110,7 +110,7 @@ def test_it_lives_beside_another_daemon_and_outlives_it(
         subprocess.run(list(map(str, command)), check=True, timeout=LIMIT_S, cwd=tmp_path, env=environment)
 
     def says() -> str:
-        code = "import bodyschema.daemon.cli as c, kbmaps; print(c.__file__); c.main()"
+        code = "import bodyschema.cli.main as c, kbmaps; print(c.__file__); c.main()"
         command = [python, "-P", "-c", code, "--version"]
         return subprocess.run(command, check=True, capture_output=True, text=True, timeout=LIMIT_S).stdout
 

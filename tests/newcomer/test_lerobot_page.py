@@ -12,9 +12,9 @@ import pytest
 from so101_on_a_port import So101
 from typed_pages import DOCS, TypedPage, commands_of, expected_mm
 
-from bodyschema.daemon.cli import command_line
+from bodyschema.cli.main import command_line
 from bodyschema.daemon.config import Config
-from bodyschema.interfaces.lerobot import read_calibration
+from bodyschema.robot.lerobot import read_calibration
 
 PAGE = (DOCS / "lerobot.md").read_text(encoding="utf-8")
 SO101 = DOCS.parent / "examples" / "so101"

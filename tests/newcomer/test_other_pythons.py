@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from small_arm import JOINTS, write_small_arm
 
-from bodyschema.interfaces.recording import Recording
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.description import RobotDescription
 
 ROOT = Path(__file__).parents[2]
 LIMIT_S = 600.0

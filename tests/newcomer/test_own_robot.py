@@ -14,11 +14,11 @@ import pytest
 import warm
 from scipy.spatial.transform import Rotation
 
-from bodyschema.daemon.cli import command_line
+from bodyschema.cli.main import command_line
 from bodyschema.daemon.config import Config
 from bodyschema.interfaces.errors import BodyschemaError
-from bodyschema.interfaces.recording import Recording
-from bodyschema.interfaces.robot import CameraSection, RobotDescription, RobotSection
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.description import CameraSection, RobotDescription, RobotSection
 from kbmaps import RigidChain
 
 ROOT = Path(__file__).parents[2]

@@ -57,8 +57,8 @@ def test_a_client_imports_neither_scipy_nor_opencv() -> None:
 import sys
 from pathlib import Path
 from bodyschema.daemon import bus, status_view
-from bodyschema.daemon.commands import predict, status
-from bodyschema.daemon.plausibility import limits
+from bodyschema.cli.commands import predict, status
+from bodyschema.calibration.plausibility import limits
 from bodyschema.daemon.config import Config
 assert Config.load(Path({str(robot)!r})).robot.chain.joints == 4
 print("heavy:", [name for name in ("scipy", "cv2", "pybullet", "matplotlib") if f"{{name}}.version" in sys.modules])

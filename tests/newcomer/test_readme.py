@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from bodyschema.daemon.bench_run import BenchRun
-from bodyschema.daemon.cli import COMMANDS, command_line
+from bodyschema.cli.hardware.bench_run import BenchRun
+from bodyschema.cli.main import COMMANDS, command_line
 from bodyschema.daemon.config import Config
 
 ROOT = Path(__file__).parents[2]

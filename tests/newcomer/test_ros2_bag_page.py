@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodyschema.daemon.cli import command_line
+from bodyschema.cli.main import command_line
 from bodyschema.interfaces.errors import RecordingError
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 
 pytest.importorskip("rosbags")
 from arm_in_a_bag import ArmInABag

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bodyschema.daemon.cli import command_line
+from bodyschema.cli.main import command_line
 
 DOCS = Path(__file__).parents[2] / "docs"
 

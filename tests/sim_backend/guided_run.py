@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.robot import RobotDescription
-from bodyschema.interfaces.toml_file import read_toml
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.toml_file import read_toml
 from bodyschema.sim_backend import SimConfig, model_file
 from bodyschema.sim_backend.physics import Physics
 from bodyschema.sim_backend.scene import Scene

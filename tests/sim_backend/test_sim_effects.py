@@ -8,8 +8,8 @@ from test_sim_truth import NO_ERRORS
 
 from bodyschema.effects import KINDS, Effect, Motion, Simulation
 from bodyschema.interfaces.records import MarkerFix
-from bodyschema.interfaces.robot import RobotDescription
-from bodyschema.interfaces.toml_file import read_toml
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.toml_file import read_toml
 from bodyschema.sim_backend import EncoderConfig, SimConfig, model_file
 from bodyschema.sim_backend.joints import JointPaths
 from bodyschema.sim_backend.physics import Physics

@@ -12,14 +12,14 @@ import pytest
 from guided_run import shipped
 
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.robot import RobotDescription
-from bodyschema.interfaces.toml_file import read_toml
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.toml_file import read_toml
 from bodyschema.sim_backend import SimConfig, SimWorld, model_file
 
 ROOT = Path(__file__).resolve().parents[2]
 HOLD_OPEN = """
 import select, signal, sys
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
 from bodyschema.sim_backend import SimConfig, SimWorld, model_file
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 try:

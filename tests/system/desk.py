@@ -12,12 +12,12 @@ import sys
 import time
 from pathlib import Path
 
-from bodyschema.daemon.bus import client
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.identity import Identity, Route
-from bodyschema.daemon.keys import Keys
-from bodyschema.daemon.view.hub import Hub
-from bodyschema.daemon.view.watch import Watch
+from bodyschema.daemon.transport.bus import client
+from bodyschema.daemon.transport.identity import Identity, Route
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.dashboard.hub import Hub
+from bodyschema.dashboard.watch import Watch
 from bodyschema.interfaces.errors import BodyschemaError, BusError
 
 LIMIT_S = 400.0

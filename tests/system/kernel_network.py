@@ -14,7 +14,7 @@ from free_ports import free_endpoint
 from two_processes import LIFE_LIMIT_S, expect_each_pair_learnt_once, learner_with, running, sampler_with, write_robot
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.store import PairReader
+from bodyschema.recordings.store.store import PairReader
 
 SOME = 20
 # Longer than a zenoh session lives without a sign of the other side.

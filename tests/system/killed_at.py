@@ -15,10 +15,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from bodyschema.daemon import checkpoint
-from bodyschema.daemon.bus import Bus
-from bodyschema.daemon.cli import main
-from bodyschema.daemon.store import PairStore
+from bodyschema.cli.main import main
+from bodyschema.daemon.learner import checkpoint
+from bodyschema.daemon.transport.bus import Bus
+from bodyschema.recordings.store.store import PairStore
 
 NOWHERE = "at a random moment"  # from outside
 

@@ -15,17 +15,17 @@ import cv2
 import numpy as np
 import warm
 
-from bodyschema.daemon.bench_wiring import Motion, bench_robot_file, open_bench
-from bodyschema.daemon.bus import Bus
-from bodyschema.daemon.command_names import CommandName
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.keys import Keys
-from bodyschema.daemon.status import SamplerStatus
-from bodyschema.daemon.store import PairReader
-from bodyschema.daemon.wire import CommandReply, CommandRequest, decode, encode
+from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.command_names import CommandName
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.status import SamplerStatus
+from bodyschema.daemon.transport.wire import CommandReply, CommandRequest, decode, encode
+from bodyschema.daemon.wiring.bench import Motion, bench_robot_file, open_bench
 from bodyschema.drivers.bench.dry_run import DryRun
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.records import FloatArray, Pair
+from bodyschema.recordings.store.store import PairReader
 
 LIMIT_S = 500.0
 

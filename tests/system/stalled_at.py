@@ -12,15 +12,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from bodyschema.daemon.cli import main
+from bodyschema.cli.main import main
 
 # The work of each loop in one round.
 WORK = {
-    "encoders": ("bodyschema.daemon.reopen", "Reopening", "read", "the encoders"),
-    "frames": ("bodyschema.daemon.reopen", "Reopening", "read", "the cameras"),
-    "learning": ("bodyschema.daemon.feed", "PairFeed", "step", None),
-    "background": ("bodyschema.daemon.findings", "Findings", "renew", None),
-    "status": ("bodyschema.daemon.learner", "Learner", "status", None),
+    "encoders": ("bodyschema.daemon.sampler.reconnect", "Reopening", "read", "the encoders"),
+    "frames": ("bodyschema.daemon.sampler.reconnect", "Reopening", "read", "the cameras"),
+    "learning": ("bodyschema.daemon.learner.feed", "PairFeed", "step", None),
+    "background": ("bodyschema.daemon.learner.findings", "Findings", "renew", None),
+    "status": ("bodyschema.daemon.learner.learner", "Learner", "status", None),
 }
 
 

@@ -26,10 +26,10 @@ from two_processes import (
     write_robot,
 )
 
-from bodyschema.daemon.bus import client
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.status import LearnerStatus
-from bodyschema.daemon.wire import JointsRequest, encode
+from bodyschema.daemon.transport.bus import client
+from bodyschema.daemon.transport.status import LearnerStatus
+from bodyschema.daemon.transport.wire import JointsRequest, encode
 from bodyschema.interfaces.errors import BodyschemaError
 
 SOME, MORE = 20, 60
@@ -133,7 +133,7 @@ def test_minutes_without_a_link_or_with_a_slow_one_cost_no_pair(tmp_path, how, p
 
 SUBSCRIBER = """
 import sys, time, zenoh
-from bodyschema.daemon.bus import Bus
+from bodyschema.daemon.transport.bus import Bus
 with Bus(connect=sys.argv[1]) as bus:
     bus.subscribe(sys.argv[2], lambda payload: (print("heard", flush=True), time.sleep(3600)))
     time.sleep(3600)

@@ -9,7 +9,7 @@ import pytest
 from failing_disk import FailingDisk
 from two_processes import expect_each_pair_learnt_once, learner_with, running, sampler_with, write_robot
 
-from bodyschema.daemon.store import PairReader
+from bodyschema.recordings.store.store import PairReader
 
 HOUR_S, YEAR_S = 3600, 31_557_600
 # Ahead, back before the start, years ahead as from a dead battery to the time of the network, and right again.

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from hostile_folder import HostileFolder
 
-from bodyschema.interfaces.recording import Recording
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.description import RobotDescription
 
 pytest.importorskip("pybullet")
 

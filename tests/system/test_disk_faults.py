@@ -26,13 +26,13 @@ from two_processes import (
     write_robot,
 )
 
-from bodyschema.daemon.bus import client
-from bodyschema.daemon.checkpoint import generations
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.status import LearnerStatus, SamplerStatus
-from bodyschema.daemon.store import PairReader
-from bodyschema.daemon.wire import CommandRequest, encode
+from bodyschema.daemon.learner.checkpoint import generations
+from bodyschema.daemon.transport.bus import client
+from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
+from bodyschema.daemon.transport.wire import CommandRequest, encode
 from bodyschema.interfaces.errors import BodyschemaError
+from bodyschema.recordings.store.store import PairReader
 
 SOME, MORE = 20, 20
 

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from two_processes import KEYS, expect_each_pair_learnt_once, learner_with, running, write_robot
 
-from bodyschema.daemon.bus import Bus, client
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.keys import Keys
-from bodyschema.daemon.wire import JointsRequest, encode
+from bodyschema.daemon.transport.bus import Bus, client
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.wire import JointsRequest, encode
 
 # By then all that is kept of pairs is full: replay, the solvers' windows, the publisher's cache.
 WARM, PART, PARTS = 24_000, 6_000, 6

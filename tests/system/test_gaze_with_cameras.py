@@ -15,11 +15,11 @@ from sampled import LIMIT_S, SamplerProcess, drawn, on_the_bench, pairs_of, samp
 from v4l2_cameras import LiveCamera, preloaded
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.wiring import demonstration_model
+from bodyschema.daemon.wiring.wiring import demonstration_model
 from bodyschema.drivers.bench.dry_run import DryRun
-from bodyschema.interfaces.pointing import Pointing
 from bodyschema.interfaces.records import FloatArray, Pair
-from bodyschema.interfaces.robot import RobotDescription
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.pointing import Pointing
 
 HEAD = [0, 1]
 DIRECTIONS = [1, -1, 1, 1, 1, 1, 1]  # of the servos

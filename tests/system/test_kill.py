@@ -12,11 +12,11 @@ import pytest
 from killed_at import LEARNER_POINTS, NOWHERE, SAMPLER_POINTS
 from two_processes import KEYS, LIFE_LIMIT_S, learner_with, pause, running, write_robot
 
-from bodyschema.daemon.bus import Bus
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.status import LearnerStatus
-from bodyschema.daemon.store import PairReader
-from bodyschema.daemon.wire import PairMessage, decode, encode, pair_to_wire
+from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.status import LearnerStatus
+from bodyschema.daemon.transport.wire import PairMessage, decode, encode, pair_to_wire
+from bodyschema.recordings.store.store import PairReader
 
 # The last sampler goes on while learners are still killed: thousands of pairs are left to learn.
 CATCH_UP_LIMIT_S = 900.0

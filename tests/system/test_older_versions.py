@@ -15,19 +15,19 @@ import pytest
 from small_arm import URDF
 from two_processes import running, status_when, write_robot
 
-from bodyschema.daemon.backup import Backup, write_backup
-from bodyschema.daemon.checkpoint import CheckpointError, read_checkpoint
+from bodyschema.cli.install.backup import Backup, write_backup
+from bodyschema.cli.install.restore import restore
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.restoring import restore
-from bodyschema.daemon.session import session_of
-from bodyschema.daemon.status import LearnerStatus
-from bodyschema.daemon.store import PairReader, PairStore
-from bodyschema.daemon.store_damage import Damage
-from bodyschema.daemon.store_schema import SCHEMA_VERSION
-from bodyschema.daemon.wire import PairMessage, pair_to_wire
+from bodyschema.daemon.learner.checkpoint import CheckpointError, read_checkpoint
+from bodyschema.daemon.sampler.session import session_of
+from bodyschema.daemon.transport.status import LearnerStatus
+from bodyschema.daemon.transport.wire import PairMessage, pair_to_wire
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import StoreError
 from bodyschema.interfaces.records import Pair
+from bodyschema.recordings.store.damage import Damage
+from bodyschema.recordings.store.schema import SCHEMA_VERSION
+from bodyschema.recordings.store.store import PairReader, PairStore
 
 OLDER = Path(__file__).parents[1] / "daemon" / "older_versions"
 PAIRS = 40  # in each of the files
@@ -94,8 +94,8 @@ import os, signal, sys
 from pathlib import Path
 from bodyschema.daemon import store_schema
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.session import session_of
-from bodyschema.daemon.store import PairStore
+from bodyschema.daemon.sampler.session import session_of
+from bodyschema.recordings.store.store import PairStore
 from bodyschema.interfaces.clock import SystemClock
 left = int(sys.argv[2])
 seal = store_schema.decoded
@@ -127,7 +127,7 @@ def test_a_killed_upgrade_leaves_older_pairs(older: Config) -> None:
 def test_a_downgrade_is_refused_with_the_remedy(config: Config, monkeypatch) -> None:
     with PairStore(config.store_file, session_of(config, SystemClock())):
         pass
-    monkeypatch.setattr("bodyschema.daemon.store_schema.SCHEMA_VERSION", SCHEMA_VERSION - 1)
+    monkeypatch.setattr("bodyschema.recordings.store.schema.SCHEMA_VERSION", SCHEMA_VERSION - 1)
     said = rf"written by a newer bodyschema \(schema {SCHEMA_VERSION}, this one knows {SCHEMA_VERSION - 1}\). Install"
     with pytest.raises(StoreError, match=said), PairReader(config.store_file):
         pass

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 from two_processes import KEYS, LIFE_LIMIT_S, answer, learner_with, running, status_when, write_robot
 
-from bodyschema.daemon import store_schema
-from bodyschema.daemon.bus import Bus
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.history import answer_pairs
-from bodyschema.daemon.session import session_of
-from bodyschema.daemon.status import LearnerStatus
-from bodyschema.daemon.store import PairReader, PairStore
-from bodyschema.daemon.store_rows import COLUMNS, checksum
-from bodyschema.daemon.wire import JointsRequest, PredictReply, decode, encode, pair_to_wire
+from bodyschema.daemon.sampler.history import answer_pairs
+from bodyschema.daemon.sampler.session import session_of
+from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.status import LearnerStatus
+from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode, pair_to_wire
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.records import MarkerFix, frozen_array
+from bodyschema.recordings.store import schema as store_schema
+from bodyschema.recordings.store.rows import COLUMNS, checksum
+from bodyschema.recordings.store.store import PairReader, PairStore
 from kbmaps import RigidChain
 
 PAIRS, SPOILT = 60, 30

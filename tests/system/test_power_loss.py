@@ -14,13 +14,13 @@ from failing_disk import Done, FailingDisk, Operation, read_log
 from power_loss import Disk
 from two_processes import KEYS, answer, ended_well, learner_with, running, write_robot
 
-from bodyschema.daemon.checkpoint import generations, read_checkpoint
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.session import session_of
-from bodyschema.daemon.store import PairReader, PairStore
-from bodyschema.daemon.wire import CommandRequest, encode, pair_to_wire
+from bodyschema.daemon.learner.checkpoint import generations, read_checkpoint
+from bodyschema.daemon.sampler.session import session_of
+from bodyschema.daemon.transport.wire import CommandRequest, encode, pair_to_wire
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import StoreError
+from bodyschema.recordings.store.store import PairReader, PairStore
 
 CHECKPOINT = "learner.ckpt"
 

@@ -17,12 +17,13 @@ from security_recipe import SEVERAL, carried_out
 from stalled_at import WORK
 from two_processes import KEYS, write_robot
 
-from bodyschema.daemon import learner, sampler
-from bodyschema.daemon.bus import client
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.status import LearnerStatus, SamplerStatus
-from bodyschema.daemon.store import PairReader
-from bodyschema.daemon.wire import PairsReply, decode
+from bodyschema.daemon.learner import learner
+from bodyschema.daemon.sampler import sampler
+from bodyschema.daemon.transport.bus import client
+from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
+from bodyschema.daemon.transport.wire import PairsReply, decode
+from bodyschema.recordings.store.store import PairReader
 
 LIMIT_S = 500.0
 WATCHDOG_S = 0.8

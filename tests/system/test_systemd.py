@@ -23,7 +23,7 @@ from test_install_service import HARDWARE, PORT, STEREO
 from two_processes import write_robot
 from v4l2_cameras import ShimCamera
 
-from bodyschema.daemon.servo_wiring import configured_ports
+from bodyschema.daemon.wiring.servos import configured_ports
 
 pytestmark = pytest.mark.soak
 BODYSCHEMA = (sys.executable, "-P", "-m", "bodyschema")

@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 import warm
 
-from bodyschema.daemon.bus import is_alive
+from bodyschema.cli.demo.scene import prepare
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.demo.scene import prepare
-from bodyschema.daemon.keys import Keys
-from bodyschema.interfaces.recording import Recording
+from bodyschema.daemon.transport.bus import is_alive
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.recordings.recording import Recording
 
 pytest.importorskip("uvicorn")
 playwright = pytest.importorskip("playwright.sync_api")

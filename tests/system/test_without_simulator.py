@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from two_processes import running, status_when, write_robot
 
-from bodyschema.daemon.cli import COMMANDS
-from bodyschema.daemon.status import LearnerStatus
+from bodyschema.cli.main import COMMANDS
+from bodyschema.daemon.transport.status import LearnerStatus
 
 ROOT = Path(__file__).parents[2]
 # As if they were not installed, wherever they are.
@@ -65,7 +65,7 @@ def test_a_camera_command_names_the_extra(guarded: Path, tmp_path: Path) -> None
 
 def test_every_command_but_the_simulator_s_can_be_loaded(guarded: Path) -> None:
     names = sorted(set(COMMANDS))
-    done = run(f"import importlib\nfor name in {names}: importlib.import_module('bodyschema.daemon.commands.' + name)")
+    done = run(f"import importlib\nfor name in {names}: importlib.import_module('bodyschema.cli.commands.' + name)")
     assert done.stderr == ""
 
 

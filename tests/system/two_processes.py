@@ -16,13 +16,13 @@ import warm
 from killed_at import NOWHERE
 from small_arm import URDF
 
-from bodyschema.daemon.bus import client
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.keys import Keys
-from bodyschema.daemon.status import LearnerStatus, SamplerStatus
-from bodyschema.daemon.wire import CommandRequest, decode, encode
+from bodyschema.daemon.transport.bus import client
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
+from bodyschema.daemon.transport.wire import CommandRequest, decode, encode
 from bodyschema.interfaces.errors import BodyschemaError
-from bodyschema.interfaces.recording import Recording
+from bodyschema.recordings.recording import Recording
 
 # It only ends a test that would never end; on a busy machine everything here takes longer, and passes.
 LIFE_LIMIT_S = 500.0

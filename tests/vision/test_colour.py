@@ -9,7 +9,7 @@ from scenes import Ball, reason, sigmas_off, stage
 
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import Reason
-from bodyschema.interfaces.toml_file import convert, read_toml
+from bodyschema.robot.toml_file import convert, read_toml
 from bodyschema.vision.config import NAMED_COLOURS, HueBand, VisionConfig
 from bodyschema.vision.tracker import StereoTracker
 

@@ -9,7 +9,7 @@ import pytest
 from ball_renderer import SMALL, Look
 from scenes import Ball, Slab, sigmas_off, stage
 
-from bodyschema.daemon.marker_wiring import learnt_colour_table
+from bodyschema.daemon.wiring.markers import learnt_colour_table
 from bodyschema.interfaces.records import MarkerFix
 from bodyschema.vision.colour import ColourGate
 from bodyschema.vision.colour_model import ColourUnlearnt, colour_at, colour_of_the_moving, colour_table

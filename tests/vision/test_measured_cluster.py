@@ -14,8 +14,8 @@ from ball_renderer import Look
 from scipy.spatial.transform import Rotation
 from tag_renderer import Sheet, photograph
 
-from bodyschema.daemon.cli import app
-from bodyschema.daemon.cluster_wiring import ClusterFile, Wanted, _require_tags, figures, said, sides_of
+from bodyschema.cli.main import app
+from bodyschema.daemon.wiring.clusters import ClusterFile, Wanted, _require_tags, figures, said, sides_of
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray

@@ -11,7 +11,7 @@ from msgspec import Meta
 
 from bodyschema.interfaces.camera import LARGEST_SIDE_PX
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.toml_file import line_of
+from bodyschema.robot.toml_file import line_of
 
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]

@@ -11,9 +11,9 @@ from typing import Protocol, Self
 import numpy as np
 
 from bodyschema.interfaces.errors import ConfigError, SourceEnded, SourceError
-from bodyschema.interfaces.limited import read_at_most
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray, ImageArray, StereoFrame, frozen_array
+from bodyschema.robot.limited import read_at_most
 
 from .look import of_image
 

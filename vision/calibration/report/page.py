@@ -8,8 +8,8 @@ from importlib.resources import files
 
 import numpy as np
 
-from bodyschema.interfaces.interval import to_its_interval
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.robot.interval import to_its_interval
 from bodyschema.vision.calibration.calibrate import Calibrated
 from bodyschema.vision.calibration.gather import Gathered
 from bodyschema.vision.calibration.report import pictures

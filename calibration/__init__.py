@@ -1,0 +1,1 @@
+"""Mathematics on recordings: calibration, latency, comparison, plausibility."""

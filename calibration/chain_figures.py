@@ -1,0 +1,225 @@
+"""Express the belief about a chain in named parameters: camera pose, marker position, joint offsets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.robot.calibrated import CalibratedGeometry
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.rpy import rpy_of
+from bodyschema.robot.urdf import inverse
+from kbmaps import ChainBelief, ChainParameters
+
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.intp]
+
+# Where what is probable differs by more than this, the pairs do not tell.
+TOLD_WITHIN = 4.0
+HALF_WIDTH_95 = 1.959964
+# A zero that is still as uncertain as it was before is nothing that the pairs show.
+NOT_SHOWN = 0.9
+# Of the numerical derivatives by tilts, shifts and zeros [rad, m].
+_STEP = 1e-6
+# Poses that stand for all, and the noise of exact pairs [m].
+_POSES, _EXACT_M = 100, 1e-6
+# From one linearisation to the next the error along a curve is squared.
+_RELINEARISED = 4
+
+
+@dataclass(frozen=True, eq=False)
+class ChainFigures:
+    """Camera xyz [m] and rpy [rad] in its link, marker xyz [m] in its own, joint zeros [rad, m]: (9 + d,) figures.
+
+    Attributes:
+        robot: the nominal model.
+        beliefs: in its chain, or in that chain placed elsewhere; the most probable first. They change one chain.
+        shares: how probable each is (m,); they add up to 1.
+        prior: what was believed of that chain before any pair.
+    """
+
+    robot: RobotDescription
+    beliefs: tuple[ChainBelief, ...]
+    shares: FloatArray
+    prior: ChainBelief
+
+    @property
+    def geometry(self) -> CalibratedGeometry:
+        """The most probable chain in the terms of the robot's files."""
+        return self._geometry(self.beliefs[0].mean, self._split(self.beliefs[0]))
+
+    @cached_property
+    def values(self) -> FloatArray:
+        """The figures (9 + d,) of the most probable chain."""
+        return self._figures(self.beliefs[0].mean, self._split(self.beliefs[0]))
+
+    @property
+    def drawn(self) -> FloatArray:
+        """The figures (9 + d,) of robot.toml and URDF."""
+        camera, marker = self.robot.camera, self.robot.robot.marker_xyz
+        return np.array([*camera.xyz, *rpy_of(camera.pose[:3, :3]), *marker, *np.zeros(len(self.robot.joints))])
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Covariance (9 + d, 9 + d) of `values`, given that zeros which are not `shown` are right.
+
+        Not knowing how well the arm is made is part of it: it is of the mixture of the beliefs.
+        """
+        covariance = np.zeros((len(self.values), len(self.values)))
+        for belief, share in zip(self.beliefs, self.shares, strict=True):
+            split = self._split(belief)
+            jacobian = self._derivatives(split)
+            apart = _unwound(self._figures(belief.mean, split) - self.values)
+            inner = _given(belief.covariance, self._hidden)
+            covariance += share * (jacobian @ inner @ jacobian.T + np.outer(apart, apart))
+        return covariance
+
+    @property
+    def half_widths(self) -> FloatArray:
+        """Half the 95 % intervals (9 + d,) of `values`."""
+        variances = np.diagonal(self.covariance)
+        return HALF_WIDTH_95 * np.sqrt(np.maximum(variances, 0.0))  # of a zero that is given, rounding is left
+
+    @cached_property
+    def shown(self) -> BoolArray:
+        """Mask (d,) of identifiable joint offsets; others may be equivalent to a rotation of the camera or the marker.
+
+        An offset that exact pairs of all poses would not show counts as not identifiable: along such directions a
+        belief that was linearised at several places seems more certain than it is.
+        """
+        zeros = self._zeros
+        return (_spread(self.beliefs[0], zeros) < self._unsure) & (_spread(self._best, zeros) < self._unsure)
+
+    @property
+    def moved(self) -> FloatArray:
+        """`values` less `drawn` (9 + d,), angles the shorter way round."""
+        return _unwound(self.values - self.drawn)
+
+    @property
+    def _unsure(self) -> FloatArray:
+        return NOT_SHOWN * _spread(self.prior, self._zeros)
+
+    @cached_property
+    def _best(self) -> ChainBelief:
+        return after_exact_pairs(self.prior, self.beliefs[0].mean, self.robot)
+
+    def _split(self, belief: ChainBelief) -> FloatArray:
+        """Return the most probable change (size,) with the joint offsets that are not identifiable kept at nominal."""
+        drawn = self._hidden
+        covariance = belief.covariance
+        gain = np.linalg.solve(covariance[np.ix_(drawn, drawn)], covariance[drawn])
+        split = belief.mean - belief.mean[drawn] @ gain
+        split[drawn] = 0.0
+        return split
+
+    @property
+    def _hidden(self) -> IntArray:
+        """Indices of the joint offsets that are not identifiable, without those that are fixed at nominal."""
+        return self._zeros[~self.shown & (_spread(self.prior, self._zeros) > 0.0)]
+
+    @property
+    def _zeros(self) -> IntArray:
+        return np.arange(self._parameters.size)[self._parameters.zeros]
+
+    @property
+    def _parameters(self) -> ChainParameters:
+        return self.beliefs[0].parameters
+
+    def _geometry(self, change: FloatArray, split: FloatArray) -> CalibratedGeometry:
+        """Return the geometry of `change`, with the camera move and joint offsets of the nearly equivalent `split`."""
+        parameters = self._parameters
+        T_placed_nominal = parameters.reference.fixed[0] @ inverse(self.robot.chain.fixed[0])
+        return CalibratedGeometry.of(
+            self.robot,
+            parameters.chain(change),
+            T_measured_nominal=parameters.base_pose(split) @ T_placed_nominal,
+            zeros=split[parameters.zeros],
+        )
+
+    def _figures(self, change: FloatArray, split: FloatArray) -> FloatArray:
+        geometry = self._geometry(change, split)
+        camera = geometry.T_parent_camera
+        return np.concatenate([camera[:3, 3], rpy_of(camera[:3, :3]), geometry.marker_xyz, split[self._zeros]])
+
+    def _derivatives(self, change: FloatArray) -> FloatArray:
+        steps = _STEP * np.eye(len(change))
+        here = self._figures(change, change)
+        return np.array([_unwound(self._figures(moved, moved) - here) for moved in change + steps]).T / _STEP
+
+
+def after_exact_pairs(prior: ChainBelief, change: FloatArray, robot: RobotDescription) -> ChainBelief:
+    """Return what exact pairs of all poses would leave of the prior, linearised at a change (size,)."""
+    _, jacobian = prior.parameters.linearised(change, _poses(robot))
+    rows = (jacobian @ prior.root).reshape(-1, prior.root.shape[1]) / _EXACT_M
+    _, singular, vt = np.linalg.svd(rows, full_matrices=False)
+    return replace(prior, root=prior.root @ (vt.T / np.sqrt(1.0 + np.square(singular))))
+
+
+def most_probable_alike(prior: ChainBelief, change: FloatArray, robot: RobotDescription) -> FloatArray:
+    """Return the change (size,) most probable under the prior among all that give the same positions as `change`.
+
+    These changes lie along a curve, so several linearisations are needed.
+    """
+    poses = _poses(robot)
+    same, found = prior.parameters.positions(change, poses), change
+    for _ in range(_RELINEARISED):
+        x, jacobian = prior.parameters.linearised(found, poses)
+        u, singular, vt = np.linalg.svd((jacobian @ prior.root).reshape(3 * _POSES, -1) / _EXACT_M, full_matrices=False)
+        target = (same - x + jacobian @ (found - prior.mean)).ravel() / _EXACT_M
+        found = prior.mean + prior.root @ (vt.T @ (singular / (1.0 + np.square(singular)) * (u.T @ target)))
+    return found
+
+
+def no_surer_than_possible(belief: ChainBelief, prior: ChainBelief, robot: RobotDescription) -> ChainBelief:
+    """Return a belief made in several linearisations, with the prior restored where pairs are uninformative.
+
+    Chains that give the same positions lie along a curve, and its tangents differ from place to place. Pairs that
+    were linearised at one place therefore seem informative about the tangents at another (Huang, Mourikis and
+    Roumeliotis 2010, on the consistency of the extended Kalman filter). In no direction is the returned belief more
+    certain than exact pairs would make it. Along directions that pairs cannot show, its mean moves to where the prior
+    is most probable.
+    """
+    change = most_probable_alike(prior, belief.mean, robot)
+    best = after_exact_pairs(prior, change, robot)
+    free = np.flatnonzero(prior.root.any(axis=1))
+    std = _spread(prior, free)
+    own, least = (scaled @ scaled.T for scaled in (each.root[free] / std[:, None] for each in (belief, best)))
+    factor = np.linalg.cholesky(own + least)
+    half = np.linalg.solve(factor, np.linalg.solve(factor, least).T)
+    shares, vectors = np.linalg.eigh((half + half.T) / 2.0)
+    root = np.zeros((len(belief.mean), len(free)))
+    root[free] = std[:, None] * (factor @ vectors) * np.sqrt(np.maximum(shares, 1.0 - shares))
+    return replace(belief, mean=change, root=root)
+
+
+def _poses(robot: RobotDescription) -> FloatArray:
+    """Return a fixed random sample of configurations (m, d) within the joint limits."""
+    return np.random.default_rng(0).uniform(robot.lower, robot.upper, (_POSES, len(robot.joints)))
+
+
+def is_told(made: Sequence[tuple[float, float]]) -> bool:
+    """Return True if the probable workmanships (axes [rad], positions [m]) agree within the factor TOLD_WITHIN."""
+    axes = [axes for axes, _ in made]
+    return max(axes) <= TOLD_WITHIN * min(axes)
+
+
+def _spread(belief: ChainBelief, which: IntArray) -> FloatArray:
+    """Return 1-sigma (k,) of some of the parameters."""
+    return np.sqrt(np.square(belief.root[which]).sum(axis=1))
+
+
+def _given(covariance: FloatArray, known: IntArray) -> FloatArray:
+    """Return the covariance (m, m) of a Gaussian conditioned on some of its components."""
+    across = covariance[:, known]
+    return covariance - across @ np.linalg.solve(covariance[np.ix_(known, known)], across.T)
+
+
+def _unwound(difference: FloatArray) -> FloatArray:
+    """Wrap the camera angles of a difference of figures (9 + d,) to [-π, π), in place, and return it."""
+    difference[3:6] = np.remainder(difference[3:6] + np.pi, 2.0 * np.pi) - np.pi
+    return difference

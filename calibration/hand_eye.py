@@ -1,0 +1,113 @@
+"""The camera's pose as ROS takes it: in SI, as quaternion and matrix, with a covariance, as a static transform."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Self
+
+import msgspec
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.whole_files import write_whole
+from bodyschema.robot.rpy import rotation_of
+
+LAUNCH = "hand_eye.launch.py"
+_STEP = 1e-6  # of the numerical derivative by roll, pitch and yaw [rad]
+_PUBLISHER = "static_transform_publisher"
+
+
+class HandEye(msgspec.Struct, frozen=True):
+    """A pose of one frame in another, in SI.
+
+    Attributes:
+        parent, child: the frames; the pose is that of `child` in `parent`.
+        translation_m: x, y, z.
+        quaternion_xyzw: unit quaternion, w not negative.
+        matrix: homogeneous, four rows of four.
+        covariance: 6 x 6, row by row as in geometry_msgs/PoseWithCovariance: x, y, z [m²], then turns about the
+            parent's x, y, z [rad²]; null where it is not known.
+        static_transform_publisher: the command that publishes it in ROS 2.
+    """
+
+    parent: str
+    child: str
+    translation_m: list[float]
+    quaternion_xyzw: list[float]
+    matrix: list[list[float]]
+    covariance: list[float] | None
+    static_transform_publisher: str
+
+    @classmethod
+    def of(cls, parent: str, child: str, T_parent_child: FloatArray, covariance: FloatArray | None = None) -> Self:
+        """Return a pose (4, 4) with its covariance (6, 6) as ROS has them."""
+        quaternion = Rotation.from_matrix(T_parent_child[:3, :3]).as_quat(canonical=True)
+        place = T_parent_child[:3, 3]
+        return cls(
+            parent,
+            child,
+            place.tolist(),
+            quaternion.tolist(),
+            T_parent_child.tolist(),
+            None if covariance is None else covariance.ravel().tolist(),
+            " ".join(["ros2 run tf2_ros", _PUBLISHER, *_arguments(place, quaternion, parent, child)]),
+        )
+
+
+def in_shell_lines(pose: HandEye) -> str:
+    """Return the command in lines that fit a terminal and can be pasted together."""
+    command, *options = pose.static_transform_publisher.split(" --")
+    rows = [options[:3], options[3:5], options[5:7], *([option] for option in options[7:])]
+    return " \\\n".join([command, *("   " + "".join(f" --{option}" for option in row) for row in rows)])
+
+
+def covariance_of_turns(rpy: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return the covariance (6, 6) of place and turns about the parent's axes.
+
+    Args:
+        rpy: roll, pitch, yaw (3,) [rad].
+        covariance: (6, 6) of x, y, z, roll, pitch, yaw.
+    """
+    jacobian, here = np.eye(6), rotation_of(rpy)
+    for k in range(3):
+        moved = rotation_of(rpy + _STEP * np.eye(3)[k]) @ here.T
+        jacobian[3:, 3 + k] = Rotation.from_matrix(moved).as_rotvec() / _STEP
+    return jacobian @ covariance @ jacobian.T
+
+
+def write_launch_file(pose: HandEye, folder: Path) -> Path:
+    """Write a ROS 2 launch file that publishes the pose on /tf_static; an older one is replaced.
+
+    Raises:
+        ConfigError: it cannot be written.
+    """
+    file = folder / LAUNCH
+    arguments = _arguments(np.array(pose.translation_m), np.array(pose.quaternion_xyzw), pose.parent, pose.child)
+    text = _LAUNCH_FILE.format(package="tf2_ros", executable=_PUBLISHER, arguments=arguments)
+    try:
+        write_whole({file: text.encode()})
+    except OSError as error:
+        raise ConfigError(f"cannot be written: {error.strerror}", file=file, remedy="Give another folder") from error
+    return file
+
+
+_LAUNCH_FILE = '''\
+"""Publish the calibrated pose of the camera on /tf_static: `ros2 launch hand_eye.launch.py`."""
+
+from launch import LaunchDescription
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    arguments = {arguments!r}
+    return LaunchDescription([Node(package={package!r}, executable={executable!r}, arguments=arguments)])
+'''
+
+
+def _arguments(place: FloatArray, quaternion: FloatArray, parent: str, child: str) -> list[str]:
+    names = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
+    numbers = [f"{value + 0.0:.9f}" for value in (*place, *quaternion)]
+    words = [word for pair in zip(names, numbers, strict=True) for word in pair]
+    return [*words, "--frame-id", parent, "--child-frame-id", child]

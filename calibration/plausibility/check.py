@@ -1,0 +1,423 @@
+"""Check that a recording can be of this robot, before any fit of it is trusted.
+
+A rigid chain with free links fits a recording with a flipped joint or an offset of 90° as well as the right one: its
+links are then nonsense. So the links are kept at nominal. The pose of the camera, the marker and the joint offsets are
+fitted to many ways to read the columns.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from bodyschema.interfaces.errors import RecordingError
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.description import RobotDescription
+from kbmaps import DegenerateDataError, RigidChain, align
+from kbmaps.chains.placement import place
+
+from .limits import KNOWN_TOOL_M, MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD, reach_m, spread_m
+from .reading import QUARTER, Reading
+
+# Number of rows to be read in other ways, evenly spread. Twice as many cost twice the time and change no verdict of the
+# tests.
+ROWS = 80
+# With fewer rows nothing is refused: a wrong reading may fit by chance.
+FEWEST_ROWS = 40
+# Width and depth of the search over readings: offsets of up to four joints by a quarter turn are found.
+WIDTH, DEPTH = 4, 5
+# Readings whose errors differ by less count as one: offsets of the first and of the last joint make no difference.
+SAME = 0.005
+# The search ends at a fit with these shares of the positions' spread: of the columns as they are, and read otherwise.
+ENOUGH_AS_IT_IS, ENOUGH = 0.03, 0.01
+# Another reading is reported if the pairs fit this many times better, and mentioned from `AS_GOOD` times on. Arms with
+# tolerances of 0.5° and 1 mm, offsets of 10° and noise of 10 mm stay below 1.15 with all wrong readings.
+MUCH_BETTER, AS_GOOD = 1.5, 1.15
+# ... and if it is more probable by this much [nats], less a penalty for each change of the reading.
+CERTAIN, A_CHANGE = 10.0, 3.0
+# A fit with residuals above these shares of the positions' spread and of the arm's reach is not of this arm.
+UNEXPLAINED, OF_REACH = 0.25, 0.02
+# ... and above this multiple of the known noise.
+NOISES = 5.0
+# A reading with one change is reported if it leaves at most half of this share of the spread, with two a third, and so
+# on. Right readings of real arms leave up to 0.032, wrong ones down to 0.03 with four changes and 0.09 with two.
+NAMED = 0.12
+# A joint offset above this is mentioned: that of one in 300 generated arms with offsets of up to 10°.
+FAR_ZERO_RAD = math.radians(20.0)
+# A known camera pose is not off by this much.
+TURNED_RAD = math.radians(30.0)
+# Share of its tolerance that is left to a joint offset kept at nominal.
+HELD = 1e-3
+# A zero of the last joint this far off is not fitted where the marker is known: its quarter turns are tried instead.
+LAST_ZERO_RAD = math.radians(3.0)
+# ... and named where the known marker comes out so many times nearer to its place: with 3, 2 of 32 markers that were
+# 50 mm off in each direction (1-sigma) came out so by chance.
+NEARER = 5.0
+# Maximum number of other, equally good readings that are listed.
+LISTED = 2
+# Distances below this share of the reach are not distinguished.
+EXACT = 1e-5
+
+
+@dataclass(frozen=True, slots=True)
+class Plausibility:
+    """Result of the plausibility check.
+
+    Attributes:
+        refusal: why the recording cannot be of this robot as it is, or None.
+        remedy: what to do about that.
+        misread: another reading of the columns was found that fits.
+        warnings: sentences about possible problems.
+        undirected: joints whose sign these pairs do not determine.
+    """
+
+    refusal: str | None = None
+    remedy: str = ""
+    misread: bool = False
+    warnings: tuple[str, ...] = ()
+    undirected: tuple[str, ...] = ()
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """All problems and warnings as sentences."""
+        refused = () if self.refusal is None else (f"{self.refusal}. {self.remedy}",)
+        return tuple(f"{text[0].upper()}{text[1:]}." for text in (*refused, *self.warnings))
+
+    def require(self, file: Path | str, *, force: bool) -> tuple[str, ...]:
+        """Return the warnings for a recording that is fitted.
+
+        Args:
+            file: the recording's file.
+            force: fit what would be refused.
+
+        Raises:
+            RecordingError: it cannot be of this robot as it is.
+        """
+        if self.refusal is not None and not force:
+            raise RecordingError(self.refusal, file=file, remedy=f"{self.remedy}. Or fit it as it is with --force")
+        return self.sentences
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """Quality of a reading's fit.
+
+    Attributes:
+        error: RMS distance of the nearest pairs, in the recording's own unit.
+        nats: minus the log-likelihood, what zeros and marker cost included.
+        zeros: added to the joints (d,) beside the quarter turns [rad, m].
+        tool_m: how far from its place the marker is [m].
+        rotation: of the nominal measurement frame in the real one (3, 3).
+    """
+
+    error: float
+    nats: float
+    zeros: FloatArray
+    tool_m: float
+    rotation: FloatArray
+
+
+def told_sigma(recording: Recording) -> float | None:
+    """Return the 1-sigma of a coordinate [m], if the recording has it."""
+    if recording.cov is None:
+        return None
+    return float(np.sqrt(np.trace(recording.cov, axis1=1, axis2=2).mean() / 3.0))
+
+
+def plausibility(
+    robot: RobotDescription,
+    q: FloatArray,
+    x: FloatArray,
+    *,
+    chain: RigidChain | None = None,
+    sigma_m: float | None = None,
+) -> Plausibility:
+    """Check pairs q (n, d) [rad, m] and x (n, 3) [m] before a fit to them is trusted.
+
+    Args:
+        robot: the robot's description.
+        q: joint values (n, d) [rad, m].
+        x: positions (n, 3) [m].
+        chain: the nominal chain if it is not the robot's.
+        sigma_m: 1-sigma of a coordinate [m] if known.
+    """
+    chain = chain or robot.chain
+    reach, spread = reach_m(robot), spread_m(x)
+    if 3 * len(q) < 2 * (chain.joints + 9) or spread < EXACT * reach:
+        return Plausibility()
+    rows = np.unique(np.linspace(0, len(q) - 1, ROWS).astype(np.intp))
+    search = _Search(chain, q[rows], x[rows], EXACT * reach, robot.camera.pose_known)
+    as_it_is, chosen, others = search.verdict()
+    fit, names = search.fits[chosen], robot.joints
+    before, after = search.fits[as_it_is].error, fit.error / chosen.scale
+    noise = 0.0 if sigma_m is None else NOISES * sigma_m
+    if before <= MUCH_BETTER * fit.error and not _nameable(chosen, fit, spread):
+        chosen, fit, after = as_it_is, search.fits[as_it_is], before
+    held = search.with_marker_known(chosen) if robot.robot.marker_known else None
+    if held is not None and chosen != as_it_is:
+        chosen, fit = held[0], held[1]
+    unexplained = after > max(UNEXPLAINED * spread / chosen.scale, OF_REACH * reach, noise)
+    if unexplained or (chosen != as_it_is and not _nameable(chosen, fit, spread) and after > noise):
+        looks = "" if chosen == as_it_is else chosen.looks(names, fit.zeros)
+        found = _hardly(_mm(before), _mm(after), looks)
+    elif chosen != as_it_is:
+        frame = _frame(fit.rotation, True) if robot.camera.pose_known and chosen.mirrored else ""
+        text = (
+            f"it seems that {chosen.looks(names, fit.zeros)}{frame}: the pairs then fit to {_mm(after)}, and as they "
+            f"are to {_mm(before)}"
+        )
+        either = "; or ".join(other.looks(names, search.fits[other].zeros) for other in others)
+        either = f". These pairs fit as well if {either}" if others else ""
+        remedy = chosen.remedy(names, fit.zeros) + either
+        if before > MUCH_BETTER * fit.error:
+            found = Plausibility(text, remedy, misread=True)
+        else:
+            found = Plausibility(warnings=(f"perhaps {text.removeprefix('it seems that ')}{either}",))
+    else:
+        far = [
+            f"with the links as drawn, the zero of {name} comes out {math.degrees(zero):+.0f}°: it is wrong, or the "
+            "URDF is of another arm"
+            for name, zero, slides in zip(names, fit.zeros, chain.prismatic, strict=True)
+            if not slides and abs(zero) > FAR_ZERO_RAD and search.held_error() > MUCH_BETTER * fit.error
+        ]
+        if fit.error > max(NAMED * spread, noise):
+            far.append(f"{_drawn_arm_misses(_mm(before))}: they may be of another robot, or their columns misread")
+        found = Plausibility(warnings=tuple(far), undirected=search.undirected(names))
+        if robot.camera.pose_known:
+            found = _turned(chain, q[rows], x[rows], fit) or found
+        if held is not None and found.refusal is None:
+            found = _turned_last(names, fit, *held)
+    if found.refusal is None or len(q) >= FEWEST_ROWS:
+        return found
+    few = f"{found.refusal}. {found.remedy}. (These are {len(q)} pairs: {FEWEST_ROWS} would tell.)"
+    return Plausibility(warnings=(few,))
+
+
+def _hardly(before: str, after: str, nearest: str) -> Plausibility:
+    """Return the refusal of a recording that no reading explains.
+
+    Args:
+        before, after: distances of the pairs as they are, and in the nearest reading.
+        nearest: that reading in words; empty if it is the columns as they are.
+    """
+    doubted = f". The nearest reading is that {nearest}, and it does not fit" if nearest else ""
+    return Plausibility(
+        f"the pairs are hardly of this robot: {_drawn_arm_misses(before)}, and with joints exchanged, counting the "
+        f"other way or a quarter turn off still by {after}",
+        "Is the recording of another robot, or the URDF of another one, or is more than one thing wrong with the "
+        f"columns? Where the positions are that noisy, say so with --sigma-mm{doubted}",
+    )
+
+
+def _drawn_arm_misses(before: str) -> str:
+    return f"placed as well as it can be, the drawn arm misses the pairs by {before}"
+
+
+def _nameable(reading: Reading, fit: _Fit, spread: float) -> bool:
+    """Return True if a fit is better than that of any wrong reading with as many changes."""
+    return fit.error < NAMED / (1 + reading.changes) * spread
+
+
+def _turned(chain: RigidChain, q: FloatArray, x: FloatArray, fit: _Fit) -> Plausibility | None:
+    """Return a refusal if the measurement frame is turned against a pose that robot.toml declares known; else None."""
+    angle = float(Rotation.from_matrix(fit.rotation).magnitude())
+    if angle < TURNED_RAD:
+        return None
+    told, free = (align(chain, q, x, pose_known=known, marker_known=False).rms for known in (True, False))
+    if told < MUCH_BETTER * free:
+        return None
+    return Plausibility(
+        f"it seems that the measurement frame is turned by {math.degrees(angle):.0f}° against [camera] of robot.toml"
+        f"{_frame(fit.rotation, False)}: the pairs then fit to {_mm(free)}, and as they are to {_mm(told)}",
+        "Correct the columns x, y, z, the pose of the camera or the zero of the first joint; or set pose_known = false",
+        misread=True,
+    )
+
+
+def _turned_last(names: tuple[str, ...], as_it_is: _Fit, reading: Reading, fit: _Fit) -> Plausibility:
+    """Report that the last joint's zero is off by quarter turns: only that explains the known marker position."""
+    return Plausibility(
+        f"it seems that {reading.looks(names, fit.zeros)}: the marker then comes out {_mm(fit.tool_m)} from its place "
+        f"in [robot] of robot.toml, and as the columns are {_mm(as_it_is.tool_m)} from it",
+        f"{reading.remedy(names, fit.zeros)}. Or correct marker_xyz, or set marker_known = false",
+        misread=True,
+    )
+
+
+def _frame(rotation: FloatArray, mirrored: bool) -> str:
+    """Return the order and signs in which x, y, z are given, if they are axes of the frame in robot.toml; else ""."""
+    given = np.diag([-1.0 if mirrored else 1.0, 1.0, 1.0]) @ rotation
+    which = np.abs(given).argmax(axis=1)
+    along = np.abs(given).max(axis=1)
+    if len(set(which.tolist())) < 3 or along.min() < math.cos(TURNED_RAD):
+        return ""
+    order = ", ".join(f"{'-' if given[k, axis] < 0.0 else ''}{'xyz'[axis]}" for k, axis in enumerate(which))
+    return f" (the columns x, y, z hold {order})"
+
+
+class _Search:
+    """Search over readings of the same pairs, with their fits."""
+
+    def __init__(self, chain: RigidChain, q: FloatArray, x: FloatArray, exact_m: float, pose_known: bool) -> None:
+        self._chain, self._q, self._x, self._exact_m, self._pose_known = chain, q, x, exact_m, pose_known
+        self._std = np.where(chain.prismatic, SLIDES_M, ZEROS_RAD)
+        self._tried: set[Reading] = set()
+        self.fits: dict[Reading, _Fit] = {}
+
+    def verdict(self) -> tuple[Reading, Reading, list[Reading]]:
+        """Return the columns as they are, the simplest reading among the best, and others nearly as simple."""
+        as_it_is = Reading.plain(self._chain.joints)
+        slides: list[bool] = self._chain.prismatic.tolist()
+        self._try([as_it_is, *as_it_is.neighbours(slides)])
+        if self._best()[0] != as_it_is:
+            # With a marker far from nominal, the fit of the right reading may have ended in a local minimum.
+            self._fit([as_it_is] * 6, tools=TOOL_M * np.concatenate([np.eye(3), -np.eye(3)]))
+        expanded, spread = [as_it_is], spread_m(self._x)
+        for depth in range(1, DEPTH):
+            best = self._best()[0]
+            left = self.fits[best].error / spread
+            if best in expanded and (left < ENOUGH or (best == as_it_is and (left < ENOUGH_AS_IT_IS or depth > 1))):
+                break
+            new = self._distinct(expanded)
+            expanded += new
+            if depth == 1:
+                self._try(as_it_is.doubles(slides))
+            self._try(other for reading in new for other in reading.neighbours(slides))
+        best = self._best()[0]
+        if self.fits[best].error > (ENOUGH_AS_IT_IS if best == as_it_is else ENOUGH) * spread:
+            self._try(as_it_is.mixed(slides))
+        best = self._best()[0]
+        if not _nameable(best, self.fits[best], spread):
+            self._fit([as_it_is], tools=self._aligned_tool())
+            self._try(as_it_is.mixed_exchanges(slides))
+            self._try(other for reading in self._distinct(expanded) for other in reading.neighbours(slides))
+        if as_it_is not in self.fits:
+            self._fit([as_it_is], held=True)
+        best = self.fits[self._best()[0]]
+        good = sorted(
+            (reading for reading in self.fits if self._as_good(self.fits[reading], best)),
+            key=lambda reading: (reading.changes, reading.quarters != as_it_is.quarters, self.fits[reading].nats),
+        )
+        others = [reading for reading in good[1:] if reading.changes <= good[0].changes + 1]
+        return as_it_is, good[0], others[:LISTED]
+
+    def _aligned_tool(self) -> FloatArray:
+        """Return the marker's offset (1, 3) [m] with nominal joint offsets: its fit starts from many places."""
+        try:
+            return align(self._chain, self._q, self._x, pose_known=False, marker_known=False).marker_shift[None]
+        except DegenerateDataError:
+            return np.zeros((1, 3))
+
+    def held_error(self) -> float:
+        """Return the RMS distance [m] of the nearest pairs with columns unchanged and joint offsets kept at nominal."""
+        held = place(self._chain, self._q[None], self._x[None], zeros_std=HELD * self._std, tool_std=TOOL_M)
+        return float(held.errors(MEASURED)[0])
+
+    def with_marker_known(self, reading: Reading) -> tuple[Reading, _Fit] | None:
+        """Return the reading with the last joint off by quarter turns, and its fit, if the known marker shows it.
+
+        With a free marker position such a turn makes no difference.
+        """
+        if self._chain.prismatic[-1]:
+            return None
+        last = np.arange(self._chain.joints) == self._chain.joints - 1
+        std = np.where(last, LAST_ZERO_RAD, self._std)
+        turned = [reading.turned((turns * last).tolist()) for turns in (0, 1, -1, 2)]
+        fits = self._placed(turned, std=std, tool_m=KNOWN_TOOL_M)
+        as_given = fits.pop(reading, None)
+        best = min(fits, key=lambda each: fits[each].nats + A_CHANGE * each.changes, default=reading)
+        if as_given is None or best not in turned:
+            return None
+        fit = fits[best]
+        clearly = fit.nats + CERTAIN < as_given.nats and NEARER * fit.tool_m < as_given.tool_m
+        return (best, fit) if clearly else None
+
+    def undirected(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the joints whose sign makes no difference."""
+        plain = Reading.plain(len(names))
+        fits = (
+            (name, self.fits.get(reading))
+            for name, reading in zip(names, plain.neighbours(self._chain.prismatic.tolist()), strict=False)
+        )
+        return tuple(name for name, fit in fits if fit is not None and self._as_good(fit, self.fits[plain]))
+
+    def _best(self) -> list[Reading]:
+        """Return all readings, the best first."""
+        return sorted(self.fits, key=lambda reading: self.fits[reading].nats + A_CHANGE * reading.changes)
+
+    def _distinct(self, expanded: list[Reading]) -> list[Reading]:
+        """Return the best readings whose fits differ from those already expanded, and from each other."""
+        seen, new = [self.fits[reading].error for reading in expanded if reading in self.fits], list[Reading]()
+        for reading in self._best():
+            error = self.fits[reading].error
+            if all(abs(error - other) > SAME * other for other in seen):
+                new.append(reading)
+                seen.append(error)
+            if len(new) == WIDTH:
+                break
+        return new
+
+    @staticmethod
+    def _as_good(fit: _Fit, best: _Fit) -> bool:
+        return fit.nats < best.nats + CERTAIN or fit.error < AS_GOOD * best.error
+
+    def _try(self, readings: Iterable[Reading]) -> None:
+        """Fit readings that were not tried yet."""
+        new = [reading for reading in dict.fromkeys(readings) if reading not in self._tried]
+        self._tried.update(new)
+        if new:
+            self._fit(new)
+
+    def _fit(self, new: list[Reading], *, held: bool = False, tools: FloatArray | None = None) -> None:
+        """Fit readings, and keep the best fit of each.
+
+        Args:
+            new: the readings.
+            held: keep the joint offsets at nominal.
+            tools: marker offsets (s, 3) [m] to start from.
+        """
+        std = self._std * (HELD if held else 1.0)
+        for reading, fit in self._placed(new, std=std, tools=tools).items():
+            if reading not in self.fits or fit.nats < self.fits[reading].nats:
+                self.fits[reading] = fit
+
+    def _placed(
+        self, new: list[Reading], *, std: FloatArray, tool_m: float = TOOL_M, tools: FloatArray | None = None
+    ) -> dict[Reading, _Fit]:
+        """Return the best fit of each reading; a zero that goes to the next quarter turn makes it another reading.
+
+        Args:
+            std: how far each zero may be off (d,) [rad, m]; 1-sigma.
+            tool_m: how far the marker may be from its place [m]; 1-sigma of a coordinate.
+            tools: moves of the marker (s, 3) [m] to start from.
+        """
+        slides = self._chain.prismatic
+        q = np.stack([reading.angles(self._q, slides) for reading in new])
+        x = np.stack([reading.positions(self._x) for reading in new])
+        placed = place(self._chain, q, x, zeros_std=std, tool_std=tool_m, tools=tools)
+        quarters = np.where(slides, 0, np.rint(placed.zeros / QUARTER)).astype(np.intp)
+        zeros = placed.zeros - QUARTER * quarters
+        errors = np.maximum(placed.errors(MEASURED), self._exact_m) * [reading.scale for reading in new]
+        moved = np.linalg.norm(placed.tools, axis=1)
+        cost = 0.5 * np.square(zeros / std).sum(axis=1) + 0.5 * np.square(moved / tool_m)
+        if self._pose_known:
+            turns = Rotation.from_matrix(placed.rotations).magnitude()
+            cost += [0.0 if r.mirrored else 0.5 * (turn / TURNED_RAD) ** 2 for r, turn in zip(new, turns, strict=True)]
+        nats = 3.0 * MEASURED * len(self._x) * np.log(errors) + cost
+        fits: dict[Reading, _Fit] = {}
+        for k, reading in enumerate(new):
+            found = reading.turned(quarters[k].tolist())
+            fit = _Fit(float(errors[k]), float(nats[k]), zeros[k], float(moved[k]), placed.rotations[k])
+            if found not in fits or fit.nats < fits[found].nats:
+                fits[found] = fit
+        return fits
+
+
+def _mm(distance_m: float) -> str:
+    return f"{1e3 * distance_m:.3g} mm" if distance_m < 1.0 else f"{distance_m:.3g} m"

@@ -1,0 +1,243 @@
+"""Report of a calibration in degrees and millimetres."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+
+from bodyschema.calibration.chain_figures import ChainFigures
+from bodyschema.calibration.hand_eye import HandEye, covariance_of_turns
+from bodyschema.calibration.plausibility.check import Plausibility
+from bodyschema.calibration.rigid_chain import Calibration, Trusted
+from bodyschema.calibration.tool_jump import tool_jump
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning.workmanship import WORKMANSHIP
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.calibrated_files import CAMERA_LINK
+from bodyschema.robot.description import RobotDescription
+
+# A joint that moved less is named [rad, m].
+STILL_RAD, STILL_M = math.radians(10.0), 0.02
+# Multiples of its tolerance beyond which a joint offset is reported, and beyond which it is not written. One in 370
+# exceeds the first if the tolerance is right; the second allows for a tolerance guessed at half its true value.
+FAR_OFF, TOO_FAR_OFF = 3.0, 5.0
+_DEG = math.degrees(1.0)
+_UNITS = (1e3, 1e3, 1e3, _DEG, _DEG, _DEG, 1e3, 1e3, 1e3)
+
+
+class Figure(msgspec.Struct, frozen=True):
+    """Nominal and calibrated value of a parameter, with the half width of its 95 % interval."""
+
+    drawn: float
+    learnt: float
+    half_width: float
+
+
+class Zero(msgspec.Struct, frozen=True):
+    """Joint offset to add to the joint's reading, in `unit` (° or mm).
+
+    `half_width` of its 95 % interval is null if the offset is not identifiable and kept at nominal; the other figures
+    are conditional on that.
+    """
+
+    joint: str
+    unit: str
+    zero: float
+    half_width: float | None
+
+
+class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
+    """The answers.
+
+    Attributes:
+        pairs: that were learnt, `outliers` of them left out.
+        camera_link, camera_xyz_mm, camera_rpy_deg: pose of the measurement frame in this link (URDF convention).
+        marker_link, marker_xyz_mm: the marker in this link.
+        zeros: of the joints, in the order of q.
+        noise_mm: 1-sigma of a measured coordinate, as the pairs scatter around the learnt arm.
+        told_noise_mm: the same as it was told with the pairs (RMS), or null; where told, the intervals rest on it.
+        misfit: residuals over what the told noise explains; 1 where it explains them, or was not told.
+        drawn_error_mm: mean distance from the pairs to the drawn arm, with what robot.toml calls not known fitted.
+        learnt_error_mm: mean distance to the learnt arm, over the same pairs, which it was fitted to.
+        axes_deg, points_mm: how well the arm is made, by the pairs: 1-sigma of an axis' tilt and shift; null where the
+            pairs do not tell.
+        shown: independent numbers of the arm that the pairs make three times as sure as they were, of `showable` that
+            positions can.
+        still: joints that hardly moved.
+        first: number of the first row (of a store: pair) that was learnt.
+        other_tool_from: number of the row from which on the marker sits elsewhere on the hand, or null: the figures
+            are then of neither tool.
+        other_tool_mm: how far from there, or null.
+        doubt: why no figure is to be trusted, or null: columns read wrongly, another robot, zeros far off.
+        beyond: why the figures are of no arm as good as was told, or null: a part of `doubt`, for which nothing is
+            written.
+        undirected: joints of which the pairs do not show which way they count.
+        expected_mm, expected_p95_mm: mean distance on poses that were not learnt, and what 95 % of them stay within,
+            from blocks of rows that were held out; null of too few rows.
+        hand_eye: the camera's pose in SI, as ROS takes it.
+        tool_xyz_m: the marker in its link, with the covariance (3 x 3, row by row) in `tool_covariance` [m²].
+        trusted: what was held as the URDF has it.
+        free_expected_mm: `expected_mm` with nothing held, where something is; else null.
+    """
+
+    robot: str
+    source: str
+    pairs: int
+    outliers: int
+    camera_link: str
+    camera_xyz_mm: list[Figure]
+    camera_rpy_deg: list[Figure]
+    marker_link: str
+    marker_xyz_mm: list[Figure]
+    zeros: list[Zero]
+    noise_mm: float
+    told_noise_mm: float | None
+    misfit: float
+    drawn_error_mm: float
+    learnt_error_mm: float
+    axes_deg: float | None
+    points_mm: float | None
+    shown: int
+    showable: int
+    still: list[str]
+    first: int
+    other_tool_from: int | None
+    other_tool_mm: float | None
+    doubt: str | None
+    beyond: str | None = None
+    undirected: list[str] = []
+    expected_mm: float | None
+    expected_p95_mm: float | None
+    hand_eye: HandEye
+    tool_xyz_m: list[float]
+    tool_covariance: list[float]
+    trusted: Trusted
+    free_expected_mm: float | None = None
+    schema: int = 1
+
+    @classmethod
+    def of(
+        cls,
+        calibration: Calibration,
+        seen: Plausibility,
+        source: str,
+        first: int = 1,
+        frame: str = CAMERA_LINK,
+        free: Calibration | None = None,
+    ) -> CalibrationReport:
+        """Build the report of `calibration`.
+
+        Args:
+            seen: plausibility of its recording.
+            source: name of the recording.
+            first: number of its first row.
+            frame: ROS name of the measurement frame.
+            free: the same calibration with nothing fixed to the URDF, for comparison.
+        """
+        jump = tool_jump(calibration.learner, calibration.recording)
+        robot, recording, learner = calibration.robot, calibration.recording, calibration.learner
+        report, made, slides = learner.report(), calibration.workmanship, robot.chain.prismatic
+        named, expected = calibration.figures, calibration.expected
+        zeros = _zeros(calibration, named.values[9:], named.half_widths[9:])
+        made_badly = _badly_made(calibration)
+        beyond = [*_far_off(calibration, zeros, TOO_FAR_OFF), *made_badly]
+        doubts = [*seen.sentences]
+        if jump is None:  # the figures of two tools are of neither
+            doubts += [*_far_off(calibration, zeros, FAR_OFF), *made_badly]
+        values, halves = named.values, named.half_widths
+        figures = [
+            Figure(*(float(unit * number) for number in numbers))
+            for unit, *numbers in zip(_UNITS, named.drawn[:9], values[:9], halves[:9], strict=True)
+        ]
+        return cls(
+            robot=robot.name,
+            source=source,
+            pairs=len(recording),
+            outliers=report.outliers,
+            camera_link=robot.camera.parent_link,
+            camera_xyz_mm=figures[:3],
+            camera_rpy_deg=figures[3:6],
+            marker_link=robot.robot.marker_link,
+            marker_xyz_mm=figures[6:],
+            zeros=zeros,
+            noise_mm=1e3 * calibration.noise_m,
+            told_noise_mm=1e3 * report.noise if calibration.noise_told else None,
+            misfit=report.misfit,
+            drawn_error_mm=1e3 * _mean_error(calibration.placed.chain.positions(recording.q), recording),
+            learnt_error_mm=1e3 * _mean_error(learner.predict(recording.q), recording),
+            axes_deg=None if made is None else _DEG * made.axes,
+            points_mm=None if made is None else 1e3 * made.points,
+            shown=calibration.shown,
+            # Everett and Hsu 1988: four for each joint that turns, two for each that slides, six for the ends of the
+            # chain, less the three turns of the marker that its place does not show.
+            showable=4 * int((~slides).sum()) + 2 * int(slides.sum()) + 3,
+            still=_still(robot, recording),
+            first=first,
+            other_tool_from=None if jump is None else first + jump.row - 1,
+            other_tool_mm=None if jump is None else 1e3 * jump.distance_m,
+            doubt=" ".join(doubts) or None,
+            beyond=" ".join(beyond) or None,
+            undirected=list(seen.undirected),
+            expected_mm=None if expected is None else 1e3 * expected.mean_m,
+            expected_p95_mm=None if expected is None else 1e3 * expected.p95_m,
+            hand_eye=_hand_eye(robot, named, frame),
+            tool_xyz_m=named.geometry.marker_xyz.tolist(),
+            tool_covariance=named.covariance[6:9, 6:9].ravel().tolist(),
+            trusted=calibration.trusted,
+            free_expected_mm=None if free is None or free.expected is None else 1e3 * free.expected.mean_m,
+        )
+
+
+def _hand_eye(robot: RobotDescription, figures: ChainFigures, frame: str) -> HandEye:
+    covariance = covariance_of_turns(figures.values[3:6], figures.covariance[:6, :6])
+    return HandEye.of(robot.camera.parent_link, frame, figures.geometry.T_parent_camera, covariance)
+
+
+def _zeros(calibration: Calibration, values: FloatArray, halves: FloatArray) -> list[Zero]:
+    robot = calibration.robot
+    units = np.where(robot.chain.prismatic, 1e3, _DEG)
+    return [
+        Zero(name, "mm" if slides else "°", float(unit * value), float(unit * half) if shown else None)
+        for name, slides, unit, value, half, shown in zip(
+            robot.joints, robot.chain.prismatic, units, values, halves, calibration.figures.shown, strict=True
+        )
+    ]
+
+
+def _far_off(calibration: Calibration, zeros: list[Zero], times: float) -> list[str]:
+    """Return messages about joint offsets larger than `times` their tolerance."""
+    told = calibration.learner.tolerances
+    said: list[str] = []
+    for zero, slides in zip(zeros, calibration.robot.chain.prismatic, strict=True):
+        tolerance = 1e3 * told.slide_zeros if slides else _DEG * told.zeros
+        if abs(zero.zero) > times * tolerance:
+            more = "" if slides else f" Where it is that far off, say so with --zeros-deg {math.ceil(abs(zero.zero))}."
+            said.append(
+                f"The zero of {zero.joint} comes out {zero.zero:+.1f} {zero.unit}, where {tolerance:.3g} {zero.unit} "
+                f"(1-sigma) were allowed for: its zero is wrong, or the URDF is of another arm.{more}"
+            )
+    return said
+
+
+def _badly_made(calibration: Calibration) -> list[str]:
+    """Return a message if the geometric errors reach the largest that are considered; else an empty list."""
+    made, (axes, points) = calibration.workmanship, WORKMANSHIP[-1]
+    if made is None or made.axes < axes:
+        return []
+    return [
+        f"The links would be off by {_DEG * axes:.2g}° and {1e3 * points:.0f} mm or more, the worst that is "
+        "considered. "
+        "The URDF or the recording is of another arm."
+    ]
+
+
+def _still(robot: RobotDescription, recording: Recording) -> list[str]:
+    least = np.where(robot.chain.prismatic, STILL_M, STILL_RAD)
+    moved = np.ptp(recording.q, axis=0)
+    return [name for name, still in zip(robot.joints, moved < least, strict=True) if still]
+
+
+def _mean_error(predicted: FloatArray, recording: Recording) -> float:
+    return float(np.linalg.norm(predicted - recording.x, axis=1).mean())

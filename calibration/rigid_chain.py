@@ -1,0 +1,246 @@
+"""A rigid chain learnt from a recording, in the terms of the robot's files, and how sure its numbers are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyschema.interfaces.errors import BodyschemaError
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning.workmanship import WORKMANSHIP, probable
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.description import RobotDescription
+from kbmaps import (
+    Alignment,
+    ChainBelief,
+    ChainParameters,
+    ChainTolerances,
+    KBMapsError,
+    RigidChain,
+    RigidLearner,
+    align,
+    rotation_matrices,
+    unexplained_variance,
+)
+
+from .chain_figures import ChainFigures, is_told
+
+IntArray = NDArray[np.intp]
+Trusted = Literal["nothing", "links", "urdf"]
+
+# How many pairs are asked. No arm is quite rigid, and thousands of pairs would take its sag for bad workmanship.
+JUDGED_PAIRS = 300
+SLIDE_ZEROS_M = 0.02
+# No measured coordinate is surer.
+ROUNDING_M = 1e-9
+# A parameter counts as determined if its uncertainty falls below this share of the prior one.
+MUCH_SURER = 1.0 / 3.0
+# Of what is said to be known, and of what is not, once it has been fitted: then far more than the fit can be off.
+KNOWN_TURN_RAD, KNOWN_PLACE_M = 0.02, 0.01
+FITTED_TURN_RAD, FITTED_PLACE_M = 0.5, 0.5
+# Number of cross-validation folds, each of two stretches far apart. Five leave four fifths of the rows to learn from;
+# more cost a fit each.
+FOLDS = 5
+# Rows that one of these fits takes at most: figures of a millimetre do not change by more, and 20,000 take a minute.
+FOLD_ROWS = 2000
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """Distances between prediction and measurement on poses that were not learnt [m], outliers left aside."""
+
+    mean_m: float
+    p95_m: float
+
+
+class CalibrationError(BodyschemaError):
+    """A recording does not calibrate this robot."""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A rigid chain learnt from a recording.
+
+    Attributes:
+        robot: the nominal model.
+        recording: what was learnt.
+        placed: the nominal chain with what robot.toml calls not known fitted: what learning started from.
+        learners: of all pairs, with the tolerances that the pairs make probable, the most probable first.
+        shares: how probable each is (m,); they add up to 1.
+        noise_told: whether the noise was told, not estimated.
+        trusted: what was held as the URDF has it.
+    """
+
+    robot: RobotDescription
+    recording: Recording
+    placed: Alignment
+    learners: tuple[RigidLearner, ...]
+    shares: FloatArray
+    noise_told: bool
+    trusted: Trusted = "nothing"
+
+    @classmethod
+    def of(
+        cls,
+        robot: RobotDescription,
+        recording: Recording,
+        *,
+        sigma_m: float | None,
+        zeros_rad: float,
+        trusted: Trusted = "nothing",
+    ) -> Calibration:
+        """Learn `recording`, around the nominal model.
+
+        Args:
+            sigma_m: 1-sigma of the positions [m] where the recording has none; None: estimated.
+            zeros_rad: how far joint zeros may be off (1-sigma) [rad].
+            trusted: what is held as the URDF has it: its links, or its joint zeros too.
+
+        Raises:
+            CalibrationError: there are too few pairs, or they do not fit the robot at all.
+        """
+        needed = 2 * len(robot.joints)
+        if len(recording) < needed:
+            raise CalibrationError(
+                f"{len(recording)} pairs are too few to calibrate {len(robot.joints)} joints; record at least {needed}"
+            )
+        known = {"pose_known": robot.camera.pose_known, "marker_known": robot.robot.marker_known}
+        try:
+            turned = recording.orientation
+            turns = None if turned is None else rotation_matrices("orientation", turned)
+            placed = align(robot.chain, recording.q, recording.x, turns=turns, **known)
+            learners, shares = _learners(placed.chain, _tolerances(robot, zeros_rad, trusted), recording, sigma_m)
+            learners[0].report()  # fits it, so that what cannot be fitted shows here
+        except KBMapsError as error:
+            raise CalibrationError(f"no chain can be fitted to the recording: {error}") from error
+        told = sigma_m is not None or recording.cov is not None
+        return cls(robot, recording, placed, learners, shares, told, trusted)
+
+    @property
+    def learner(self) -> RigidLearner:
+        """The most probable one."""
+        return self.learners[0]
+
+    @property
+    def workmanship(self) -> ChainTolerances | None:
+        """Estimated workmanship of the arm; None if the pairs do not determine it."""
+        made = [(learner.tolerances.axes, learner.tolerances.points) for learner in self.learners]
+        return self.learner.tolerances if is_told(made) else None
+
+    @property
+    def noise_m(self) -> float:
+        """1-sigma of a measured coordinate [m], as the pairs scatter around the learnt chain; outliers apart."""
+        report = self.learner.report()
+        if not self.noise_told:
+            return report.noise
+        squares = np.sort(np.square(self.learner.predict(self.recording.q) - self.recording.x).sum(axis=1))
+        return float(np.sqrt(squares[: len(squares) - report.outliers].sum() / max(report.freedom, 1.0)))
+
+    @cached_property
+    def expected(self) -> Expected | None:
+        """Errors on new poses, from contiguous blocks that were each held out; None of too few rows."""
+        rows = len(self.recording)
+        fold = np.arange(rows) * 2 * FOLDS // rows % FOLDS
+        if rows < FOLDS * 2 * len(self.robot.joints):
+            return None
+        sigma_m = self.learner.report().noise if self.noise_told else None
+        told = _told(self.recording, self.learner, np.arange(rows))
+        predicted = np.empty_like(self.recording.x)
+        for held_out in range(FOLDS):
+            kept = np.flatnonzero(fold != held_out)
+            kept = kept[np.unique(np.linspace(0, len(kept) - 1, FOLD_ROWS).astype(np.intp))]
+            fresh = RigidLearner(self.placed.chain, self.learner.tolerances)
+            q, x = self.recording.q[kept], self.recording.x[kept]
+            fresh.learn(q, x, sigma_m) if told is None else fresh.learn(q, x, cov=told[kept])
+            try:
+                predicted[fold == held_out] = fresh.predict(self.recording.q[fold == held_out])
+            except KBMapsError:
+                return None
+        distances = np.linalg.norm(predicted - self.recording.x, axis=1)[self.learner.inliers]
+        return Expected(float(distances.mean()), float(np.quantile(distances, 0.95)))
+
+    @cached_property
+    def shown(self) -> int:
+        """Number of independent parameters whose uncertainty the pairs reduce to less than a third (`MUCH_SURER`).
+
+        The prior allows an arm of the worst workmanship.
+        """
+        report, (axes, points) = self.learner.report(), WORKMANSHIP[-1]
+        parameters = ChainParameters(self.placed.chain)
+        before = ChainBelief.from_tolerances(parameters, replace(self.learner.tolerances, axes=axes, points=points))
+        _, jacobian = parameters.linearised(self.learner.change, self.recording.q)
+        rows = (jacobian @ before.root).reshape(-1, before.root.shape[1]) / (report.noise * report.misfit)
+        left = 1.0 / np.sqrt(1.0 + np.square(np.linalg.svd(rows, compute_uv=False)))
+        return int((left < MUCH_SURER).sum())
+
+    @cached_property
+    def figures(self) -> ChainFigures:
+        """Calibrated figures; their uncertainty includes that of the workmanship."""
+        prior = ChainBelief.from_tolerances(ChainParameters(self.placed.chain), self.learner.tolerances)
+        return ChainFigures(self.robot, tuple(map(_claimed, self.learners)), self.shares, prior)
+
+
+def _learners(
+    nominal: RigidChain, choices: list[ChainTolerances], recording: Recording, sigma_m: float | None
+) -> tuple[tuple[RigidLearner, ...], FloatArray]:
+    """Return learners of all pairs with the tolerances that a sample of the pairs makes probable, and their shares."""
+    told = None if recording.cov is None else recording.cov + ROUNDING_M**2 * np.eye(3)
+    some = np.unique(np.linspace(0, len(recording) - 1, JUDGED_PAIRS).astype(np.intp))
+
+    def learner(tolerances: ChainTolerances, rows: IntArray) -> RigidLearner:
+        fresh = RigidLearner(nominal, tolerances)
+        if told is None:
+            fresh.learn(recording.q[rows], recording.x[rows], sigma_m)
+        else:
+            fresh.learn(recording.q[rows], recording.x[rows], cov=told[rows])
+        return fresh
+
+    told = _told(recording, learner(choices[-1], some), some)
+    evidence = np.array([learner(tolerances, some).log_evidence for tolerances in choices])
+    kept, shares = probable(evidence)
+    everything = np.arange(len(recording))
+    return tuple(learner(choices[k], everything) for k in kept), shares
+
+
+def _told(recording: Recording, learner: RigidLearner, rows: IntArray) -> FloatArray | None:
+    """Return covariances (n, 3, 3) [m²]: stated, plus what the arm adds in some rows; None where none are stated."""
+    if recording.cov is None:
+        return None
+    return recording.cov + (ROUNDING_M**2 + _of_the_arm(learner, recording, rows)) * np.eye(3)
+
+
+def _of_the_arm(learner: RigidLearner, recording: Recording, rows: IntArray) -> float:
+    """Return the variance [m²] per coordinate that these rows have beyond the instrument's: encoders, backlash."""
+    assert recording.cov is not None
+    good = rows[learner.inliers]
+    residuals = recording.x[good] - learner.predict(recording.q[good])
+    freedom = max(learner.scatter.freedom, 1.0)
+    return unexplained_variance(residuals, recording.cov[good] + ROUNDING_M**2 * np.eye(3), freedom)
+
+
+def _tolerances(robot: RobotDescription, zeros_rad: float, trusted: Trusted) -> list[ChainTolerances]:
+    links = WORKMANSHIP if trusted == "nothing" else ((0.0, 0.0),)
+    free_zeros = trusted != "urdf"
+    pose_known, marker_known = robot.camera.pose_known, robot.robot.marker_known
+    return [
+        ChainTolerances(
+            axes=axes,
+            points=points,
+            zeros=zeros_rad if free_zeros else 0.0,
+            slide_zeros=SLIDE_ZEROS_M if free_zeros else 0.0,
+            tool=KNOWN_PLACE_M if marker_known else FITTED_PLACE_M,
+            base_rotation=KNOWN_TURN_RAD if pose_known else FITTED_TURN_RAD,
+            base_translation=KNOWN_PLACE_M if pose_known else FITTED_PLACE_M,
+        )
+        for axes, points in links
+    ]
+
+
+def _claimed(learner: RigidLearner) -> ChainBelief:
+    """Return the learner's belief, widened like its intervals to allow for a noise level that was estimated."""
+    belief = learner.belief
+    return replace(belief, root=learner.report().widening * belief.root)

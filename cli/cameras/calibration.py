@@ -1,0 +1,348 @@
+"""Cameras and the board from the command line: what is asked, what is run, what is written."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.whole_files import write_whole
+from bodyschema.vision.board import Board
+from bodyschema.vision.board.board import Pattern
+from bodyschema.vision.board.page import page as board_page
+from bodyschema.vision.calibration.calibrate import Asked, Calibrated, ModelChoice, calibrate
+from bodyschema.vision.calibration.check import Check, check
+from bodyschema.vision.calibration.gather import Gathered, gathered, require_both
+from bodyschema.vision.calibration.images import ImagePair, PairFiles, pair_files, read_pairs, write_pair
+from bodyschema.vision.calibration.live import LiveViews
+from bodyschema.vision.calibration.report import page as report_page
+from bodyschema.vision.calibration.view import EYES, ONE_EYE
+from bodyschema.vision.printing.sheet import rulers_mm
+from bodyschema.vision.rectified import Rectification
+from bodyschema.vision.rig import CalibrationError, OneEyeRig, StereoRig
+from bodyschema.vision.rig_file import read_rig, write_rig
+from bodyschema.vision.spread import covariance_of
+from bodyschema.vision.triangulated import triangulated
+
+from .board_pages import write_page
+
+REPORT = "report.html"
+NORMAL_95 = 1.96
+# Position uncertainty is reported for a point straight ahead at this distance [m].
+AHEAD_M = 0.6
+_SQUARES = re.compile(r"(\d{1,9})\s*[xX×]\s*(\d{1,9})")
+
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Images:
+    """Location of the images.
+
+    Attributes:
+        folder: the folder.
+        left, right: patterns of the eyes' files.
+        side_by_side: each image shows both eyes.
+        one: all images are of one camera.
+    """
+
+    folder: Path
+    left: str | None = None
+    right: str | None = None
+    side_by_side: bool = False
+    one: bool = False
+
+    def files(self) -> list[PairFiles]:
+        """Return the files that belong together. Raise CalibrationError if there are none."""
+        if self.one and (self.right is not None or self.side_by_side):
+            raise ConfigError("--one is of one camera alone", remedy="Leave --right and --side-by-side away")
+        if (self.left is None) != (self.right is None) and not self.one:
+            raise ConfigError("--left and --right belong together", remedy="Give both patterns, or none")
+        return pair_files(self.folder, self.left, self.right, side_by_side=self.side_by_side, one=self.one)
+
+
+class Parameter(msgspec.Struct):
+    """A parameter with half the width of its 95 % interval."""
+
+    name: str
+    value: float
+    half_width: float
+
+
+class ViewFigures(msgspec.Struct):
+    """RMS errors of a view per image coordinate, fitted and not fitted [px]."""
+
+    name: str
+    rms_px: float
+    held_out_px: float
+
+
+class LeftOutView(msgspec.Struct):
+    """A view that does not fit the others."""
+
+    name: str
+    rms_px: float
+    usual_px: float
+
+
+class UnusableImage(msgspec.Struct):
+    """An image that could not be used."""
+
+    name: str
+    eye: str
+    why: str
+    text: str
+
+
+class CamerasFile(msgspec.Struct):
+    """Output of `bodyschema calibrate cameras --json`. Half widths are those of 95 % intervals.
+
+    One camera alone has no baseline.
+    """
+
+    model: str
+    image_size_px: tuple[int, int]
+    serials: tuple[str, ...]
+    board: str
+    baseline_mm: float | None
+    baseline_half_width_mm: float | None
+    position_half_widths_mm: tuple[float, float, float] | None
+    reprojection_px: float
+    held_out_px: float
+    held_out_by_model_px: dict[str, float]
+    rectified_focal_px: float
+    parameters: list[Parameter]
+    views: list[ViewFigures]
+    left_out: list[LeftOutView]
+    unusable: list[UnusableImage]
+    missing: list[str]
+    size_was_measured: bool
+
+
+class CheckFile(msgspec.Struct):
+    """Output of `bodyschema calibrate check --json`. Half widths are those of 95 % intervals."""
+
+    holds: bool
+    wrong: list[str]
+    corners: int
+    epipolar_px: float
+    rows_px: float
+    rows_half_width_px: float
+    roll_deg: float
+    roll_half_width_deg: float
+    square_mm: float
+    square_half_width_mm: float
+    nominal_mm: float
+
+
+def board_of(
+    squares: str,
+    square_mm: float,
+    *,
+    marker_mm: float | None = None,
+    dictionary: str | None = None,
+    pattern: Pattern = "charuco",
+) -> Board:
+    """Return the board described by the options.
+
+    Args:
+        squares: columns x rows, for example 8x6.
+
+    Raises:
+        ConfigError: the options describe no valid board.
+    """
+    read = _SQUARES.fullmatch(squares.strip())
+    if read is None:
+        raise ConfigError(f"--squares {squares} is not as in 8x6", remedy="Give columns x rows, of squares")
+    return Board(int(read[1]), int(read[2]), 1e-3 * square_mm, _metres(marker_mm), dictionary, pattern)
+
+
+def as_printed(drawn: Board, ruler_mm: float | None) -> Board:
+    """Return the board in its printed size, at which the longer ruler of its page measures `ruler_mm`.
+
+    Raises:
+        ConfigError: `ruler_mm` is not between half and twice the nominal length; another line was measured.
+    """
+    if ruler_mm is None:
+        return drawn
+    width, height = drawn.size_m
+    length = rulers_mm((1e3 * width, 1e3 * height))[0]
+    scale = ruler_mm / length
+    if not 0.5 < scale < 2.0:
+        raise ConfigError(
+            f"--ruler-mm {ruler_mm:g}: the ruler across of this page is {length:g} mm as drawn",
+            remedy="Measure the line below the board, from the outer edge of its first tick to that of its last",
+        )
+    return replace(drawn, square_m=scale * drawn.square_m, marker_m=scale * drawn.marker_side_m)
+
+
+def write_board(board: Board, paper: str, out: Path) -> tuple[float, float]:
+    """Write the board's page as PDF or SVG; the lengths of its rulers, across and upright [mm].
+
+    Raises:
+        ConfigError: it does not fit, the ending is neither, or the file cannot be written.
+    """
+    page = board_page(board, paper)
+    write_page(page, out)
+    return page.rulers_mm
+
+
+def from_images(images: Images, board: Board, tell: Tell) -> Gathered:
+    """All views in a folder's images.
+
+    Raises:
+        CalibrationError: there are no pairs, sizes differ, or an eye never sees a usable board.
+    """
+    files = images.files()
+    tell(f"looking for the board in {len(files)} {'images' if images.one else 'pairs of images'}")
+    found = gathered(read_pairs(files, side_by_side=images.side_by_side), board, tell)
+    require_both(found)
+    return found
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """Settings of a calibration besides views and board; see `bodyschema.vision.calibration.calibrate.Asked`."""
+
+    serials: tuple[str, ...] = ("", "")
+    model: ModelChoice = "auto"
+    scale_sigma: float = 0.001
+    baseline_mm: float | None = None
+
+
+def calibrated(found: Gathered, wanted: Wanted, tell: Tell) -> Calibrated:
+    """Calibrate from the views. Raise CalibrationError with the reasons if the result is not good enough."""
+    asked = Asked(
+        image_size_px=found.image_size_px,
+        serials=wanted.serials[: len(found.eyes)],
+        date=SystemClock().utc(),
+        model=wanted.model,
+        scale_sigma=wanted.scale_sigma,
+        baseline_m=_metres(wanted.baseline_mm),
+    )
+    return calibrate(found.views, found.board, asked, tell)
+
+
+def of_cameras(wanted: Wanted) -> Callable[[Gathered, tuple[str, ...], Tell], Calibrated]:
+    """Return a variant of `calibrated` for cameras with known serials; the serials in `wanted` take precedence."""
+
+    def of(found: Gathered, serials: tuple[str, ...], tell: Tell) -> Calibrated:
+        known = tuple(own or told for own, told in zip(wanted.serials, serials, strict=False))
+        return calibrated(found, replace(wanted, serials=known), tell)
+
+    return of
+
+
+def live_views(board: Board, eyes: int) -> LiveViews:
+    """Return an empty collection of views of the board, for one eye or two."""
+    return LiveViews(board, eyes=EYES if eyes > 1 else ONE_EYE)
+
+
+def kept_in(folder: Path | None) -> Callable[[ImagePair, int], None]:
+    """Return a function that writes the images of a view into `folder`; it does nothing if `folder` is None."""
+    return lambda pair, number: None if folder is None else write_pair(pair, folder, number)
+
+
+def write_calibrated_cameras(result: Calibrated, found: Gathered, out: Path) -> Path:
+    """Write cameras.toml with its report beside it, and return the report's path."""
+    write_rig(result.rig, out)
+    report = out.with_name(f"{out.stem}_{REPORT}")
+    write_whole({report: report_page(result, found).encode()})
+    return report
+
+
+def figures(result: Calibrated, found: Gathered, *, size_was_measured: bool) -> CamerasFile:
+    """Return the figures of a calibration.
+
+    Args:
+        size_was_measured: the board, or the distance between the lenses, was measured with a ruler.
+    """
+    rig, fitted = result.rig, result.fitted
+    pair = rig if isinstance(rig, StereoRig) else None
+    errors = zip(fitted.views, fitted.bundle.view_rms_px().tolist(), fitted.held_out.view_rms_px.tolist(), strict=True)
+    widths = NORMAL_95 * rig.sigma
+    return CamerasFile(
+        model=rig.model,
+        image_size_px=rig.image_size_px,
+        serials=rig.serials,
+        board=rig.made.board,
+        baseline_mm=None if pair is None else 1e3 * pair.baseline_m,
+        baseline_half_width_mm=None if pair is None else 1e3 * NORMAL_95 * pair.baseline_sigma_m,
+        position_half_widths_mm=None if pair is None else _position_half_widths_mm(pair),
+        reprojection_px=rig.made.reprojection_px,
+        held_out_px=rig.made.held_out_px,
+        held_out_by_model_px={str(model): px for model, px in result.rivals_px.items()},
+        rectified_focal_px=Rectification(rig).calibration.focal_px,
+        parameters=[Parameter(*each) for each in zip(rig.names, rig.vector.tolist(), widths.tolist(), strict=True)],
+        views=[ViewFigures(view.name, rms, held_out) for view, rms, held_out in errors],
+        left_out=[LeftOutView(each.name, each.rms_px, each.usual_px) for each in fitted.left_out],
+        unusable=[UnusableImage(each.name, each.eye, each.fault.why, each.fault.text) for each in found.unusable],
+        missing=result.coverage.missing(),
+        size_was_measured=size_was_measured,
+    )
+
+
+def checked(file: Path, images: Images, board: Board) -> tuple[CheckFile, str]:
+    """One look at the board with the calibration in `file`, and which pair it was: the newest that shows the board.
+
+    Raises:
+        ConfigError: the file is damaged.
+        CalibrationError: no pair shows the board to both eyes, or the images are of another size.
+    """
+    rig = pair_in(file)
+    files = images.files()
+    for pair in reversed(files):
+        found = gathered(read_pairs([pair], side_by_side=images.side_by_side), board)
+        rig.require(found.image_size_px, rig.serials)
+        if found.views and found.views[0].is_stereo:
+            return check_figures(check(rig, found.views[0], board)), f"view {pair.name}"
+    require_both(gathered(read_pairs(files, side_by_side=images.side_by_side), board))
+    raise CalibrationError("no pair of images shows the board to both eyes. Hold it into the middle of both images")
+
+
+def pair_in(file: Path) -> StereoRig:
+    """Return the stereo calibration in `file`. Raise CalibrationError if it is of one camera only."""
+    rig = read_rig(file)
+    if isinstance(rig, OneEyeRig):
+        raise CalibrationError(
+            f"{file} is of one camera: one look at the board checks two against each other. Calibrate it again to see "
+            "whether it changed: `bodyschema calibrate cameras`"
+        )
+    return rig
+
+
+def check_figures(found: Check) -> CheckFile:
+    """Return the figures of a check."""
+    return CheckFile(
+        holds=found.holds,
+        wrong=list(found.wrong),
+        corners=found.corners,
+        epipolar_px=found.epipolar_px,
+        rows_px=found.rows_px,
+        rows_half_width_px=NORMAL_95 * found.rows_sigma_px,
+        roll_deg=found.roll_deg,
+        roll_half_width_deg=NORMAL_95 * found.roll_sigma_deg,
+        square_mm=1e3 * found.square_m,
+        square_half_width_mm=1e3 * NORMAL_95 * found.square_sigma_m,
+        nominal_mm=1e3 * found.nominal_m,
+    )
+
+
+def _position_half_widths_mm(rig: StereoRig) -> tuple[float, float, float]:
+    """Return 95 % half widths of a position straight ahead in the left camera's frame, due to the calibration alone."""
+    eye = -rig.R_right_left.T @ rig.translation_m
+    x = np.array([[0.5 * eye[0], 0.5 * eye[1], AHEAD_M]])
+    left, right = rig.left.project(x), rig.right.project(x @ rig.R_right_left.T + rig.translation_m)
+    covariance = covariance_of(rig, lambda other: triangulated(other, left, right)[0])
+    across, down, ahead = (1e3 * NORMAL_95 * np.sqrt(np.diag(covariance))).tolist()
+    return across, down, ahead
+
+
+def _metres(mm: float | None) -> float | None:
+    return None if mm is None else 1e-3 * mm

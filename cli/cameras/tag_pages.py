@@ -1,0 +1,111 @@
+"""Create pages of tags, and the matching tables of robot.toml."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.vision.cluster.page import FACE_SIDES, shape_page, tags_page
+from bodyschema.vision.cluster.shapes import Shape, cube, plate
+from bodyschema.vision.cluster.tables import cluster_tables, tag_tables
+from bodyschema.vision.tag_config import Dictionary
+
+from .board_pages import write_page
+
+ShapeName = Literal["tags", "plate", "cube"]
+_RUN = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?")
+_MOST_TAGS = 100
+
+
+@dataclass(frozen=True)
+class Tags:
+    """The tags to print.
+
+    Attributes:
+        shape: single tags, or one body of them.
+        ids: numbers of the tags as in 0-5,9; None: as many as the shape has, from 0 on.
+        side_mm: side of the black squares.
+        columns, rows, fold_deg: columns, rows and fold angle [°] of a plate.
+    """
+
+    shape: ShapeName = "tags"
+    ids: str | None = None
+    dictionary: Dictionary = "apriltag_36h11"
+    side_mm: float = 40.0
+    columns: int = 2
+    rows: int = 1
+    fold_deg: float = 0.0
+
+    @property
+    def body(self) -> Shape | None:
+        """The body to fold from the tags; None if they are cut apart."""
+        if self.shape == "tags":
+            return None
+        return cube() if self.shape == "cube" else plate(self.columns, self.rows, self.fold_deg)
+
+    @property
+    def numbers(self) -> list[int]:
+        """Numbers of the tags. ConfigError if they cannot be parsed, or one is repeated."""
+        if self.ids is None:
+            return list(range(1 if self.body is None else len(self.body.faces)))
+        return numbers_of(self.ids)
+
+
+def numbers_of(ids: str) -> list[int]:
+    """Parse tag numbers as in 0-5,9. ConfigError if they cannot be parsed, or one is repeated."""
+    found: list[int] = []
+    for part in ids.split(","):
+        run = _RUN.fullmatch(part.strip())
+        if run is None:
+            raise ConfigError(f"--ids {ids} is not as in 0-5,9", remedy="Give numbers, or runs of them")
+        found += range(int(run[1]), int(run[2] or run[1]) + 1)[: _MOST_TAGS + 1]
+    if len(found) > _MOST_TAGS:
+        raise ConfigError(f"--ids {ids} are more than {_MOST_TAGS}", remedy="Print them on several pages")
+    if len(set(found)) < len(found) or not found:
+        raise ConfigError(f"--ids {ids} has a tag twice, or none", remedy="No number may be there twice")
+    return found
+
+
+def write_tags(tags: Tags, paper: str, out: Path) -> tuple[float, float]:
+    """Write the page as PDF or SVG; return the lengths of its horizontal and vertical rulers [mm].
+
+    Raises:
+        ConfigError: there are no such tags, they do not fit, or the file cannot be written.
+    """
+    body, ids = tags.body, tags.numbers
+    if body is None:
+        page = tags_page(ids, tags.dictionary, tags.side_mm, paper)
+    else:
+        page = shape_page(body, ids, tags.dictionary, tags.side_mm, paper)
+    write_page(page, out)
+    return page.rulers_mm
+
+
+def face_mm(tags: Tags) -> float:
+    """Return the width of a face between cuts or folds [mm]."""
+    return FACE_SIDES * tags.side_mm
+
+
+def tables(tags: Tags) -> str:
+    """Return the tables of robot.toml for the nominal shape; for single tags those of the first one."""
+    body, side_m = tags.body, 1e-3 * tags.side_mm
+    if body is None:
+        return tag_tables(tags.dictionary, side_m, tags.numbers[0])
+    return cluster_tables(tags.dictionary, side_m, body.placed(tags.numbers, 1e-3 * face_mm(tags)))
+
+
+def as_printed(tags: Tags, drawn_mm: float, measured_mm: float) -> Tags:
+    """Scale the tags to the size at which the ruler of `drawn_mm` measures `measured_mm`.
+
+    ConfigError for another line.
+    """
+    scale = measured_mm / drawn_mm
+    if not 0.5 < scale < 2.0:
+        raise ConfigError(
+            f"--ruler-mm {measured_mm:g}: the ruler across of this page is {drawn_mm:g} mm as drawn",
+            remedy="Measure the line below the drawing, from the outer edge of its first tick to that of its last",
+        )
+    return replace(tags, side_mm=scale * tags.side_mm)

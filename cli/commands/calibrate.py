@@ -1,0 +1,181 @@
+"""`bodyschema calibrate`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import cyclopts
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from bodyschema.cli.commands.calibrate_cameras import cameras, check
+from bodyschema.cli.commands.latency import latency
+from bodyschema.cli.commands.options import (
+    AS_THEY_ARE,
+    LeRobotFile,
+    SourceOptions,
+    SourceRobotFile,
+    flag,
+    lerobot_lines,
+    robot_file,
+)
+
+CAMERA_FRAME = "calibrated_camera"
+
+# Without a help of its own its page shows what `arm` says, beside the commands.
+calibrate = cyclopts.App(name="calibrate")
+calibrate.command(cameras, sort_key=1)
+calibrate.command(check, sort_key=2)
+calibrate.command(latency, sort_key=3)
+
+
+@calibrate.default
+def arm(
+    source: Annotated[
+        Path | None,
+        Parameter(
+            help="A recording (.csv, .parquet), a ROS bag, a LeRobotDataset or a pair store (.sqlite); else the "
+            "robot's own store."
+        ),
+    ] = None,
+    /,
+    *,
+    robot: SourceRobotFile = None,
+    sigma_mm: Annotated[
+        float | None,
+        Parameter(
+            help="1-sigma of a measured coordinate where the source has none [mm]; else estimated.",
+            validator=Number(gt=0, lte=1000),
+        ),
+    ] = None,
+    zeros_deg: Annotated[
+        float, Parameter(help="How far joint zeros may be off, 1-sigma [°].", validator=Number(gt=0, lte=60))
+    ] = 3.0,
+    first: Annotated[
+        int | None,
+        Parameter(
+            help="Number of the first row to learn; of a store, else the first with the present tool.",
+            validator=Number(gte=1),
+        ),
+    ] = None,
+    last: Annotated[int | None, Parameter(help="Number of the last row to learn.", validator=Number(gte=1))] = None,
+    out: Annotated[
+        Path | None, Parameter(help="Write the calibrated robot into this folder: a URDF and a robot.toml.")
+    ] = None,
+    trust_urdf: Annotated[
+        bool, flag("Camera and tool alone: links and joint zeros are right as the URDF has them.")
+    ] = False,
+    only: Annotated[
+        Literal["offsets"] | None,
+        Parameter(help="offsets: joint offsets, camera and tool; the links are right as the URDF has them."),
+    ] = None,
+    camera_frame: Annotated[str, Parameter(help="What ROS calls the measurement frame, for TF.")] = CAMERA_FRAME,
+    taken: SourceOptions = AS_THEY_ARE,
+    lerobot: LeRobotFile = None,
+    write: Annotated[bool, flag("Write the file of --lerobot; the old one is kept beside it.")] = False,
+    as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
+    force: Annotated[
+        bool,
+        flag(
+            "Go on, and write, although the pairs do not seem to be of this robot, or its zeros are far off; replace "
+            "files in OUT."
+        ),
+    ] = False,
+) -> None:
+    """Calibrate camera, tool and joint offsets, with 95 % intervals; writes a calibrated URDF.
+
+    Learns a rigid chain from all pairs, around the nominal one. Outliers are left out. All pairs have to be of one
+    tool: from a store those are learnt that the learner beside it counts since the tool was last changed. Where
+    residuals jump as with another tool, this is said, with the row, and nothing is written.
+
+    Pairs whose columns are exchanged, count the other way, have another zero or unit, or are of another robot, are
+    refused. Zeros off by more than five times --zeros-deg, and links worse than those of any arm, are printed and not
+    written. --force overrules both.
+
+    The URDF opens in pybullet, Pinocchio and ROS: it has the camera and the marker as links of their own, and takes
+    its positions from them to rounding as the learnt chain does. Meshes, masses and limits stay.
+
+    Needs: a recording or a store, and its robot.toml; no hardware. The daemon may be running: its store is read. What
+    robot.toml calls not known (`pose_known`, `marker_known`) is taken from the pairs alone, the rest is trusted to
+    1° and 10 mm.
+
+    Next: `bodyschema run --robot OUT/robot.toml` starts from what was learnt. With --lerobot the joint offsets go into
+    the servos instead, by LeRobot's own calibration file.
+    """
+    import math
+    import sys
+
+    from rich.console import Console
+
+    from bodyschema.calibration.hand_eye import in_shell_lines, write_launch_file
+    from bodyschema.calibration.plausibility.check import plausibility, told_sigma
+    from bodyschema.calibration.plausibility.limits import require_units
+    from bodyschema.calibration.report import CalibrationReport
+    from bodyschema.calibration.rigid_chain import Calibration, CalibrationError
+    from bodyschema.cli.recordings.present_tool import first_pair
+    from bodyschema.cli.terminal.calibration_view import two_tools, view
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.transport.wire import encode
+    from bodyschema.interfaces.errors import RequestError
+    from bodyschema.recordings import files as recordings
+    from bodyschema.robot.calibrated_files import write_calibrated
+
+    if write and (lerobot is None or out is not None):
+        raise RequestError(
+            "--write is for --lerobot FILE, and without --out: offsets belong into the servos or into a URDF, not both"
+        )
+    if trust_urdf and only is not None:
+        raise RequestError("--trust-urdf has no offsets to find. Give it, or --only offsets")
+    trusted = "urdf" if trust_urdf else "nothing" if only is None else "links"
+    config = Config.load(robot_file(robot, source))
+    description, source = config.robot, source or config.store_file
+    if source.suffix.lower() in recordings.STORE_ENDINGS:
+        stored = recordings.stored_pairs(source)
+        recording = recordings.of_robot(stored.recording, description.joints, source)
+        first = first or first_pair(stored, source.with_name(config.checkpoint_file.name), description.name)
+    else:
+        recording = taken.opened(config, source, lerobot)
+    first = first or 1
+    recording = recordings.between(recording, first, last, source)
+    sigma_m = None if sigma_mm is None else 1e-3 * sigma_mm
+    require_units(description, recording, source)
+    seen = plausibility(description, recording.q, recording.x, sigma_m=told_sigma(recording) or sigma_m)
+    if seen.misread:
+        seen.require(source, force=force)
+    settings = {"sigma_m": sigma_m, "zeros_rad": math.radians(zeros_deg)}
+    found = Calibration.of(description, recording, **settings, trusted=trusted)
+    free = None if trusted == "nothing" else Calibration.of(description, recording, **settings)
+    report = CalibrationReport.of(found, seen, source.name, first, camera_frame, free)
+    if report.other_tool_from is None:
+        seen.require(source, force=force)
+    written = launch = None
+    if out is not None or write:
+        if report.other_tool_from is not None:
+            raise CalibrationError(f"nothing was written. {two_tools(report)}")
+        if report.beyond is not None and not force:
+            raise CalibrationError(f"nothing was written. {report.doubt} Or write it as it is with --force")
+    if out is not None:
+        heading = f"Calibrated by bodyschema from {report.pairs} pairs of {source.name}"
+        written = write_calibrated(description, found.figures.geometry, out, heading, replace=force)
+        launch = write_launch_file(report.hand_eye, out)
+    lines: list[str] = []
+    if lerobot is not None:
+        offsets = {zero.joint: math.radians(zero.zero) for zero in report.zeros if zero.half_width is not None}
+        lines = lerobot_lines(config, lerobot, offsets, write=write)
+    if as_json:
+        sys.stdout.write(encode(report).decode() + "\n")
+        return
+    console = Console(highlight=False)
+    console.print(view(report))
+    for line in ["", *lines] if lines else []:
+        console.print(line, markup=False, soft_wrap=True)
+    console.print(f"\nIn ROS 2:\n{in_shell_lines(report.hand_eye)}", markup=False, soft_wrap=True)
+    if written is not None:
+        console.print(f"{launch} written, which publishes the same.", markup=False, soft_wrap=True)
+        console.print(
+            f"\n{written} written. Next: stop what runs with {config.file.name} (the new one has its ports), then "
+            f"`bodyschema run --robot {written}`",
+            markup=False,
+            soft_wrap=True,
+        )

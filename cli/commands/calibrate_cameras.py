@@ -1,0 +1,191 @@
+"""`bodyschema calibrate cameras` and `bodyschema calibrate check`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from bodyschema.cli.commands.board_options import AS_PRINTED, BY_NAME, EyeFiles, EyeImages, PrintedBoard
+from bodyschema.cli.commands.options import HERE, RobotFile, flag
+
+if TYPE_CHECKING:
+    from bodyschema.cli.cameras.calibration import Board, Calibrated, CheckFile, Gathered, Wanted
+    from bodyschema.daemon.config import Config
+
+CAMERAS = Path("cameras.toml")
+
+
+def cameras(
+    images: EyeImages = None,
+    /,
+    *,
+    robot: RobotFile = HERE,
+    files: EyeFiles = BY_NAME,
+    printed: PrintedBoard = AS_PRINTED,
+    baseline_mm: Annotated[
+        float | None,
+        Parameter(help="Distance of the eyes measured by hand [mm]; refused where the images contradict it."),
+    ] = None,
+    scale_sigma_percent: Annotated[
+        float, Parameter(help="How well the size of a square is known, 1-sigma [%].", validator=Number(gte=0, lt=10))
+    ] = 0.1,
+    lens: Annotated[
+        Literal["auto", "pinhole", "fisheye"], Parameter(help="`auto`: what foretells views better.")
+    ] = "auto",
+    left_serial: Annotated[
+        str, Parameter(help="What tells the left camera from all others; live, it is known.", show_default=False)
+    ] = "",
+    right_serial: Annotated[str, Parameter(help="The same of the right camera.", show_default=False)] = "",
+    save: Annotated[
+        Path | None, Parameter(help="Live: keep the images of all views in this folder, as IMAGES has them.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        Parameter(help="The file to write, with a report beside it; else cameras.toml, live beside robot.toml."),
+    ] = None,
+    as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
+) -> None:
+    """Calibrate two cameras, or the lens of one, from views of a board: writes cameras.toml and a report.
+
+    About 20 pairs of images, or 20 images of one camera alone (--one), the board held still in each: all over the
+    images, tilted by 20° to 40° each way, near and far. Without IMAGES the robot's own cameras look: it is said what to
+    show next, and a view is taken by itself as soon as the board is still and the view is new; it ends when the
+    calibration is good enough, or with Ctrl-C. Views that do not fit the others are left out and named. It is refused,
+    with the reasons, when it is not good enough; what is wrong with the board's size no image can tell, so measure the
+    ruler on the print. One camera alone does not need to know it.
+
+    Needs: the board that `bodyschema board` wrote (or a plain chessboard), and images of it, no hardware; or
+    robot.toml with cameras, and no sampler that runs.
+
+    Next: open the report; `bodyschema calibrate check` whenever a camera may have been touched.
+    """
+    from rich.console import Console
+
+    from bodyschema.cli.cameras.calibration import Wanted, figures, write_calibrated_cameras
+    from bodyschema.cli.cameras.calibration_view import cameras_view
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.transport.wire import encode
+    from bodyschema.daemon.wiring.cameras import calibration_file, names_calibration
+
+    board = printed.board()
+    wanted = Wanted((left_serial, right_serial), lens, 0.01 * scale_sigma_percent, baseline_mm)
+    named = True
+    if images is not None:
+        found, result = _of_images(images, files, board, wanted)
+        out = out or CAMERAS
+    else:
+        config = Config.load(robot)
+        found, result = _live(config, board, wanted, save)
+        out, named = out or calibration_file(config), names_calibration(config)
+    report = write_calibrated_cameras(result, found, out)
+    told = figures(result, found, size_was_measured=printed.ruler_mm is not None or baseline_mm is not None)
+    if as_json:
+        sys.stdout.write(encode(told).decode() + "\n")
+        return
+    console = Console(highlight=False)
+    console.print(cameras_view(told))
+    console.print(f"\n{out} written. Open {report}.", markup=False, soft_wrap=True)
+    if not named:
+        console.print(f'In [vision.cameras] write\ncalibration = "{out.name}"', markup=False, soft_wrap=True)
+
+
+def check(
+    images: EyeImages = None,
+    /,
+    *,
+    robot: RobotFile = HERE,
+    calibration: Annotated[
+        Path | None, Parameter(help="The calibration to check; else cameras.toml, live the one in robot.toml.")
+    ] = None,
+    files: EyeFiles = BY_NAME,
+    printed: PrintedBoard = AS_PRINTED,
+    seconds: Annotated[
+        float, Parameter(help="Live: how long the board is waited for [s].", validator=Number(gt=0))
+    ] = 60.0,
+    as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
+) -> None:
+    """Check that a camera calibration still holds, from one look at the board.
+
+    The last pair of images that shows the board to both eyes is taken; without IMAGES the robot's own cameras look
+    until the board is held still. A camera that was turned up or down or about its line of sight moves the rows apart;
+    one that was turned inwards or outwards changes the size that a square seems to have. Exit code 1 when the
+    calibration does not hold.
+
+    Needs: cameras.toml, and a pair of images of the board, no hardware; or robot.toml with cameras, and no sampler that
+    runs.
+
+    Next: `bodyschema calibrate cameras` again, when it does not hold.
+    """
+    from rich.console import Console
+
+    from bodyschema.cli.cameras.calibration import checked
+    from bodyschema.cli.cameras.calibration_view import check_view
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.transport.wire import encode
+    from bodyschema.daemon.wiring.cameras import calibration_file
+
+    board = printed.board()
+    if images is not None:
+        found, name = checked(calibration or CAMERAS, files.of(images), board)
+    else:
+        config = Config.load(robot)
+        found, name = _checked_live(config, calibration or calibration_file(config), board, seconds)
+    if as_json:
+        sys.stdout.write(encode(found).decode() + "\n")
+    else:
+        Console(highlight=False).print(check_view(found, name))
+    if not found.holds:
+        sys.exit(1)
+
+
+def _of_images(images: Path, files: EyeFiles, board: Board, wanted: Wanted) -> tuple[Gathered, Calibrated]:
+    from rich.console import Console
+
+    from bodyschema.cli.cameras.calibration import calibrated, from_images
+
+    progress = Console(stderr=True, highlight=False)
+
+    def tell(text: str) -> None:
+        progress.print(text, soft_wrap=True, markup=False)
+
+    found = from_images(files.of(images), board, tell)
+    return found, calibrated(found, wanted, tell)
+
+
+def _live(config: Config, board: Board, wanted: Wanted, save: Path | None) -> tuple[Gathered, Calibrated]:
+    from rich.console import Console
+
+    from bodyschema.cli.cameras.calibration import kept_in, live_views, of_cameras
+    from bodyschema.cli.cameras.live_calibration import LiveCalibration
+    from bodyschema.cli.cameras.live_calibration_view import guidance_on
+    from bodyschema.daemon.service.signals import on_termination
+    from bodyschema.daemon.wiring.cameras import open_eyes, require_cameras
+    from bodyschema.interfaces.clock import SystemClock
+
+    clock, eyes = SystemClock(), require_cameras(config).eyes
+    views = live_views(board, eyes)
+    with guidance_on(Console(stderr=True, highlight=False), board.name, clock) as show:
+        calibration = LiveCalibration(
+            open_eyes(config, clock), views, of_cameras(wanted), show, clock, keep=kept_in(save)
+        )
+        with on_termination(calibration.stop):
+            return calibration.run()
+
+
+def _checked_live(config: Config, file: Path, board: Board, seconds: float) -> tuple[CheckFile, str]:
+    from rich.console import Console
+
+    from bodyschema.cli.cameras.calibration import check_figures
+    from bodyschema.cli.cameras.live_calibration import LiveViews, checked_live
+    from bodyschema.cli.cameras.live_calibration_view import guidance_on
+    from bodyschema.daemon.wiring.cameras import open_eyes
+    from bodyschema.interfaces.clock import SystemClock
+
+    clock = SystemClock()
+    with guidance_on(Console(stderr=True, highlight=False), board.name, clock) as show:
+        found = checked_live(open_eyes(config, clock), file, LiveViews(board), show, clock, seconds)
+    return check_figures(found), "now"

@@ -1,0 +1,55 @@
+"""`bodyschema command`."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from bodyschema.cli.commands.options import HERE, RobotFile
+from bodyschema.daemon.transport.command_names import BOTHS, SAMPLERS, CommandName
+
+Process = Literal["sampler", "learner"]
+
+
+def command(
+    name: Annotated[CommandName, Parameter(help="What to do.")],
+    /,
+    *,
+    to: Annotated[
+        Process | None,
+        Parameter(help="Who is to do it; else who knows the command, and for pause, resume and reload the sampler."),
+    ] = None,
+    robot: RobotFile = HERE,
+) -> None:
+    """Send a command to a running process.
+
+    `pause` and `resume` stop and restart accepting pairs (or, with --to learner, learning). `reload` reads robot.toml
+    again and lists the settings that need a restart. `zero_force_on` lets the servos hold the arm, `gaze_on` turns the
+    head to the hand, and `..._off` switches their torque off. `accept_turns` is for a joint that lost its turn count
+    while its bus was away, if it is where the message says: it assumes the turn nearest to its last position.
+    `tool_changed` reports a tool change; `rollback` restores the model before the last change; `reset_to_prior`
+    discards what was learnt, but not the stored pairs; `checkpoint` writes the learner's state now.
+
+    Needs: that process running (`bodyschema run`).
+
+    Next: `bodyschema status`.
+    """
+    from rich.console import Console
+
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.transport.bus import client
+    from bodyschema.daemon.transport.keys import Keys
+    from bodyschema.daemon.transport.wire import CommandReply, CommandRequest, decode, encode
+    from bodyschema.interfaces.errors import RequestError
+
+    process: Process = to or ("sampler" if name in SAMPLERS else "learner")
+    if process == "sampler" and name not in SAMPLERS:
+        raise RequestError(f"{name} is a command of the learner: drop --to")
+    if process == "learner" and name in SAMPLERS and name not in BOTHS:
+        raise RequestError(f"{name} is a command of the sampler: drop --to")
+    config = Config.load(robot)
+    with client(config.route(process)) as bus:
+        reply = bus.ask_one(Keys(config.robot.name).command(process), encode(CommandRequest(name)))
+    done = decode(reply, CommandReply)
+    Console(highlight=False, soft_wrap=True).print(f"{process}: {done.message}", markup=False)

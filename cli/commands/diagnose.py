@@ -1,0 +1,117 @@
+"""`bodyschema diagnose`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from bodyschema.cli.commands.options import (
+    AS_THEY_ARE,
+    LeRobotFile,
+    SourceOptions,
+    SourceRobotFile,
+    flag,
+    lerobot_lines,
+    robot_file,
+)
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def diagnose(
+    recording: Annotated[
+        Path | None,
+        Parameter(
+            help="A recording (.csv, .parquet), a ROS bag, a LeRobotDataset or a pair store (.sqlite); or --live."
+        ),
+    ] = None,
+    /,
+    *,
+    live: Annotated[bool, flag("Take the running sampler's pairs, in the place of a recording.")] = False,
+    robot: SourceRobotFile = None,
+    out: Annotated[
+        Path | None,
+        Parameter(help="Write diagnosis.json, report.html, extended.toml and perhaps a corrected URDF here."),
+    ] = None,
+    effects: Annotated[str | None, Parameter(help="Look for these alone, as in backlash,joint_offset.")] = None,
+    exclude: Annotated[str | None, Parameter(help="Do not look for these.")] = None,
+    seed: Annotated[int, Parameter(help="Of the resampling behind the intervals.", validator=Number(gte=0))] = 0,
+    taken: SourceOptions = AS_THEY_ARE,
+    lerobot: LeRobotFile = None,
+    write: Annotated[bool, flag("Write the file of --lerobot; the old one is kept beside it.")] = False,
+    as_json: Annotated[bool, flag("Print diagnosis.json.", name="--json")] = False,
+    force: Annotated[bool, flag("Go on although the pairs do not seem to be of this robot.")] = False,
+) -> None:
+    """Find what the simulation gets wrong in a recording, why, and how much correcting it helps.
+
+    Every effect that is known is tried at every joint, alone and together, and judged by blocks of rows that were not
+    fitted. What remains are causes with their numbers and how sure they are; or that nothing is wrong; or that this
+    recording cannot decide, or that no known effect explains it. The exit code is 0 whatever is found.
+
+    Without --out nothing is written. Pairs whose columns are exchanged, count the other way, have another zero or unit,
+    or are of another robot, are refused.
+
+    Needs: a recording or a store and its robot.toml, no hardware; with --live a running sampler.
+
+    Next: open OUT/report.html; OUT/extended.toml takes the place of robot.toml in any command, and
+    `bodyschema export` turns it into models for MuJoCo, controllers and drivers.
+    """
+    import sys
+
+    from rich.console import Console
+
+    from bodyschema.cli.terminal.diagnosis_run import Asked, measured, results_in, run, written
+    from bodyschema.cli.terminal.diagnosis_view import view
+    from bodyschema.daemon.config import Config
+    from bodyschema.interfaces.errors import RequestError
+
+    if write and lerobot is None:
+        raise RequestError("--write is for --lerobot FILE. Give LeRobot's calibration file")
+    config = Config.load(robot_file(robot, recording))
+    asked = Asked.of(effects, exclude, seed)
+    source = measured(config, recording, lambda file: taken.opened(config, file, lerobot), live=live)
+    told = Console(stderr=True, highlight=False)
+    with results_in(out), _progress(told) as tell:
+        found = run(config, source, asked, tell, force=force)
+        if out is not None:
+            tell("writing the report")
+            written(found, out)
+    for warning in found.warnings:
+        told.print(f"Warning: {warning}", markup=False, soft_wrap=True)
+    lines: list[str] = []
+    if lerobot is not None:
+        offsets = {
+            cause.where: cause.parameters["offset_rad"].value
+            for cause in found.file.causes
+            if cause.effect == "joint_offset" and cause.where is not None and "offset_rad" in cause.parameters
+        }
+        lines = lerobot_lines(config, lerobot, offsets, write=write)
+    if as_json:
+        sys.stdout.write(found.json + "\n")
+        return
+    console = Console(highlight=False)
+    console.print(view(found.file, found.remedies, timed=found.timed))
+    for line in ["", *lines] if lines else []:
+        console.print(line, markup=False, soft_wrap=True)
+    if out is not None:
+        console.print(
+            f"\nOpen {out / 'report.html'}. Beside it are diagnosis.json and extended.toml, the simulation with what "
+            "was found, which takes the place of robot.toml.",
+            markup=False,
+        )
+
+
+@contextmanager
+def _progress(console: Console) -> Iterator[Callable[[str], None]]:
+    """One line that changes on a terminal; elsewhere a line for each step."""
+    if console.is_terminal:
+        with console.status("reading") as status:
+            yield status.update
+        return
+    yield lambda text: console.print(text, soft_wrap=True, markup=False)

@@ -1,0 +1,105 @@
+"""`bodyschema export`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from bodyschema.cli.commands.options import AS_THEY_ARE, HERE, DatasetCalibration, RobotFile, SourceOptions, flag
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def export(
+    source: Annotated[
+        Path,
+        Parameter(
+            help="A pair store (.sqlite), a recording (.csv, .parquet), a ROS bag, a LeRobotDataset, or a robot "
+            "(extended.toml)."
+        ),
+    ],
+    out: Annotated[
+        Path,
+        Parameter(
+            help="The file; its ending says the format: .csv, .parquet, .mcap, .rrd for pairs, .xml (MJCF), .urdf, "
+            ".json (run-time correction) or .txt (settings of drivers) for a robot."
+        ),
+    ],
+    /,
+    *,
+    robot: RobotFile = HERE,
+    taken: SourceOptions = AS_THEY_ARE,
+    lerobot: DatasetCalibration = None,
+    measured: Annotated[
+        Path | None, Parameter(help="With a robot: a recording or store; prints the errors of OUT on it.")
+    ] = None,
+    force: Annotated[bool, flag("Replace OUT when it is there.")] = False,
+) -> None:
+    """Turn pairs into files of other programs, and a robot with what was found into MJCF, URDF or a correction.
+
+    A store may be in use by a running sampler. MCAP opens in Foxglove: joints and positions under `/pair`, the marker
+    under `/marker`, and as metadata what the joints were read with (servos, firmware, homing offsets).
+
+    A robot is an extended.toml that `bodyschema diagnose` wrote, or a robot.toml. What the format cannot hold is
+    printed, and stands in the file. examples/correction has programs that read the correction at run time.
+
+    Needs: for a recording robot.toml, which names its joints; for Parquet and MCAP the extra `export`
+    (`pip install 'bodyschema[export]'`), for .rrd the extra `rerun`. MuJoCo, if it is installed, replays the MJCF.
+
+    Next: `bodyschema replay` on a CSV or Parquet file; `python -m mujoco.viewer --mjcf=OUT` on an MJCF file.
+    """
+    from rich.console import Console
+
+    from bodyschema.daemon.config import Config
+    from bodyschema.interfaces.errors import RequestError
+    from bodyschema.recordings import files as recordings
+
+    console = Console(highlight=False, soft_wrap=True)
+    if source.suffix.lower() == ".toml":
+        _export_robot(source, out, measured, console, force=force)
+        return
+    if measured is not None:
+        raise RequestError("--measured goes with a robot: give an extended.toml in the place of SOURCE")
+    recordings.check_target(out, force=force)
+    if source.suffix.lower() in recordings.STORE_ENDINGS:
+        recording, devices = recordings.from_store(source), recordings.devices_of(source)
+    else:
+        recording, devices = taken.opened(Config.load(robot), source, lerobot), []
+    recordings.write(recording, out, devices)
+    console.print(f"{len(recording)} pairs written to {out}", markup=False)
+
+
+def _export_robot(source: Path, out: Path, measured: Path | None, console: Console, *, force: bool) -> None:
+    from rich.table import Table
+
+    from bodyschema.calibration.plausibility.limits import require_units
+    from bodyschema.cli.terminal import robot_export
+    from bodyschema.effects import load_simulation
+    from bodyschema.interfaces.errors import RequestError
+    from bodyschema.recordings import files as recordings
+
+    robot_export.check_target(out, force=force)
+    if measured is not None and out.suffix.lower() == robot_export.DRIVERS:
+        raise RequestError("--measured goes with a model: settings of drivers (.txt) predict nothing")
+    simulation = load_simulation(source)
+    recording = None
+    if measured is not None:
+        recording = recordings.opened(measured, simulation.robot.joints)
+        require_units(simulation.robot, recording, measured)
+    for sentence in robot_export.write(simulation, out):
+        console.print(sentence, markup=False)
+    count = len(simulation.all_effects)
+    console.print(f"{simulation.robot.name} with {count} effects written to {out}", markup=False)
+    if recording is None:
+        return
+    rows, why_not = robot_export.compared(simulation, recording, out)
+    table = Table("model", "RMS [mm]", "mean [mm]", "gain [%]", title=f"{len(recording)} rows of {measured}")
+    for row in rows:
+        gain = "" if row.gain_percent is None else f"{row.gain_percent:.1f}"
+        table.add_row(row.model, f"{row.rms_mm:.3f}", f"{row.mean_mm:.3f}", gain)
+    console.print(table)
+    if why_not is not None:
+        console.print(why_not, markup=False)

@@ -1,0 +1,90 @@
+"""`bodyschema calibrate latency`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from bodyschema.cli.commands.options import HERE, RobotFile, flag
+
+if TYPE_CHECKING:
+    from bodyschema.calibration.latency import Wiggle
+    from bodyschema.daemon.config import Config
+
+SECONDS = 5.0
+
+
+def latency(
+    recording: Annotated[
+        Path | None, Parameter(help="What an earlier call saved; else the arm and the cameras themselves.")
+    ] = None,
+    /,
+    *,
+    robot: RobotFile = HERE,
+    seconds: Annotated[
+        float, Parameter(help="How long the arm is moved [s].", validator=Number(gte=3, lte=120))
+    ] = SECONDS,
+    sim: Annotated[bool, flag("The simulated robot in the place of the hardware: to see it done.")] = False,
+    save: Annotated[Path | None, Parameter(help="Keep readings and positions in this CSV file.")] = None,
+    as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
+) -> None:
+    """Measure the latency of the cameras' time stamps, with its uncertainty. Move the arm by hand for 5 s.
+
+    Move it to and fro, quickly but unevenly, with more than one joint and the marker in sight of both cameras. The
+    estimate is the time shift at which the marker follows the joint angles best. No calibrated model is needed:
+    deviations of the arm from its URDF are fitted along.
+
+    Needs: robot.toml with encoders and cameras, and no running sampler; or a recording; or --sim.
+
+    Next: put the two printed lines into [vision.cameras].
+    """
+    from rich.console import Console
+
+    from bodyschema.calibration.latency import latency_of
+    from bodyschema.cli.hardware.wiggling import write_wiggle
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.transport.wire import encode
+
+    config = Config.load(robot)
+    console = Console(highlight=False, soft_wrap=True)
+    wiggle = _wiggle(config, recording, seconds, sim=sim)
+    if save is not None:
+        write_wiggle(wiggle, config.robot.joints, save)
+    found = latency_of(wiggle, config.robot.chain)
+    if as_json:
+        sys.stdout.write(encode(found).decode() + "\n")
+        return
+    console.print(
+        f"{found.fixes} fixes at {found.speed_m_s:.2f} m/s, {1e3 * found.residual_m:.1f} mm from where the angles "
+        f"bring the marker: images are taken {1e3 * found.latency_s:.1f} ± {1e3 * found.sigma_s:.1f} ms before their "
+        "time stamps. In [vision.cameras] write",
+        markup=False,
+    )
+    console.print(f"latency_s = {found.latency_s:.4f}", markup=False)
+    console.print(f"latency_sigma_s = {found.sigma_s:.4f}", markup=False)
+
+
+def _wiggle(config: Config, recording: Path | None, seconds: float, *, sim: bool) -> Wiggle:
+    from rich.console import Console
+
+    from bodyschema.cli.hardware.wiggling import collected, read_wiggle
+    from bodyschema.daemon.wiring.wiring import open_sources
+    from bodyschema.interfaces.errors import BodyschemaError
+
+    if recording is not None and sim:
+        raise BodyschemaError("give a recording or --sim, not both")
+    if recording is not None:
+        return read_wiggle(recording, config.robot.joints)
+    console = Console(stderr=True, highlight=False)
+    cameras = None if sim else config.tables.vision.cameras
+    known_s = 0.0 if cameras is None else cameras.latency_s
+    with open_sources(config, sim=sim) as sources, console.status("move the arm to and fro, unevenly") as status:
+        seen = collected(sources, seconds, lambda t: status.update(f"go on moving: {max(seconds - t, 0):.0f} s"))
+    for text in (*seen.health, seen.said):
+        if text:
+            console.print(text, markup=False, soft_wrap=True)
+    return seen.wiggle.with_stamps_later(known_s)  # as the camera sent them, before robot.toml's latency was subtracted

@@ -1,0 +1,173 @@
+"""`bodyschema marker`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import cyclopts
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from bodyschema.cli.commands.board_options import BY_NAME, EyeFiles
+from bodyschema.cli.commands.options import HERE, RobotFile, flag
+
+marker = cyclopts.App(
+    name="marker",
+    help="""The marker: a page of tags to print, where they are on what was built, or a ball's colour.
+
+    Needs: a printer for tags; for a ball images in the light and at the exposure of later.
+
+    Next: `bodyschema marker print`, or `bodyschema marker learn`.
+    """,
+)
+
+
+Family = Annotated[
+    Literal["apriltag_36h11", "aruco_6x6_50", "aruco_6x6_100", "aruco_6x6_250", "aruco_6x6_1000", "aruco_mip_36h12"],
+    Parameter(help="Which tags."),
+]
+
+
+@marker.command(name="print", sort_key=1)
+def print_tags(
+    *,
+    shape: Annotated[
+        Literal["tags", "plate", "cube"],
+        Parameter(help="Single tags to cut apart; a plate, flat or folded between its columns; a cube to fold."),
+    ] = "tags",
+    ids: Annotated[
+        str | None,
+        Parameter(help="Numbers of the tags, as in 0-5,9, row by row; else from 0 on.", show_default=False),
+    ] = None,
+    family: Family = "apriltag_36h11",
+    side_mm: Annotated[
+        float, Parameter(help="Side of a tag's black square [mm].", validator=Number(gte=5, lte=500))
+    ] = 40.0,
+    columns: Annotated[int, Parameter(help="Of a plate.", validator=Number(gte=1, lte=20))] = 2,
+    rows: Annotated[int, Parameter(help="Of a plate.", validator=Number(gte=1, lte=20))] = 1,
+    fold_deg: Annotated[
+        float, Parameter(help="By how much each column of a plate is folded away from the one before [°].")
+    ] = 0.0,
+    ruler_mm: Annotated[
+        float | None,
+        Parameter(
+            help="What the line below measures on the print [mm]; the tables are then of that size.",
+            validator=Number(gt=0),
+            show_default=False,
+        ),
+    ] = None,
+    paper: Annotated[str, Parameter(help="A4, A3, A2, A1, A0, letter, legal or tabloid.")] = "A4",
+    out: Annotated[Path, Parameter(help="The file to write, .pdf or .svg.")] = Path("tags.pdf"),
+) -> None:
+    """Write a page with tags in true size, and print their tables for robot.toml.
+
+    Cut along solid lines and fold along dashed ones. Print at 100 % ("actual size") and measure the two rulers. Paper
+    alone is not rigid: glue the sheet around a block, or onto a plate, with faces of the stated width. The tables hold
+    for the nominal shape; `bodyschema marker cluster` measures where the tags really are.
+
+    Needs: a printer.
+
+    Next: put the printed tables into robot.toml; `bodyschema marker cluster` for tags glued by hand.
+    """
+    from rich.console import Console
+
+    from bodyschema.cli.cameras.tag_pages import Tags, as_printed, face_mm, tables, write_tags
+
+    drawn = Tags(shape, ids, family, side_mm, columns, rows, fold_deg)
+    across, upright = write_tags(drawn, paper, out)
+    tags = drawn if ruler_mm is None else as_printed(drawn, across, ruler_mm)
+    said = f"{out} written. Print it at 100 %, then measure: the line below is {across:g} mm, the other {upright:g} mm."
+    if drawn.body is not None:
+        said += f" Each face is {face_mm(tags):.1f} mm wide."
+    Console(stderr=True, highlight=False).print(said, markup=False, soft_wrap=True)
+    sys.stdout.write(tables(tags))
+
+
+@marker.command(sort_key=2)
+def cluster(
+    images: Annotated[Path, Parameter(help="Folder with the images: left01.png and right01.png, or left/ and right/.")],
+    /,
+    *,
+    side_mm: Annotated[float, Parameter(help="Side of the black squares as measured [mm].", validator=Number(gt=0))],
+    other_sides_mm: Annotated[
+        str | None, Parameter(help="Tags of another side [mm], as in 7=25,8=25.", show_default=False)
+    ] = None,
+    calibration: Annotated[Path, Parameter(help="The calibration of the cameras.")] = Path("cameras.toml"),
+    files: EyeFiles = BY_NAME,
+    ids: Annotated[
+        str | None, Parameter(help="Numbers of its tags, as in 0-5,9; else all that are seen.", show_default=False)
+    ] = None,
+    family: Family = "apriltag_36h11",
+    as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
+) -> None:
+    """Measure the poses of a cluster's tags from images, and print its tables for robot.toml.
+
+    Take about 20 pairs of images and turn the cluster from one to the next, so that every two neighbouring tags are
+    seen together at some time. The tags' poses and all cluster poses are fitted together; the marker's frame is that of
+    the tag with the lowest number. Observations that do not fit one rigid body are left out and named.
+
+    Needs: cameras.toml, and images of those cameras; no hardware.
+
+    Next: put the printed tables into robot.toml; `bodyschema watch cameras`.
+    """
+    from rich.console import Console
+
+    from bodyschema.cli.cameras.tag_pages import numbers_of
+    from bodyschema.daemon.transport.wire import encode
+    from bodyschema.daemon.wiring.clusters import Wanted, figures, measured, said, sides_of, tables
+
+    progress = Console(stderr=True, highlight=False, soft_wrap=True)
+    numbers = None if ids is None else tuple(numbers_of(ids))
+    wanted = Wanted(family, 1e-3 * side_mm, numbers, sides_of(other_sides_mm) if other_sides_mm else {})
+    found = measured(files.of(images), calibration, wanted, lambda text: progress.print(text, markup=False))
+    if as_json:
+        sys.stdout.write(encode(figures(found)).decode() + "\n")
+        return
+    progress.print(said(found), markup=False)
+    sys.stdout.write(tables(found, wanted))
+
+
+@marker.command(sort_key=3)
+def learn(
+    *images: Annotated[Path, Parameter(help="Image files of one camera; with --auto in the order of time.")],
+    at: Annotated[
+        tuple[float, float] | None,
+        Parameter(help="Column and row of a pixel in the middle of the ball, in the first image [px]."),
+    ] = None,
+    auto: Annotated[bool, flag("Learn the colour of what moves; the camera stands still.")] = False,
+    robot: RobotFile = HERE,
+    seconds: Annotated[
+        float, Parameter(help="Without IMAGES: how long the ball is moved [s].", validator=Number(gte=1, lte=120))
+    ] = 5.0,
+) -> None:
+    """Learn a ball's colour from images, and print the table [vision.colour] for robot.toml.
+
+    With --at, the ball is the region that has the colour of that pixel and is connected to it. With --auto, give three
+    images or more in which the ball moves; the most colourful moving object is taken. With --auto and no images, the
+    robot's own cameras watch while you move the ball.
+
+    Needs: image files, no hardware; or robot.toml with cameras, and no running sampler.
+
+    Next: put the printed table into robot.toml, in place of `colour = ...`.
+    """
+    from bodyschema.daemon.wiring.markers import learnt_colour_table
+    from bodyschema.interfaces.errors import BodyschemaError
+
+    if auto == (at is not None) or (not images and not auto):
+        raise BodyschemaError("give image files and --at COLUMN ROW, or --auto; the robot's own cameras need --auto")
+    sys.stdout.write(learnt_colour_table(images, at) if images else _learnt_live(robot, seconds))
+
+
+def _learnt_live(robot: Path, seconds: float) -> str:
+    from rich.console import Console
+
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.wiring.cameras import open_eyes
+    from bodyschema.daemon.wiring.markers import moving_colour_table
+    from bodyschema.interfaces.clock import SystemClock
+
+    clock, console = SystemClock(), Console(stderr=True, highlight=False, soft_wrap=True)
+    eyes = open_eyes(Config.load(robot), clock)
+    return moving_colour_table(eyes, clock, seconds, lambda text: console.print(text, markup=False))

@@ -1,0 +1,112 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+if TYPE_CHECKING:
+    from bodyschema.daemon.config import Config
+    from bodyschema.recordings.recording import Recording
+
+HERE = Path("robot.toml")
+VARIABLE = "BODYSCHEMA_ROBOT"
+RobotFile = Annotated[Path, Parameter(env_var=VARIABLE, help="The robot's description.")]
+
+SourceRobotFile = Annotated[
+    Path | None,
+    Parameter(show_default=False, help=f"robot.toml; else the one beside the source, {VARIABLE}, or here."),
+]
+
+
+LeRobotFile = Annotated[
+    Path | None,
+    Parameter(
+        name="--lerobot", help="LeRobot's calibration file: show its homing offsets with the joint offsets found."
+    ),
+]
+
+
+DatasetCalibration = Annotated[
+    Path | None,
+    Parameter(name="--lerobot", help="Of a dataset: LeRobot's calibration file of the arm it was recorded with."),
+]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class SourceOptions:
+    """What to take from a ROS bag or a LeRobotDataset."""
+
+    joint_topic: Annotated[str | None, Parameter(help="Of a bag: the topic with the joint states.")] = None
+    marker_topic: Annotated[str | None, Parameter(help="Of a bag: the topic with the marker's positions.")] = None
+    marker_frame: Annotated[str | None, Parameter(help="Of a bag: the marker's frame, where it comes by TF.")] = None
+    markers: Annotated[
+        Path | None, Parameter(help="Of a bag or a dataset: a file with the marker's positions (t, x, y, z).")
+    ] = None
+    lerobot_unit: Annotated[
+        Literal["degrees", "range_m100_100"] | None,
+        Parameter(help="Of a dataset: the unit of its readings, where they do not show it."),
+    ] = None
+
+    marker_delay_ms: Annotated[
+        float,
+        Parameter(
+            help="Of a bag or a dataset: how late the marker's positions are stamped [ms].",
+            validator=Number(gte=-10_000, lte=10_000),
+        ),
+    ] = 0.0
+
+    def opened(self, config: Config, source: Path, lerobot: Path | None = None) -> Recording:
+        """Return the recording in `source`; `lerobot` is LeRobot's calibration of the arm of a dataset."""
+        from bodyschema.cli.recordings.foreign import Taken, opened
+
+        taken = Taken(
+            self.joint_topic,
+            self.marker_topic,
+            self.marker_frame,
+            self.markers,
+            lerobot,
+            self.lerobot_unit,
+            1e-3 * self.marker_delay_ms,
+        )
+        return opened(config, source, taken)
+
+
+AS_THEY_ARE = SourceOptions()
+
+
+def flag(text: str, *, name: str | None = None) -> Parameter:
+    """Return an option without a value, off by default."""
+    return Parameter(name=name, help=text, negative="", show_default=False)
+
+
+def several(text: str) -> Parameter:
+    """Return an option that may be given more than once; the default is no value."""
+    return Parameter(help=f"{text}; more than once for several.", negative="", show_default=False)
+
+
+def robot_file(given: Path | None, source: Path | None) -> Path:
+    """Return `given`; else the robot.toml beside `source`; else that of the environment or the working directory."""
+    if given is not None:
+        return given
+    if source is not None and (beside := source.parent / HERE).exists():
+        return beside
+    return Path(os.environ.get(VARIABLE, HERE))
+
+
+def lerobot_lines(config: Config, file: Path, offsets_rad: Mapping[str, float], *, write: bool) -> list[str]:
+    """Return what joint offsets change in LeRobot's calibration `file`, after writing it where `write` says so."""
+    from bodyschema.cli.hardware.lerobot_offsets import CorrectedCalibration, after_writing, difference
+
+    corrected = CorrectedCalibration.of(config, file, offsets_rad)
+    lines = difference(corrected)
+    if not any(change.ticks for change in corrected.changes):
+        return lines
+    return [*lines, after_writing(corrected.write()) if write else "Nothing is written without --write."]

@@ -1,0 +1,127 @@
+"""`bodyschema predict`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from bodyschema.cli.commands.options import HERE, RobotFile, flag
+
+if TYPE_CHECKING:
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.transport.wire import JointsRequest, PredictReply
+    from bodyschema.interfaces.records import FloatArray
+
+
+def predict(
+    *q: Annotated[float, Parameter(help="One value for each joint, in robot.toml's order [rad; m if it slides].")],
+    robot: RobotFile = HERE,
+    deg: Annotated[bool, flag("Angles are in degrees.")] = False,
+    as_json: Annotated[bool, flag("Print the learner's reply as it is.", name="--json")] = False,
+) -> None:
+    """Ask the learner for the marker position in the measurement frame.
+
+    Without values, reads them from standard input as JSON: one vector, or a list of them. Write negative values
+    after `--`, as in `bodyschema predict --deg -- 10 -20 30 40 0 15 5`.
+
+    Needs: a running learner (`bodyschema run` or `bodyschema learner`).
+
+    Next: the same from your own program, over zenoh: docs/zenoh.md.
+    """
+    import numpy as np
+    from rich.console import Console
+
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.transport.bus import client
+    from bodyschema.daemon.transport.keys import Keys
+    from bodyschema.daemon.transport.wire import PredictReply, decode, encode
+
+    config = Config.load(robot)
+    request = _request(q, config, deg)
+    with client(config.route("learner")) as bus:
+        payload = bus.ask_one(Keys(config.robot.name).predict, encode(request))
+    if as_json:
+        sys.stdout.write(payload.decode() + "\n")
+        return
+    _show(decode(payload, PredictReply))
+    for note in _notes(config, np.array(request.q), deg):
+        Console(highlight=False).print(note, style="yellow", markup=False)
+
+
+def _notes(config: Config, q: FloatArray, deg: bool) -> Iterator[str]:
+    """Yield remarks on joint values q (n, d) [rad, m] that the arm cannot have."""
+    import numpy as np
+
+    from bodyschema.calibration.plausibility.limits import beyond_limits, limits_text
+
+    beyond = beyond_limits(config.robot, q)
+    for joint in np.flatnonzero(beyond.any(axis=0)):
+        worst = q[beyond[:, joint], joint][np.abs(q[beyond[:, joint], joint]).argmax()]
+        unit = " m" if config.robot.chain.prismatic[joint] else " rad"
+        forgotten = "" if deg or unit == " m" else ". --deg takes degrees"
+        limits = limits_text(config.robot, int(joint))
+        yield (
+            f"{config.robot.joints[joint]} cannot be at {worst:.4g}{unit}: its limits are {limits}{forgotten}. The "
+            "answer is the model's all the same"
+        )
+
+
+def _request(values: tuple[float, ...], config: Config, deg: bool) -> JointsRequest:
+    """Return the request. RequestError if the input is not a vector of joint angles."""
+    import numpy as np
+
+    from bodyschema.daemon.transport.wire import JointsRequest, joint_angles
+    from bodyschema.interfaces.errors import RequestError
+
+    if values:
+        request = JointsRequest(list(values))
+    elif sys.stdin.isatty():
+        raise RequestError(
+            f"no joint angles; give {len(config.robot.joints)} ({', '.join(config.robot.joints)}), or JSON on stdin"
+        )
+    else:
+        request = _from_standard_input(config)
+    angles = joint_angles(request, config.robot.joints)
+    if deg:
+        turns = ~config.robot.chain.prismatic
+        angles[:, turns] = np.radians(angles[:, turns])
+    return JointsRequest(angles.tolist())
+
+
+def _from_standard_input(config: Config) -> JointsRequest:
+    from bodyschema.daemon.transport.wire import JointsRequest, decode
+    from bodyschema.interfaces.errors import RequestError
+
+    text = sys.stdin.buffer.read()
+    names = ", ".join(config.robot.joints)
+    if not text.strip():
+        raise RequestError(f"no joint angles, and standard input is empty; give {len(config.robot.joints)} ({names})")
+    try:
+        return decode(b'{"q":' + text + b"}", JointsRequest)
+    except RequestError as error:
+        wanted = f"a JSON list of {len(config.robot.joints)} numbers ({names}), or a list of such lists"
+        raise RequestError(f"standard input is not {wanted}") from error
+
+
+def _show(reply: PredictReply) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from bodyschema.cli.terminal.screen import two_digits
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for name in ("x", "y", "z", "1-sigma of x, y, z"):
+        table.add_column(Text(f"{name} [mm]"), justify="right", no_wrap=True)
+    table.add_column("", no_wrap=True)
+    for x, sigma, inside in zip(reply.x, reply.sigma, reply.in_support, strict=True):
+        spread = ", ".join(two_digits(1e3 * value) for value in sigma)
+        where = "where data was" if inside else "away from all data"
+        table.add_row(*(f"{1e3 * value:.1f}" for value in x), spread, where)
+    console = Console(highlight=False)
+    console.print(table)
+    age = "none since it started" if reply.age_s is None else f"the newest {reply.age_s:.1f} s old"
+    console.print(f"model {reply.model}, {reply.pairs} pairs learnt, {age}", style="dim")

@@ -1,0 +1,63 @@
+"""`bodyschema record`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from bodyschema.cli.commands.options import HERE, RobotFile, flag
+
+
+def record(
+    out: Annotated[Path, Parameter(help="The file; its ending .csv, .parquet, .mcap or .rrd says the format.")],
+    /,
+    *,
+    robot: RobotFile = HERE,
+    from_seq: Annotated[
+        int, Parameter(name="--from", help="Sequence number of the first pair.", validator=Number(gte=1))
+    ] = 1,
+    follow: Annotated[bool, flag("Go on with the pairs to come, until Ctrl-C.")] = False,
+    force: Annotated[bool, flag("Replace OUT when it is there.")] = False,
+) -> None:
+    """Copy the running sampler's pairs into a file.
+
+    For the store of a sampler that is not running, use `bodyschema export`.
+
+    Needs: a running sampler (`bodyschema run` or `bodyschema sampler`).
+
+    Next: `bodyschema replay` on a CSV or Parquet file.
+    """
+    from rich.console import Console
+
+    from bodyschema.cli.recordings.recorder import History, copy_history, follow_history
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.service.signals import Wishes, on_termination
+    from bodyschema.daemon.transport.bus import client
+    from bodyschema.recordings import files as recordings
+
+    recordings.check_target(out, force=force)
+    config = Config.load(robot)
+    console = Console(highlight=False, soft_wrap=True)
+    joints = config.robot.joints
+    with client(config.route("sampler")) as bus:
+        history = History(bus, config.robot, from_seq)
+        if follow:
+            wishes = Wishes()
+            with on_termination(wishes.end):
+                console.print(f"writing pairs to {out} as they come; Ctrl-C ends it", markup=False)
+                count = follow_history(history, joints, out, lambda: wishes.ending)
+        else:
+            count = copy_history(history, joints, out)
+    last = f", the last has the number {history.next_seq - 1}" if count else "; no file was left"
+    console.print(f"{count} pairs written to {out}{last}", markup=False)
+    if history.missing.count:
+        one = history.missing.count == 1
+        console.print(
+            f"{history.missing.count} pair{'' if one else 's'} between them {'is' if one else 'are'} missing "
+            f"(number{'' if one else 's'} {history.missing}): the sampler's disk changed them, or they were deleted "
+            "([daemon] keep_days, keep_mb); `bodyschema status` tells which",
+            markup=False,
+        )

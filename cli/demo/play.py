@@ -1,0 +1,193 @@
+"""Script of the demo: guide the arm, change its tool half-way, continue, and report the result."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from bodyschema.cli.terminal.screen import rejected
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.status import LearnerStatus, Outlook, SamplerStatus
+from bodyschema.daemon.transport.wire import CommandRequest, decode, encode
+from bodyschema.interfaces.errors import BusError
+
+from .judge import Judge, Verdict
+from .plot import CurveRow
+from .processes import Asker, Daemon, started_asker, started_daemon
+from .scene import Scene
+
+STALL_LIMIT_S = 60.0
+GLANCE_S = 0.5
+TOOL_LENGTH_M = 0.25
+PAIRS_BETWEEN_VERDICTS = 15
+
+
+@dataclass
+class Snapshot:
+    """The data that the view shows."""
+
+    change_after: int
+    target: int
+    asker: Asker
+    phase: str
+    sampler: SamplerStatus
+    learner: LearnerStatus
+    verdict: Verdict | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Chapter:
+    """State at the end of one part of the demo.
+
+    Attributes:
+        pairs: number of pairs learnt with this part's tool.
+        verdict: errors against the ground truth.
+        claimed_m: predicted error [m], or None.
+        claimed_rad: predicted error of the marker's orientation [rad], or None.
+        outlook: expected gain of further pairs, or None.
+    """
+
+    pairs: int
+    verdict: Verdict
+    claimed_m: float | None
+    claimed_rad: float | None
+    outlook: Outlook | None
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Result of the demo: the learning curve, and the state before and after the tool change.
+
+    `changed_at` is the number of pairs before the change.
+    """
+
+    rows: list[CurveRow]
+    first_tool: Chapter
+    second_tool: Chapter
+    changed_at: int
+    answers: int
+    unanswered: int
+
+
+def play(scene: Scene, *, first: int, second: int, seed: int, show: Callable[[Snapshot], None]) -> Outcome:
+    """Run the demo to its end.
+
+    Args:
+        first, second: pairs to learn before and after the tool change.
+        show: called with the current state about twice a second.
+
+    Raises:
+        BusError: a process did not start, died, or stopped making progress; its log has the reason.
+    """
+    config = Config.load(scene.robot_file)
+    endpoints, keys = config.tables.zenoh, Keys(config.robot.name)
+    with ExitStack() as stack:
+        daemon = stack.enter_context(started_daemon(scene))
+        daemon.wait_for(endpoints.sampler, keys.alive("sampler"))
+        daemon.wait_for(endpoints.learner, keys.alive("learner"))
+        sampler = stack.enter_context(Bus(connect=endpoints.sampler, client=True))
+        learner = stack.enter_context(Bus(connect=endpoints.learner, client=True))
+        asker = stack.enter_context(started_asker(scene, seed))
+        stage = _Stage(config, daemon, sampler, learner, asker, show, seed)
+        before = stage.learn(first, f"guided by hand, {first} pairs with the first tool", first, first + second)
+        changed_at = stage.change_tool()
+        after = stage.learn(second, "guided by hand, the tool is 250 mm longer now", first, first + second)
+        return Outcome(stage.rows, before, after, changed_at, asker.answers, asker.unanswered)
+
+
+def stalled(sampler: SamplerStatus) -> str:
+    """Return the message for a sampler that has made no pair for too long."""
+    why = ", ".join(f"{count} rejected: {reason}" for reason, count in rejected(sampler))
+    seen = f"the sampler has seen {sampler.frames} frames" + (f", {why}" if why else "")
+    return f"no new pair for {STALL_LIMIT_S:.0f} s; {seen}. More may be in daemon.log. Try another --seed or marker"
+
+
+@dataclass
+class _Stage:
+    config: Config
+    daemon: Daemon
+    sampler: Bus
+    learner: Bus
+    asker: Asker
+    show: Callable[[Snapshot], None]
+    seed: int
+    rows: list[CurveRow] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._keys = Keys(self.config.robot.name)
+        self._judge = Judge(self.config.robot, self.sampler, self.learner, self.seed)
+
+    def learn(self, pairs: int, phase: str, change_after: int, target: int) -> Chapter:
+        """Wait until the learner has learnt `pairs` pairs with the present tool."""
+        snapshot = Snapshot(change_after, target, self.asker, phase, self._sampler_status(), self._learner_status())
+        begin = snapshot.learner.pairs
+        next_verdict, progress_at = begin + 1, time.monotonic()
+        while True:
+            self.daemon.check()
+            learnt = snapshot.learner.pairs
+            snapshot.sampler, snapshot.learner = self._sampler_status(), self._learner_status()
+            if snapshot.learner.pairs != learnt:
+                progress_at = time.monotonic()
+            done = snapshot.learner.pairs >= begin + pairs
+            if done or snapshot.learner.pairs >= next_verdict:
+                snapshot.verdict = self._verdict(snapshot.learner)
+                next_verdict = snapshot.learner.pairs + PAIRS_BETWEEN_VERDICTS
+            self.asker.update()
+            self.show(snapshot)
+            if done and snapshot.verdict is not None:
+                told = snapshot.learner
+                claimed_rad = None if told.orientation is None else told.orientation.claimed_rad
+                return Chapter(told.pairs - begin, snapshot.verdict, told.claimed_error_m, claimed_rad, told.outlook)
+            if time.monotonic() - progress_at > STALL_LIMIT_S:
+                raise BusError(stalled(snapshot.sampler))
+            time.sleep(GLANCE_S)
+
+    def change_tool(self) -> int:
+        """Act as a user would: pause, change the tool, report it to the learner, resume.
+
+        Return the earlier pairs' number.
+        """
+        self._command("sampler", "pause")
+        self._judge.follow()
+        while self._learner_status().last_seq < self._judge.seen:
+            self.daemon.check()
+            time.sleep(0.05)
+        changed_at = self._judge.seen
+        marker = np.array(self.config.robot.robot.marker_xyz)
+        self._judge.change_tool(marker * (1.0 + TOOL_LENGTH_M / float(np.linalg.norm(marker))))
+        self._judge.new_region()
+        self._command("learner", "tool_changed")
+        self._command("sampler", "resume")
+        return changed_at
+
+    def _verdict(self, learner: LearnerStatus) -> Verdict | None:
+        verdict = self._judge.verdict()
+        if verdict is not None:
+            self.rows.append(
+                CurveRow(
+                    pairs=verdict.pairs,
+                    truth_m=verdict.error_m,
+                    claimed_m=learner.claimed_error_m,
+                    prequential_m=learner.prequential_m.get(learner.answering),
+                    nominal_m=verdict.nominal_m,
+                    angle_rad=verdict.angle_rad,
+                )
+            )
+        return verdict
+
+    def _sampler_status(self) -> SamplerStatus:
+        return decode(self.sampler.ask_one(self._keys.status("sampler")), SamplerStatus)
+
+    def _learner_status(self) -> LearnerStatus:
+        return decode(self.learner.ask_one(self._keys.status("learner")), LearnerStatus)
+
+    def _command(self, process: str, command: Literal["pause", "resume", "tool_changed"]) -> None:
+        bus = self.sampler if process == "sampler" else self.learner
+        bus.ask_one(self._keys.command(process), encode(CommandRequest(command)))

@@ -1,0 +1,180 @@
+"""The demo's folder: a robot.toml of its own with free ports, the robot's URDF, and what the demo leaves behind."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import socket
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from bodyschema.daemon.wiring.wiring import demonstration_model
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.robot.description import RobotDescription
+
+from .tags import cube_tables, tag_tables
+
+STATE = "state"
+# A folder with this file is a demo's, and may be emptied by the next one.
+MARK = ".bodyschema-demo"
+Bus = Literal["dynamixel", "feetech", "serial", "ros2"]
+Marker = Literal["ball", "tag", "cluster"]
+Camera = Literal["stereo", "mono"]
+# Of the simulation's ball.
+BALL_RADIUS_M = 0.02
+# Light ones in the neck, strong ones in the shoulder.
+DYNAMIXEL = {
+    "neck_yaw": "XL330-M288",
+    "neck_pitch": "XL330-M288",
+    "shoulder_flexion": "XM540-W270",
+    "shoulder_abduction": "XM540-W270",
+    "upperarm_rotation": "XM430-W350",
+    "elbow_flexion": "XM430-W350",
+    "forearm_rotation": "XM430-W350",
+}
+FEETECH = {joint: "STS3250" if joint.startswith("shoulder") else "STS3215" for joint in DYNAMIXEL}
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """Paths of the files of one demo."""
+
+    folder: Path
+
+    @property
+    def robot_file(self) -> Path:
+        """The robot's description with the demo's ports and seed."""
+        return self.folder / "robot.toml"
+
+    @property
+    def log_file(self) -> Path:
+        """Log of the two processes."""
+        return self.folder / "daemon.log"
+
+    @property
+    def store_file(self) -> Path:
+        """The sampler's pairs."""
+        return self.folder / STATE / "pairs.sqlite"
+
+    @property
+    def recording_file(self) -> Path:
+        """All accepted pairs."""
+        return self.folder / "recording.csv"
+
+    @property
+    def first_tool_file(self) -> Path:
+        """The pairs with the first tool alone, which one model can explain."""
+        return self.folder / "first_tool.csv"
+
+    @property
+    def curve_file(self) -> Path:
+        """The learning curve as numbers."""
+        return self.folder / "learning_curve.csv"
+
+    @property
+    def plot_file(self) -> Path:
+        """The learning curve as a picture."""
+        return self.folder / "learning_curve.svg"
+
+
+def prepare(
+    folder: Path, seed: int, *, bus: Bus | None = None, marker: Marker = "ball", camera: Camera = "stereo"
+) -> Scene:
+    """Lay out the demo's folder; what an earlier demo left there is replaced.
+
+    Args:
+        bus: what the joints are read through, from a bench.
+        marker: what is in the hand.
+        camera: the stereo pair, or its left eye alone.
+
+    Raises:
+        ConfigError: the folder is neither empty nor a demo's, or cannot be written.
+    """
+    model = demonstration_model()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        found = sorted(path.name for path in folder.iterdir())
+        if found and MARK not in found:
+            raise ConfigError(f"holds {found[0]!r}, and no demo was here", file=folder, remedy="Give another --out")
+        for path in list(folder.iterdir()):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        (folder / MARK).touch()
+        for path in model.parent.iterdir():
+            if path.suffix in {".urdf", ".toml"}:
+                shutil.copyfile(path, folder / path.name)
+        scene = Scene(folder.resolve())
+        scene.robot_file.write_text(
+            _described(model, camera) + _own_tables(seed, bus) + _marker(marker, model), encoding="utf-8"
+        )
+    except OSError as error:
+        raise ConfigError(
+            f"cannot be written: {error.strerror}", file=folder, remedy="Give another --out or free some space"
+        ) from error
+    return scene
+
+
+def _described(model: Path, camera: Camera) -> str:
+    """Return the robot.toml shipped with the model, reduced to one eye if there is only one camera."""
+    text = model.read_text(encoding="utf-8")
+    return text if camera == "stereo" else re.sub(r"(?m)^baseline_m = .*$", "eyes = 1", text)
+
+
+def _own_tables(seed: int, bus: Bus | None) -> str:
+    sampler, learner = _free_ports(2)
+    bench = "" if bus is None else f"servo_bench = true\n{_joints(bus)}"
+    return f"""
+[zenoh]
+sampler = "tcp/127.0.0.1:{sampler}"
+learner = "tcp/127.0.0.1:{learner}"
+
+[daemon]
+state_dir = "{STATE}"
+
+[sim]
+seed = {seed}
+{bench}"""
+
+
+def _marker(marker: Marker, model: Path) -> str:
+    """Return the [vision] tables for the marker in the hand."""
+    towards_hand = -np.array(RobotDescription.load(model).robot.marker_xyz)
+    match marker:
+        case "ball":
+            return f"\n[vision]\nradius_m = {BALL_RADIUS_M}\n"
+        case "tag":
+            return tag_tables(towards_hand)
+        case "cluster":
+            return cube_tables(towards_hand)
+
+
+def _joints(bus: Bus) -> str:
+    """Return the [drivers] tables for the arm's joints on this kind of bus."""
+    match bus:
+        case "dynamixel":
+            return _servos("dynamixel", DYNAMIXEL)
+        case "feetech":
+            return _servos("feetech", FEETECH)
+        case "serial":
+            encoders = (f'[[drivers.serial_lines.encoders]]\njoint = "{joint}"\n' for joint in DYNAMIXEL)
+            return "\n".join(["", "[drivers.serial_lines]", 'port = "bus"', "", *encoders])
+        case "ros2":
+            return "\n[drivers.ros2]\n"
+
+
+def _servos(make: str, models: Mapping[str, str]) -> str:
+    lines = ["", f"[drivers.{make}.buses.arm]", 'port = "bus"']
+    for id, (joint, model) in enumerate(models.items(), 1):
+        lines += ["", f"[[drivers.{make}.servos]]", f'joint = "{joint}"', f"id = {id}", f'model = "{model}"']
+    return "\n".join(lines) + "\n"
+
+
+def _free_ports(count: int) -> list[int]:
+    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
+    ports = [server.getsockname()[1] for server in sockets]
+    for server in sockets:
+        server.close()
+    return ports

@@ -1,0 +1,1 @@
+"""Scan and watch the joints of an arm, and describe it."""

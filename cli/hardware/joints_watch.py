@@ -1,0 +1,299 @@
+"""Watch an arm's joints while a person moves them: positions, ranges, and the motion that the URDF predicts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Protocol, Self, runtime_checkable
+
+import msgspec
+import numpy as np
+
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.sampler.reconnect import Reopening
+from bodyschema.daemon.transport.status import JointRange
+from bodyschema.interfaces.protocols import Clock, JointSource
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.urdf import chain_between
+from kbmaps import RigidChain
+
+READ_S = 0.1
+SPEED_OVER_S = 0.1
+TEMPERATURE_EVERY_S = 0.5  # one servo in turn
+MOVED_RAD = math.radians(3.0)
+STILL_RAD = math.radians(0.5)
+STILL_S = 1.0
+BEYOND = 0.01  # [rad or m]: elasticity of a stop, resolution of an encoder
+SEEN_M = 0.01  # a marker that moved less shows no direction
+WORDS = (("forward", "back"), ("left", "right"), ("up", "down"))  # REP 103: x, y, z
+
+
+class Sample(Protocol):
+    """A servo's sample; see `drivers.dynamixel.channel.Sample`."""
+
+    @property
+    def velocity(self) -> float: ...
+    @property
+    def current(self) -> float | None: ...
+
+
+class Fitted(Protocol):
+    """An identified servo; see `bodyschema.drivers.servos.handshake.FittedServo`."""
+
+    @property
+    def id(self) -> int: ...
+    @property
+    def direction(self) -> int: ...
+
+
+class EncoderJoints(JointSource, Protocol):
+    """A real arm's encoders, which report their health.
+
+    See `bodyschema.drivers.serial_lines.joints.SerialLineJoints`.
+    """
+
+    @property
+    def health(self) -> tuple[str, ...]: ...
+
+
+@runtime_checkable
+class ServoJoints(EncoderJoints, Protocol):
+    """Encoders that are servos; see `bodyschema.drivers.servos.joints.ServoJoints`."""
+
+    @property
+    def servos(self) -> Sequence[Fitted]: ...
+
+    @property
+    def samples(self) -> Mapping[str, Sample | None]: ...
+    @property
+    def drives(self) -> Sequence[object]: ...
+    def temperature_c(self, joint: str) -> float | None: ...
+
+
+class JointState(msgspec.Struct, frozen=True):
+    """Current state of one joint.
+
+    Attributes:
+        id: ID of its servo; None if it has none.
+        angle: [rad], as in q of the pairs.
+        velocity: [rad/s]. current: [A], None where it is not measured. temperature_c: None until known.
+        low, high: range since the start [rad].
+        lower, upper: the URDF's limits [rad].
+        within_limits: True if it has always been within them; a wrong sign or zero shows here.
+    """
+
+    joint: str
+    id: int | None
+    angle: float
+    velocity: float
+    current: float | None
+    temperature_c: float | None
+    low: float
+    high: float
+    lower: float
+    upper: float
+    within_limits: bool
+
+    @property
+    def range(self) -> JointRange:
+        """The part of its limits that it has covered."""
+        return JointRange(self.low, self.high, self.lower, self.upper)
+
+
+class Seen(msgspec.Struct, frozen=True):
+    """Current state of the arm.
+
+    Attributes:
+        moved: the joint moved last, and the marker motion predicted by the URDF; empty before that.
+        health: problems of the servos.
+        trouble: reason why nothing can be read at present, or None.
+        signs_in: where the signs and zeros of the joints are set.
+    """
+
+    joints: tuple[JointState, ...]
+    moved: str
+    health: tuple[str, ...]
+    trouble: str | None
+    signs_in: str
+
+
+class JointsWatch:
+    """Reads an arm, and keeps the ranges seen so far."""
+
+    def __init__(self, config: Config, source: EncoderJoints, clock: Clock) -> None:
+        """Store the settings; nothing is opened yet."""
+        self._robot, self._source, self._clock = config.robot, source, clock
+        self._servos = source if isinstance(source, ServoJoints) else None
+        drivers = config.tables.drivers
+        self._signs_in = signs_in(is_ros2=drivers.ros2 is not None, is_plugin=drivers.plugin is not None)
+        self._reading = Reopening(source, "the encoders", clock)
+        self._opened = ExitStack()
+        self._temperatures: dict[str, float | None] = dict.fromkeys(config.robot.joints)
+        self._asked, self._next_s = 0, -math.inf
+        self._q: FloatArray | None = None
+        self._low = self._high = np.zeros(len(config.robot.joints))
+        self._speeds = Speeds(len(config.robot.joints))
+        self._signs = SignCheck(config.robot)
+
+    def __enter__(self) -> Self:
+        self._opened.enter_context(self._reading)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._opened.close()
+
+    def look(self) -> Seen | None:
+        """Read once and return the state; None until all joints are known."""
+        reading = self._reading.read(READ_S)
+        if reading is not None:
+            self._low = reading.q if self._q is None else np.minimum(self._low, reading.q)
+            self._high = reading.q if self._q is None else np.maximum(self._high, reading.q)
+            self._q = reading.q
+            self._speeds.take(reading.t, reading.q)
+            self._signs.take(reading.t, reading.q)
+            self._feel_one()
+        has_all = self._servos is not None or self._speeds.are_known
+        return self._seen(self._q) if self._q is not None and has_all else None
+
+    def look_all_over(self) -> Seen | None:
+        """Call `look` until each servo was queried for its health."""
+        return [self.look() for _ in self._robot.joints][-1]
+
+    def know_temperatures(self) -> None:
+        """Query all temperatures."""
+        if self._servos is not None:
+            for joint in self._temperatures:
+                self._temperatures[joint] = self._servos.temperature_c(joint)
+
+    def _feel_one(self) -> None:
+        if self._servos is None or self._clock.now() < self._next_s:
+            return
+        joint = self._robot.joints[self._asked % len(self._robot.joints)]
+        self._temperatures[joint] = self._servos.temperature_c(joint)
+        self._asked += 1
+        self._next_s = self._clock.now() + TEMPERATURE_EVERY_S
+
+    def _seen(self, q: FloatArray) -> Seen:
+        joints = tuple(self._joint(place, float(angle)) for place, angle in enumerate(q))
+        return Seen(joints, self._signs.said, self._source.health, self._reading.trouble, self._signs_in)
+
+    def _joint(self, place: int, angle: float) -> JointState:
+        name = self._robot.joints[place]
+        servo = None if self._servos is None else self._servos.servos[place]
+        sample = None if self._servos is None else self._servos.samples.get(name)
+        told = None if servo is None or sample is None else servo.direction * sample.velocity
+        low, high = float(self._low[place]), float(self._high[place])
+        lower, upper = float(self._robot.lower[place]), float(self._robot.upper[place])
+        return JointState(
+            joint=name,
+            id=None if servo is None else servo.id,
+            angle=angle,
+            velocity=float(self._speeds.v[place]) if told is None else told,
+            current=None if sample is None else sample.current,
+            temperature_c=self._temperatures[name],
+            low=low,
+            high=high,
+            lower=lower,
+            upper=upper,
+            within_limits=lower - BEYOND <= low and high <= upper + BEYOND,
+        )
+
+
+def signs_in(*, is_ros2: bool, is_plugin: bool) -> str:
+    """Return where the signs and zeros of the joints are set, for messages."""
+    if is_ros2:
+        return "[drivers.ros2.names] or the URDF: ROS 2 gives the angles with their signs and zeros"
+    if is_plugin:
+        return "the settings of its driver, or the URDF"
+    return "direction and zero_ticks in robot.toml: direction = -1 turns it round"
+
+
+class Speeds:
+    """Velocities of joints whose encoders do not report them.
+
+    Attributes:
+        v: over the last tenth of a second or more [rad/s], shape (d,).
+        are_known: True once the joints were observed long enough.
+    """
+
+    def __init__(self, d: int) -> None:
+        """Start at rest."""
+        self.v: FloatArray = np.zeros(d)
+        self.are_known = False
+        self._t, self._q = -math.inf, self.v
+
+    def take(self, t: float, q: FloatArray) -> None:
+        """Add the joint angles `q` (d,) [rad] at `t` [s]."""
+        passed = t - self._t
+        if passed < SPEED_OVER_S:
+            return
+        if math.isfinite(passed):
+            self.v, self.are_known = (q - self._q) / passed, True
+        self._t, self._q = t, q
+
+
+@dataclass(frozen=True, slots=True)
+class _Rest:
+    t: float
+    q: FloatArray
+
+
+class SignCheck:
+    """Predicts by the URDF where the marker went when one joint was moved, for the user to compare.
+
+    Attributes:
+        said: the prediction in words, for the joint moved last; empty before.
+    """
+
+    def __init__(self, robot: RobotDescription) -> None:
+        """Start at rest."""
+        self._robot, self._chain = robot, _from_parent(robot)
+        self._begin: FloatArray | None = None
+        self._rest: _Rest | None = None
+        self.said = ""
+
+    def take(self, t: float, q: FloatArray) -> None:
+        """Add the joint angles `q` (d,) [rad] at `t` [s]."""
+        if self._begin is None:
+            self._begin = q
+        if self._rest is None or np.abs(q - self._rest.q).max() > STILL_RAD:
+            self._rest = _Rest(t, q)
+        moved = q - self._begin
+        place = int(np.abs(moved).argmax())
+        if abs(moved[place]) > MOVED_RAD:
+            self.said = self._sentence(place, self._begin, float(moved[place]))
+        if t - self._rest.t > STILL_S:  # at rest: what follows is another move
+            self._begin = q
+
+    def _sentence(self, place: int, begin: FloatArray, moved: float) -> str:
+        joint, turn = self._robot.joints[place], f"{math.degrees(moved):+.0f}°"
+        end = begin.copy()
+        end[place] += moved
+        went = self._chain.positions(end[None])[0] - self._chain.positions(begin[None])[0]
+        axis = int(np.abs(went).argmax())
+        if abs(went[axis]) < SEEN_M:
+            way = "counter-clockwise" if moved > 0 else "clockwise"
+            return f"{joint} {turn}: by the URDF it turned {way}, its axis pointing at you"
+        word, sign = WORDS[axis][int(went[axis] < 0)], "+-"[int(went[axis] < 0)]
+        parent = self._robot.camera.parent_link
+        return f"{joint} {turn}: by the URDF the marker went {word} ({sign}{'xyz'[axis]} of {parent})"
+
+
+def _from_parent(robot: RobotDescription) -> RigidChain:
+    """Return the chain from the link that carries the cameras to the marker."""
+    section = robot.robot
+    return chain_between(
+        robot.tree,
+        section.joints,
+        section.held_at,
+        start=robot.camera.parent_link,
+        end=section.marker_link,
+        T_start_camera=np.eye(4),
+        marker_xyz=np.array(section.marker_xyz),
+    )

@@ -1,0 +1,179 @@
+"""A robot.toml for an arm of LeRobot: its joints, servos, IDs and zeros, from a URDF and LeRobot's calibration."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from bodyschema.daemon.wiring.servos import KnownModel, Servos, known_models
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.robot.lerobot import (
+    ARMS,
+    RAD_PER_TICK,
+    Calibrations,
+    JointServo,
+    LeRobotArm,
+    Make,
+    read_calibration,
+)
+from bodyschema.robot.suggest import did_you_mean
+from bodyschema.robot.urdf import MOVING, UrdfTree
+
+from .robot_template import guess_of, key_name, quoted, robot_toml
+from .scan_report import ScannedPort
+
+BAUD = 1_000_000
+# Where the middle of a joint's limits is nearer to 0 than this, 0 is meant to be the middle: the URDF of SO-101 has
+# wrist_roll from -157° to 163°, and LeRobot's own kinematics gives it the degrees as they are.
+MIDDLE_WITHIN_RAD = math.radians(5.0)
+Scan = Callable[[Sequence[int]], Sequence[ScannedPort]]
+
+
+@dataclass(frozen=True, slots=True)
+class LeRobotServo:
+    """The servo of a joint.
+
+    Attributes:
+        middle_rad: the joint's angle where LeRobot reads 0° [rad].
+    """
+
+    joint: str
+    id: int
+    model: str
+    direction: int
+    zero_ticks: float
+    middle_rad: float
+
+
+def lerobot_arm(name: str) -> LeRobotArm:
+    """Return the arm that LeRobot calls `name`; ConfigError where its motors are not known."""
+    if name not in ARMS:
+        raise ConfigError(f"--lerobot {name}: the motors of this arm are not known", remedy=did_you_mean(name, ARMS))
+    return ARMS[name]
+
+
+def lerobot_robot_toml(
+    arm: LeRobotArm, urdf: Path, robot: Path, calibration: Path, port: str, cameras: Sequence[str] = ()
+) -> str:
+    """Return the text of a robot.toml for `arm`.
+
+    Args:
+        robot: the file that is to be written; the URDF is named relative to it.
+        calibration: LeRobot's file of this arm.
+        port: where its servos are.
+
+    Raises:
+        ConfigError: the URDF has other joints, or the calibration is not of this arm.
+    """
+    tree = UrdfTree.load(urdf)
+    guess = guess_of(tree, os.path.relpath(urdf, robot.parent), _end(tree, arm.joints))._replace(
+        name=key_name(calibration.stem)
+    )
+    servos = _servos(arm, tree, read_calibration(calibration, arm.joints), calibration)
+    return robot_toml(guess, cameras) + _servo_tables(arm, servos, calibration, port)
+
+
+def lerobot_port(arm: LeRobotArm, scan: Scan) -> str:
+    """Return the only port that has all motors of `arm`.
+
+    Raises:
+        ConfigError: none or more than one has.
+    """
+    wanted = {(arm.id(name), arm.models[name]) for name in arm.joints}
+    scanned = scan([BAUD])
+    found = [bus.port for bus in scanned if wanted <= {(servo.id, servo.model) for servo in bus.servos}]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise ConfigError(
+            f"such arms are on {' and '.join(found)}", remedy="Give --port with the one to take, leader or follower"
+        )
+    looked = ", ".join(f"{bus.port} has {_ids(bus)}" for bus in scanned)
+    raise ConfigError(
+        f"no port has servos {', '.join(f'ID {id} ({model})' for id, model in sorted(wanted))}: {looked}",
+        remedy="Switch the arm's supply on, or give --port",
+    )
+
+
+def joint_servos(servos: Servos) -> list[JointServo]:
+    """Return how each joint is read, from the servos of robot.toml."""
+    known, found = known_models(), list[JointServo]()
+    for servo in servos.servos:
+        model = known[servo.model]
+        zero = model.zero_ticks if servo.zero_ticks is None else servo.zero_ticks
+        found.append(JointServo(servo.joint, _make(model), servo.direction, zero))
+    return found
+
+
+def _make(model: KnownModel) -> Make:
+    return "feetech" if model.table.endswith("feetech") else "dynamixel"
+
+
+def _ids(bus: ScannedPort) -> str:
+    return ", ".join(f"ID {servo.id} ({servo.model})" for servo in bus.servos) or "none"
+
+
+def _end(tree: UrdfTree, joints: Sequence[str]) -> str:
+    """Return the link that the last of `joints` moves, and no joint beyond it; the farthest of them."""
+    missing = [joint for joint in joints if joint not in tree.joints]
+    if missing:
+        raise ConfigError(
+            f"has no joint {', '.join(missing)}; it has {', '.join(tree.joints)}",
+            file=tree.file,
+            remedy="Rename the URDF's joints to LeRobot's motors",
+        )
+    start, ends = tree.joints[joints[-1]].child, list[tuple[int, str]]()
+    for link in tree.links:
+        way = tree.path(start, link)
+        if all(not upward and joint.kind not in MOVING for joint, upward in way):
+            ends.append((len(way), link))
+    return max(ends, key=lambda end: end[0])[1]
+
+
+def _servos(arm: LeRobotArm, tree: UrdfTree, calibrations: Calibrations, file: Path) -> list[LeRobotServo]:
+    found: list[LeRobotServo] = []
+    for name in arm.joints:
+        joint, motor = tree.joints[name], calibrations[name]
+        if motor.id != arm.id(name):
+            raise ConfigError(
+                f"{name} has ID {motor.id}, and LeRobot gives it ID {arm.id(name)}",
+                file=file,
+                remedy="Give the calibration of this kind of arm",
+            )
+        direction = -1 if arm.make == "feetech" and motor.drive_mode else 1
+        middle = (joint.lower + joint.upper) / 2
+        middle = 0.0 if abs(middle) < MIDDLE_WITHIN_RAD else middle
+        zero = motor.middle - direction * middle / RAD_PER_TICK
+        zero = zero if middle == 0.0 else round(zero)
+        found.append(LeRobotServo(name, motor.id, arm.models[name], direction, zero, middle))
+    return found
+
+
+def _servo_tables(arm: LeRobotArm, servos: Sequence[LeRobotServo], calibration: Path, port: str) -> str:
+    table = f"drivers.{arm.make}"
+    lines = [
+        "",
+        f"# The servos, with IDs and zeros from LeRobot's {calibration.name}: 0 is the middle of the recorded range.",
+        "# CHECK directions with `bodyschema joints`: move a joint, and look where its angle goes.",
+        f"[{table}.buses.arm]",
+        f"port = {quoted(port)}",
+        f"baud = {BAUD:_}",
+        "",
+    ]
+    for servo in servos:
+        check = ""
+        if servo.middle_rad:
+            check = f"  # CHECK: taken from the middle of the URDF's limits, {math.degrees(servo.middle_rad):.0f}°"
+        lines += [
+            f"[[{table}.servos]]",
+            f"joint = {quoted(servo.joint)}",
+            f"id = {servo.id}",
+            f"model = {quoted(servo.model)}",
+            f"direction = {servo.direction}",
+            f"zero_ticks = {servo.zero_ticks:.5g}{check}",
+            "",
+        ]
+    return "\n".join(lines)

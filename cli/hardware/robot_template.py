@@ -1,0 +1,165 @@
+"""The robot.toml that `bodyschema config init` writes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from bodyschema.robot.urdf import UrdfTree
+
+
+class Guess(NamedTuple):
+    """Description of a robot guessed from its URDF, for the user to correct."""
+
+    name: str
+    urdf: str
+    joints: list[str]
+    marker_link: str
+    camera_link: str
+
+
+EXAMPLE = Guess("my_robot", "my_robot.urdf", ["joint_1", "joint_2"], "hand", "base_link")
+
+_TEMPLATE = """\
+# A robot for bodyschema. Mend what is marked CHECK, then type `bodyschema config check`.
+
+[robot]
+# Part of the zenoh keys: letters, digits, _ . -
+name = {name}
+# Relative to this file.
+urdf = {urdf}
+# CHECK: the joints between camera and marker that are read and learnt, in the order from the camera to the marker.
+joints = {joints}
+# CHECK: the link that carries the marker, and the marker's centre in it [m].
+marker_link = {marker_link}
+marker_xyz = [0.0, 0.0, 0.0]
+# true once marker_xyz was measured; false fits it first.
+marker_known = false
+# Who bears the arm's weight: torque_free | zero_force | held
+hold = "torque_free"
+
+# The measurement frame: the left optical frame, x right, y down, z forward.
+[camera]
+# CHECK: the link the cameras stand on, or ride on (a head).
+parent_link = {camera_link}
+# CHECK: pose of the left optical frame in it [m, rad], as in URDF; this rpy looks along the link's x axis.
+xyz = [0.0, 0.0, 0.0]
+rpy = [-1.5707963267948966, 0.0, -1.5707963267948966]
+# true once the pose was measured; false fits it first.
+pose_known = false
+# The rectified stereo pair, from its calibration; all or none. One camera alone: eyes = 1, and no baseline_m.
+# focal_px = 600.0
+# principal_point_px = [319.5, 239.5]
+# baseline_m = 0.09
+# image_size_px = [640, 480]
+
+# Where the two processes listen; this machine only, unless you say otherwise.
+[zenoh]
+sampler = "tcp/127.0.0.1:7447"
+learner = "tcp/127.0.0.1:7448"
+
+[daemon]
+# Store and checkpoint; else $XDG_STATE_HOME/bodyschema/<name>.
+# state_dir = "state"
+# Neighbouring pairs are this far apart in joint space; farther starts a new segment.
+min_step_deg = 1.0
+max_step_deg = 3.0
+
+[drivers]
+# Played in the place of encoders and camera; or start with --sim.
+# recording = "recording.csv"
+
+[vision]
+# red, orange, yellow, green, cyan, blue, magenta, or a band of hues as the table [vision.colour].
+colour = "red"
+# Of the marker ball [m].
+radius_m = 0.020
+
+# CHECK: the cameras; `bodyschema scan` names those that are plugged in, docs/cameras.md tells the rest.
+{cameras}"""
+
+_CAMERAS = """\
+[vision.cameras]
+# calibration = "cameras.toml"   # as `bodyschema calibrate cameras` wrote it; without it images are rectified already
+# latency_s = 0.0                # as `bodyschema calibrate latency` says, with its latency_sigma_s
+# One camera alone is the table [vision.cameras.one] with device in the place of left and right: docs/one_camera.md.
+[vision.cameras.two]
+left = {left}
+right = {right}
+image_size_px = [640, 480]
+fps = 30.0
+# exposure_s = 0.005             # a short one: a moving ball blurs. Without a value the camera chooses.
+# gain = 64
+# white_balance_k = 4600
+# focus = 0
+"""
+_EXAMPLES = "/dev/v4l/by-id/usb-LEFT-video-index0", "/dev/v4l/by-id/usb-RIGHT-video-index0"
+
+
+def robot_toml(guess: Guess, cameras: Sequence[str] = ()) -> str:
+    """Return the text of a commented robot.toml; with two cameras or more, the first two are its eyes."""
+    joints = "[" + ", ".join(quoted(joint) for joint in guess.joints) + "]"
+    return _TEMPLATE.format(
+        name=quoted(guess.name),
+        urdf=quoted(guess.urdf),
+        joints=joints,
+        marker_link=quoted(guess.marker_link),
+        camera_link=quoted(guess.camera_link),
+        cameras=_camera_tables(cameras),
+    )
+
+
+def _camera_tables(cameras: Sequence[str]) -> str:
+    """Return the cameras' tables; with fewer than two cameras, an example that is commented out."""
+    left, right = map(quoted, cameras[:2] if len(cameras) >= 2 else _EXAMPLES)
+    text = _CAMERAS.format(left=left, right=right)
+    if len(cameras) >= 2:
+        return text
+    return "".join(line if line.startswith("#") else f"# {line}" for line in text.splitlines(keepends=True))
+
+
+def quoted(text: str) -> str:
+    """Return `text` as a TOML string."""
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'
+
+
+def guess_from(urdf: Path, robot: Path) -> Guess:
+    """Guess the chain with the most moving joints in `urdf`, from its root to the last link fixed to its end.
+
+    Args:
+        robot: path of the robot.toml to be written; the URDF is named relative to it.
+
+    Raises:
+        RobotError: the URDF cannot be read.
+    """
+    from bodyschema.robot.urdf import MOVING, UrdfTree
+
+    tree = UrdfTree.load(urdf)
+    root = _root(tree)
+    paths = {link: [joint for joint, _ in tree.path(root, link)] for link in tree.links}
+    moving = {link: sum(joint.kind in MOVING for joint in path) for link, path in paths.items()}
+    end = max(tree.links, key=lambda link: (moving[link], len(paths[link])))
+    return guess_of(tree, os.path.relpath(urdf, robot.parent), end)
+
+
+def guess_of(tree: UrdfTree, urdf: str, end: str) -> Guess:
+    """Return the chain of moving joints from the root of `tree` to the link `end`."""
+    from bodyschema.robot.urdf import MOVING
+
+    root = _root(tree)
+    joints = [joint.name for joint, _ in tree.path(root, end) if joint.kind in MOVING]
+    return Guess(key_name(tree.name), urdf, joints, end, root)
+
+
+def key_name(text: str) -> str:
+    """Return `text` as a robot's name, which is part of the zenoh keys."""
+    return "".join(c if c.isascii() and (c.isalnum() or c in "_.-") else "_" for c in text).lstrip(".-") or "robot"
+
+
+def _root(tree: UrdfTree) -> str:
+    children = {joint.child for joint in tree.joints.values()}
+    return next(link for link in tree.links if link not in children)

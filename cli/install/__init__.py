@@ -1,0 +1,1 @@
+"""Install services, udev rules and routers; back up and restore."""

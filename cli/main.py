@@ -1,0 +1,209 @@
+"""The command `bodyschema`. Commands are imported when they run, so that `--help` is fast."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import sys
+
+try:
+    import resource
+    import shutil
+    from typing import NoReturn
+
+    import cyclopts
+
+    from bodyschema.daemon.service.remedies import as_typed, printable
+    from bodyschema.daemon.service.signals import end_with_parent
+    from bodyschema.interfaces.errors import BodyschemaError, ConfigError
+    from bodyschema.interfaces.extras import missing_module
+except KeyboardInterrupt:  # loading takes a quarter of a second, in which no `main` can catch it
+    sys.exit(130)
+
+GROUPS = {
+    "Start": {
+        "demo": "Learn a simulated arm from scratch, in about a minute.",
+        "config": "Write, check or show robot.toml: begin here.",
+        "robot": "Write robot.toml for the servos that a scan found.",
+        "doctor": "Check ports, servos, disk, clock and network.",
+    },
+    "Calibrate and diagnose": {
+        "calibrate": "Calibrate arm, hand-eye and tool, or stereo cameras.",
+        "diagnose": "Find what the simulation gets wrong, and the causes.",
+        "replay": "Learn from a recording; report the held-out error.",
+        "simulate": "Predict the marker for recorded joint angles.",
+        "compare": "Compare two recordings row by row.",
+        "board": "Print a board for camera calibration.",
+        "marker": "Print tags, measure a cluster, learn a ball's colour.",
+        "reproduce": "Run the paper's experiments again.",
+    },
+    "Run": {
+        "run": "Start sampler and learner, and keep them running.",
+        "sampler": "Run the sampler: encoders and cameras in, pairs out.",
+        "learner": "Run the learner: pairs in, predictions out.",
+        "status": "Show the state of sampler and learner.",
+        "view": "Serve a live page: errors, next poses, controls.",
+        "predict": "Predict the marker position at given joint angles.",
+        "ik": "Find joint angles that bring the marker to a position.",
+        "command": "Pause, resume, report a tool change, reset.",
+        "install": "Install systemd services, or udev rules.",
+        "router": "Run the zenoh router that connects several machines.",
+    },
+    "Hardware": {
+        "scan": "Find servos on all ports, rates and protocols.",
+        "joints": "Show joint angles live: signs, ranges, health.",
+        "watch": "Show what the cameras and the tracker see.",
+        "servos": "Read and write servo EEPROM settings, with undo.",
+        "bench": "Emulate the servos of robot.toml on a port.",
+    },
+    "Data and fleet": {
+        "record": "Save the running sampler's pairs to a file.",
+        "export": "Convert pairs or a robot: CSV, Parquet, MCAP, MJCF, URDF.",
+        "backup": "Save pairs, checkpoint and robot.toml to one file.",
+        "restore": "Restore a backup; nothing is overwritten unasked.",
+        "fleet": "Monitor and diagnose many robots.",
+    },
+}
+COMMANDS = {name: summary for group in GROUPS.values() for name, summary in group.items()}
+# One object each: commands that are apps keep theirs, and two of the same name are refused.
+_SECTIONS = {title: cyclopts.Group(title, sort_key=place) for place, title in enumerate(GROUPS)}
+
+
+# Each paragraph is one line: the terminal's width wraps it.
+_HELP = """Calibrate a robot arm by moving it by hand in front of a camera.
+
+Joint encoders and a stereo camera give samples. A learner turns them into the forward kinematics that the camera \
+sees, hand-eye and tool included.
+
+New here? Type: bodyschema demo. Each command's --help says what it needs and what comes next."""
+
+
+def command_line(called: str | None = None) -> cyclopts.App:
+    """Return the command line.
+
+    Args:
+        called: the command whose own help page may be requested. A summary given here would replace that page, so this
+            command is registered without one and shows its function's docstring.
+    """
+    line = cyclopts.App(
+        name="bodyschema",
+        help=_HELP,
+        version=_version,
+        help_format="markdown" if called in COMMANDS else "plaintext",  # rendering markdown takes 0.1 s of CPU
+    )
+    line["--help"].group = line["--version"].group = cyclopts.Group("Options", sort_key=len(GROUPS))
+    for title, commands in GROUPS.items():
+        group = _SECTIONS[title]
+        for order, (name, summary) in enumerate(commands.items()):
+            own = None if name == called else summary
+            line.command(f"bodyschema.cli.commands.{name}:{name}", name=name, help=own, group=group, sort_key=order)
+    return line
+
+
+def _version() -> str:
+    from importlib.metadata import version
+
+    return version("bodyschema")
+
+
+app = command_line()
+
+# A learner with two neighbours opens 26 files, one of fifty robots 200. Libraries abort when they cannot open more.
+FEWEST_FILES, ENOUGH_FILES = 64, 1024
+RAISE_LIMIT = "`ulimit -n 1024` in the shell, or LimitNOFILE=1024 in the unit, allows more"
+
+
+def allow_enough_files() -> None:
+    """Raise this process's limit of open files to `ENOUGH_FILES`, as far as the system permits.
+
+    Raises:
+        ConfigError: the process may open fewer than `FEWEST_FILES`.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    allowed = ENOUGH_FILES if hard == resource.RLIM_INFINITY else min(hard, ENOUGH_FILES)
+    if allowed < FEWEST_FILES:
+        raise ConfigError(f"this process may open {hard} files and needs {FEWEST_FILES}", remedy=RAISE_LIMIT)
+    if soft != resource.RLIM_INFINITY and soft < allowed:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
+
+
+# Help pages put text beside names: where no column is left for the text, wrapping fails or never ends.
+NARROWEST = 20
+
+
+def prepare_streams() -> None:
+    """Make standard streams of any kind usable: closed ones, encodings without our characters, terminals too narrow.
+
+    Files and pipes get UTF-8, as programs read it; a terminal of another encoding shows `?` for what it lacks.
+    """
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:  # else a store would get the number of a closed stream
+        pass
+    os.close(descriptor)
+    for name, number, mode in (("stdin", 0, "r"), ("stdout", 1, "w"), ("stderr", 2, "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, mode, encoding="utf-8", closefd=False))
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace") if stream.isatty() else stream.reconfigure(encoding="utf-8")
+    columns = shutil.get_terminal_size().columns
+    if columns < NARROWEST or os.environ.get("COLUMNS") == "0":
+        os.environ["COLUMNS"] = str(max(columns, NARROWEST))
+
+
+def _told(error: OSError) -> BodyschemaError:
+    """Return an error of the system that no command expects in one line."""
+    said = error.strerror or str(error)
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        return BodyschemaError(f"too many files and connections are open. {RAISE_LIMIT}")
+    if error.filename is not None:
+        return BodyschemaError(f"{os.fsdecode(error.filename)}: {said}")
+    if isinstance(error, FileNotFoundError):
+        return BodyschemaError("the current folder was deleted. Change into another")
+    return BodyschemaError(f"the output cannot be written: {said}")
+
+
+def _drop_output() -> None:
+    """Drop what is left of the output, which Python would otherwise try to write when it ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+
+
+def _fail(error: BodyschemaError) -> NoReturn:
+    print(f"bodyschema: {as_typed(printable(str(error)))}", file=sys.stderr)  # noqa: T201
+    sys.exit(1)
+
+
+def main() -> None:
+    """Run the command line; known errors become one line and exit code 1."""
+    # BLAS threads spin on the small matrices of tracker and learner and double the time.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # OpenCV would allocate 3 GiB for a malicious PNG of a few kilobytes; the largest cameras have 100 megapixels.
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**27))
+    arguments = sys.argv[1:]
+    try:
+        end_with_parent()
+        prepare_streams()
+        allow_enough_files()
+        try:
+            command_line(arguments[0] if arguments else None)(arguments)
+        finally:
+            sys.stdout.flush()
+    except BodyschemaError as error:
+        _fail(error)
+    except ModuleNotFoundError as error:
+        missing = missing_module(error)
+        if missing is None:
+            raise
+        _fail(missing)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except BrokenPipeError:  # the reader of our output has closed it, as `head` does
+        _drop_output()
+        sys.exit(1)
+    except OSError as error:
+        _drop_output()
+        _fail(_told(error))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Get recordings: from the running robot, from other programs, from the simulation."""

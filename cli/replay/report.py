@@ -1,0 +1,168 @@
+"""Report of a replay, as JSON and as text."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+
+import msgspec
+import numpy as np
+
+from bodyschema.calibration.evaluate import BLOCKS, ErrorFigures
+from bodyschema.cli.terminal.findings_view import outlook_sentence
+from bodyschema.cli.terminal.screen import mm
+from bodyschema.daemon.transport.status import Outlook
+from bodyschema.interfaces.records import FloatArray
+
+
+class Figures(msgspec.Struct, frozen=True):
+    """Distances between prediction and measurement on the held-out rows [mm]."""
+
+    mean_mm: float
+    rms_mm: float
+    median_mm: float
+    p95_mm: float
+    max_mm: float
+
+    @classmethod
+    def of(cls, figures: ErrorFigures) -> Figures:
+        """Return the figures in mm."""
+        metres = (figures.mean_m, figures.rms_m, figures.median_m, figures.p95_m, figures.max_m)
+        return cls(*(1e3 * value for value in metres))
+
+
+class AngleFigures(msgspec.Struct, frozen=True):
+    """Angles between predicted and measured orientation on the held-out rows [°], and the learner's predicted error.
+
+    Attributes:
+        mean_deg, median_deg, p95_deg: of the angles.
+        claimed_deg: mean angle to the truth that the learner predicts in its support, or null.
+    """
+
+    mean_deg: float
+    median_deg: float
+    p95_deg: float
+    claimed_deg: float | None
+
+    @classmethod
+    def of(cls, angles_rad: FloatArray, claimed_rad: float | None) -> AngleFigures:
+        """Return the figures of angles (n,) [rad]."""
+        mean, median, p95 = np.degrees(
+            [angles_rad.mean(), np.median(angles_rad), np.quantile(angles_rad, 0.95)]
+        ).tolist()
+        return cls(mean, median, p95, None if claimed_rad is None else math.degrees(claimed_rad))
+
+
+class ReplayReport(msgspec.Struct, frozen=True, kw_only=True):
+    """Results of a replay.
+
+    Attributes:
+        rows: in the recording.
+        held_out: of these, held-out rows, in `held_out_blocks` of 10 contiguous blocks.
+        accepted: pairs that the sampler made of the others; `rejected` by reason.
+        any_step: True if the sampler's step and speed rules were relaxed.
+        before: best alignment of what robot.toml declares unknown, fitted to the learnt rows.
+        after: the learner's predictions, queried over zenoh.
+        fitted: what `before` fitted, as named in robot.toml.
+        answering: the model that answered.
+        prequential_mm: recent mean error on pairs before they were learnt, by model [mm].
+        claimed_mm: mean error to the truth that the learner predicts in its support [mm], or null.
+        in_support_share: share of held-out rows in the learner's support.
+        within_sigma_share: share of held-out coordinates within 1-sigma of prediction and stated noise together.
+        replayed: replay steps of the instant learner.
+        outlook: gain that the learner expects of further pairs, or null.
+        doubt: possible problems of the recording, or null: columns read wrongly, another robot.
+        learning_s: time from the first pair to the end of learning [s].
+        angle: of the marker's orientation; null if the recording has none.
+    """
+
+    recording: str
+    robot: str
+    rows: int
+    held_out: int
+    held_out_blocks: int
+    accepted: int
+    rejected: dict[str, int]
+    any_step: bool
+    steps: str
+    fitted: list[str]
+    before: Figures
+    after: Figures
+    answering: str
+    prequential_mm: dict[str, float]
+    claimed_mm: float | None
+    in_support_share: float
+    within_sigma_share: float
+    doubted: int
+    replayed: int
+    outlook: Outlook | None
+    doubt: str | None
+    learning_s: float
+    angle: AngleFigures | None = None
+    schema: int = 1
+
+
+def as_text(report: ReplayReport, width: int = 80) -> str:
+    """Return the report for a terminal of `width` columns; figures in columns are not wrapped."""
+    rejected = ", ".join(f"{count} {reason}" for reason, count in sorted(report.rejected.items())) or "none"
+    fitted = f"the nominal model with {' and '.join(report.fitted)} fitted" if report.fitted else "the nominal model"
+    lines = [
+        f"{report.rows} rows of {report.recording}; {report.held_out} held out "
+        f"({report.held_out_blocks} of {BLOCKS} contiguous blocks)",
+        f"the sampler accepted {report.accepted} pairs; rejected: {rejected}",
+    ]
+    if report.any_step:
+        lines.append(f"--any-step: the step and speed rules were relaxed; {report.steps}")
+    lines += [
+        "",
+        "error on the held-out rows        mean         RMS      median        95 %",
+        f"before: aligned          {_row(report.before)}",
+        f"after: learnt            {_row(report.after)}",
+        "",
+        *([] if report.angle is None else [_angles(report.angle)]),
+        f"before is {fitted} to the rows that were learnt; after is what the learner answers (model: "
+        f"{report.answering}). {_verdict(report)}",
+        f"error on new pairs before they were learnt: {_by_model(report.prequential_mm)}",
+        f"the errors above count the noise of the measurements; the learner claims {mm(_metres(report.claimed_mm))} to "
+        "the truth where data is; its 1-sigma and that noise together cover "
+        f"{report.within_sigma_share:.0%} of the held-out coordinates (68 % is right); "
+        f"{report.in_support_share:.0%} of the held-out rows lie where data was",
+        *([] if report.outlook is None else [outlook_sentence(report.outlook)]),
+        f"{report.replayed} replay steps, {report.doubted} pairs doubted, {report.learning_s:.1f} s",
+        *([] if report.doubt is None else ["", f"Warning: {report.doubt}"]),
+    ]
+    return "\n".join(_wrapped(line, width) for line in lines)
+
+
+def _angles(angle: AngleFigures) -> str:
+    claim = "" if angle.claimed_deg is None else f"; the learner claims {angle.claimed_deg:.3f}° to the truth"
+    return (
+        f"orientation on the held-out rows: mean {angle.mean_deg:.3f}°, median {angle.median_deg:.3f}°, 95 % within "
+        f"{angle.p95_deg:.3f}°{claim}"
+    )
+
+
+def _wrapped(line: str, width: int) -> str:
+    if len(line) <= width or "   " in line:
+        return line
+    return textwrap.fill(line, width, break_long_words=False, break_on_hyphens=False)
+
+
+def _row(figures: Figures) -> str:
+    columns = (figures.mean_mm, figures.rms_mm, figures.median_mm, figures.p95_mm)
+    return "".join(f"{value:9.3f} mm" for value in columns)
+
+
+def _verdict(report: ReplayReport) -> str:
+    ratio = report.after.mean_mm / report.before.mean_mm if report.before.mean_mm else 1.0
+    if abs(ratio - 1.0) < 0.01:
+        return "Learning left the mean error as it was."
+    return f"Learning {'lowered' if ratio < 1 else 'raised'} the mean error to {ratio:.0%}."
+
+
+def _by_model(errors: dict[str, float]) -> str:
+    return ", ".join(f"{name} {value:.3f} mm" for name, value in errors.items()) or "none"
+
+
+def _metres(value_mm: float | None) -> float | None:
+    return None if value_mm is None else 1e-3 * value_mm

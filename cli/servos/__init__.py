@@ -1,0 +1,1 @@
+"""Change the settings of servos, assign them to joints, and undo it."""

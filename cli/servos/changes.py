@@ -1,0 +1,228 @@
+"""Plan, write, log and undo changes of servo EEPROM settings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+
+import msgspec
+
+from bodyschema.daemon.wiring.eeprom import (
+    BAUD,
+    HOMING_OFFSET,
+    ID,
+    Change,
+    Done,
+    FittedServo,
+    Outcome,
+    Setting,
+    Wanted,
+    Workbench,
+    entry_of,
+    model_called,
+    setting_called,
+    settings_by_name,
+)
+from bodyschema.interfaces.errors import BodyschemaError, ConfigError
+from bodyschema.interfaces.protocols import Clock
+
+from .log import LoggedWrite, ServoLog
+
+ALONE = (ID, BAUD)  # these change the servo's address
+POSITION_MODE, IGNORED_BEYOND = 3, 1024  # Dynamixel servos ignore a larger homing offset in this mode
+
+
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """A planned change, and the location of its servo."""
+
+    wanted: Wanted
+    change: Change
+
+    @property
+    def is_needed(self) -> bool:
+        """True if it changes anything."""
+        return self.change.now != self.change.then
+
+
+def assignments(texts: Sequence[str]) -> list[tuple[str, str]]:
+    """Parse `NAME=VALUE` assignments. ConfigError if one is malformed."""
+    found: list[tuple[str, str]] = []
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals or not name or not value:
+            raise ConfigError(f"{text!r} sets nothing", remedy="Write NAME=VALUE, as in return_delay=0")
+        found.append((name.strip().lower(), value.strip()))
+    names = [name for name, _ in found]
+    if len(set(names)) < len(names):
+        raise ConfigError("the same setting twice", remedy="Give each once")
+    for name in ALONE:
+        if name in names and len(names) > 1:
+            raise ConfigError(f"{name} has to be set alone", remedy="Set the others first, in a command of their own")
+    return found
+
+
+def plan(workbench: Workbench, wanted: Sequence[Wanted], wishes: Sequence[tuple[str, str]]) -> list[Planned]:
+    """Plan the writes. Queries the servos, and writes nothing.
+
+    Raises:
+        ConfigError: a model lacks a setting, a value is out of range, or an ID is taken.
+        SourceError: a servo does not answer, or is another model.
+    """
+    if any(name == ID for name, _ in wishes) and len(wanted) > 1:
+        raise ConfigError("several servos cannot get one ID", remedy="Name one, with --joint or --id")
+    planned: list[Planned] = []
+    for one in wanted:
+        known = settings_by_name(workbench, one.model)
+        values = [(setting_called(name, known, one.model.name), text) for name, text in wishes]
+        numbers = [(setting, setting.value(text)) for setting, text in values]
+        bus = workbench.bus(one.port, one.baud)
+        servo = workbench.fitted(bus, one.entry, one.model)
+        for setting, then in numbers:
+            change = Change(servo, setting, workbench.value(bus, servo, setting), then)
+            if setting.name == ID and then != change.now and workbench.is_taken(bus, then):
+                raise ConfigError(
+                    f"the ID {then} is taken on {one.port}", remedy="`bodyschema scan` shows who is there"
+                )
+            planned.append(Planned(one, change))
+    return planned
+
+
+def plan_zeros(workbench: Workbench, wanted: Sequence[Wanted]) -> list[Planned]:
+    """Plan homing offsets that set the joints to 0 at their present positions; writes nothing.
+
+    Raises:
+        ConfigError: a model has no homing offset, or would ignore it.
+        SourceError: a servo does not answer, or is another model.
+    """
+    planned = []
+    for one in wanted:
+        known = settings_by_name(workbench, one.model)
+        setting = setting_called(HOMING_OFFSET, known, one.model.name)
+        bus = workbench.bus(one.port, one.baud)
+        servo = workbench.fitted(bus, one.entry, one.model)
+        then = workbench.homing_offset(bus, servo)
+        _require_heeded(one, servo, setting, then)
+        planned.append(Planned(one, Change(servo, setting, servo.homing_offset, then)))
+    return planned
+
+
+def _require_heeded(wanted: Wanted, servo: FittedServo, setting: Setting, then: int) -> None:
+    """Raise ConfigError if the servo would ignore such an offset, or cannot store it."""
+    gentle = "`bodyschema servos zero` without --in-servo tells the zero_ticks for robot.toml, which serve as well"
+    what = f"joint {servo.joint!r} would need the homing offset {setting.shown(then)}"
+    if not setting.lowest <= then <= setting.highest:
+        raise ConfigError(f"{what}, which is out of range", remedy=gentle)
+    is_near = wanted.table != "dynamixel" or wanted.model.series == "P" or abs(then) <= IGNORED_BEYOND
+    if not is_near and servo.operating_mode == POSITION_MODE:
+        raise ConfigError(
+            f"{what}, which it ignores in position mode", remedy=f"{gentle}. Or set operating_mode=extended"
+        )
+
+
+def zero_ticks(workbench: Workbench, wanted: Sequence[Wanted]) -> list[tuple[FittedServo, int]]:
+    """Return each servo's present position: the zero_ticks that put its joint at 0 there. Writes nothing."""
+    found = []
+    for one in wanted:
+        bus = workbench.bus(one.port, one.baud)
+        servo = workbench.fitted(bus, one.entry, one.model)
+        found.append((servo, workbench.position(bus, servo)))
+    return found
+
+
+def carry_out(
+    workbench: Workbench, planned: Iterable[Planned], log: ServoLog, clock: Clock, *, undoes: int | None = None
+) -> list[Done]:
+    """Switch torque off and verify it, then write what is needed; log each write before sending it to the servo.
+
+    Raises:
+        SourceError: a servo's torque stays on, or it does not answer: nothing was written.
+        ConfigError: the log cannot be written: nothing was written.
+    """
+    needed = [each for each in planned if each.is_needed]
+    for each in needed:
+        workbench.torque_off(workbench.bus(each.wanted.port, each.wanted.baud), [each.change.servo])
+    batch = log.next_batch()
+    entries = {id(each.change): _entry(each, batch, clock.utc(), undoes) for each in needed}
+    done: list[Done] = []
+    for _, together in groupby(needed, key=lambda each: (each.wanted.port, each.change.setting.name)):
+        group = list(together)
+        log.append([entries[id(each.change)] for each in group])
+        came = _written(workbench, group)
+        log.append([_closed(entries[id(one.change)], one) for one in came])
+        done += came
+    return done
+
+
+def _written(workbench: Workbench, group: Sequence[Planned]) -> list[Done]:
+    """Write all planned values of one setting on one port; with baud rates, write all before querying any servo."""
+    first = group[0]
+    if first.change.setting.name != BAUD:
+        bus = workbench.bus(first.wanted.port, first.wanted.baud)
+        return [workbench.write(bus, each.change) for each in group]
+    done: list[Done] = []
+    for then in dict.fromkeys(each.change.then for each in group):
+        changes = [each.change for each in group if each.change.then == then]
+        rate = rate_of(first.change.setting, then)
+        done += workbench.write_bauds(first.wanted.port, first.wanted.baud, rate, changes)
+    return done
+
+
+def rate_of(setting: Setting, value: int) -> int:
+    """Return the baud rate that a register's value stands for [bit/s]."""
+    return next(int(word) for word, known in setting.words.items() if known == value)
+
+
+def plan_undo(workbench: Workbench, entries: Sequence[LoggedWrite]) -> tuple[list[Planned], list[str]]:
+    """Plan the writes that restore the old values; also return what is left unchanged, with reasons. Writes nothing."""
+    planned, left = [], []
+    for entry in reversed(entries):
+        model = model_called(entry.table, entry.model)
+        setting = setting_called(entry.name, settings_by_name(workbench, model), model.name)
+        place = msgspec.structs.replace(
+            entry,
+            id=entry.new if entry.name == ID else entry.id,
+            baud=rate_of(setting, entry.new) if entry.name == BAUD else entry.baud,
+        )
+        try:
+            wanted = Wanted(entry.table, place.port, place.baud, entry_of(entry.joint, place.id, model), model)
+            bus = workbench.bus(wanted.port, wanted.baud)
+            servo = workbench.fitted(bus, wanted.entry, model)
+            now = workbench.value(bus, servo, setting)
+        except BodyschemaError as error:
+            left.append(str(error))
+            continue
+        if now == entry.new:
+            planned.append(Planned(wanted, Change(servo, setting, now, entry.old)))
+        else:
+            left.append(f"{entry.joint} (ID {entry.id}): {entry.name} is {setting.shown(now)}, which we did not write")
+    return planned, left
+
+
+def is_well(done: Sequence[Done]) -> bool:
+    """Return True if everything was written without remarks."""
+    return all(one.outcome is Outcome.WRITTEN and not one.said for one in done)
+
+
+def _entry(planned: Planned, batch: int, utc: str, undoes: int | None) -> LoggedWrite:
+    wanted, change = planned.wanted, planned.change
+    return LoggedWrite(
+        utc=utc,
+        batch=batch,
+        table=wanted.table,
+        port=wanted.port,
+        baud=wanted.baud,
+        id=change.servo.id,
+        model=wanted.model.name,
+        joint=change.servo.joint,
+        name=change.setting.name,
+        address=change.setting.register.address,
+        old=change.now,
+        new=change.then,
+        undoes=undoes,
+    )
+
+
+def _closed(entry: LoggedWrite, done: Done) -> LoggedWrite:
+    return msgspec.structs.replace(entry, state=done.outcome.value)

@@ -1,0 +1,159 @@
+"""Print a calibration report on a terminal of 80 columns."""
+
+from __future__ import annotations
+
+from rich import box
+from rich.console import Group
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+from bodyschema.calibration.report import CalibrationReport, Figure, Zero
+
+# Told noise that explains the residuals leaves less than this.
+MISFIT = 1.5
+# If held-out errors exceed those with free links by this factor, the URDF is measurably wrong. Chance on 5 blocks of a
+# good arm stays below 1.1.
+WRONG_URDF = 1.25
+
+
+def view(report: CalibrationReport) -> Group:
+    """Return tables of the figures, followed by sentences on their meaning."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    table.add_column(Text(f"{report.robot}, {report.pairs} pairs of {report.source}"), overflow="fold")
+    for name in ("drawn", "learnt", "95 %"):
+        table.add_column(name, justify="right", no_wrap=True)
+    _section(table, f"camera on {report.camera_link}")
+    _figures(table, ("x [mm]", "y [mm]", "z [mm]"), report.camera_xyz_mm, 2)
+    _figures(table, ("roll [°]", "pitch [°]", "yaw [°]"), report.camera_rpy_deg, 3)
+    _section(table, f"marker on {report.marker_link} (tool centre point)")
+    _figures(table, ("x [mm]", "y [mm]", "z [mm]"), report.marker_xyz_mm, 2)
+    _section(table, "joint zeros, to be added to the readings")
+    for zero in report.zeros:
+        table.add_row(Text(f"  {zero.joint} [{zero.unit}]"), "", *_zero(zero))
+    return Group(table, *(Padding(Text(sentence), (1, 0, 0, 0), expand=False) for sentence in sentences(report)))
+
+
+def sentences(report: CalibrationReport) -> list[str]:
+    """Return the report as sentences."""
+    said = [_expected(report)] if report.expected_mm is not None else []
+    said += [
+        f"Mean distance to the pairs: {report.drawn_error_mm:.3f} mm for the drawn arm in its best place, "
+        f"{report.learnt_error_mm:.3f} mm for the learnt one. {_noise(report)} {_outliers(report)}",
+        _workmanship(report),
+    ]
+    if report.trusted == "nothing":
+        said.append(
+            f"The pairs show {report.shown} of the {report.showable} numbers that positions can show of such an arm."
+            + _advice(report)
+        )
+    hidden = [zero.joint for zero in report.zeros if zero.half_width is None]
+    if hidden and report.trusted != "urdf":
+        said.append(
+            f"Left as drawn: {', '.join(hidden)}. Nothing that was measured tells {_such_zeros(hidden)} from a turn of "
+            "the camera, of the marker, or of a neighbouring joint, and nothing needs to: the positions are the same. "
+            "The other figures are given that."
+        )
+    if report.undirected:
+        said.append(
+            f"These pairs do not show which way {', '.join(report.undirected)} "
+            f"count{'s' if len(report.undirected) == 1 else ''}: the positions are the same either way."
+        )
+    if report.first > 1:
+        said.insert(0, f"Learnt from number {report.first} on.")
+    if report.other_tool_from is not None:
+        said.insert(0, two_tools(report))
+    if report.misfit > MISFIT:
+        said.append(
+            f"The residuals are {report.misfit:.1f} times what the noise explains: the arm is not quite a rigid chain "
+            "(it sags, its encoders are eccentric), or the noise is larger than told. The intervals are wider for it."
+        )
+    if report.doubt is not None:
+        said.insert(0, report.doubt)
+    return said
+
+
+def two_tools(report: CalibrationReport) -> str:
+    """Return advice for a recording made with two different tools."""
+    return (
+        f"From number {report.other_tool_from} on the marker sits about {report.other_tool_mm:.0f} mm elsewhere on the "
+        "hand: these are pairs of two tools, and no figure is right for both. Calibrate them apart: "
+        f"--first {report.other_tool_from}, or --last {(report.other_tool_from or 0) - 1}."
+    )
+
+
+def _noise(report: CalibrationReport) -> str:
+    scatter = f"Noise of a coordinate, as the pairs scatter: {report.noise_mm:.3f} mm"
+    if report.told_noise_mm is None:
+        return f"{scatter}."
+    return f"{scatter}; as was told with them: {report.told_noise_mm:.3f} mm, on which the intervals rest."
+
+
+def _expected(report: CalibrationReport) -> str:
+    return (
+        f"Expect {report.expected_mm:.2g} mm on new poses, 95 % ≤ {report.expected_p95_mm:.2g} mm: predicted from the "
+        "other blocks of the recording, noise included."
+    )
+
+
+def _trusted(report: CalibrationReport) -> str:
+    what = "Links and zeros are" if report.trusted == "urdf" else "The links are"
+    said = f"{what} those of the URDF; the intervals hold if it is right."
+    free, expected = report.free_expected_mm, report.expected_mm
+    if free is None or expected is None or expected < WRONG_URDF * free:
+        return said
+    return f"{said} The recording says it is not: with nothing held, expect {free:.2g} mm on new poses."
+
+
+def _workmanship(report: CalibrationReport) -> str:
+    if report.trusted != "nothing":
+        return _trusted(report)
+    if report.axes_deg is None or report.points_mm is None:
+        return "These pairs do not tell how well the arm is made; the intervals hold for a good one and for a bad one."
+    return (
+        f"This arm is made to about {report.axes_deg:.2g}° (axes) and {report.points_mm:.2g} mm (their places), as the "
+        "pairs have it."
+    )
+
+
+def _advice(report: CalibrationReport) -> str:
+    if report.still:
+        return f" Hardly moved: {', '.join(report.still)}. Pairs where they move would show more."
+    if report.shown < report.showable:
+        return " Where axes stay parallel, or the marker sits on one, the rest does not matter; else move more joints."
+    return ""
+
+
+def _outliers(report: CalibrationReport) -> str:
+    if report.outliers == 0:
+        return "No outliers."
+    return f"{report.outliers} outlier{'s' if report.outliers > 1 else ''} left out."
+
+
+def _such_zeros(hidden: list[str]) -> str:
+    return "its zero" if len(hidden) == 1 else "their zeros"
+
+
+def _section(table: Table, title: str) -> None:
+    table.add_row(Text(title, style="bold"), "", "", "")
+
+
+def _figures(table: Table, names: tuple[str, ...], figures: list[Figure], digits: int) -> None:
+    for name, figure in zip(names, figures, strict=True):
+        table.add_row(
+            Text(f"  {name}"),
+            _fixed(figure.drawn, digits),
+            _fixed(figure.learnt, digits),
+            f"± {figure.half_width:.{digits}f}",
+        )
+
+
+def _fixed(value: float, digits: int) -> str:
+    """Format with fixed digits, without a minus sign before zero."""
+    return f"{round(value, digits) + 0.0:.{digits}f}"
+
+
+def _zero(zero: Zero) -> tuple[str, str]:
+    if zero.half_width is None:
+        return "as drawn", "–"
+    return f"{zero.zero:+.3f}", f"± {zero.half_width:.3f}"

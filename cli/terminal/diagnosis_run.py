@@ -1,0 +1,259 @@
+"""One diagnosis from the command line: where the pairs come from, what is asked, what is written."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from bodyschema.calibration.hand_eye import HandEye
+from bodyschema.calibration.plausibility.check import plausibility, told_sigma
+from bodyschema.calibration.plausibility.limits import require_units
+from bodyschema.cli.recordings.recorder import History
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.transport.bus import client
+from bodyschema.diagnosis.conclusion import conclusion
+from bodyschema.diagnosis.diagnosis import Diagnosis
+from bodyschema.diagnosis.diagnosis import diagnose as diagnosed
+from bodyschema.diagnosis.hypotheses import STILL
+from bodyschema.diagnosis.observations import ticks
+from bodyschema.diagnosis.remedies import remedies
+from bodyschema.diagnosis.report import About, page
+from bodyschema.diagnosis.result import DiagnosisFile
+from bodyschema.diagnosis.words import modelled
+from bodyschema.effects import KINDS, write_corrected, write_extended
+from bodyschema.interfaces.errors import BodyschemaError, RecordingError, RequestError
+from bodyschema.interfaces.records import Pair
+from bodyschema.interfaces.whole_files import write_whole
+from bodyschema.learning import NominalModel
+from bodyschema.recordings import files as recordings
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.calibrated_files import CAMERA_LINK
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.suggest import did_you_mean
+
+DIAGNOSIS, REPORT = "diagnosis.json", "report.html"
+# Effects that are always looked for.
+ALWAYS = ("outliers",)
+# Minimum number of pairs per joint.
+FEWEST_PAIRS_A_JOINT = 5
+Tell = Callable[[str], None]
+
+
+class DiagnosisError(BodyschemaError):
+    """There is nothing to diagnose, or it cannot be of this robot."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Settings of a diagnosis.
+
+    Attributes:
+        only, without: names of effects; all when `only` is empty.
+        seed: of the resampling.
+    """
+
+    only: tuple[str, ...]
+    without: tuple[str, ...]
+    seed: int
+
+    @classmethod
+    def of(cls, only: str | None, without: str | None, seed: int) -> Asked:
+        """Parse comma-separated names. Raise RequestError if an effect is unknown, or none remains."""
+        asked = cls(_names(only, "--effects"), _names(without, "--exclude"), seed)
+        if set(asked.only or KINDS) <= set(asked.without):
+            raise RequestError("--effects and --exclude leave nothing to look for. Exclude fewer")
+        return asked
+
+
+def _names(text: str | None, option: str) -> tuple[str, ...]:
+    if text is None:
+        return ()
+    names = tuple(name.strip() for name in text.split(",") if name.strip())
+    if not names:
+        raise RequestError(f"{option} names no effect. Known are: {', '.join(KINDS)}")
+    for name in names:
+        if name in ALWAYS:
+            raise RequestError(f"{option} {name}: {name} are always looked for, and left out. Take it out")
+        if name not in KINDS:
+            raise RequestError(f"{option}: there is no effect {name!r}. {did_you_mean(name, KINDS)}")
+    return names
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """Recording and its name."""
+
+    recording: Recording
+    name: str
+
+
+def measured(
+    config: Config, file: Path | None, opened: Callable[[Path], Recording] | None = None, *, live: bool
+) -> Source:
+    """Return the pairs of a recording, of a store, or of the running sampler.
+
+    Args:
+        opened: function that reads `file`; by default as a recording or a store.
+
+    Raises:
+        RequestError: neither or both of `file` and `live` were given.
+        BusError: no sampler is running.
+        RecordingError: they cannot be read, or are not in radians and metres.
+    """
+    if live == (file is not None):
+        raise RequestError("name a recording, or give --live for the running sampler's pairs: one of the two")
+    joints = config.robot.joints
+    if file is None:
+        with client(config.route("sampler")) as bus:
+            recording, name = _history(History(bus, config.robot, 1), joints), f"the sampler of {config.robot.name}"
+    else:
+        recording, name = recordings.opened(file, joints) if opened is None else opened(file), file.name
+    require_units(config.robot, recording, file or Path(name))
+    return Source(recording, name)
+
+
+def _history(history: History, joints: tuple[str, ...]) -> Recording:
+    pairs: list[Pair] = []
+    while page := history.page():
+        pairs += page
+    if not pairs:
+        raise DiagnosisError("the sampler has no pairs yet. Move the arm in front of the camera")
+    return recordings.from_pairs(pairs, joints)
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Diagnosis with its context for the report.
+
+    Attributes:
+        warnings: what may be wrong with the recording itself.
+    """
+
+    diagnosis: Diagnosis
+    source: Source
+    robot: RobotDescription
+    warnings: tuple[str, ...]
+
+    @cached_property
+    def file(self) -> DiagnosisFile:
+        """The contents of diagnosis.json."""
+        return conclusion(self.diagnosis)
+
+    @property
+    def json(self) -> str:
+        """diagnosis.json, with the camera's pose beside what was found."""
+        told = msgspec.to_builtins(self.file, enc_hook=float) | {"hand_eye": msgspec.to_builtins(self.hand_eye)}
+        return msgspec.json.format(msgspec.json.encode(told), indent=1).decode()
+
+    @property
+    def hand_eye(self) -> HandEye:
+        """The camera's pose with what was found in it; how sure it is, `bodyschema calibrate` tells."""
+        placed = self.diagnosis.extended.simulation.placed
+        return HandEye.of(self.robot.camera.parent_link, CAMERA_LINK, placed.robot.camera.pose @ placed.camera_pose)
+
+    @property
+    def timed(self) -> bool:
+        """True if the recording has times."""
+        return self.source.recording.t is not None
+
+    @property
+    def remedies(self) -> list[str]:
+        """Remedies for the causes found."""
+        run = self.diagnosis.extended.run
+        torques = np.abs(run.torques).max(axis=0) if run.simulation.gravity.known else None
+        return remedies(self.file, self.robot, ticks(self.source.recording.q), torques)
+
+
+def run(config: Config, source: Source, asked: Asked, tell: Tell, *, force: bool = False) -> Found:
+    """Diagnose.
+
+    Args:
+        force: go on with pairs that do not seem to be of this robot.
+
+    Raises:
+        DiagnosisError: there is too little to go by.
+        RecordingError: the pairs cannot be of this robot as they are.
+    """
+    robot, recording = config.robot, source.recording
+    fewest = FEWEST_PAIRS_A_JOINT * len(robot.joints)
+    if len(recording) < fewest:
+        raise DiagnosisError(
+            f"{source.name}: {len(recording)} pairs are too few to tell causes of {len(robot.joints)} joints apart. "
+            f"Record at least {fewest}; some hundred are better"
+        )
+    if np.ptp(recording.q, axis=0).max() < STILL:
+        raise DiagnosisError(f"{source.name}: no joint ever moved. Guide each joint through its range")
+    tell(f"{len(recording)} pairs of {source.name}")
+    chain = NominalModel.extended_by(config.simulation).chain
+    seen = plausibility(robot, recording.q, recording.x, chain=chain, sigma_m=told_sigma(recording))
+    warnings = seen.require(source.name, force=force)
+    diagnosis = diagnosed(
+        recording, config.simulation, only=asked.only, without=asked.without, seed=asked.seed, tell=tell
+    )
+    if not diagnosis.hypotheses.effects:
+        raise DiagnosisError(
+            f"{source.name}: nothing to look for. {' '.join(diagnosis.hypotheses.limitations)}".strip()
+        )
+    return Found(diagnosis, source, robot, warnings)
+
+
+@contextmanager
+def results_in(folder: Path | None) -> Iterator[None]:
+    """Make the folder for results before minutes of work are lost, and remove it when they end without a result.
+
+    Raises:
+        RecordingError: nothing can be written to it.
+    """
+    if folder is None:
+        yield
+        return
+    new = [place for place in (folder, *folder.parents) if not place.exists()]
+    require_writable(folder)
+    try:
+        yield
+    except BaseException:
+        for place in new:
+            with suppress(OSError):  # something else was put there meanwhile
+                place.rmdir()
+        raise
+
+
+def require_writable(folder: Path) -> None:
+    """Make the folder; raise RecordingError where nothing can be written to it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        told = f"cannot be written: {error.strerror or error}"
+        raise RecordingError(told, file=folder, remedy="Give another folder") from error
+
+
+def written(found: Found, folder: Path) -> None:
+    """Write the files of DIR.
+
+    Raises:
+        ConfigError, RecordingError: they cannot be written.
+    """
+    about = About(found.source.name, found.robot.name, version("bodyschema"))
+    heading = f"Found by bodyschema {about.version} in {len(found.source.recording)} pairs of {about.recording}"
+    extended = found.diagnosis.extended.written
+    told = " ".join(filter(None, [f"{heading}.", modelled(found.file.unexplained)]))
+    write_extended(extended, folder, told, replace=True)
+    # Tolerances alone are put into a URDF where the recording shows them.
+    bare = extended if found.diagnosis.tolerated.seen[:2].any() else extended.with_background(())
+    write_corrected(bare, folder, heading)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        report = page(found.diagnosis, found.file, found.remedies, about)
+        write_whole({folder / DIAGNOSIS: f"{found.json}\n".encode(), folder / REPORT: report.encode()})
+    except OSError as error:
+        raise RecordingError(f"cannot be written: {error.strerror or error}", file=folder) from error

@@ -1,0 +1,214 @@
+"""Query the two processes' states and show them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self
+
+import msgspec
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from bodyschema.cli.servos.servos_view import servos_table
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.service.remedies import as_typed
+from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.identity import Route
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.status import UNDECIDED, BusStatus, LearnerStatus, OrientationStatus, SamplerStatus
+from bodyschema.daemon.transport.wire import decode
+from bodyschema.daemon.transport.zenoh_config import PROCESSES
+from bodyschema.interfaces.errors import BusError, RequestError
+
+from .findings_view import calibration_table, outlook_lines
+from .screen import coverage_table, degrees, mm, rejected
+
+ANSWER_LIMIT_S = 2.0
+EVERY_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """States of the processes; None for one that did not answer."""
+
+    sampler: SamplerStatus | None
+    learner: LearnerStatus | None
+
+    @property
+    def nobody(self) -> bool:
+        """True if neither answered."""
+        return self.sampler is None and self.learner is None
+
+
+class Watcher:
+    """Queries both processes for their states. Use as a context manager; the processes may come and go."""
+
+    def __init__(self, config: Config) -> None:
+        self._keys = Keys(config.robot.name)
+        self._routes = {process: config.route(process) for process in PROCESSES}
+        self._sessions: dict[str, Bus] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for process in list(self._sessions):
+            self._leave(process)
+
+    def look(self) -> Seen:
+        """Return their current states."""
+        sampler, learner = self._ask("sampler"), self._ask("learner")
+        return Seen(
+            sampler=None if sampler is None else decode(sampler, SamplerStatus),
+            learner=None if learner is None else decode(learner, LearnerStatus),
+        )
+
+    def follow(self) -> Iterator[Seen]:
+        """Yield their states about once a second, without end."""
+        while True:
+            yield self.look()
+            time.sleep(EVERY_S)
+
+    def _ask(self, process: str) -> bytes | None:
+        try:
+            if process not in self._sessions:
+                self._sessions[process] = Bus(connect=self._routes[process], client=True).__enter__()
+            return self._sessions[process].ask_one(self._keys.status(process), timeout_s=ANSWER_LIMIT_S)
+        except (BusError, RequestError):
+            self._leave(process)
+            return None
+
+    def _leave(self, process: str) -> None:
+        session = self._sessions.pop(process, None)
+        if session is not None:
+            session.__exit__(None, None, None)
+
+
+def as_json(seen: Seen) -> str:
+    """Return both states as one line of JSON."""
+    return msgspec.json.encode({"sampler": seen.sampler, "learner": seen.learner}).decode()
+
+
+def screen(seen: Seen, config: Config) -> RenderableType:
+    """Return a screen of both states; a small terminal cuts off the end of the joints' coverage."""
+    chain = config.robot.chain
+    parts: list[RenderableType] = []
+    parts += _absent("sampler", config.route("sampler")) if seen.sampler is None else _sampler(seen.sampler)
+    parts.append(Text())
+    slides = {name for name, slides in zip(config.robot.joints, chain.prismatic, strict=True) if slides}
+    parts += _absent("learner", config.route("learner")) if seen.learner is None else _learner(seen.learner)
+    if seen.learner is not None and seen.learner.calibration is not None:
+        parts += [Text(), calibration_table(seen.learner.calibration, slides)]
+    if seen.sampler is not None and seen.sampler.coverage:
+        parts += [Text(), coverage_table(seen.sampler, slides)]
+    return Group(*parts)
+
+
+def _absent(process: str, route: Route) -> list[RenderableType]:
+    said = f"does not answer on {route}. Start it with `bodyschema {process}`, or both with `bodyschema run`."
+    return [Text.assemble((process, "bold"), " ", (as_typed(said), "yellow"))]
+
+
+def _sampler(status: SamplerStatus) -> list[RenderableType]:
+    reasons = ", ".join(f"{count} {reason}" for reason, count in rejected(status)) or "none"
+    facts = _facts()
+    facts.add_row("pairs", f"{status.pairs} in {status.segment} segments, {status.pairs_per_s:.1f}/s")
+    facts.add_row("frames", f"{status.frames}, {status.frames_per_s:.1f}/s; readings {status.readings_per_s:.0f}/s")
+    facts.add_row("rejected", reasons)
+    for name, bus in status.buses.items():
+        facts.add_row(f"bus {name}", _bus(bus))
+    facts.add_row("store", f"{status.store}, {status.disk_free_bytes / 1e9:.1f} GB free")
+    servos = [Text(), servos_table(status.servos)] if status.servos else []
+    return [_head("sampler", status), facts, *_health(status.health), *servos]
+
+
+def _bus(bus: BusStatus) -> str:
+    wrong = ", ".join(f"{count} × {name}" for name, count in sorted(bus.troubles.items(), key=lambda item: -item[1]))
+    way = f"{bus.way}; " if bus.way else ""
+    return f"{way}{bus.answered:.2%} of {bus.exchanges} questions answered{f': {wrong}' if wrong else ''}"
+
+
+def _learner(status: LearnerStatus) -> list[RenderableType]:
+    errors = ", ".join(f"{name} {mm(error)}" for name, error in status.prequential_m.items()) or "-"
+    saved = "none yet" if status.checkpoint_age_s is None else f"{status.checkpoint_age_s:.0f} s ago"
+    doubted = f", {status.doubted} doubted" if status.doubted else ""
+    refused = f", {status.refused} refused" if status.refused else ""
+    facts = _facts()
+    facts.add_row("pairs", f"{status.pairs} learnt, {status.replayed} replay steps{doubted}{refused}")
+    if status.behind:
+        age = "" if status.age_s is None else f"; the newest learnt is {_duration(status.age_s)} old"
+        facts.add_row("", f"{status.behind} stored and not learnt yet{age}")
+    facts.add_row("new pairs", f"missed by: {errors}")
+    if status.prequential_pairs:
+        facts.add_row("", f"mean of the last {status.prequential_pairs}, measurement noise included")
+    facts.add_row("claimed", f"{mm(status.claimed_error_m)} from the truth where data is{_elsewhere(status)}")
+    if status.orientation is not None:
+        facts.add_row("orientation", _orientation(status.orientation))
+    if status.changes:
+        for number, line in enumerate(_change(status)):
+            facts.add_row("" if number else "change", line)
+    for name, line in zip(("enough?", ""), outlook_lines(status.outlook), strict=False):
+        facts.add_row(name, line)
+    facts.add_row("answering", f"{status.answering}, model {status.model or 'none yet'}")
+    facts.add_row("checkpoint", saved)
+    return [_head("learner", status), facts, *_health(status.health)]
+
+
+def _elsewhere(status: LearnerStatus) -> str:
+    return "" if status.outlook is None else f", {mm(status.outlook.anywhere_m)} over all joints' ranges"
+
+
+def _change(status: LearnerStatus) -> Iterator[str]:
+    since, change = f"{status.pairs_since_change} pairs since", status.last_change
+    if change is None:
+        # Rolled back, or learning was restarted.
+        yield f"none in force of {status.changes} told or found; {status.pairs_since_change} pairs count"
+        return
+    when = f"at pair {change.first_seq}"
+    if change.earliest_seq < change.latest_seq:
+        when += f" ({change.earliest_seq} to {change.latest_seq})"
+    moved = "" if change.moved_m is None else f", marker moved by {mm(change.moved_m)}"
+    yield f"{change.kind} {when}{moved} ({'found' if change.found else 'told'}); {since}"
+    if change.kind == UNDECIDED:
+        yield ", ".join(f"{kind} {share:.0%}" for kind, share in change.probabilities.items())
+    elif change.alike is not None:
+        yield f"or {change.alike}: no motion tells them apart"
+    if change.can_roll_back:
+        yield as_typed("`bodyschema command rollback` goes back to the model before it")
+
+
+def _facts() -> Table:
+    facts = Table.grid(padding=(0, 2))
+    facts.add_column(no_wrap=True, min_width=len("checkpoint"), style="dim")
+    return facts
+
+
+def _head(process: str, status: SamplerStatus | LearnerStatus) -> Text:
+    colour = "red" if status.state == "failed" else "yellow" if status.state == "paused" else "green"
+    return Text.assemble(
+        (process, "bold"), f" of {status.robot} is ", (status.state, colour), f", up for {_duration(status.uptime_s)}"
+    )
+
+
+def _health(sentences: list[str]) -> list[RenderableType]:
+    return [Text(f"! {as_typed(sentence)}", style="yellow") for sentence in sentences]
+
+
+def _duration(seconds: float) -> str:
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {seconds:02d} s" if minutes else f"{seconds} s"
+
+
+def _orientation(status: OrientationStatus) -> str:
+    errors = ", ".join(f"{name} {degrees(error)}" for name, error in status.prequential_rad.items())
+    return (
+        f"{status.answering} answers, of {status.pairs} pairs; new pairs: {errors}; "
+        f"claimed {degrees(status.claimed_rad)} where data is"
+    )

@@ -1,0 +1,1 @@
+"""The learner process: pairs in, predictions out."""

@@ -1,0 +1,108 @@
+"""Answer the learner's queries (predictions, Jacobians, inverse kinematics, the model) from its current snapshot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from bodyschema.daemon.transport.bus import Request
+from bodyschema.daemon.transport.wire import (
+    IkReply,
+    IkRequest,
+    JacobianReply,
+    JointsRequest,
+    PredictReply,
+    decode,
+    encode,
+    joint_angles,
+    joint_vector,
+    position,
+)
+from bodyschema.learning import Learning, LearntModel
+from bodyschema.robot.description import RobotDescription
+from kbmaps import InverseKinematics
+
+
+class Answers:
+    """Handlers for the learner's queries. They take no lock, so that learning never delays them."""
+
+    def __init__(
+        self, learning: Learning, robot: RobotDescription, age_s: Callable[[str | None], float | None]
+    ) -> None:
+        """Answer from the state of `learning`.
+
+        Args:
+            age_s: age of the model [s], given the time at which its newest pair was stored (`PairFeed.age_s`).
+        """
+        self._learning, self._robot, self._age_s = learning, robot, age_s
+        self._joints = robot.joints
+        self._inverse: tuple[LearntModel, InverseKinematics] | None = None
+
+    def predict(self, request: Request) -> bytes:
+        """Return positions, 1-sigma and support. Raise RequestError for a bad request, or before there is a model."""
+        q = joint_angles(decode(request.payload, JointsRequest, request.encoding), self._joints)
+        snapshot = self._learning.snapshot
+        prediction = snapshot.predict(q)
+        reply = PredictReply(
+            x=prediction.x.tolist(),
+            sigma=prediction.sigma.tolist(),
+            in_support=prediction.in_support.tolist(),
+            model=snapshot.digest,
+            pairs=snapshot.pairs,
+            age_s=self._age_s(snapshot.newest_utc),
+            R=None if prediction.R is None else prediction.R.tolist(),
+            sigma_R=None if prediction.sigma_R is None else prediction.sigma_R.tolist(),
+        )
+        return encode(reply, request.encoding)
+
+    def jacobian(self, request: Request) -> bytes:
+        """Return the Jacobians dx/dq. Raise RequestError as `predict` does."""
+        q = joint_angles(decode(request.payload, JointsRequest, request.encoding), self._joints)
+        snapshot = self._learning.snapshot
+        jacobians = snapshot.require_model().jacobian(q)
+        return encode(JacobianReply(jacobians.tolist(), snapshot.digest, snapshot.pairs), request.encoding)
+
+    def ik(self, request: Request) -> bytes:
+        """Return joint angles that put the marker at the requested position. Raise RequestError as `predict` does."""
+        wanted = decode(request.payload, IkRequest, request.encoding)
+        x = position("x", wanted.x)
+        start = None if wanted.start is None else joint_vector("start", wanted.start, self._joints)
+        snapshot = self._learning.snapshot
+        inverse = self._inverse_of(snapshot.require_model())
+        if wanted.posture is None:
+            posture = None
+        elif wanted.posture == "middle":
+            posture = inverse.middle
+        else:
+            posture = joint_vector("posture", wanted.posture, self._joints)
+        found = inverse.solve(x, start=start, posture=posture)
+        there = snapshot.predict(found.q[None])
+        reply = IkReply(
+            q=found.q.tolist(),
+            x=found.x.tolist(),
+            distance=found.distance,
+            converged=found.converged,
+            reason=found.reason,
+            sigma=there.sigma[0].tolist(),
+            in_support=bool(there.in_support[0]),
+            model=snapshot.digest,
+            pairs=snapshot.pairs,
+        )
+        return encode(reply, request.encoding)
+
+    def _inverse_of(self, model: LearntModel) -> InverseKinematics:
+        """Return the solver for this model.
+
+        The last one is cached, since building it costs as much as several answers.
+        """
+        kept = self._inverse
+        if kept is None or kept[0] is not model:
+            kept = model, InverseKinematics(model, self._robot.lower, self._robot.upper)
+            self._inverse = kept
+        return kept[1]
+
+    def model(self, _request: Request) -> bytes:
+        """Return the best KB-Map as one self-describing file; its metadata name the robot and the answering model."""
+        snapshot = self._learning.snapshot
+        kbmap = snapshot.require_map()
+        texts = {"robot": self._robot.name, "joints": " ".join(self._joints), "pairs": str(snapshot.pairs)}
+        return kbmap.with_metadata(texts | {"model": kbmap.digest, "answering": snapshot.digest}).to_bytes()

@@ -1,0 +1,179 @@
+"""Findings about a learner for its user: camera and tool pose, sufficiency of the data, and problems."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from bodyschema.calibration.chain_figures import ChainFigures, is_told, no_surer_than_possible
+from bodyschema.calibration.plausibility.check import FEWEST_ROWS, ROWS, plausibility
+from bodyschema.daemon.transport.status import ChainCalibration, JointZero, LearntFigure, Outlook
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.learning import Learning
+from bodyschema.learning.members import SOLVED
+from bodyschema.learning.outlook import Known, Scatter, foreseen
+from bodyschema.learning.workmanship import WORKMANSHIP, probable
+from bodyschema.robot.description import RobotDescription
+from kbmaps import ChainBelief, KBMapsError
+
+log = logging.getLogger(__name__)
+
+# Findings take at most 1/SHARE of the background thread's time, which the robots share, and recur no more often.
+SHARE = 10.0
+EVERY_S = 1.0
+
+
+class FindingTurns:
+    """Limits all users of the background thread together to `SHARE` of its time. For that thread alone.
+
+    Attributes:
+        due_at: time of the next permitted finding.
+    """
+
+    def __init__(self) -> None:
+        self.due_at = -math.inf
+
+    def took(self, begin: float, seconds: float) -> None:
+        """Note that one finding took `seconds` from `begin` on."""
+        self.due_at = begin + SHARE * seconds
+
+
+class Findings:
+    """Computes calibration and outlook whenever there is a new chain, or another model answers.
+
+    Only the background thread may call it. Any thread may read the results.
+    """
+
+    def __init__(
+        self,
+        learning: Learning,
+        robot: RobotDescription,
+        clock: Clock,
+        robots: int = 1,
+        turns: FindingTurns | None = None,
+    ) -> None:
+        """Start without findings.
+
+        Args:
+            robots: number of robots that share the background thread.
+            turns: their common time limit.
+        """
+        self._learning, self._robot, self._clock = learning, robot, clock
+        self._turns = turns or FindingTurns()
+        self._parts = SHARE * robots
+        self._found_of: tuple[ChainBelief | None, str] = None, ""
+        self._due_at = clock.now()
+        self._found: tuple[ChainCalibration | None, Outlook | None] = None, None
+        self._checked, self._doubts = 0, ()
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Reasons to suspect that the pairs are of another robot: exchanged columns, reversed joints."""
+        return self._doubts
+
+    @property
+    def calibration(self) -> ChainCalibration | None:
+        """Pose of camera and tool, and joint offsets; None before the first solution with the present tool."""
+        return self._found[0] if self._learning.belief is not None else None
+
+    @property
+    def outlook(self) -> Outlook | None:
+        """Expected gain of further pairs; None until a solution with the present tool answers."""
+        answers = self._learning.belief is not None and self._learning.snapshot.answering in SOLVED
+        return self._found[1] if answers else None
+
+    @property
+    def at_rest(self) -> bool:
+        """True if the findings are up to date with the current chain and model."""
+        return self._found_of == self._present
+
+    @property
+    def _present(self) -> tuple[ChainBelief | None, str]:
+        return self._learning.belief, self._learning.snapshot.answering
+
+    def renew(self) -> None:
+        """Compute all findings again if their inputs have changed and the time limit permits."""
+        self._check()
+        begin, present = self._clock.now(), self._present
+        if present[0] is None:
+            self._found_of, self._found = present, (None, None)  # the findings belong to another tool
+            return
+        if present == self._found_of or begin < max(self._due_at, self._turns.due_at):
+            return
+        self._found_of, known = present, self._learning.known()
+        if known is None:
+            self._found = None, None
+            return
+        try:
+            self._found = _found(self._robot, known)
+        except (KBMapsError, np.linalg.LinAlgError) as error:
+            log.warning("status has no calibration for now: %s", error)
+            self._found = None, None
+        seconds = self._clock.now() - begin
+        self._turns.took(begin, seconds)
+        self._due_at = begin + max(self._parts * seconds, EVERY_S)
+
+    def _check(self) -> None:
+        """Check the pairs with the present tool once there are enough, and again whenever their number has doubled."""
+        begin, count = self._clock.now(), self._learning.counters.since_change
+        if count < self._checked:
+            self._checked, self._doubts = 0, ()
+        if count < max(FEWEST_ROWS, 2 * self._checked) or begin < self._turns.due_at:
+            return
+        q, x = self._learning.kept(ROWS)
+        self._checked = count
+        self._doubts = plausibility(self._robot, q, x, chain=self._learning.nominal.chain).sentences
+        self._turns.took(begin, self._clock.now() - begin)
+
+
+def _found(robot: RobotDescription, known: Known) -> tuple[ChainCalibration, Outlook | None]:
+    scatter = Scatter.of(known)
+    outlook = foreseen(known, scatter, robot.joints) if known.solved else None
+    return calibrated(robot, known, scatter), outlook
+
+
+def calibrated(robot: RobotDescription, known: Known, scatter: Scatter) -> ChainCalibration:
+    """Return the chain in the terms of robot.toml."""
+    found, workmanship = figures(robot, known)
+    numbers = [
+        LearntFigure(*(float(part) for part in parts))
+        for parts in zip(found.drawn, found.drawn + found.moved, found.half_widths, strict=True)
+    ]
+    return ChainCalibration(
+        pairs=known.pairs,
+        camera_link=robot.camera.parent_link,
+        camera_xyz=numbers[:3],
+        camera_rpy=numbers[3:6],
+        marker_link=robot.robot.marker_link,
+        marker_xyz=numbers[6:9],
+        zeros={
+            name: JointZero(number.learnt, number.half_width) if shown else None
+            for name, number, shown in zip(robot.joints, numbers[9:], found.shown, strict=True)
+        },
+        axes_rad=None if workmanship is None else workmanship[0],
+        points_m=None if workmanship is None else workmanship[1],
+        noise_m=scatter.noise_m,
+        outliers=scatter.outliers,
+    )
+
+
+def figures(robot: RobotDescription, known: Known) -> tuple[ChainFigures, tuple[float, float] | None]:
+    """Return the figures, and the estimated manufacturing tolerances: 1-sigma of axis tilt [rad] and axis shift [m].
+
+    The tolerances are None where the pairs do not determine them.
+
+    With the learner's initial tolerances, an axis tilt could be mistaken for any joint offset. The pairs determine the
+    tolerances, but seldom sharply, so the figures average over all probable tolerances.
+    """
+    wide = known.tolerances
+    made = [(wide.axes, wide.points)]
+    made += [(axes, points) for axes, points in WORKMANSHIP if axes < wide.axes and points < wide.points]
+    prior = known.nominal.belief(known.wide.parameters.reference, wide)
+    belief = no_surer_than_possible(known.wide, prior, robot)
+    beliefs = [belief.tightened(wide, replace(wide, axes=axes, points=points)) for axes, points in made]
+    kept, shares = probable(np.array([evidence for _, evidence in beliefs]))
+    told = is_told([made[k] for k in kept])
+    return ChainFigures(robot, tuple(beliefs[k][0] for k in kept), shares, prior), made[kept[0]] if told else None

@@ -1,0 +1,186 @@
+"""Run one process that learns for one or several robots: zenoh session, solver process and background thread.
+
+Each robot has its own thread for new pairs, so that a stuck sampler does not stop the others from learning. Less urgent
+work is done for all in turns.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.learner.background import Background
+from bodyschema.daemon.learner.findings import FindingTurns
+from bodyschema.daemon.learner.learner import LISTENING, LOOPS, Learner, more_rarely, status_line
+from bodyschema.daemon.learner.solver_pool import SharedSolver
+from bodyschema.daemon.learner.solver_process import SolverProcess
+from bodyschema.daemon.service.notify import Notifier
+from bodyschema.daemon.service.service import Service
+from bodyschema.daemon.service.signals import Wishes
+from bodyschema.daemon.service.thread_names import show_name
+from bodyschema.daemon.transport.access import Names, Subjects, access_control
+from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.identity import SECURE
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.wire import encode
+from bodyschema.interfaces.errors import BodyschemaError, ConfigError
+from bodyschema.interfaces.protocols import Clock
+
+log = logging.getLogger(__name__)
+
+TICK_S = 0.05
+STATUS_EVERY_S = 1.0
+# Fraction of one processor; the rest is left to new pairs and queries, which share the interpreter.
+SHARED_WORK = 0.3
+# Python's thread switch interval; its default of 5 ms would delay every query.
+SWITCH_INTERVAL_S = 2e-4
+
+
+def run_learners(configs: Sequence[Config], clock: Clock, wishes: Wishes, notifier: Notifier) -> None:
+    """Learn and answer for all robots until `wishes` requests the end.
+
+    Args:
+        notifier: is notified once everything is up, that every loop works, and of the learners' states.
+
+    Raises:
+        ConfigError: the robots cannot be served by one process.
+        BusError: a learner's port is in use.
+        CheckpointError: an unusable checkpoint cannot be moved aside.
+    """
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    loops = LOOPS if len(configs) == 1 else (*(_loop(config) for config in configs), *LOOPS[1:])
+    service = Service(notifier, loops, clock)
+    with ExitStack() as stack:
+        process = stack.enter_context(SolverProcess())
+        bus = stack.enter_context(Bus(settings=session_settings(configs)))
+        learners = _learners(configs, process, bus, clock, service)
+        gc.collect()
+        gc.freeze()  # objects of the start-up need not be scanned again
+        failed = stack.enter_context(_working(learners, service, clock))
+        for config, learner in zip(configs, learners, strict=True):
+            stack.enter_context(learner.serving())
+            log.info("the learner of %s answers on %s", config.robot.name, config.tables.zenoh.learner)
+        service.ready()
+        attend(
+            learners, [bus.publisher(Keys(c.robot.name).status("learner")) for c in configs], wishes, service, failed
+        )
+        service.stopping()
+
+
+def session_settings(configs: Sequence[Config]) -> dict[str, Any]:
+    """Return zenoh's configuration of the one session of all robots.
+
+    Raises:
+        ConfigError: two have the same name, or their tables [zenoh] name different routers or certificates.
+    """
+    settings = configs[0].zenoh_settings("learner")
+    if len(configs) == 1:
+        return settings
+    first, names = configs[0], set[str]()
+    for config in configs:
+        if config.robot.name in names:
+            raise ConfigError(f"two robots are called {config.robot.name}", file=config.file, remedy="Rename one")
+        names.add(config.robot.name)
+        if _way(config) != _way(first):
+            raise ConfigError(
+                f"[zenoh] has another router, or other certificates, than {first.file}",
+                file=config.file,
+                remedy="Robots of one learner share them; else give this one a learner of its own",
+            )
+    for key in ("listen/endpoints", "connect/endpoints"):
+        settings[key] = list(dict.fromkeys(end for c in configs for end in c.zenoh_settings("learner")[key]))
+    identity = _way(first)[1]
+    if identity is not None and any(end.startswith(SECURE) for end in settings["listen/endpoints"]):
+        who = {config.robot.name: config.tables.zenoh.access or Names() for config in configs}
+        settings["access_control"] = access_control(who, Subjects(identity.by_user))
+    return settings
+
+
+def _way(config: Config) -> tuple[str, Any]:
+    return config.tables.zenoh.router, config.tables.zenoh.identity(config.file.parent)
+
+
+def _loop(config: Config) -> str:
+    return f"{LISTENING} {config.robot.name}"
+
+
+def _learners(
+    configs: Sequence[Config], process: SolverProcess, bus: Bus, clock: Clock, service: Service
+) -> list[Learner]:
+    if len(configs) == 1:
+        return [Learner(configs[0], process, bus, clock, service)]
+    shared, turns = SharedSolver(process), FindingTurns()
+    return [
+        Learner(config, shared.seat(), bus, clock, service, loop=_loop(config), robots=len(configs), turns=turns)
+        for config in configs
+    ]
+
+
+@contextmanager
+def _working(learners: Sequence[Learner], service: Service, clock: Clock) -> Iterator[list[Exception]]:
+    """Run the background thread; an exception that ended it early is in the list."""
+    stop, failed = threading.Event(), list[Exception]()
+    share = 1.0 if len(learners) == 1 else SHARED_WORK
+    background = Background(learners, service, clock, stop, share=share)
+
+    def guarded() -> None:
+        show_name()
+        try:
+            background.run()
+        except Exception as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=guarded, name="background")
+    thread.start()
+    try:
+        yield failed
+    finally:
+        stop.set()
+        thread.join()
+
+
+def attend(
+    learners: Sequence[Learner],
+    publishers: Sequence[Any],
+    wishes: Wishes,
+    service: Service,
+    failed: Sequence[Exception],
+) -> None:
+    """Publish states, write checkpoints and serve requests until the end is requested."""
+    every_s = STATUS_EVERY_S * more_rarely(len(learners))  # a status takes milliseconds
+    begin = time.monotonic()
+    due = [begin + every_s * k / len(learners) for k in range(len(learners))]
+    while not wishes.ending:
+        # Taken before the round: a request that comes during it is for every learner, in the next round.
+        reloading, wishes.reloading = wishes.reloading, False
+        for k, (learner, publish) in enumerate(zip(learners, publishers, strict=True)):
+            if time.monotonic() >= due[k]:
+                due[k] = time.monotonic() + every_s
+                status = learner.status()
+                publish(encode(status))
+                line = status_line(status)
+                service.tell(line if len(learners) == 1 else f"{len(learners)} robots; {status.robot}: {line}")
+            if reloading:
+                _reload(learner, service)
+            learner.tick()
+        if failed:
+            raise failed[0]
+        time.sleep(TICK_S)
+
+
+def _reload(learner: Learner, service: Service) -> None:
+    """Reload; the result goes to the log, because the request came by a signal."""
+    service.reloading()
+    try:
+        log.info("robot.toml was read again: %s", learner.reload())
+    except BodyschemaError as error:
+        log.error("robot.toml was read again and is not followed: %s", error)
+    finally:
+        service.reloaded()

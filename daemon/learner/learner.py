@@ -1,0 +1,364 @@
+"""The learner process of one robot. It needs a sampler for new pairs, but keeps answering without one.
+
+Threads: zenoh's (queries, from an immutable snapshot; published pairs, into a queue), one for each robot that learns
+each pair immediately, one at low priority for replay and the solver's orders, and the main thread for status and
+checkpoints; `bodyschema.daemon.learner.host` has the last two.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from importlib.metadata import version
+
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.learner.answers import Answers
+from bodyschema.daemon.learner.changes import Changes
+from bodyschema.daemon.learner.checkpoint import CheckpointError, write_checkpoint
+from bodyschema.daemon.learner.expected import ExpectedMarker
+from bodyschema.daemon.learner.feed import BEHIND, PairFeed
+from bodyschema.daemon.learner.findings import Findings, FindingTurns
+from bodyschema.daemon.learner.resume import go_on
+from bodyschema.daemon.sampler.history import Page, read_page
+from bodyschema.daemon.service.reload import reload
+from bodyschema.daemon.service.service import Service, with_health
+from bodyschema.daemon.service.thread_names import show_name
+from bodyschema.daemon.transport.bus import Bus, Request
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.status import LearnerStatus
+from bodyschema.daemon.transport.wire import OCTETS, CommandReply, CommandRequest, decode, encode
+from bodyschema.daemon.wiring.wiring import open_marker_topic
+from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.learning import Learning, NominalModel
+from bodyschema.learning.solver import LARGEST_NET, Solver
+
+log = logging.getLogger(__name__)
+
+HISTORY_LIMIT_S = 5.0
+IDLE_S = 0.2
+# How long pairs may wait to be evaluated as one batch, per robot of a process, and at most [s].
+TOGETHER_S, LONGEST_TOGETHER_S = 0.08, 1.0
+# Up to this many robots per process, states and checkpoints are as frequent as for one alone.
+AS_OFTEN_AS_ONE = 10
+# Name of the loop that must keep running.
+LISTENING = "learning"
+LOOPS = (LISTENING, "background", "status")
+TABLES = ("robot", "camera", "zenoh", "daemon", "drivers", "learner", "effects", "background", "unexplained")
+CHANGEABLE = {("learner", "checkpoint_every_s")}
+
+
+class Learner:
+    """One robot's learner with its answers, its checkpoint and its state of health."""
+
+    def __init__(
+        self,
+        config: Config,
+        solver: Solver,
+        bus: Bus,
+        clock: Clock,
+        service: Service | None = None,
+        *,
+        loop: str = LISTENING,
+        robots: int = 1,
+        turns: FindingTurns | None = None,
+    ) -> None:
+        """Restore the learner from its checkpoint; nothing is declared yet.
+
+        Args:
+            solver: for this robot alone.
+            loop: name of its loop of new pairs for the watchdog.
+            robots: number of robots in the process, including this one.
+            turns: their common time limit for calibration and outlook.
+        """
+        self._config, self._bus, self._clock = config, bus, clock
+        self._service = Service.nobodys(clock) if service is None else service
+        self._loop = loop
+        self._settings, self._robot = config.tables.learner, config.robot
+        self._keys = Keys(config.robot.name)
+        self._version = version("bodyschema")  # reads a file: once, while descriptors are available
+        self._nominal = NominalModel.extended_by(config.simulation)
+        self._learning, self._set_aside = go_on(
+            lambda: Learning(self._nominal, self._settings, solver, together_s=together_s(robots)),
+            config.checkpoint_file,
+            config.robot.name,
+        )
+        self._feed = PairFeed(self._learning, self._history, clock, lambda: self._service.beat(loop))
+        self._findings = Findings(self._learning, config.robot, clock, robots, turns)
+        self._answers = Answers(self._learning, config.robot, self._feed.age_s)
+        self._more_rarely = more_rarely(robots)
+        self._sampler_alive = False
+        self._started_at = clock.now()
+        self._checkpointed_at: float | None = None
+        self._checkpointed_pairs = self._learning.counters.pairs
+        self._checkpoint_problem: str | None = None
+        self._checkpoint_lock = threading.Lock()
+        self._changes = Changes(self._robot.joints, self._learning.change)
+        self._rested_with: int | None = None
+        self._stop = threading.Event()
+        self._failure: Exception | None = None
+
+    @contextlib.contextmanager
+    def serving(self) -> Iterator[None]:
+        """Answer and learn until the end of the with statement; then write a last checkpoint."""
+        listening = threading.Thread(target=self._guarded, args=(self._learn_pairs,), name="learn_pairs")
+        listening.start()
+        try:
+            self._declare()
+            with self._publishing():
+                yield
+        finally:
+            self._stop.set()
+            self._feed.wake()
+            listening.join()
+            self.checkpoint()
+
+    def _publishing(self) -> contextlib.AbstractContextManager[None]:
+        found = open_marker_topic(self._config, self._clock)
+        if found is None:
+            return contextlib.nullcontext()
+        return ExpectedMarker(*found, lambda: self._learning.snapshot, self._clock).publishing()
+
+    def tick(self) -> None:
+        """Do the main thread's periodic work: write a checkpoint when one is due.
+
+        Raises:
+            BaseException: the exception that ended one of the threads.
+        """
+        if self._failure is not None:
+            raise self._failure
+        self._service.beat("status")
+        waited_s = self._clock.now() - (self._checkpointed_at or self._started_at)
+        new = self._learning.counters.pairs != self._checkpointed_pairs
+        if new and waited_s >= self._settings.checkpoint_every_s * self._more_rarely:
+            self.checkpoint()
+
+    def checkpoint(self) -> None:
+        """Write a checkpoint; a failure appears in the health."""
+        with self._checkpoint_lock:
+            state = self._learning.state()
+            try:
+                write_checkpoint(self._config.checkpoint_file, state, robot=self._robot.name, utc=self._clock.utc())
+            except CheckpointError as error:
+                if self._checkpoint_problem is None:
+                    log.error("%s", error)
+                self._checkpoint_problem = str(error)
+            else:
+                self._checkpoint_problem = None
+                self._checkpointed_pairs = state.header.counters.pairs
+            self._checkpointed_at = self._clock.now()
+
+    def status(self) -> LearnerStatus:
+        """Return the learner's state."""
+        counters = self._learning.counters
+        at_rest = self._rested_with == counters.pairs  # before the status below: it is final then
+        snapshot, recent = self._learning.snapshot, self._learning.recent()
+        now = self._clock.now()
+        written = self._checkpointed_at if self._checkpoint_problem is None else None
+        return LearnerStatus(
+            robot=self._robot.name,
+            store=counters.store,
+            state=self._state(counters.pairs),
+            pairs=counters.pairs,
+            last_seq=counters.last_seq,
+            pairs_since_change=counters.since_change,
+            sampler_alive=self._sampler_alive,
+            replayed=counters.replayed,
+            answering=snapshot.answering,
+            prequential_m=dict(recent.means),
+            prequential_pairs=recent.pairs,
+            claimed_error_m=self._learning.claimed_error_m(),
+            curve=self._learning.curve,
+            model=snapshot.digest,
+            calibration=self._findings.calibration,
+            outlook=self._findings.outlook,
+            gaps_recovered=counters.gaps_recovered,
+            refused=counters.refused,
+            doubted=counters.doubted,
+            changes=counters.changes,
+            last_change=self._changes.status(self._learning.change, can_roll_back=self._learning.can_roll_back),
+            at_rest=at_rest,
+            checkpoint_age_s=None if written is None else now - written,
+            uptime_s=now - self._started_at,
+            health=list(self._health()),
+            orientation=self._learning.orientation_status(),
+            missed=counters.missed,
+            behind=self._feed.behind,
+            age_s=self._feed.age_s(snapshot.newest_utc),
+            version=self._version,
+        )
+
+    def _state(self, pairs: int) -> str:
+        if self._feed.paused:
+            return "paused"
+        if pairs == 0:
+            return "waiting"
+        return "aligning" if self._learning.aligning else "learning"
+
+    def _health(self) -> Iterator[str]:
+        if not self._sampler_alive:
+            yield (
+                f"no sampler on {self._config.tables.zenoh.sampler}, so no new pairs; start it with "
+                "`bodyschema sampler`. Predictions go on"
+            )
+        for problem in (self._feed.problem, self._checkpoint_problem, self._set_aside):
+            if problem is not None:
+                yield problem
+        yield from self._findings.doubts
+        behind = self._feed.behind
+        if behind >= BEHIND and not self._feed.paused:
+            age_s = self._feed.age_s(self._learning.snapshot.newest_utc)
+            newest = "" if age_s is None else f", and the newest that was learnt is {age_s:.0f} s old"
+            yield (
+                f"{behind} stored pairs are not learnt yet{newest}: predictions are of that time. It catches up by "
+                "itself while pairs come more slowly than they are learnt; if the number grows, lower [learner] "
+                "replays_per_pair or run the learner on a faster machine"
+            )
+        if self._feed.refused is not None:
+            yield f"pairs were refused, {self._learning.counters.refused} so far; the last: {self._feed.refused}"
+        if self._nominal.size > LARGEST_NET:
+            yield f"{self._nominal.joints} joints are too many for the exact map; the others learn without it"
+
+    def _declare(self) -> None:
+        bus, keys, answers = self._bus, self._keys, self._answers
+        bus.answer(keys.predict, answers.predict)
+        bus.answer(keys.jacobian, answers.jacobian)
+        bus.answer(keys.ik, answers.ik)
+        bus.answer(keys.model, answers.model, encoding=OCTETS)
+        bus.answer(keys.status("learner"), lambda request: encode(self.status(), request.encoding))
+        bus.answer(keys.command("learner"), self._command)
+        bus.subscribe(keys.pair, self._feed.offer, quick=True)
+        bus.watch(keys.alive("sampler"), self._sampler_changed)
+        bus.token(keys.alive("learner"))
+
+    def _sampler_changed(self, alive: bool) -> None:
+        self._sampler_alive = alive
+        if alive:
+            self._feed.wake()
+
+    def _history(self, begin: int) -> Page:
+        return read_page(self._bus.ask_one(f"{self._keys.pairs}?from={begin}", timeout_s=HISTORY_LIMIT_S))
+
+    def _command(self, request: Request) -> bytes:
+        command = decode(request.payload, CommandRequest, request.encoding).command
+        carried_out: dict[str, Callable[[], str]] = {
+            "pause": self._pause,
+            "resume": self._resume,
+            "reset_to_prior": self._reset_to_prior,
+            "tool_changed": self._tool_changed,
+            "rollback": self._rollback,
+            "checkpoint": self._checkpoint_now,
+            "reload": self.reload,
+        }
+        if command not in carried_out:
+            raise RequestError(
+                f"the learner has nothing to do with {command}. Send it to {self._keys.command('sampler')}"
+            )
+        message = carried_out[command]()
+        log.info("command %s: %s", command, message)
+        return encode(CommandReply(command, message), request.encoding)
+
+    def _pause(self) -> str:
+        self._feed.pause()
+        return "no pairs are learnt until resume; predictions go on"
+
+    def _resume(self) -> str:
+        self._feed.resume()
+        return "pairs are learnt again, those missed first"
+
+    def _reset_to_prior(self) -> str:
+        with self._feed.lock:
+            foreign = self._feed.foreign_store
+            self._learning.reset_to_prior(forget_store=foreign is not None)
+            self._changes.note(None)
+            self._feed.restart()
+        self._feed.wake()
+        self.checkpoint()
+        if foreign is not None:
+            return f"the learner begins anew with the pairs of the store {foreign}"
+        return "the learner is back at the nominal model; only pairs from now on count"
+
+    def _tool_changed(self) -> str:
+        with self._feed.lock:
+            self._learning.tool_changed()
+            self._changes.note(self._learning.change)
+        self.checkpoint()
+        return (
+            "pairs with the old tool no longer count; what they taught is where learning starts again. "
+            "`bodyschema command rollback` takes it back"
+        )
+
+    def _rollback(self) -> str:
+        with self._feed.lock:
+            undone = self._learning.change
+            self._learning.rollback()
+            self._changes.note(self._learning.change, rolled_back=True)
+        self.checkpoint()
+        since = "the last change" if undone is None else f"pair {undone.first_seq}"
+        return f"the model before {since} answers again; pairs since then do not count"
+
+    def _checkpoint_now(self) -> str:
+        self.checkpoint()
+        if self._checkpoint_problem is not None:
+            raise CheckpointError(self._checkpoint_problem)
+        return f"written to {self._config.checkpoint_file}"
+
+    def reload(self) -> str:
+        """Read robot.toml again; return a message about the result.
+
+        Raises:
+            ConfigError: robot.toml is invalid; nothing changed.
+        """
+        found = reload(self._config, TABLES, CHANGEABLE)
+        self._config, self._settings = found.config, found.config.tables.learner
+        return found.message("learner")
+
+    def _guarded(self, loop: Callable[[], None]) -> None:
+        show_name()
+        try:
+            loop()
+        except Exception as error:
+            self._failure = error
+
+    def _learn_pairs(self) -> None:
+        while not self._stop.is_set():
+            self._service.beat(self._loop)
+            self._feed.step(IDLE_S)
+            self._learning.judge_due(self._clock.now())
+            with self._feed.lock:
+                self._changes.note(self._learning.change)
+
+    def work(self) -> bool:
+        """Do a piece of background work; return False if there is none. SolverLostError: the solver lost its pairs."""
+        self._findings.renew()
+        worked = self._learning.work()
+        pairs = self._learning.counters.pairs
+        self._rested_with = pairs if self._learning.at_rest and self._findings.at_rest else None
+        return worked
+
+    def restart_solver(self) -> None:
+        """Send the pairs to a new solver."""
+        self._learning.restart_solver()
+        self._rested_with = None
+
+    def solve_soon(self) -> None:
+        """Let the solver catch up, since there is no other work."""
+        self._learning.solve_soon()
+
+
+def more_rarely(robots: int) -> float:
+    """Return the factor by which states and checkpoints are rarer when `robots` robots share a process."""
+    return max(1.0, robots / AS_OFTEN_AS_ONE)
+
+
+def together_s(robots: int) -> float:
+    """Return how long pairs may wait to be evaluated together [s] when `robots` robots share a process."""
+    return 0.0 if robots == 1 else min(TOGETHER_S * robots, LONGEST_TOGETHER_S)
+
+
+def status_line(status: LearnerStatus) -> str:
+    """Return the learner's state as one line."""
+    claimed = "" if status.claimed_error_m is None else f", {1e3 * status.claimed_error_m:.1f} mm claimed"
+    return with_health(f"{status.state}, {status.pairs} pairs, {status.answering} answers{claimed}", status.health)

@@ -1,0 +1,111 @@
+"""Share one solver process between several robots: each has a seat, and they take turns by need."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+from bodyschema.daemon.learner.solver_process import SolverLostError, SolverProcess
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning import Solved, Task
+
+
+class SharedSolver:
+    """Gives a process one robot's orders at a time. Single-threaded.
+
+    A robot's orders wait here for its turn, because the process does not read while it solves.
+    """
+
+    def __init__(self, process: SolverProcess) -> None:
+        self._process = process
+        self._seats: list[Seat] = []
+        self._solving: Seat | None = None
+        self._turn = 0
+
+    def seat(self) -> Seat:
+        """Add a robot, and return its solver."""
+        seat = Seat(self, self._process, len(self._seats))
+        self._seats.append(seat)
+        return seat
+
+    def attend(self) -> None:
+        """Collect the process's answers, and give the turn to the robot with the greatest need.
+
+        Raises:
+            SolverLostError: the process has ended; all seats are empty.
+        """
+        try:
+            if self._solving is not None and (solved := self._process.poll()) is not None:
+                self._solving.answers.append(solved)
+                if solved.last:
+                    self._solving = None
+            if self._solving is None:
+                self._give_turn()
+        except SolverLostError:
+            self._solving = None
+            for seat in self._seats:
+                seat.clear()
+            raise
+
+    def _give_turn(self) -> None:
+        waiting = [seat for seat in self._seats if seat.asked]
+        if not waiting:
+            return
+        self._turn += 1
+        seat = max(waiting, key=lambda seat: seat.need(self._turn))
+        seat.tell(self._turn)
+        self._solving = seat
+
+
+class Seat:
+    """A `Solver` of one robot, in a process shared with others.
+
+    Attributes:
+        asked: True if a solution is wanted that the process does not work on yet.
+        answers: answers not fetched yet.
+    """
+
+    def __init__(self, shared: SharedSolver, process: SolverProcess, robot: int) -> None:
+        self._shared, self._process, self._robot = shared, process, robot
+        self._orders: deque[Callable[[], None]] = deque()
+        self._pairs = self._new = self._had_turn = 0
+        self.asked = False
+        self.answers: deque[Solved] = deque()
+
+    def start(self, task: Task) -> None:
+        """Discard all pairs and start a new task."""
+        self.clear()
+        self._orders.append(lambda: self._process.start(task, self._robot))
+
+    def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None) -> None:
+        """Queue more pairs, q (n, d) [rad], x (n, 3) [m] and orientations (n, 4), NaN where a pair has none."""
+        self._new += len(q)
+        self._orders.append(lambda: self._process.learn(q, x, turns, self._robot))
+
+    def solve(self) -> None:
+        """Request the solution for all pairs so far, for this robot's next turn."""
+        self.asked = True
+
+    def poll(self) -> Solved | None:
+        """Return the next solution that has arrived, without waiting."""
+        self._shared.attend()
+        return self.answers.popleft() if self.answers else None
+
+    def need(self, turn: int) -> float:
+        """Return the urgency: the relative growth of the pairs, times the number of turns of others since."""
+        return (turn - self._had_turn) * self._new / max(self._pairs, 1)
+
+    def tell(self, turn: int) -> None:
+        """Send all queued orders to the process, and request a solution."""
+        while self._orders:
+            self._orders[0]()
+            self._orders.popleft()
+        self._process.solve(self._robot)
+        self._pairs, self._new, self._had_turn, self.asked = self._pairs + self._new, 0, turn, False
+
+    def clear(self) -> None:
+        """Discard all orders and answers."""
+        self._orders.clear()
+        self.answers.clear()
+        self._pairs = self._new = 0
+        self.asked = False

@@ -1,0 +1,289 @@
+"""Run the solver in a separate process.
+
+One solve takes tenths of a second inside LAPACK, which holds the interpreter's lock; in a thread it would delay answers
+by that time. The child works at low priority, uses a processor at most half of the time, and ends with its parent.
+
+Both directions carry frames: four bytes of length, then a MessagePack message.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import struct
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from types import TracebackType
+from typing import IO, Self
+
+import msgspec
+import numpy as np
+
+from bodyschema.interfaces.errors import BodyschemaError
+from bodyschema.interfaces.interpreter import module_command
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning import DirectSolver, Solved, Task
+from bodyschema.learning.members import RESIDUAL
+from bodyschema.learning.orientation_solver import OrientationSolution
+from kbmaps import ChainBelief, ChainTolerances, KBMap, OrientedChain, ResidualModel
+
+NICENESS = 5
+LONGEST_REST_S = 5.0
+END_LIMIT_S = 5.0
+_LENGTH = struct.Struct("<I")
+
+
+class SolverLostError(BodyschemaError):
+    """The solver's process has ended; `start` starts a new one."""
+
+
+class StartTask(msgspec.Struct, frozen=True, tag="start"):
+    """Discard all pairs and start this task."""
+
+    number: int
+    prior: bytes
+    belief: bytes
+    residual: bytes | None
+    prior_stays: bool
+    tolerances: ChainTolerances | None
+    robot: int = 0
+
+
+class Learn(msgspec.Struct, frozen=True, tag="learn"):
+    """Pairs: q (n, joints), x (n, 3) and orientations (n, 4) as little-endian float64."""
+
+    joints: int
+    q: bytes
+    x: bytes
+    turns: bytes | None = None
+    robot: int = 0
+
+
+class Solve(msgspec.Struct, frozen=True, tag="solve"):
+    """Request a solution for all pairs so far."""
+
+    robot: int = 0
+
+
+class Oriented(msgspec.Struct, frozen=True):
+    """An `OrientationSolution`, its models as bytes."""
+
+    pairs: int
+    chain: bytes
+    map: bytes | None
+    map_noise: float
+
+
+class Solution(msgspec.Struct, frozen=True):
+    """One answer to `Solve`; the model is missing if there is no solution.
+
+    A `ResidualModel` contains the arm's estimate, and is sent alone.
+    """
+
+    task: int
+    pairs: int
+    name: str
+    model: bytes | None
+    belief: bytes | None
+    last: bool
+    wide: bytes | None
+    orientation: Oriented | None = None
+
+
+_orders = msgspec.msgpack.Decoder(StartTask | Learn | Solve)
+_solutions = msgspec.msgpack.Decoder(Solution)
+
+
+class SolverProcess:
+    """A `Solver` in a child process, started with the first task. Use as a context manager.
+
+    It may hold the pairs of several robots, by their numbers, and solves for one at a time.
+
+    All methods but `__exit__` raise SolverLostError when the child has died.
+    """
+
+    def __init__(self) -> None:
+        self._child: subprocess.Popen[bytes] | None = None
+        self._received = bytearray()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end()
+
+    @property
+    def pid(self) -> int | None:
+        """Process id of the child; None before the first task."""
+        return self._child.pid if self._child is not None else None
+
+    def start(self, task: Task, robot: int = 0) -> None:
+        """Discard all pairs and start a new task."""
+        if self._child is None:
+            command = module_command("bodyschema.daemon.learner.solver_process")
+            environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+            # A process group of its own: Ctrl-C in a terminal is handled by the parent.
+            try:
+                self._child = subprocess.Popen(
+                    command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, process_group=0
+                )
+            except OSError as error:  # out of memory, or too many open files
+                raise SolverLostError(f"the solver cannot be started: {error.strerror}; it is tried again") from error
+        self._send(
+            StartTask(
+                number=task.number,
+                prior=task.prior.to_bytes(),
+                belief=task.belief.to_bytes(),
+                residual=None if task.residual is None else task.residual.to_bytes(),
+                prior_stays=task.prior_stays,
+                tolerances=task.tolerances,
+                robot=robot,
+            )
+        )
+
+    def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None, robot: int = 0) -> None:
+        """Send more pairs, q (n, d) [rad], x (n, 3) [m] and orientations (n, 4), NaN where a pair has none."""
+        told = None if turns is None else turns.astype("<f8").tobytes()
+        self._send(Learn(q.shape[1], q.astype("<f8").tobytes(), x.astype("<f8").tobytes(), told, robot))
+
+    def solve(self, robot: int = 0) -> None:
+        """Request the solution for all pairs so far."""
+        self._send(Solve(robot))
+
+    def poll(self) -> Solved | None:
+        """Return the next solution that has arrived, without waiting."""
+        child = self._child
+        if child is None or child.stdout is None:
+            return None
+        while select.select([child.stdout], [], [], 0)[0]:
+            part = os.read(child.stdout.fileno(), 1 << 20)
+            if not part:
+                raise self._lost()
+            self._received += part
+        return self._next_solution()
+
+    def _next_solution(self) -> Solved | None:
+        if len(self._received) < _LENGTH.size:
+            return None
+        end = _LENGTH.size + _LENGTH.unpack_from(self._received)[0]
+        if len(self._received) < end:
+            return None
+        solution = _solutions.decode(bytes(self._received[_LENGTH.size : end]))
+        del self._received[:end]
+        return _unpacked(solution)
+
+    def _send(self, order: StartTask | Learn | Solve) -> None:
+        if self._child is None or self._child.stdin is None:
+            raise SolverLostError("the solver has not been started")
+        try:
+            _write(self._child.stdin, order)
+        except OSError as error:
+            raise self._lost() from error
+
+    def _lost(self) -> SolverLostError:
+        code = self._end()
+        return SolverLostError(f"the solver's process ended with exit code {code}; it is started again")
+
+    def _end(self) -> int | None:
+        child, self._child = self._child, None
+        self._received.clear()
+        if child is None or child.stdin is None or child.stdout is None:
+            return None
+        with contextlib.suppress(OSError):  # buffered data has no reader any more
+            child.stdin.close()
+        child.terminate()
+        try:
+            return child.wait(END_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            return child.wait()
+        finally:
+            child.stdout.close()
+
+
+def _unpacked(solution: Solution) -> Solved:
+    model = belief = None
+    if solution.model is not None and solution.name == RESIDUAL:
+        model = belief = ResidualModel.from_bytes(solution.model)
+    elif solution.model is not None:
+        model, belief = KBMap.from_bytes(solution.model), _belief(solution.belief)
+    turned = None if solution.orientation is None else _orientation_from(solution.orientation)
+    wide = _belief(solution.wide)
+    return Solved(solution.task, solution.pairs, solution.name, model, belief, solution.last, wide, turned)
+
+
+def _orientation_from(packed: Oriented) -> OrientationSolution:
+    kbmap = None if packed.map is None else KBMap.from_bytes(packed.map)
+    return OrientationSolution(packed.pairs, OrientedChain.from_bytes(packed.chain), kbmap, packed.map_noise)
+
+
+def _packed_orientation(solution: OrientationSolution) -> Oriented:
+    kbmap = None if solution.map is None else solution.map.to_bytes()
+    return Oriented(solution.pairs, solution.chain.to_bytes(), kbmap, solution.map_noise)
+
+
+def _belief(data: bytes | None) -> ChainBelief | None:
+    return None if data is None else ChainBelief.from_bytes(data)
+
+
+def serve(orders: IO[bytes], solutions: IO[bytes]) -> None:
+    """Carry out orders until they end; before another solve, rest for as long as the last one took."""
+    solvers: defaultdict[int, DirectSolver] = defaultdict(DirectSolver)
+    rested_at = 0.0
+    while (order := _read(orders)) is not None:
+        solver = solvers[order.robot]
+        if isinstance(order, StartTask):
+            prior, belief = KBMap.from_bytes(order.prior), ChainBelief.from_bytes(order.belief)
+            residual = None if order.residual is None else ResidualModel.from_bytes(order.residual)
+            solver.start(Task(order.number, prior, belief, residual, order.prior_stays, order.tolerances))
+            rested_at = 0.0  # a new task starts with few pairs, and its first result is awaited
+        elif isinstance(order, Learn):
+            solver.learn(
+                np.frombuffer(order.q, dtype="<f8").reshape(-1, order.joints),
+                np.frombuffer(order.x, dtype="<f8").reshape(-1, 3),
+                None if order.turns is None else np.frombuffer(order.turns, dtype="<f8").reshape(-1, 4),
+            )
+        else:
+            time.sleep(max(rested_at - time.monotonic(), 0.0))
+            rested_at = time.monotonic() + min(_solve(solver, solutions), LONGEST_REST_S)
+
+
+def _solve(solver: DirectSolver, solutions: IO[bytes]) -> float:
+    """Solve, and send each solution as it is found; return the processor time used [s]."""
+    begin = time.process_time()  # on a busy machine most of the wall time is waiting, which is rest enough
+    for solved in solver.solutions():
+        learnt = None if solved.model is None else solved.model.to_bytes()
+        belief = solved.belief.to_bytes() if isinstance(solved.belief, ChainBelief) else None
+        wide = None if solved.wide is None else solved.wide.to_bytes()
+        turned = None if solved.orientation is None else _packed_orientation(solved.orientation)
+        _write(solutions, Solution(solved.task, solved.pairs, solved.name, learnt, belief, solved.last, wide, turned))
+    return time.process_time() - begin
+
+
+def _write(stream: IO[bytes], message: msgspec.Struct) -> None:
+    payload = msgspec.msgpack.encode(message)
+    stream.write(_LENGTH.pack(len(payload)) + payload)
+    stream.flush()
+
+
+def _read(stream: IO[bytes]) -> StartTask | Learn | Solve | None:
+    """Return the next order; None if the parent has gone, even in the middle of one."""
+    head = stream.read(_LENGTH.size)
+    if len(head) < _LENGTH.size:
+        return None
+    length = _LENGTH.unpack(head)[0]
+    payload = stream.read(length)
+    return _orders.decode(payload) if len(payload) == length else None
+
+
+if __name__ == "__main__":
+    os.nice(NICENESS)
+    try:
+        serve(sys.stdin.buffer, sys.stdout.buffer)
+    except BrokenPipeError:
+        os._exit(0)  # the parent died while a solution was being sent; flushing at exit would only fail again

@@ -1,0 +1,1 @@
+"""The sampler process: joint readings and camera frames in, pairs out."""

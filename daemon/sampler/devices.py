@@ -1,0 +1,100 @@
+"""Record which devices read the joints, and report how a change of them affects the pairs."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Protocol, runtime_checkable
+
+from bodyschema.interfaces.protocols import Clock, JointSource
+from bodyschema.recordings.store.store import PairStore
+
+log = logging.getLogger(__name__)
+
+Device = Mapping[str, Any]
+
+ANEW = "or keep it, and begin anew with another --state-dir"
+IN_SERVO = {"homing_offset_ticks": "homing_offset", "drive_mode": "drive_mode"}
+IN_ROBOT_TOML = ("zero_ticks", "direction")
+
+
+@runtime_checkable
+class KeepsRecord(Protocol):
+    """Encoders that can identify themselves; see `bodyschema.drivers.servos.joints.ServoJoints`."""
+
+    @property
+    def record(self) -> Sequence[Device]:
+        """For each joint: `joint`, and its identifying properties by name; empty until the devices were queried."""
+        ...
+
+
+class DeviceWatch:
+    """Records in the store which devices read the joints, and detects changes.
+
+    Attributes:
+        changes: differences from the devices of earlier pairs, with remedies.
+    """
+
+    def __init__(self, joints: JointSource, store: PairStore, wall: Clock) -> None:
+        """Store the settings; nothing is queried yet.
+
+        Args:
+            joints: queried if they keep a record.
+            store: open.
+        """
+        self._joints = joints if isinstance(joints, KeepsRecord) else None
+        self._store, self._wall = store, wall
+        stored = store.reader.devices()
+        self._before: Sequence[Device] = stored[-1].record if stored else ()
+        self._kept: Sequence[Device] = ()
+        self.changes: list[str] = []
+
+    def note_again(self) -> None:
+        """Start again for a new session, which has its own record."""
+        self._kept = ()
+
+    def look(self) -> bool:
+        """Store the record if it is new; return True if pairs from now on differ from earlier ones."""
+        record = () if self._joints is None else self._joints.record
+        if not record or record == self._kept:
+            return False
+        found = differences(self._before, record)
+        self._store.note_devices(self._wall.utc(), record)
+        self._before = self._kept = record
+        for said in found:
+            log.warning("%s", said)
+        self.changes += found
+        return bool(found)
+
+
+def differences(before: Sequence[Device], now: Sequence[Device]) -> list[str]:
+    """Return sentences on what makes measurements with `now` differ from those with `before`, with remedies."""
+    then = {device["joint"]: device for device in before}
+    return [said for device in now if device["joint"] in then for said in _said(then[device["joint"]], device)]
+
+
+def _said(before: Device, now: Device) -> Iterator[str]:
+    joint, changed = now["joint"], {key for key in now if key in before and before[key] != now[key]}
+    if "model" in changed:
+        yield (
+            f"joint {joint!r} has another servo than the pairs before: {before['model']} then, {now['model']} now. "
+            f"Its zero is another one: put the old one back, {ANEW}"
+        )
+        return
+    for key, name in IN_SERVO.items():
+        if key in changed:
+            yield (
+                f"the zero of {joint!r} is not what the pairs before were measured with: {name} was {before[key]}, is "
+                f"{now[key]}. Write it back (`bodyschema servos set {name}={before[key]} --joint {joint}`), {ANEW}"
+            )
+    for key in IN_ROBOT_TOML:
+        if key in changed:
+            yield (
+                f"the zero of {joint!r} is not what the pairs before were measured with: {key} in robot.toml was "
+                f"{before[key]}, is {now[key]}. Put it back, {ANEW}"
+            )
+    if "firmware" in changed:
+        yield (
+            f"the firmware of {joint!r} was {before['firmware']}, is {now['firmware']}: compare its angle in a known "
+            "pose with `bodyschema joints`; pairs before may have another zero"
+        )

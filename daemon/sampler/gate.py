@@ -1,0 +1,121 @@
+"""Decide which measurements become pairs, and which segment they belong to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyschema.daemon.config import DaemonConfig
+from bodyschema.interfaces.records import FloatArray, Pair, Reason
+
+from .align import joint_difference
+
+# This many consecutive fixes that agree with each other, but not with the previous position, are accepted.
+CONFIRMATIONS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Accepted:
+    """The measurement is a pair of this segment."""
+
+    segment: int
+
+
+class _Fix(NamedTuple):
+    t: float
+    x: FloatArray
+
+
+class Gate:
+    """Accepts a measurement if its joint-space step from the last pair is neither too small nor implausible.
+
+    A step is the Euclidean norm over all joints in degrees; prismatic joints count with `metres_per_degree`. A step
+    below `min_step_deg` is not a pair, also across a restart or a gap, so that an arm at rest does not fill the store.
+    A step above `max_step_deg`, a pause longer than `segment_gap_s`, a `break_segment` and a marker that jumped start a
+    new segment.
+
+    A marker that moved faster than `max_marker_speed_m_s` from its last accepted position is refused. It is accepted
+    again after `CONFIRMATIONS` consecutive fixes that agree with each other (a tool change), when it could have moved
+    there in the elapsed time, or after `segment_gap_s`.
+
+    With `any_step`, neither step nor speed is checked: a static recording has no path between its poses.
+    """
+
+    def __init__(self, rules: DaemonConfig, prismatic: NDArray[np.bool_], last: Pair | None = None) -> None:
+        """Start after `last`, the newest pair in the store.
+
+        Args:
+            prismatic: which joints are prismatic, shape (d,).
+        """
+        self._prismatic = prismatic
+        self.follow(rules)
+        self._segment = 0 if last is None else last.segment
+        self._q: FloatArray | None = None if last is None else last.q
+        self._t: float | None = None
+        self._broken = True
+        self._believed: _Fix | None = None
+        self._suspect: _Fix | None = None
+        self._suspects = 0
+
+    def follow(self, rules: DaemonConfig) -> None:
+        """Apply these rules from now on; the segment continues."""
+        self._rules = rules
+        self._degrees_per_unit = np.where(self._prismatic, 1 / rules.metres_per_degree, 180 / np.pi)
+
+    @property
+    def segment(self) -> int:
+        """Number of the current segment; 0 before the first."""
+        return self._segment
+
+    def break_segment(self) -> None:
+        """Start a new segment with the next pair, regardless of its step."""
+        self._broken = True
+        self._believed = None
+
+    def offer(self, t: float, q: FloatArray, x: FloatArray) -> Accepted | Reason:
+        """Return the segment if joint angles `q` [rad or m] (d,) and marker `x` [m] (3,) make a pair, else the reason.
+
+        Args:
+            t: time of the measurement [s], later than all before.
+        """
+        rules = self._rules
+        if not rules.any_step and not self._believe(_Fix(t, x)):
+            return Reason.IMPLAUSIBLE_SPEED
+        step_deg = self._step_deg(q)
+        if step_deg < rules.min_step_deg and not rules.any_step:
+            return Reason.TOO_NEAR
+        paused = self._t is None or t - self._t > rules.segment_gap_s
+        if self._broken or paused or step_deg > rules.max_step_deg:
+            self._segment += 1
+        self._t, self._q, self._broken = t, q, False
+        return Accepted(self._segment)
+
+    def is_too_fast(self, moved: FloatArray) -> bool:
+        """Return True if joints that moved by `moved` [rad or m], (d,), within the time uncertainty make no pair."""
+        return float(np.linalg.norm(moved * self._degrees_per_unit)) > self._rules.max_time_error_deg
+
+    def _step_deg(self, q: FloatArray) -> float:
+        if self._q is None:
+            return np.inf
+        return float(np.linalg.norm(joint_difference(q, self._q, self._prismatic) * self._degrees_per_unit))
+
+    def _believe(self, fix: _Fix) -> bool:
+        jumped = self._reachable(self._suspect, fix)
+        last = self._believed
+        if last is not None and fix.t - last.t <= self._rules.segment_gap_s and not self._reachable(last, fix):
+            self._suspects = self._suspects + 1 if jumped else 1
+            self._suspect = fix
+            if self._suspects < CONFIRMATIONS:
+                return False
+        self._broken |= jumped
+        self._believed, self._suspect, self._suspects = fix, None, 0
+        return True
+
+    def _reachable(self, last: _Fix | None, fix: _Fix) -> bool:
+        if last is None:
+            return False
+        distance = float(np.linalg.norm(fix.x - last.x))
+        return distance <= self._rules.max_marker_speed_m_s * (fix.t - last.t)

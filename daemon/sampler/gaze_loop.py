@@ -1,0 +1,125 @@
+"""Aim the head at the hand, by the learnt model where it is accurate there, otherwise by the nominal one."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode
+from bodyschema.interfaces.errors import BusError, ConfigError, RequestError
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.pointing import Pointing
+
+from .sources import Head, Sources
+
+log = logging.getLogger(__name__)
+
+PERIOD_S = 0.04
+GAIN = 0.5  # fraction of a step towards the centre; the head follows with a delay
+GOOD_M = 0.02  # a learnt model with a larger uncertainty at the hand is not used
+ASK_AGAIN_S = 1.0
+PREDICT_S = 0.2  # how long the head waits for the learner
+
+Predict = Callable[[bytes], bytes]
+"""Asks the learner: a `JointsRequest`, and its `PredictReply`; BusError or RequestError without an answer."""
+
+
+class HandModel:
+    """Hand position in the measurement frame, by the best available model.
+
+    Attributes:
+        source: learnt or nominal: the model used last.
+    """
+
+    def __init__(self, robot: RobotDescription, predict: Predict, clock: Clock) -> None:
+        self._chain, self._predict, self._clock = robot.chain, predict, clock
+        self._ask_s = -math.inf
+        self.source = "nominal"
+
+    def positions(self, q: FloatArray) -> FloatArray:
+        """Return marker positions (n, 3) [m] at q (n, d) [rad], all by one model, which the first row selects."""
+        learnt = self._learnt(q) if self._clock.now() >= self._ask_s else None
+        source = "nominal" if learnt is None else "learnt"
+        if source != self.source:
+            log.info("the gaze goes by the %s model", source)
+            self.source = source
+        return self._chain.positions(q) if learnt is None else learnt
+
+    def _learnt(self, q: FloatArray) -> FloatArray | None:
+        try:
+            reply = decode(self._predict(encode(JointsRequest(q.tolist()))), PredictReply)
+        except (BusError, RequestError):
+            self._ask_s = self._clock.now() + ASK_AGAIN_S
+            return None
+        x = np.array(reply.x)
+        is_good = reply.in_support[:1] == [True] and max(reply.sigma[0]) <= GOOD_M
+        return x if is_good and x.shape == (len(q), 3) and np.isfinite(x).all() else None
+
+
+class GazeLoop:
+    """Aims the head, in a thread of its own. If that fails the head stands still, as its target is stale."""
+
+    def __init__(self, robot: RobotDescription, head: Head, model: HandModel) -> None:
+        """Store the settings; nothing is started yet.
+
+        Raises:
+            ConfigError: [camera] describes no stereo pair.
+        """
+        if robot.calibration is None:
+            raise ConfigError(
+                "gaze needs to know how the cameras see", file=robot.file, remedy="Describe the stereo pair in [camera]"
+            )
+        self._head, self._model = head, model
+        self._places = [robot.joints.index(joint) for joint in head.head]
+        self._pointing = Pointing(robot.calibration, self._places, head.lower, head.upper)
+        self._told_s = -math.inf
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="gaze")
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ending.set()
+        self._thread.join()
+
+    def look(self) -> None:
+        """Aim the head once, if there is a newer reading."""
+        pose = self._head.pose
+        if pose is None or pose[0] <= self._told_s:
+            return
+        self._told_s, q = pose
+        step = self._pointing.step(q[None], self._model.positions)[0]
+        self._head.aim(self._told_s, self._pointing.clipped(q[self._places] + GAIN * step))
+
+    def _run(self) -> None:
+        try:
+            while not self._ending.wait(PERIOD_S):
+                self.look()
+        except Exception:
+            log.exception("the gaze failed; the head stands still")
+
+
+def gaze_of(robot: RobotDescription, sources: Sources, bus: Bus, wall: Clock) -> GazeLoop | None:
+    """Return the gaze loop of a robot that has a head, with its cameras as calibrated; None if it has none."""
+    if sources.head is None:
+        return None
+    key = Keys(robot.name).predict
+    if sources.calibration is not None:
+        robot = replace(robot, calibration=sources.calibration)
+    model = HandModel(robot, lambda payload: bus.ask_one(key, payload, timeout_s=PREDICT_S), wall)
+    return GazeLoop(robot, sources.head, model)

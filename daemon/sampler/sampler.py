@@ -1,0 +1,404 @@
+"""Run the sampler: marker fixes and joint readings in, pairs into the store and onto zenoh."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from contextlib import ExitStack
+from importlib.metadata import version
+
+import numpy as np
+
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.service.service import Service, with_health
+from bodyschema.daemon.transport.bus import Bus, Request
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.status import SamplerStatus
+from bodyschema.daemon.transport.wire import CommandReply, CommandRequest, decode, encode, pair_to_wire
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import ConfigError, RequestError, SourceEnded
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.records import FloatArray, JointReading, MarkerFix, MarkerMiss, Reason
+from bodyschema.recordings.store.file import disk_free
+from bodyschema.recordings.store.store import PairStore
+
+from .align import JointBuffer
+from .counters import Tally
+from .devices import DeviceWatch
+from .gate import Accepted, Gate
+from .gaze_loop import gaze_of
+from .history import answer_pairs
+from .powered import asked
+from .reconnect import Reopening
+from .resilient_writer import Storing
+from .rules import SamplerRules
+from .servo_status import accept_turns, buses_of, complaints_of, servos_of
+from .simulation import answer_simulation
+from .sources import Sources
+
+log = logging.getLogger(__name__)
+
+READ_TIMEOUT_S = 0.2
+JOINTS_TIMEOUT_S = 1.0  # how long a frame waits for the encoders to reach its time
+AROUND_S = 0.1  # [s] around a frame whose time is uncertain, to estimate the joints' speed
+STATUS_EVERY_S = 1.0
+SILENT_AFTER_S = 2.0  # a source without data for this long is reported
+ZERO_FORCE = "zero_force"  # value of [robot] hold, and name of the drive
+PAIR_CACHE = 1000
+LOW_DISK_BYTES = 200 * 2**20
+# Loops that must keep running.
+LOOPS = ("encoders", "frames")
+
+
+class Sampler:
+    """Turns measurements into pairs: aligned in time, gated, committed to the store, and then published.
+
+    One thread reads the encoders, the thread that calls `run` does the rest, and zenoh's threads answer queries.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        sources: Sources,
+        bus: Bus,
+        store: PairStore,
+        *,
+        exit_at_end: bool = False,
+        wall: Clock | None = None,
+        service: Service | None = None,
+    ) -> None:
+        """Prepare a sampler over an open bus and an open store; `run` opens the sources.
+
+        Args:
+            exit_at_end: return from `run` when the sources end, instead of continuing to serve the history.
+            wall: the machine's clock, for rates and UTC; all other times are the sources'.
+            service: is notified once everything is up, that `LOOPS` work, and of the sampler's state.
+
+        Raises:
+            ConfigError: the encoders' joints differ from robot.toml's.
+        """
+        if sources.joints.joints != config.robot.joints:
+            raise ConfigError(
+                f"the encoders give the joints {', '.join(sources.joints.joints)}, [robot] joints are "
+                f"{', '.join(config.robot.joints)}",
+                file=config.file,
+                remedy="Make both the same, in the same order",
+            )
+        self._config, self._bus, self._store, self._exit_at_end = config, bus, store, exit_at_end
+        self._wall = SystemClock() if wall is None else wall
+        self._service = Service.nobodys(self._wall) if service is None else service
+        self._keys = Keys(config.robot.name)
+        self._version = version("bodyschema")  # reads a file: once, while descriptors are available
+        self._powered = {drive.name: drive for drive in sources.powered}
+        held = config.robot.robot.hold == "zero_force"
+        self._bears = self._powered.get(ZERO_FORCE) if held else None
+        self._cameras = sources.cameras
+        self._gaze = gaze_of(config.robot, sources, bus, self._wall)
+        self._simulation, self._source_clock = sources.simulation, sources.clock
+        self._joints = Reopening(sources.joints, "the encoders", self._wall, forbidden=self._service.forbidden)
+        self._encoders, self._devices = sources.joints, DeviceWatch(sources.joints, store, self._wall)
+        self._marker = Reopening(sources.marker, "the cameras", self._wall, forbidden=self._service.forbidden)
+        rules, prismatic = config.tables.daemon, config.robot.chain.prismatic
+        self._buffer = JointBuffer(prismatic, rules.max_reading_gap_s, live=sources.live, kept_s=AROUND_S)
+        self._gate = Gate(rules, prismatic, store.last())
+        self._storing = Storing(store, self._wall)
+        self._tally = Tally(config.robot, self._wall, store.audit.joint_ranges)
+        self._seq = store.audit.newest
+        self._publish = bus.publisher(self._keys.pair, cache=PAIR_CACHE)
+        self._publish_status = bus.publisher(self._keys.status("sampler"))
+        self._stopping = self._reloading = False
+        # Once a pause is acknowledged, no pair may follow.
+        self._deciding = threading.Lock()
+        self._rules = SamplerRules(
+            config, store, self._devices, self._wall, gate=self._gate, buffer=self._buffer, deciding=self._deciding
+        )
+        self._paused = False
+        self._resumed_at = -math.inf
+        self._ended = False
+        self._failure: Exception | None = None
+        self._bad_readings = 0
+        self._losses = 0
+        self._last_reading = self._last_frame = self._next_status = self._wall.now()
+
+    def stop(self) -> None:
+        """Request the end of `run`. Only sets a flag: a signal handler may call it."""
+        self._stopping = True
+
+    def reload(self) -> None:
+        """Request that `run` reads robot.toml again. Only sets a flag: a signal handler may call it."""
+        self._reloading = True
+
+    def run(self) -> None:
+        """Sample until `stop`, or with `exit_at_end` until the sources end.
+
+        Raises:
+            StoreError: the store is damaged; the pair was not published, and no pair followed.
+            SourceError: a source could not be opened at the start.
+        """
+        self._service.tell("opening encoders and cameras")
+        with ExitStack() as stack:
+            stack.callback(self._service.stopping)
+            stack.enter_context(self._joints)
+            stack.enter_context(self._marker)
+            self._devices.look()
+            reader = threading.Thread(target=self._read_encoders, name="encoders")
+            reader.start()
+            stack.callback(reader.join)
+            stack.callback(self._buffer.close)
+            stack.callback(self.stop)
+            if self._gaze is not None:
+                stack.enter_context(self._gaze)
+            self._serve()
+            name, endpoint = self._config.robot.name, self._config.tables.zenoh.sampler
+            log.info("the sampler of %s answers on %s; %d pairs are in %s", name, endpoint, self._seq, self._store.file)
+            try:
+                self._sample()
+                self._serve_history()
+            except Exception as error:
+                self._failure = error
+                self._tell()
+                raise
+
+    def status(self) -> SamplerStatus:
+        """Return the sampler's state; from any thread."""
+        tally = self._tally
+        return SamplerStatus(
+            robot=self._config.robot.name,
+            store=self._store.identity,
+            state=self._state(),
+            pairs=self._seq,
+            segment=self._gate.segment,
+            uptime_s=tally.uptime_s,
+            frames=tally.frames,
+            frames_per_s=tally.frames_per_s,
+            readings_per_s=tally.readings_per_s,
+            pairs_per_s=tally.pairs_per_s,
+            rejected=tally.rejected,
+            coverage=tally.coverage,
+            disk_free_bytes=disk_free(self._store.file),
+            health=self._health(),
+            servos=servos_of(self._encoders),
+            buses=buses_of(self._encoders),
+            version=self._version,
+            unreadable=self._store.reader.present_damage().count,
+        )
+
+    def _serve(self) -> None:
+        bus, keys = self._bus, self._keys
+        bus.answer(keys.pairs, lambda request: answer_pairs(self._store.reader, request))
+        bus.answer(keys.status("sampler"), lambda request: encode(self.status(), request.encoding))
+        bus.answer(keys.command("sampler"), self._obey)
+        if self._simulation is not None:
+            world, clock = self._simulation, self._source_clock
+            bus.answer(keys.simulation, lambda request: answer_simulation(world, clock, request))
+        bus.token(keys.alive("sampler"))
+
+    def _sample(self) -> None:
+        while not self._stopping:
+            self._tell_when_due()
+            try:
+                seen = self._marker.read(READ_TIMEOUT_S)
+            except SourceEnded:
+                break
+            self._check_encoders()
+            if seen is None:
+                self._buffer.make_room()
+                continue
+            self._last_frame = self._wall.now()
+            self._tally.frames += 1
+            if self._tally.readings:
+                self._service.ready()
+            reason = self._take(seen)
+            if reason is not None:
+                self._tally.reject(reason)
+
+    def _serve_history(self) -> None:
+        self._check_encoders()
+        if self._stopping:
+            return
+        self._ended = True
+        self._service.ready()
+        log.info("the sources are through; %d pairs are in the store", self._seq)
+        self._tell()
+        while not (self._stopping or self._exit_at_end):
+            time.sleep(READ_TIMEOUT_S)
+            self._tell_when_due()
+
+    def _take(self, seen: MarkerFix | MarkerMiss) -> Reason | None:
+        """Make a pair from a detection, or return the reason why not."""
+        self._buffer.forget_before(seen.t)
+        if self._paused or seen.t <= self._resumed_at:
+            self._gate.break_segment()
+            return Reason.PAUSED
+        if isinstance(seen, MarkerMiss):
+            return seen.reason
+        if not (np.isfinite(seen.x).all() and np.isfinite(seen.cov).all()):
+            return Reason.NOT_FINITE
+        q = self._angles(seen)
+        if isinstance(q, Reason):
+            return q
+        if self._bears is not None and self._bears.state != "on":
+            self._gate.break_segment()
+            return Reason.NOT_BORNE
+        with self._deciding:
+            if self._paused:
+                self._gate.break_segment()
+                return Reason.PAUSED
+            others = self._storing.attempt(self._devices.look)
+            if others is None:
+                return Reason.NOT_STORED
+            if others:
+                self._gate.break_segment()
+            verdict = self._gate.offer(seen.t, q, seen.x)
+            if isinstance(verdict, Reason):
+                return verdict
+            return self._accept(verdict, q, seen)
+
+    def _angles(self, fix: MarkerFix) -> FloatArray | Reason:
+        """Return the joint angles at the time of a fix, if they are accurate enough despite that time's uncertainty."""
+        if fix.t_sigma > 0:
+            moved = self._buffer.moved(fix.t, fix.t_sigma, JOINTS_TIMEOUT_S)
+            if isinstance(moved, Reason):
+                return moved
+            if self._gate.is_too_fast(moved):
+                return Reason.MOVING
+        q = self._buffer.at(fix.t, JOINTS_TIMEOUT_S)
+        if not isinstance(q, Reason) and self._gate.is_too_fast(self._buffer.slack(fix.t)):
+            return Reason.LATE_JOINTS
+        return q
+
+    def _accept(self, verdict: Accepted, q: FloatArray, fix: MarkerFix) -> Reason | None:
+        pair = self._storing.append(verdict.segment, q, fix)
+        if pair is None:
+            self._gate.break_segment()
+            return Reason.NOT_STORED
+        self._seq = pair.seq
+        self._tally.accept(q)
+        self._publish(encode(pair_to_wire(pair)))
+        return None
+
+    def _check_encoders(self) -> None:
+        if self._failure is not None:
+            raise self._failure
+        losses = self._joints.losses + self._marker.losses
+        if losses != self._losses:
+            self._losses = losses
+            self._gate.break_segment()
+
+    def _read_encoders(self) -> None:
+        try:
+            while not self._stopping:
+                self._service.beat("encoders")
+                reading = self._joints.read(READ_TIMEOUT_S)
+                if reading is not None:
+                    self._take_reading(reading)
+                elif self._joints.trouble is not None:
+                    self._buffer.silence()
+        except SourceEnded:
+            self._service.leave("encoders")
+            self._buffer.silence()
+        except Exception as error:
+            log.exception("the encoders' thread failed")
+            self._failure = error
+            self._buffer.close()
+
+    def _take_reading(self, reading: JointReading) -> None:
+        self._last_reading = self._wall.now()
+        self._tally.readings += 1
+        if np.isfinite(reading.q).all():
+            self._buffer.put(reading)
+            return
+        self._bad_readings += 1
+        if self._bad_readings == 1:
+            joint = self._config.robot.joints[int(np.argmin(np.isfinite(reading.q)))]
+            log.warning("the encoder of joint %r gave a number that is not finite; such readings are not used", joint)
+
+    def _obey(self, request: Request) -> bytes:
+        command = decode(request.payload, CommandRequest, request.encoding).command
+        if command == "accept_turns":
+            return encode(CommandReply(command, accept_turns(self._encoders)), request.encoding)
+        name, _, way = command.rpartition("_")
+        if way in ("on", "off"):
+            return encode(CommandReply(command, self._power(name, on=way == "on")), request.encoding)
+        if command == "reload":
+            return encode(CommandReply(command, self._rules.reload()), request.encoding)
+        if command not in ("pause", "resume"):
+            raise RequestError(
+                f"the sampler has nothing to do with {command}. Send it to {self._keys.command('learner')}"
+            )
+        if command == "resume" and self._paused:
+            # A frame still in transit shows the arm during the pause.
+            self._resumed_at = self._source_clock.now()
+        with self._deciding:
+            self._paused = command == "pause"
+        message = "no pairs are accepted until resume" if self._paused else "pairs are accepted, in a new segment"
+        log.info("%s: %s", command, message)
+        return encode(CommandReply(command, message), request.encoding)
+
+    def _power(self, name: str, *, on: bool) -> str:
+        if self._simulation is not None:
+            raise RequestError(f"{name} is of a real arm: in the simulation the head follows the hand by itself")
+        if name not in self._powered:
+            raise RequestError(f"{name} is not configured: docs/hardware.md shows its table [drivers.dynamixel.{name}]")
+        said = asked(self._powered[name], on=on)
+        log.info("%s", said)
+        return said
+
+    def _tell_when_due(self) -> None:
+        self._service.beat("frames")
+        if self._reloading:
+            self._reloading = False
+            self._rules.reload_aside(self._service)
+        self._tally.tick()
+        if self._wall.now() >= self._next_status:
+            self._rules.trim()
+            self._tell()
+
+    def _tell(self) -> None:
+        self._next_status = self._wall.now() + STATUS_EVERY_S
+        status = self.status()
+        self._publish_status(encode(status))
+        line = f"{status.state}, {status.pairs} pairs, {status.pairs_per_s:.1f}/s"
+        self._service.tell(with_health(line, status.health))
+
+    def _state(self) -> str:
+        if self._failure is not None:
+            return "failed"
+        if self._ended:
+            return "ended"
+        return "paused" if self._paused else "running"
+
+    def _health(self) -> list[str]:
+        said: list[str] = [trouble for trouble in (self._joints.trouble, self._marker.trouble) if trouble]
+        said += complaints_of(self._encoders) + self._devices.changes + self._storing.complaints
+        if self._failure is not None:
+            said.append(str(self._failure))
+        elif not self._ended:
+            said += self._silences() + self._tally.complaints
+        said += [text for drive in self._powered.values() for text in drive.complaints]
+        if self._cameras is not None and self._marker.trouble is None:
+            said += self._cameras.health
+        if self._bears is not None and self._bears.state != "on":
+            said.append(
+                f"{ZERO_FORCE} is to bear the arm ([robot] hold) and is {self._bears.state}: no pairs are taken"
+            )
+        if self._bad_readings:
+            said.append(f"{self._bad_readings} encoder readings were not finite and were not used")
+        if disk_free(self._store.file) < LOW_DISK_BYTES:
+            said.append(f"the disk of {self._store.file} is nearly full")
+        said += self._store.complaints
+        return list(dict.fromkeys(said))  # servos repeat the complaints of their drives
+
+    def _silences(self) -> list[str]:
+        now = self._wall.now()
+        silent = (
+            ("encoders", self._joints.trouble, self._last_reading),
+            ("cameras", self._marker.trouble, self._last_frame),
+        )
+        return [
+            f"the {name} have said nothing for {now - since:.0f} s"
+            for name, trouble, since in silent
+            if trouble is None and now - since > SILENT_AFTER_S
+        ]

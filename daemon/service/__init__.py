@@ -1,0 +1,1 @@
+"""Signals, logs, watchdog and supervision of a process."""

@@ -1,0 +1,89 @@
+"""Read robot.toml again while a process runs: what takes effect at once, and what needs a restart."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from bodyschema.daemon.config import Config
+
+Key = tuple[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Reload:
+    """Result of reading robot.toml again.
+
+    Attributes:
+        config: the configuration in force from now on; unchanged if nothing changed that can.
+        changed: settings that take effect, as in `daemon.min_step_deg = 2.0`.
+        waiting: settings that need a restart.
+    """
+
+    config: Config
+    changed: list[str]
+    waiting: list[str]
+
+    def message(self, process: str) -> str:
+        """Return a summary, with what to do."""
+        said = [f"in force now: {', '.join(self.changed)}"] if self.changed else []
+        if self.waiting:
+            restart = f"systemctl restart bodyschema-{process}@{self.config.robot.name}"
+            said.append(
+                f"{', '.join(self.waiting)} cannot change while the {process} runs: start it anew (`{restart}`, or "
+                "Ctrl-C and again); no pair is lost by that"
+            )
+        return ". ".join(said) or "nothing that the process knows of is other than it was"
+
+
+def reload(config: Config, tables: Collection[str], changeable: Collection[Key]) -> Reload:
+    """Read the robot.toml of `config` again.
+
+    Args:
+        config: the configuration in force; settings overridden on the command line stay overridden.
+        tables: those that the process uses.
+        changeable: table and key of settings that may change while it runs.
+
+    Raises:
+        ConfigError: robot.toml is invalid now; nothing changed.
+    """
+    found = config.reread()
+    changed: list[str] = []
+    waiting: list[str] = []
+    taken: dict[str, msgspec.Struct] = {}
+    for table in tables:
+        then, now = _table(config, table), _table(found, table)
+        for key in sorted(then.keys() | now.keys()):
+            if then.get(key) == now.get(key):
+                continue
+            if (table, key) in changeable:
+                changed.append(f"{table}.{key} = {msgspec.json.encode(now[key]).decode()}")
+                before: msgspec.Struct = taken.get(table) or getattr(config.tables, table)
+                taken[table] = msgspec.structs.replace(before, **{key: now[key]})
+            else:
+                waiting.append(f"{table}.{key}")
+    if not _same_arm(config, found):
+        waiting.append("the URDF")
+    return Reload(config.with_tables(msgspec.structs.replace(config.tables, **taken)), changed, waiting)
+
+
+def _table(config: Config, name: str) -> dict[str, Any]:
+    """Return the settings of a table, defaults included."""
+    described = {"robot": config.robot.robot, "camera": config.robot.camera}
+    table = described.get(name, getattr(config.tables, name))
+    if isinstance(table, msgspec.Struct):
+        return msgspec.structs.asdict(table)
+    return {"": table}
+
+
+def _same_arm(a: Config, b: Config) -> bool:
+    """Return True if both have the same chain from camera to marker, apart from robot.toml's settings."""
+    if a.robot.robot != b.robot.robot or a.robot.camera != b.robot.camera:
+        return True  # reported already
+    arrays = ((a.robot.lower, b.robot.lower), (a.robot.upper, b.robot.upper))
+    chains = ((getattr(a.robot.chain, name), getattr(b.robot.chain, name)) for name in ("fixed", "axes", "prismatic"))
+    return all(np.array_equal(one, other) for one, other in (*arrays, *chains))

@@ -1,0 +1,115 @@
+"""Restart child processes when they die."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Sequence
+
+from bodyschema.daemon.service.signals import with_parent
+from bodyschema.interfaces.errors import BodyschemaError
+
+log = logging.getLogger(__name__)
+
+POLL_S = 0.1
+SETTLED_AFTER_S = 30.0  # longer than any start, also on a busy machine
+FIRST_WAIT_S = 0.5
+LONGEST_WAIT_S = 30.0
+END_LIMIT_S = 10.0
+
+
+class Child:
+    """A process that is kept running.
+
+    If a process refuses to start (it ends with an error code of its own before ever running for `SETTLED_AFTER_S`), a
+    person is needed, and this is an error. A process that was killed, or ends later, is restarted, with growing waits
+    until it settles.
+    """
+
+    def __init__(self, name: str, command: Sequence[str]) -> None:
+        self.name = name
+        self._command = command
+        self._process: subprocess.Popen[bytes] | None = None
+        self._settled = False
+        self._started_at = 0.0
+        self._start_at = 0.0
+        self._wait_s = FIRST_WAIT_S
+
+    def tend(self) -> None:
+        """Start the process if it is not running and its waiting time is over.
+
+        Raises:
+            BodyschemaError: it refused to start.
+        """
+        now = time.monotonic()
+        if self._process is None:
+            if now >= self._start_at:
+                environment = os.environ | with_parent()
+                self._process = subprocess.Popen(self._command, stdin=subprocess.DEVNULL, env=environment)
+                self._started_at = now
+            return
+        lasted_s = now - self._started_at
+        if lasted_s > SETTLED_AFTER_S:
+            self._settled, self._wait_s = True, FIRST_WAIT_S
+        code = self._process.poll()
+        if code is not None:
+            self._process = None
+            self._ended(code, now)
+
+    def end(self) -> None:
+        """Request the end of the process."""
+        if self._process is not None:
+            self._process.send_signal(signal.SIGTERM)
+
+    def join(self, deadline: float) -> None:
+        """Wait for the end of the process until `deadline` on the monotonic clock [s], then kill it."""
+        if self._process is None:
+            return
+        try:
+            self._process.wait(max(deadline - time.monotonic(), 0.0))
+        except subprocess.TimeoutExpired:
+            log.error("the %s did not end in %g s and was killed", self.name, END_LIMIT_S)
+            self._process.kill()
+            self._process.wait()
+        self._process = None
+
+    def _ended(self, code: int, now: float) -> None:
+        if code > 0 and not self._settled:
+            raise BodyschemaError(f"the {self.name} could not start (exit code {code}); its message is above")
+        how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+        log.error("the %s %s; starting it again in %g s", self.name, how, self._wait_s)
+        self._start_at = now + self._wait_s
+        self._wait_s = min(2 * self._wait_s, LONGEST_WAIT_S)
+
+
+class Supervisor:
+    """Keeps child processes running until `stop`, and ends them all."""
+
+    def __init__(self, children: Sequence[Child]) -> None:
+        self._children = children
+        self._stopping = False
+
+    def stop(self) -> None:
+        """Request the end of `run`. Only sets a flag: a signal handler may call it."""
+        self._stopping = True
+
+    def run(self) -> None:
+        """Keep the children running until `stop`.
+
+        Raises:
+            BodyschemaError: one of them refused to start; the others were ended.
+        """
+        try:
+            while not self._stopping:
+                for child in self._children:
+                    child.tend()
+                time.sleep(POLL_S)
+        finally:
+            for child in self._children:
+                child.end()
+            deadline = time.monotonic() + END_LIMIT_S
+            for child in self._children:
+                child.join(deadline)

@@ -1,0 +1,1 @@
+"""The zenoh side: keys, messages, access."""

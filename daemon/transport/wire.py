@@ -1,0 +1,298 @@
+"""Messages over zenoh: JSON, or MessagePack when the request asks for it. Every message has a schema number.
+
+Requests are checked for unknown keys. Replies and publications may gain keys, so readers ignore unknown ones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from bodyschema.interfaces.covariance import from_upper, upper_triangle
+from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.records import FARTHEST_M, LARGEST_Q, FloatArray, Pair, frozen_array
+from bodyschema.recordings.columns import QUATERNION_TOLERANCE
+from bodyschema.robot.suggest import with_choices
+
+from .command_names import CommandName
+
+JSON = "application/json"
+MSGPACK = "application/msgpack"
+OCTETS = "application/octet-stream"
+SCHEMA = 1
+LARGEST_BATCH = 10_000
+
+M = TypeVar("M")
+
+_json_encoder = msgspec.json.Encoder()
+_msgpack_encoder = msgspec.msgpack.Encoder()
+
+
+class PairMessage(msgspec.Struct, frozen=True):
+    """One pair: units and frames as in `bodyschema.interfaces.records.Pair`.
+
+    `cov` [m²] and `cov_R` [rad²] are upper triangles, row by row.
+    """
+
+    store: str
+    seq: Annotated[int, Meta(ge=1)]
+    segment: int
+    t: float
+    utc: str
+    q: list[float]
+    x: tuple[float, float, float]
+    cov: tuple[float, float, float, float, float, float]
+    R: tuple[float, float, float, float] | None = None
+    cov_R: tuple[float, float, float, float, float, float] | None = None
+    schema: int = SCHEMA
+
+
+class PairsReply(msgspec.Struct, frozen=True):
+    """Stored pairs in order. `last_seq` is the newest pair in the store; continue from where the reply ends."""
+
+    store: str
+    last_seq: int
+    pairs: list[PairMessage]
+    schema: int = SCHEMA
+
+
+class JointsRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`{"q": [rad…]}` or `{"q": [[rad…]…]}`."""
+
+    q: list[float | list[float]]
+
+
+class PredictReply(msgspec.Struct, frozen=True):
+    """Predictions, a row for each row of the request.
+
+    Attributes:
+        x: marker positions in the measurement frame [m].
+        sigma: their 1-sigma per axis [m].
+        in_support: True where the joint angles lie within the support of the data.
+        model: hash of the answering model.
+        pairs: number of pairs it had learnt.
+        age_s: age of the newest of them: the time from it to the newest pair known to be stored, plus the time since
+            the learner heard of that one; null before any since the learner started.
+        R: orientations of the marker in the measurement frame, unit quaternions x, y, z, w; null if none is learnt.
+        sigma_R: their 1-sigma, of a small rotation about each axis of the measurement frame [rad]; null with R.
+    """
+
+    x: list[list[float]]
+    sigma: list[list[float]]
+    in_support: list[bool]
+    model: str
+    pairs: int
+    age_s: float | None
+    R: list[list[float]] | None = None
+    sigma_R: list[list[float]] | None = None
+    schema: int = SCHEMA
+
+
+class JacobianReply(msgspec.Struct, frozen=True):
+    """Jacobians dx/dq [m/rad], a 3 × d matrix for each row of the request."""
+
+    J: list[list[list[float]]]
+    model: str
+    pairs: int
+    schema: int = SCHEMA
+
+
+class IkRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The requested marker position.
+
+    Attributes:
+        x: in the measurement frame [m].
+        start: current joint angles of the arm [rad]; the answer is close to them if possible.
+        posture: joint angles to stay close to where x leaves a choice [rad], or "middle" of the joint limits.
+    """
+
+    x: tuple[float, float, float]
+    start: list[float] | None = None
+    posture: Literal["middle"] | list[float] | None = None
+
+
+class IkReply(msgspec.Struct, frozen=True):
+    """Joint angles within the limits, and the remaining distance.
+
+    Attributes:
+        q: joint angles [rad].
+        x: position of the marker there, by the model [m].
+        distance: from x to the requested position [m].
+        converged: True if it is zero, to the solver's tolerance.
+        reason: `reached`, `out_of_reach` or `steps_ran_out`.
+        sigma: 1-sigma per axis of x relative to the ground truth [m].
+        in_support: True if q lies within the support of the data.
+        model: hash of the answering model.
+        pairs: number of pairs it had learnt.
+    """
+
+    q: list[float]
+    x: list[float]
+    distance: float
+    converged: bool
+    reason: str
+    sigma: list[float]
+    in_support: bool
+    model: str
+    pairs: int
+    schema: int = SCHEMA
+
+
+class CommandRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A command to one of the processes; each documents its commands."""
+
+    command: CommandName
+
+
+class CommandReply(msgspec.Struct, frozen=True):
+    """Confirmation of a command; `message` describes the result."""
+
+    command: str
+    message: str
+    schema: int = SCHEMA
+
+
+class ErrorReply(msgspec.Struct, frozen=True):
+    """Error in a request; nothing was changed."""
+
+    error: str
+    schema: int = SCHEMA
+
+
+def encode(message: object, encoding: str = JSON) -> bytes:
+    """Return a message's bytes in `encoding`."""
+    return _msgpack_encoder.encode(message) if encoding == MSGPACK else _json_encoder.encode(message)
+
+
+def decode(payload: bytes, kind: type[M], encoding: str = JSON) -> M:
+    """Return the message in `payload`.
+
+    Raises:
+        RequestError: it is not of this type; the message says where.
+    """
+    try:
+        decoder: Any = msgspec.msgpack if encoding == MSGPACK else msgspec.json
+        return decoder.decode(payload, type=kind)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise RequestError(f"not a {kind.__name__}: {with_choices(str(error), kind)}") from error
+
+
+def pair_to_wire(pair: Pair) -> PairMessage:
+    """Return a pair as its message."""
+    x, y, z = pair.x.tolist()
+    return PairMessage(
+        store=pair.store,
+        seq=pair.seq,
+        segment=pair.segment,
+        t=pair.t,
+        utc=pair.utc,
+        q=pair.q.tolist(),
+        x=(x, y, z),
+        cov=upper_triangle(pair.cov),
+        R=None if pair.R is None else _four(pair.R),
+        cov_R=None if pair.cov_R is None else upper_triangle(pair.cov_R),
+    )
+
+
+def pair_from_wire(message: PairMessage, joints: int) -> Pair:
+    """Return a message as a pair.
+
+    Raises:
+        RequestError: it has another number of joints, a non-finite number, or an invalid quaternion.
+    """
+    q = np.array(message.q)
+    numbers = np.concatenate([q, message.x, message.cov, [message.t], message.R or (), message.cov_R or ()])
+    if len(q) != joints:
+        raise RequestError(f"pair {message.seq} has {len(q)} joint angles, this robot has {joints}")
+    if not np.isfinite(numbers).all():
+        raise RequestError(f"pair {message.seq} has a number that is not finite")
+    if message.R is not None and abs(math.hypot(*message.R) - 1.0) > QUATERNION_TOLERANCE:
+        raise RequestError(f"pair {message.seq} has an R of the length {math.hypot(*message.R):.6g}, not 1")
+    return Pair(
+        store=message.store,
+        seq=message.seq,
+        segment=message.segment,
+        t=message.t,
+        utc=message.utc,
+        q=frozen_array(q),
+        x=frozen_array(message.x),
+        cov=frozen_array(from_upper(message.cov)),
+        R=None if message.R is None else frozen_array(message.R),
+        cov_R=None if message.cov_R is None else frozen_array(from_upper(message.cov_R)),
+    )
+
+
+def _four(turn: FloatArray) -> tuple[float, float, float, float]:
+    x, y, z, w = turn.tolist()
+    return x, y, z, w
+
+
+def position(name: str, values: Sequence[float]) -> FloatArray:
+    """Return a requested position, shape (3,) [m].
+
+    Raises:
+        RequestError: a number is not finite, or too large to be in metres.
+    """
+    x = np.array(values, dtype=np.float64)
+    if not np.isfinite(x).all():
+        raise RequestError(f"{name} is not finite")
+    farthest = float(np.abs(x).max())
+    if farthest > FARTHEST_M:
+        raise RequestError(
+            f"{name} lies {farthest:.3g} m away; positions are in metres, at most {FARTHEST_M:.0f} on each axis"
+        )
+    return x
+
+
+def joint_vector(name: str, values: Sequence[float], joints: tuple[str, ...]) -> FloatArray:
+    """Return one number for each joint, shape (d,) [rad].
+
+    Raises:
+        RequestError: the count is wrong, or a value is impossible for its joint.
+    """
+    if len(values) != len(joints):
+        raise RequestError(
+            f"{name} has {len(values)} numbers; this robot has {len(joints)} joints: {', '.join(joints)}"
+        )
+    vector = np.array(values, dtype=np.float64)
+    _require_angles(vector[None], joints, lambda _: name)
+    return vector
+
+
+def joint_angles(request: JointsRequest, joints: tuple[str, ...]) -> FloatArray:
+    """Return the request's joint angles, shape (n, d) [rad].
+
+    Raises:
+        RequestError: a row has the wrong length, a value is impossible for a joint, or the batch is empty or too large.
+    """
+    if not request.q:
+        raise RequestError("q is empty; send one vector of joint angles or a list of them")
+    one_vector = not any(isinstance(entry, list) for entry in request.q)
+    rows = [request.q] if one_vector else request.q
+    if len(rows) > LARGEST_BATCH:
+        raise RequestError(f"q has {len(rows)} rows; send at most {LARGEST_BATCH} at once")
+    for number, row in enumerate(rows):
+        if not isinstance(row, list) or len(row) != len(joints):
+            length = len(row) if isinstance(row, list) else 1
+            raise RequestError(
+                f"row {number} of q has {length} numbers; this robot has {len(joints)} joints: {', '.join(joints)}"
+            )
+    q = np.array(rows, dtype=np.float64)
+    _require_angles(q, joints, lambda row: f"row {row} of q")
+    return q
+
+
+def _require_angles(q: FloatArray, joints: tuple[str, ...], named: Callable[[int], str]) -> None:
+    wrong = np.argwhere(~(np.abs(q) <= LARGEST_Q))
+    if len(wrong) == 0:
+        return
+    row, column = wrong[0].tolist()
+    value = float(q[row, column])
+    if math.isfinite(value):
+        raise RequestError(f"{named(row)} is {value:.3g} at joint {joints[column]!r}; angles are in radians")
+    raise RequestError(f"{named(row)} is not finite at joint {joints[column]!r}")

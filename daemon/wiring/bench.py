@@ -1,0 +1,283 @@
+"""The wiring of benches: the arm that robot.toml describes without the arm, alone or in the simulation's place."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import monotonic
+from typing import Any
+
+import msgspec
+
+from bodyschema.daemon.config import Config
+from bodyschema.drivers.bench.asked_faults import AskedFault, FaultKinds
+from bodyschema.drivers.bench.dry_run import Angle, BenchArm, DryRun
+from bodyschema.drivers.bench.motion import played, swinging
+from bodyschema.drivers.bench.through_driver import LATENCY_MS, READ_S, Behind, ThroughDriver
+from bodyschema.drivers.dynamixel.config import DynamixelConfig
+from bodyschema.drivers.feetech.config import FeetechConfig
+from bodyschema.drivers.ros2.config import Ros2Config
+from bodyschema.drivers.serial_lines.config import SerialLinesConfig
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.protocols import JointSource
+from bodyschema.interfaces.records import JointReading
+from bodyschema.robot.limited import read_at_most
+from bodyschema.robot.toml_file import read_toml
+from bodyschema.robot.toml_text import toml_text
+
+PATH_S = 40.0  # of guided motion, played to and fro
+MARK = "# Written by `bodyschema bench`, which removes it when it ends."
+PSEUDO_TERMINALS = "/dev/pts/"
+BOARD_RATE_HZ, BOARD_BAUD = 500.0, 921_600  # of a board in the simulation's place, which waits for each line
+SETTLED_S = 2e-3  # how far off the time of a line may be
+
+OnPorts = DynamixelConfig | FeetechConfig | SerialLinesConfig
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Motion of a bench: for each joint its angle [rad] as a function of time, and a description in words."""
+
+    angles: dict[str, Angle]
+    words: str
+
+
+def require_on_ports(config: Config) -> OnPorts:
+    """Return the servos or encoders of robot.toml. Raise ConfigError if it has none."""
+    match config.tables.drivers.hardware:
+        case DynamixelConfig() | FeetechConfig() | SerialLinesConfig() as hardware:
+            return hardware
+    raise ConfigError(
+        "no servos are configured, and no encoders",
+        file=config.file,
+        remedy="Add the table [drivers.dynamixel], [drivers.feetech] or [drivers.serial_lines] (docs/hardware.md), "
+        "or let `bodyschema robot new` write it",
+    )
+
+
+def limits_of(config: Config) -> list[tuple[float, float]]:
+    """Return the lower and upper limit of each joint [rad]."""
+    return list(zip(config.robot.lower.tolist(), config.robot.upper.tolist(), strict=True))
+
+
+def bench_motion(config: Config, tell: Callable[[float], None]) -> Motion:
+    """Return a motion guided by the simulated hand; without the simulation, a slow swing of each joint.
+
+    Args:
+        tell: called with the fraction of the path that is computed.
+    """
+    joints = config.robot.joints
+    why = _no_simulation(config)
+    if why:
+        angles = swinging(limits_of(config), monotonic())
+        return Motion(dict(zip(joints, angles, strict=True)), f"each joint swings slowly by itself ({why})")
+    from bodyschema.sim_backend.guided_path import guided_path
+
+    from .wiring import simulation_settings
+
+    sim = simulation_settings(config)
+    path = guided_path(config.robot, sim, PATH_S, config.simulation, lambda done_s: tell(done_s / PATH_S))
+    angles = played(path, sim.encoders.rate_hz, monotonic())
+    words = f"guided by the simulated hand, {PATH_S:.0f} s of path to and fro"
+    return Motion(dict(zip(joints, angles, strict=True)), words)
+
+
+def _no_simulation(config: Config) -> str:
+    if find_spec("pybullet") is None:
+        return "for a guided path: pip install 'bodyschema[sim]'"
+    if config.robot.calibration is None:
+        return "for a guided path describe the cameras in [camera]"
+    return ""
+
+
+def open_bench(
+    config: Config, port: Path, motion: Motion, *, faults: Sequence[str] = (), return_delay_s: float, seed: int
+) -> DryRun:
+    """Return the arm of robot.toml behind `port` (several buses: each at `port`-NAME), not opened yet.
+
+    Raises:
+        ConfigError: no servos or encoders are configured, a fault is invalid, or a port's path is occupied.
+    """
+    hardware = require_on_ports(config)
+    asked = [AskedFault.parsed(text, config.robot.joints, _kinds(hardware)) for text in faults]
+    arm = _arm(hardware, motion.angles, faults=asked, return_delay_s=return_delay_s, seed=seed)
+    names = list(arm.devices)
+    links = {name: port if len(names) == 1 else port.with_name(f"{port.name}-{name}") for name in names}
+    for link in links.values():
+        _require_free(link)
+    return DryRun(arm, links, faults=asked)
+
+
+def _kinds(hardware: OnPorts) -> FaultKinds:
+    match hardware:
+        case DynamixelConfig():
+            from bodyschema.drivers.dynamixel.bench.arm import KINDS
+        case FeetechConfig():
+            from bodyschema.drivers.feetech.bench.arm import KINDS
+        case SerialLinesConfig():
+            from bodyschema.drivers.serial_lines.bench.arm import KINDS
+    return KINDS
+
+
+def _arm(hardware: OnPorts, angles: Mapping[str, Angle], *, return_delay_s: float = 0.0, **settings: Any) -> BenchArm:
+    match hardware:
+        case DynamixelConfig():
+            from bodyschema.drivers.dynamixel.bench.arm import DynamixelArm
+
+            return DynamixelArm(hardware, angles, return_delay_s=return_delay_s, **settings)
+        case FeetechConfig():
+            from bodyschema.drivers.feetech.bench.arm import FeetechArm
+
+            return FeetechArm(hardware, angles, return_delay_s=return_delay_s, **settings)
+        case SerialLinesConfig():
+            from bodyschema.drivers.serial_lines.bench.arm import EncoderArm
+
+            return EncoderArm(hardware, angles, **settings)
+
+
+def bench_ports(bench: DryRun) -> list[str]:
+    """Describe in words the devices on each port."""
+    match bench.config:
+        case SerialLinesConfig() as config:
+            return [f"{_counted(len(config.encoders), 'encoder')} on {config.port} at {config.baud:,} bit/s"]
+        case config:
+            fitted = {name: sum(config.bus_of(servo) == name for servo in config.servos) for name in config.buses}
+            return [
+                f"{_counted(fitted[name], 'servo')} on {bus.port} at {bus.baud:,} bit/s"
+                for name, bus in config.buses.items()
+            ]
+
+
+def bench_commands(bench: DryRun) -> tuple[str, ...]:
+    """Return the names of the commands that can talk to the devices on the ports."""
+    return ("doctor", "joints") if isinstance(bench.config, SerialLinesConfig) else ("scan", "doctor", "joints")
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+def _require_free(link: Path) -> None:
+    """ConfigError when something is there that no earlier bench left, or the terminal it leads to is still open."""
+    is_of_a_bench = link.is_symlink() and os.readlink(link).startswith(PSEUDO_TERMINALS)
+    if is_of_a_bench and link.exists():
+        remedy = f"Give another --port, or end that bench. If none runs: rm {link}"
+        raise ConfigError("another bench has this port", file=link, remedy=remedy)
+    if not is_of_a_bench and os.path.lexists(link):
+        raise ConfigError("is there already", file=link, remedy="Give another --port, a name that is not taken")
+    if not link.parent.is_dir():
+        raise ConfigError("there is no such folder", file=link.parent, remedy="Give another --port")
+
+
+def bench_robot_file(config: Config, bench: DryRun, port: Path) -> Path:
+    """Write a copy of robot.toml beside `port`, with the bench's ports and its own state.
+
+    Raises:
+        ConfigError: another file is there, or it cannot be written.
+    """
+    file = port.with_name(f"{port.name}.toml")
+    tables, _ = read_toml(config.file)
+    tables["robot"]["urdf"] = str(config.robot.tree.file.resolve())
+    match bench.config:
+        case SerialLinesConfig() as board:
+            tables["drivers"]["serial_lines"]["port"] = str(Path(board.port).absolute())
+        case servos:
+            _, make = servos.table.split(".")
+            for name, bus in servos.buses.items():
+                tables["drivers"][make]["buses"][name]["port"] = str(Path(bus.port).absolute())
+    tables.setdefault("daemon", {})["state_dir"] = str(port.with_name(f"{port.name}.state").absolute())
+    if "unexplained" in tables:
+        tables["unexplained"]["model"] = str((config.file.parent / tables["unexplained"]["model"]).resolve())
+    try:
+        if file.exists() and not read_at_most(file).startswith(MARK.encode()):
+            raise ConfigError("is there already, and no bench wrote it", file=file, remedy="Give another --port")
+        file.write_text(f"{MARK}\n{toml_text(tables)}", encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"cannot be written: {error.strerror}", file=file, remedy="Give another --port") from error
+    return file
+
+
+# --- in the simulation's place
+
+
+def require_bench(config: Config) -> OnPorts | Ros2Config:
+    """Return the driver settings for reading the simulation's joints. Raise ConfigError if robot.toml has none."""
+    robot = config.tables.drivers.ros2
+    return require_on_ports(config) if robot is None else robot
+
+
+OpenDriver = Callable[[OnPorts | Ros2Config], JointSource]
+
+
+def through_bench(config: Config, joints: JointSource, open_driver: OpenDriver) -> JointSource:
+    """Return the simulation's joints, read from a bench by the driver configured in robot.toml."""
+    hardware = require_bench(config)
+    match hardware:
+        case DynamixelConfig() | FeetechConfig():
+            return ThroughDriver(joints, lambda angles: _looking_at_servos(hardware, angles, open_driver))
+        case SerialLinesConfig():
+            return ThroughDriver(joints, lambda angles: _looking_at_lines(hardware, angles, open_driver))
+        case Ros2Config():
+            return ThroughDriver(joints, lambda angles: _looking_at_messages(hardware, angles, open_driver))
+
+
+@contextmanager
+def _looking_at_servos(
+    hardware: DynamixelConfig | FeetechConfig, angles: Mapping[str, Angle], open_driver: OpenDriver
+) -> Iterator[Behind]:
+    buses = {name: msgspec.structs.replace(bus, latency_ms=LATENCY_MS) for name, bus in hardware.buses.items()}
+    patient = msgspec.structs.replace(hardware, buses=buses)
+    with _on_a_bench(_arm(patient, angles)) as bench, open_driver(bench.config) as servos:
+        yield Behind(servos, lambda: servos.read(READ_S))
+
+
+@contextmanager
+def _looking_at_lines(
+    hardware: SerialLinesConfig, angles: Mapping[str, Angle], open_driver: OpenDriver
+) -> Iterator[Behind]:
+    """Yield joints read from a board on a bench; each look waits for a line measured after it."""
+    from bodyschema.drivers.serial_lines.bench.listener import Listener
+
+    clock = SystemClock()
+    quick = msgspec.structs.replace(hardware, baud=BOARD_BAUD, delay_ms=0.0, native_usb=False)
+    arm = _arm(quick, angles, rate_hz=BOARD_RATE_HZ)
+    with _on_a_bench(arm) as bench, open_driver(bench.config) as encoders, Listener(encoders) as listener:
+        yield Behind(encoders, lambda: listener.after(clock.now() + SETTLED_S, READ_S))
+
+
+@contextmanager
+def _looking_at_messages(
+    hardware: Ros2Config, angles: Mapping[str, Angle], open_driver: OpenDriver
+) -> Iterator[Behind]:
+    """Yield joints read from a node and a router in this process; the node publishes at each look."""
+    from bodyschema.drivers.ros2.bench.node import Node
+    from bodyschema.drivers.ros2.bench.zenoh_robot import ZenohRobot
+
+    clock = SystemClock()
+    node = Node(dict(zip(hardware.ros_names(tuple(angles)), angles.values(), strict=True)), rate_hz=1.0)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        router = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    here = msgspec.structs.replace(hardware, router=router)
+    with ZenohRobot([node], router, domain=here.domain, topic=here.topic) as robot, open_driver(here) as joints:
+
+        def look() -> JointReading | None:
+            robot.publish(node, clock.now())
+            return joints.read(READ_S)
+
+        yield Behind(joints, look)
+
+
+@contextmanager
+def _on_a_bench(arm: BenchArm) -> Iterator[DryRun]:
+    with (
+        TemporaryDirectory(prefix="bodyschema-bench-") as folder,
+        DryRun(arm, {name: Path(folder) / name for name in arm.devices}) as bench,
+    ):
+        yield bench

@@ -1,0 +1,246 @@
+"""The wiring of real cameras: what robot.toml asks for, how it is looked at, which there are."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import monotonic
+
+from bodyschema.daemon.config import Config
+from bodyschema.drivers.checks import Check, holders
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import BodyschemaError, ConfigError
+from bodyschema.interfaces.protocols import Clock, StereoCamera
+from bodyschema.robot.toml_file import line_of, read_toml
+from bodyschema.vision.cameras.config import CamerasConfig, ImagesConfig, UvcSettings, VideosConfig
+from bodyschema.vision.cameras.controls import left_to_the_camera
+from bodyschema.vision.cameras.film import Film
+from bodyschema.vision.cameras.ideal import IdealCamera
+from bodyschema.vision.cameras.live import CameraFigures, LiveEyes
+from bodyschema.vision.cameras.opened import eyes_of
+from bodyschema.vision.cameras.serials import connected
+from bodyschema.vision.cameras.watched import PlainEyes, WatchedCamera
+from bodyschema.vision.rectified import RectifiedCamera
+from bodyschema.vision.rig import OneEyeRig, Rig
+from bodyschema.vision.rig_file import read_rig
+
+LOOK_S = 2.0  # `doctor` looks at the images
+READ_S = 0.5
+PAGE = "docs/cameras.md"
+
+
+def cameras_of(config: Config) -> CamerasConfig | None:
+    """Return the cameras configured in robot.toml; None if it has none."""
+    return config.tables.vision.cameras
+
+
+def require_cameras(config: Config) -> CamerasConfig:
+    """Return the cameras configured in robot.toml. Raise ConfigError if it has none."""
+    cameras = cameras_of(config)
+    if cameras is None:
+        raise ConfigError(
+            "no cameras are configured", file=config.file, remedy=f"Add the table [vision.cameras]: {PAGE}"
+        )
+    return cameras
+
+
+def open_eyes(config: Config, clock: Clock) -> LiveEyes | Film:
+    """Return the cameras of robot.toml with unprocessed images, not opened yet.
+
+    Raises:
+        ConfigError: no cameras are configured.
+    """
+    return eyes_of(require_cameras(config), config.file.parent, clock)
+
+
+def calibration_file(config: Config) -> Path:
+    """Return the calibration file named in robot.toml; by default cameras.toml beside it."""
+    cameras = require_cameras(config)
+    return config.file.parent / (cameras.calibration or "cameras.toml")
+
+
+def names_calibration(config: Config) -> bool:
+    """Return True if robot.toml names a calibration."""
+    return require_cameras(config).calibration is not None
+
+
+def camera_of(config: Config, eyes: LiveEyes | Film) -> StereoCamera:
+    """Return `eyes` with rectified images, not opened yet: by the calibration file, else by [camera].
+
+    Raises:
+        ConfigError: there is no calibration, or the file cannot be read.
+    """
+    cameras = require_cameras(config)
+    if cameras.calibration is not None:
+        rig = read_rig(calibration_file(config))
+        return RectifiedCamera(eyes, _of_files(rig, cameras) if isinstance(eyes, Film) else rig)
+    if config.robot.calibration is None:
+        raise ConfigError(
+            "nothing says how the cameras see",
+            file=config.file,
+            line=line_of(read_toml(config.file)[1], ("vision", "cameras")),
+            remedy="Type `bodyschema calibrate cameras`; or, where the images are rectified already, describe the "
+            "stereo pair in [camera]",
+        )
+    return IdealCamera(eyes, config.robot.calibration)
+
+
+def _of_files(rig: Rig, cameras: CamerasConfig) -> Rig:
+    """Return the rig without serials unless it names these files: files do not tell which cameras took them."""
+    layout = cameras.layout
+    names = {layout.left, layout.right} if isinstance(layout, ImagesConfig | VideosConfig) else set[str | None]()
+    if names & set(rig.serials):
+        return rig
+    return replace(rig, serials=("",)) if isinstance(rig, OneEyeRig) else replace(rig, serials=("", ""))
+
+
+def require_usable(config: Config) -> None:
+    """ConfigError when pairs cannot be made of the cameras' images and the encoders' readings."""
+    camera_of(config, open_eyes(config, SystemClock()))
+    layout = require_cameras(config).layout
+    if isinstance(layout, ImagesConfig | VideosConfig) and not layout.speed:
+        raise ConfigError(
+            "images at speed 0 are not on the encoders' clock",
+            file=config.file,
+            line=line_of(read_toml(config.file)[1], ("vision", "cameras")),
+            remedy="Give a speed above 0",
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Watched:
+    """Cameras for a person to look at.
+
+    Attributes:
+        camera: gives the pictures, not opened yet. eyes: tells how the cameras are.
+        is_calibrated: whether the marker is looked for.
+    """
+
+    camera: WatchedCamera | PlainEyes
+    eyes: LiveEyes | Film
+    is_calibrated: bool
+
+
+def open_watched(config: Config) -> Watched:
+    """Return the cameras of robot.toml, not opened yet; once calibrated, detections are drawn into their images."""
+    eyes = open_eyes(config, SystemClock())
+    is_calibrated = require_cameras(config).calibration is not None or config.robot.calibration is not None
+    if not is_calibrated:
+        return Watched(PlainEyes(eyes), eyes, is_calibrated)
+    return Watched(WatchedCamera(camera_of(config, eyes), config.tables.vision), eyes, is_calibrated)
+
+
+# --- what `doctor` says
+
+
+def camera_checks(config: Config) -> Iterator[Check]:
+    """Yield checks that the cameras of robot.toml are present and send images when both are open at once."""
+    cameras = require_cameras(config)
+    missing = False
+    for name, device in cameras.devices.items():
+        for check in _device_checks(name, device):
+            missing |= check.state == "wrong"
+            yield check
+    if missing:
+        return
+    eyes = open_eyes(config, SystemClock())
+    try:
+        yield from _open_checks(eyes, cameras)
+    except BodyschemaError as error:
+        yield Check("cameras", "wrong", str(error))
+
+
+def _device_checks(name: str, device: str) -> Iterator[Check]:
+    if not os.path.exists(device):
+        yield Check(name, "wrong", f"{device} is not there", _where(device))
+    elif not os.access(device, os.R_OK | os.W_OK):
+        said = f"{device} may not be opened: you are not in the group video"
+        yield Check(name, "wrong", said, "sudo usermod -aG video $USER    # then log in again")
+    elif others := holders(device):
+        said = f"{device} is open in process {others[0].pid}: {others[0].command}"
+        yield Check(name, "warning", said, f"kill {others[0].pid}    # cameras can be opened once")
+
+
+def _where(device: str) -> str:
+    found = [name for name in connected() if name != device]
+    known = f"this machine has {', '.join(found)}" if found else "this machine has no camera"
+    return f"plug it in; {known}"
+
+
+def _open_checks(eyes: LiveEyes | Film, cameras: CamerasConfig) -> Iterator[Check]:
+    """Open the cameras together for a while and yield checks of what they send."""
+    with ExitStack() as stack:
+        stack.enter_context(eyes)
+        serials = eyes.serials
+        frames, until = 0, monotonic() + LOOK_S
+        sigma_s = 0.0
+        while monotonic() < until:
+            frame = eyes.read(READ_S)
+            if frame is not None:
+                frames, sigma_s = frames + 1, frame.t_sigma
+            if isinstance(eyes, Film):
+                break
+        width, height = eyes.image_size_px
+        said = f"{' and '.join(serials)}: {width}x{height} pixels, time known to {1e3 * sigma_s:.0f} ms"
+        yield Check("cameras", "ok" if frames else "warning", said if frames else f"{said}; no pair of images came")
+        if isinstance(eyes, LiveEyes):
+            yield from _live_checks(eyes, cameras)
+
+
+def _live_checks(eyes: LiveEyes, cameras: CamerasConfig) -> Iterator[Check]:
+    for figures in eyes.figures:
+        yield Check(figures.name, "ok", _told(figures))
+    for complaint in eyes.health:
+        what, _, remedy = complaint.partition(": ")
+        yield Check("cameras", "warning", what, remedy)
+    layout = cameras.layout
+    free = left_to_the_camera(layout) if isinstance(layout, UvcSettings) else []
+    if free:
+        said = f"{', '.join(free)} not fixed: brightness, colour or focus may wander"
+        yield Check("cameras", "warning", said, f"set {free[0]} in [vision.cameras.…]: {PAGE}")
+    if cameras.latency_sigma_s is None:
+        said = f"the latency is not known, only that it is about {1e3 * cameras.sigma_s:.0f} ms at most"
+        yield Check("cameras", "warning", said, "bodyschema calibrate latency")
+
+
+def _told(figures: CameraFigures) -> str:
+    rate = "" if figures.fps is None else f", {figures.fps:.1f} frames/s"
+    stamps = "" if figures.stamps is None else f", dated by the {'kernel' if figures.stamps == 'kernel' else 'arrival'}"
+    torn = f", {figures.damaged} damaged" if figures.damaged else ""
+    return f"{figures.frames} frames{rate}{stamps}{torn}"
+
+
+def camera_lines(config: Config) -> Iterator[str]:
+    """Describe in words where images come from. Raise ConfigError if the calibration cannot be read."""
+    cameras = require_cameras(config)
+    match cameras.layout:
+        case UvcSettings() as layout:
+            for name, device in cameras.devices.items():
+                yield f"{name} {device}"
+            width, height = layout.image_size_px
+            yield f"images of {width}x{height} pixels for each eye, {layout.fps:g} a second, as {layout.fourcc}"
+        case ImagesConfig(left=left, right=right) as images:
+            yield f"images {left if right is None else f'{left} and {right}'}, {_speed(images.speed)}"
+        case VideosConfig() as films:
+            names = " and ".join(name for name in (films.left, films.right, films.side_by_side) if name)
+            yield f"films {names}, {_speed(films.speed)}"
+    known = "" if cameras.latency_sigma_s is not None or not cameras.devices else ", not measured"
+    yield f"taken {1e3 * cameras.latency_s:.1f} ms before their time stamp ± {1e3 * cameras.sigma_s:.1f} ms{known}"
+    if cameras.calibration is not None:
+        yield _calibrated_by(cameras.calibration, calibration_file(config))
+
+
+def _calibrated_by(name: str, file: Path) -> str:
+    if not file.exists():
+        return f"calibrated by {name}, which is not there yet: `bodyschema calibrate cameras`"
+    rig = read_rig(file)
+    if isinstance(rig, OneEyeRig):
+        return f"calibrated by {name}: one {rig.model} lens"
+    return f"calibrated by {name}: {rig.model} lenses, baseline {1e3 * rig.baseline_m:.1f} mm"
+
+
+def _speed(speed: float) -> str:
+    return f"at {speed:g} times their speed" if speed else "as fast as they are read"

@@ -1,0 +1,167 @@
+"""HTTP routes of the page."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
+from typing import Literal, Protocol
+
+import msgspec
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+from starlette.types import Receive, Scope, Send
+
+from bodyschema.daemon.transport.command_names import CommandName
+from bodyschema.daemon.transport.wire import CommandReply, decode, encode
+from bodyschema.interfaces.errors import BusError, RequestError
+
+from .documents import Process
+from .guard import Guard
+from .hub import Follower, Hub, HubFullError
+
+STATIC = Path(__file__).parent / "static"
+LARGEST_BODY = 4096
+# Interval of keep-alive comments to an idle browser, so that proxies do not close the connection.
+HEARTBEAT_S = 10.0
+# Delay after which a browser reconnects.
+RETRY_MS = 1000
+_JSON, _EVENTS = "application/json", "text/event-stream"
+# The report is one file with its own style, and no script.
+_REPORT_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'; sandbox"
+
+Endpoint = Callable[[Request], Awaitable[Response]]
+
+
+class PageCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Command of a button of the page; reset and torque are not available."""
+
+    process: Process
+    command: Literal["pause", "resume", "tool_changed"]
+
+
+class Commands(Protocol):
+    """Sends commands to processes."""
+
+    def command(self, process: Process, name: CommandName) -> str:
+        """Return the process's reply; BusError if it does not answer, RequestError if it refuses."""
+        ...
+
+
+class Diagnosing(Protocol):
+    """Runs diagnoses, one after the other."""
+
+    def start(self) -> int:
+        """Start a diagnosis and return its number; RequestError if one is running."""
+        ...
+
+    def stop(self) -> None:
+        """End the running diagnosis; RequestError if none is running."""
+        ...
+
+    def report(self) -> bytes | None:
+        """Return the last report; None if there is none."""
+        ...
+
+
+def application(hub: Hub, commands: Commands, diagnoses: Diagnosing) -> Starlette:
+    """Return the page's application on the documents of `hub`."""
+
+    async def index(_: Request) -> Response:
+        return FileResponse(STATIC / "index.html")
+
+    async def state(_: Request) -> Response:
+        return Response(hub.all(), media_type=_JSON)
+
+    async def events(request: Request) -> Response:
+        if request.method == "HEAD":  # otherwise the answer would never end
+            return Response(media_type=_EVENTS)
+        try:
+            return _EventStream(hub, hub.follow())
+        except HubFullError as error:
+            return JSONResponse({"error": str(error)}, status_code=503)
+
+    async def command(request: Request) -> Response:
+        asked = decode(await _body(request), PageCommand)
+        message = await run_in_threadpool(commands.command, asked.process, asked.command)
+        return Response(encode(CommandReply(asked.command, message)), media_type=_JSON)
+
+    async def diagnose(_: Request) -> Response:
+        return JSONResponse({"number": await run_in_threadpool(diagnoses.start)}, status_code=202)
+
+    async def stop_diagnosing(_: Request) -> Response:
+        await run_in_threadpool(diagnoses.stop)
+        return Response(status_code=204)
+
+    async def report(_: Request) -> Response:
+        page = await run_in_threadpool(diagnoses.report)
+        if page is None:
+            return JSONResponse({"error": "there is no report yet. Press `Diagnose now`"}, status_code=404)
+        return Response(page, media_type="text/html", headers={"Content-Security-Policy": _REPORT_POLICY})
+
+    routes = [
+        Route("/", index),
+        Route("/api/state", state),
+        Route("/api/events", events),
+        Route("/api/command", _explained(command), methods=["POST"]),
+        Route("/api/diagnosis", _explained(diagnose), methods=["POST"]),
+        Route("/api/diagnosis", _explained(stop_diagnosing), methods=["DELETE"]),
+        Route("/report", report),
+        Mount("/static", StaticFiles(directory=STATIC)),
+    ]
+    return Starlette(routes=routes, middleware=[Middleware(Guard)])
+
+
+def _explained(endpoint: Endpoint) -> Endpoint:
+    """Return the endpoint with our errors reported as JSON."""
+
+    async def explained(request: Request) -> Response:
+        try:
+            return await endpoint(request)
+        except RequestError as error:
+            return JSONResponse({"error": str(error)}, status_code=400)
+        except BusError as error:
+            return JSONResponse({"error": str(error)}, status_code=503)
+
+    return explained
+
+
+async def _body(request: Request) -> bytes:
+    if request.headers.get("content-type", "").split(";")[0] != _JSON:
+        raise RequestError(f"send {_JSON}")
+    body = b""
+    async for part in request.stream():
+        body += part
+        if len(body) > LARGEST_BODY:
+            raise RequestError(f"send at most {LARGEST_BODY} bytes")
+    return body
+
+
+class _EventStream(StreamingResponse):
+    """Server-sent events: each new document under its topic, until the hub closes or the browser disconnects."""
+
+    def __init__(self, hub: Hub, follower: Follower) -> None:
+        super().__init__(_events(hub, follower), media_type=_EVENTS)
+        self._hub, self._follower = hub, follower
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self._hub.leave(self._follower)
+
+
+async def _events(hub: Hub, follower: Follower) -> AsyncIterator[bytes]:
+    yield f"retry: {RETRY_MS}\n\n".encode()
+    while True:
+        news = await follower.take(HEARTBEAT_S)
+        if not news:
+            yield b": still here\n\n"
+        for topic, document in news.items():
+            yield b"event: %s\ndata: %s\n\n" % (topic.encode(), document)
+        if hub.closed:
+            return

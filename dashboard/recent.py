@@ -1,0 +1,97 @@
+"""Newest pairs of the sampler: their segments, and the model's residuals at them."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from bodyschema.daemon.transport.wire import PredictReply
+from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.records import Pair
+
+from .documents import CloudDocument, Segment
+
+KEPT = 3000
+LARGEST_CLOUD = 800
+SHOWN_SEGMENTS = 40
+# Decimals of a coordinate [m] that is sent to the page: a micrometre.
+DECIMALS = 6
+
+NOTHING = CloudDocument("", [], [], [], None, None)
+
+
+class RecentPairs:
+    """At most `KEPT` pairs of one store, in order."""
+
+    def __init__(self) -> None:
+        self._pairs: deque[Pair] = deque(maxlen=KEPT)
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    @property
+    def newest(self) -> Pair | None:
+        """Newest pair."""
+        return self._pairs[-1] if self._pairs else None
+
+    def add(self, pairs: Iterable[Pair]) -> None:
+        """Append pairs."""
+        self._pairs.extend(pairs)
+
+    def segments(self) -> list[Segment]:
+        """Return the newest segments, the newest last."""
+        runs: list[list[Pair]] = []
+        for pair in self._pairs:
+            if runs and runs[-1][0].segment == pair.segment:
+                runs[-1].append(pair)
+            else:
+                runs.append([pair])
+        begins = self._pairs[0].seq if self._pairs else 1
+        return [
+            Segment(
+                segment=run[0].segment,
+                pairs=len(run),
+                utc=run[0].utc,
+                lasted_s=max(run[-1].t - run[0].t, 0.0),
+                complete=begins == 1 or run[0].seq > begins,
+            )
+            for run in runs[-SHOWN_SEGMENTS:]
+        ]
+
+    def chosen(self, after_seq: int, upto_seq: int) -> list[Pair]:
+        """Return at most `LARGEST_CLOUD` pairs after one sequence number and up to another, evenly spread."""
+        wanted = [pair for pair in self._pairs if after_seq < pair.seq <= upto_seq]
+        if len(wanted) <= LARGEST_CLOUD:
+            return wanted
+        return [wanted[k] for k in np.linspace(0, len(wanted) - 1, LARGEST_CLOUD).round().astype(int)]
+
+
+def cloud(pairs: list[Pair], predict: Callable[[list[list[float]]], PredictReply]) -> CloudDocument:
+    """Return the model's residuals at pairs.
+
+    Args:
+        pairs: the pairs.
+        predict: queries the learner; RequestError while it has no model.
+
+    Raises:
+        BusError: the learner does not answer.
+    """
+    if not pairs:
+        return NOTHING
+    try:
+        reply = predict([pair.q.tolist() for pair in pairs])
+    except RequestError:
+        return NOTHING
+    x = np.array([pair.x for pair in pairs])
+    residual = x - np.array(reply.x)
+    lengths = np.linalg.norm(residual, axis=1)
+    return CloudDocument(
+        model=reply.model,
+        x=x.round(DECIMALS).tolist(),
+        residual=residual.round(DECIMALS).tolist(),
+        segment=[pair.segment for pair in pairs],
+        median_m=float(np.median(lengths)),
+        p95_m=float(np.quantile(lengths, 0.95)),
+    )

@@ -1,0 +1,87 @@
+"""HTTP server of the page on loopback."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+from collections.abc import Callable
+
+import uvicorn
+
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.service.local_web import LOOPBACK
+from bodyschema.daemon.service.signals import on_termination
+from bodyschema.interfaces.errors import ConfigError
+
+from .app import application
+from .diagnosing import Diagnoses
+from .hub import Hub
+from .watch import Watch
+
+MOST_CONNECTIONS = 100
+END_LIMIT_S = 3
+
+
+class _Server(uvicorn.Server):
+    """Ends the event streams first: a browser holds them open for ever."""
+
+    def __init__(self, config: uvicorn.Config, hub: Hub) -> None:
+        super().__init__(config)
+        self._hub = hub
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Close the hub, then shut down."""
+        self._hub.close()
+        await super().shutdown(sockets)
+
+    def stop(self) -> None:
+        """Let `serve` end. Only sets a flag: a signal handler may call it."""
+        self.should_exit = True
+
+
+def serve(config: Config, port: int, ready: Callable[[str], None]) -> None:
+    """Serve the page of one robot until SIGTERM or Ctrl-C.
+
+    Args:
+        config: the robot's configuration.
+        port: on loopback; 0 takes one that is free.
+        ready: called with the page's address when a browser may request it.
+
+    Raises:
+        ConfigError: the port cannot be used.
+    """
+    with listening(port) as listener:
+        hub = Hub()
+        with (
+            Watch(config, hub) as watch,
+            Diagnoses(
+                config.file, config.robot.joints, watch.history, lambda document: hub.put("diagnosis", document)
+            ) as diagnoses,
+        ):
+            settings = uvicorn.Config(
+                application(hub, watch, diagnoses),
+                http="h11",
+                ws="none",
+                lifespan="off",
+                access_log=False,
+                log_config=None,
+                server_header=False,
+                proxy_headers=False,
+                limit_concurrency=MOST_CONNECTIONS,
+                timeout_graceful_shutdown=END_LIMIT_S,
+            )
+            logging.getLogger("uvicorn").setLevel(logging.WARNING)
+            server = _Server(settings, hub)
+            with on_termination(server.stop):
+                ready(f"http://{LOOPBACK}:{listener.getsockname()[1]}/")
+                asyncio.run(server.serve(sockets=[listener]))
+
+
+def listening(port: int) -> socket.socket:
+    """Return a socket on loopback; ConfigError if the port cannot be used."""
+    try:
+        return socket.create_server((LOOPBACK, port))
+    except OSError as error:
+        remedy = "Give another --port, or --port 0 for one that is free"
+        raise ConfigError(f"port {port} cannot be used: {error.strerror}", remedy=remedy) from error

@@ -1,0 +1,186 @@
+"""Follows both processes over zenoh, and keeps the hub's documents up to date."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from contextlib import ExitStack
+from importlib.metadata import version
+from types import TracebackType
+from typing import Self
+
+from bodyschema.cli.recordings.recorder import History
+from bodyschema.cli.terminal.findings_view import outlook_sentence
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.command_names import CommandName
+from bodyschema.daemon.transport.identity import Route
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
+from bodyschema.daemon.transport.wire import CommandReply, CommandRequest, JointsRequest, PredictReply, decode, encode
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import BusError, RecordingError, RequestError
+from bodyschema.interfaces.protocols import Clock
+
+from .course import Course, Series
+from .documents import Process, RobotDocument
+from .heard import Heard
+from .hub import Hub
+from .recent import KEPT, RecentPairs, cloud
+
+log = logging.getLogger(__name__)
+
+EVERY_S = 1.0
+CLOUD_EVERY_S = 2.0
+PREDICT_LIMIT_S = 2.0
+# Longer than a tool change or switching torque on takes.
+COMMAND_LIMIT_S = 10.0
+
+
+class Watch:
+    """Follows both processes while the with statement lasts; they may come and go."""
+
+    def __init__(self, config: Config, hub: Hub, clock: Clock | None = None) -> None:
+        """Initialise without opening anything; documents go to `hub`."""
+        self._config, self._hub = config, hub
+        self._clock = SystemClock() if clock is None else clock
+        self._keys = Keys(config.robot.name)
+        routes: dict[Process, Route] = {"sampler": config.route("sampler"), "learner": config.route("learner")}
+        self._sampler = Heard(SamplerStatus, str(routes["sampler"]), self._clock)
+        self._learner = Heard(LearnerStatus, str(routes["learner"]), self._clock)
+        self._sessions = {process: Bus(connect=route) for process, route in routes.items()}
+        self._series, self._course = Series(), Course()
+        self._recent = RecentPairs()
+        self._history: History | None = None
+        self._store: str | None = None
+        self._cloud_of: tuple[str, int] | None = None
+        self._cloud_at = -CLOUD_EVERY_S
+        self._stopping = threading.Event()
+        self._open: ExitStack | None = None
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            for session in self._sessions.values():
+                stack.enter_context(session)
+            self._listen()
+            worker = threading.Thread(target=self._work, name="view")
+            worker.start()
+            stack.callback(worker.join)
+            stack.callback(self._stopping.set)
+            self._open = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._open is not None:
+            self._open.close()
+
+    def command(self, process: Process, name: CommandName) -> str:
+        """Send a command to a process and return its reply.
+
+        Raises:
+            BusError: it does not answer.
+            RequestError: it refused.
+        """
+        payload = encode(CommandRequest(name))
+        reply = self._sessions[process].ask_one(self._keys.command(process), payload, timeout_s=COMMAND_LIMIT_S)
+        return decode(reply, CommandReply).message
+
+    def history(self, newest: int) -> History:
+        """Return the sampler's newest pairs, `newest` of them, to be read page by page.
+
+        Raises:
+            BusError: the sampler does not answer.
+        """
+        status = self._sampler.status
+        if status is None or not self._sampler.answers:
+            raise BusError("the sampler does not answer, and it has the pairs. Start it with `bodyschema sampler`")
+        return History(self._sessions["sampler"], self._config.robot, max(1, status.pairs - newest + 1))
+
+    def _listen(self) -> None:
+        robot, joints = self._config.robot, self._config.robot.joints
+        slides = tuple(name for name, slides in zip(joints, robot.chain.prismatic, strict=True) if slides)
+        self._hub.put("robot", RobotDocument(robot.name, joints, slides, version("bodyschema")))
+        heard_of: dict[Process, Heard[SamplerStatus] | Heard[LearnerStatus]]
+        heard_of = {"sampler": self._sampler, "learner": self._learner}
+        for process, heard in heard_of.items():
+            session = self._sessions[process]
+            session.subscribe(self._keys.status(process), lambda payload, heard=heard: heard.take(payload, time.time()))
+            session.watch(self._keys.alive(process), heard.note_alive)
+
+    def _work(self) -> None:
+        while True:
+            try:
+                self._look()
+            except (BusError, RequestError, RecordingError) as error:
+                log.debug("%s", error)  # the page shows which process does not answer
+            except Exception:
+                log.exception("the page is not up to date")
+            if self._stopping.wait(EVERY_S):
+                return
+
+    def _look(self) -> None:
+        self._hub.put("sampler", self._sampler.document)
+        self._hub.put("learner", self._learner.document)
+        status = self._learner.status if self._learner.answers else None
+        if status is not None:
+            self._course.note(status, time.time())
+            outlook = status.outlook
+            self._hub.put("outlook", None if outlook is None else outlook_sentence(outlook))
+        self._hub.put("course", self._course.document)
+        self._note_figures(status)
+        if self._sampler.answers:
+            self._catch_up()
+        if status is not None:
+            self._renew_cloud(status)
+
+    def _note_figures(self, learner: LearnerStatus | None) -> None:
+        sampler = self._sampler.status if self._sampler.answers else None
+        self._series.add(
+            time.time(),
+            error_m=None if learner is None else learner.prequential_m.get(learner.answering),
+            claimed_m=None if learner is None else learner.claimed_error_m,
+            pairs_per_s=None if sampler is None else sampler.pairs_per_s,
+            predict_s=None if learner is None else self._predict_time(),
+        )
+        self._hub.put("series", self._series.document)
+
+    def _predict_time(self) -> float | None:
+        """Return the time of one prediction [s], round trip, as any program would see it."""
+        newest, robot = self._recent.newest, self._config.robot
+        q = (0.5 * (robot.lower + robot.upper) if newest is None else newest.q).tolist()
+        begin = time.perf_counter()
+        try:
+            self._predict([q])
+        except (BusError, RequestError):
+            return None
+        return time.perf_counter() - begin
+
+    def _predict(self, q: list[list[float]]) -> PredictReply:
+        payload = encode(JointsRequest([*q]))
+        reply = self._sessions["learner"].ask_one(self._keys.predict, payload, timeout_s=PREDICT_LIMIT_S)
+        return decode(reply, PredictReply)
+
+    def _catch_up(self) -> None:
+        status = self._sampler.status
+        if status is None:
+            return
+        restarted = self._history is not None and status.pairs < self._history.next_seq - 1
+        if self._history is None or status.store != self._store or restarted:
+            self._history, self._store, self._recent = self.history(KEPT), status.store, RecentPairs()
+        had = len(self._recent), self._recent.newest
+        while page := self._history.page():
+            self._recent.add(page)
+        if had != (len(self._recent), self._recent.newest):
+            self._hub.put("segments", self._recent.segments())
+
+    def _renew_cloud(self, status: LearnerStatus) -> None:
+        now = self._clock.now()
+        of = (status.model, status.last_seq)
+        if of == self._cloud_of or now - self._cloud_at < CLOUD_EVERY_S or status.store != self._store:
+            return
+        pairs = self._recent.chosen(status.last_seq - status.pairs_since_change, status.last_seq)
+        self._hub.put("cloud", cloud(pairs, self._predict))
+        self._cloud_of, self._cloud_at = of, now

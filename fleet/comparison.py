@@ -1,0 +1,227 @@
+"""Comparison of the models of robots of one type: distance from the median model, and outlying figures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.stats import norm
+
+from bodyschema.calibration.comparison import Distances, laid_on
+from bodyschema.daemon.transport.status import ChainCalibration, JointRange
+from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.records import FloatArray
+
+POSES = 400
+# With two robots, an outlier cannot be attributed to either.
+FEWEST_TO_JUDGE = 3
+# A robot is off if one of its figures stands out, or if its model's distance from the median exceeds this multiple of
+# both the models' predicted errors and the robots' median distance.
+FAR = 3.0
+# Probability that chance makes any figure of any robot stand out.
+CHANCE = 0.05
+ROUNDS = 20
+# Standard error of a median of normal numbers, over that of their mean.
+MEDIAN_COSTS = math.sqrt(math.pi / 2.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Predictions of one robot's learner at the common poses.
+
+    Attributes:
+        robot: its name.
+        x: positions (n, 3) in its own measurement frame [m].
+        sigma_m: its predicted error there, root mean square of the distance [m].
+        in_support: share of the poses that lie where it has data.
+        calibration: its calibration; None without one.
+    """
+
+    robot: str
+    x: FloatArray
+    sigma_m: float
+    in_support: float
+    calibration: ChainCalibration | None
+
+
+class Odd(msgspec.Struct, frozen=True):
+    """Figure of a robot that differs from the others' by more than its uncertainty and their spread.
+
+    Attributes:
+        figure: in words, as in `zero of elbow`.
+        difference, half_width: from the median of the robots, with half its 95 % interval [unit].
+        unit: rad or m.
+    """
+
+    figure: str
+    difference: float
+    half_width: float
+    unit: str
+
+
+class Unit(msgspec.Struct, frozen=True, kw_only=True):
+    """One robot compared with the others.
+
+    Attributes:
+        robot: its name.
+        apart: distance of its model from the median model, after a rigid alignment: cameras may stand anywhere.
+        claimed_mm: predicted error of its learner at the poses, root mean square.
+        in_support: share of the poses that lie where it has data.
+        is_off: true if it is an outlier; null if there are too few robots to decide.
+        odd: its figures that stand out, the most improbable first.
+        camera_moved_mm, camera_turned_deg: from the camera pose in its robot.toml.
+    """
+
+    robot: str
+    apart: Distances
+    claimed_mm: float
+    in_support: float
+    is_off: bool | None
+    odd: tuple[Odd, ...]
+    camera_moved_mm: float | None
+    camera_turned_deg: float | None
+
+
+class TypeComparison(msgspec.Struct, frozen=True):
+    """Robots with the same joints.
+
+    Attributes:
+        joints: their names.
+        poses: number of common poses.
+        low, high: the range of each joint that the poses are from [rad or m].
+        units: the robots.
+    """
+
+    joints: tuple[str, ...]
+    poses: int
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    units: tuple[Unit, ...]
+
+
+def common_poses(coverages: Sequence[Mapping[str, JointRange]], joints: tuple[str, ...], seed: int = 0) -> FloatArray:
+    """Return poses (n, d) [rad, m] from the median ranges of the robots.
+
+    One robot that hardly moved does not matter.
+
+    Raises:
+        RequestError: no robot reports the ranges of its joints.
+    """
+    ranges = [[(each[joint].low, each[joint].high) for joint in joints] for each in coverages]
+    if not ranges:
+        raise RequestError("no sampler of these robots answers, so nobody knows where their joints have been")
+    low, high = np.sort(np.median(np.array(ranges), axis=0), axis=1).T
+    return np.random.default_rng(seed).uniform(low, high, (POSES, len(joints)))
+
+
+def compared(joints: tuple[str, ...], q: FloatArray, models: Sequence[Model]) -> TypeComparison:
+    """Compare the models of at least two robots, at the poses q (n, d)."""
+    middle = median_model([model.x for model in models])
+    apart = [Distances.of(laid_on(middle, model.x)[0] - middle) for model in models]
+    typical = float(np.median([each.rms_mm for each in apart]))
+    claimed = float(np.median([1e3 * model.sigma_m for model in models]))
+    figures = _figures(models)
+    judged = len(models) >= FEWEST_TO_JUDGE
+    odd = [_odd(k, figures) if judged else () for k in range(len(models))]
+    far = [FAR * max(typical, math.hypot(1e3 * model.sigma_m, claimed)) for model in models]
+    units = tuple(
+        Unit(
+            robot=model.robot,
+            apart=each,
+            claimed_mm=1e3 * model.sigma_m,
+            in_support=model.in_support,
+            is_off=bool(odd[k]) or each.rms_mm > far[k] if judged else None,
+            odd=odd[k],
+            camera_moved_mm=_camera_moved(model.calibration),
+            camera_turned_deg=_camera_turned(model.calibration),
+        )
+        for k, (model, each) in enumerate(zip(models, apart, strict=True))
+    )
+    low, high = (tuple(map(float, ends)) for ends in (q.min(axis=0), q.max(axis=0)))
+    return TypeComparison(joints, len(q), low, high, units)
+
+
+def median_model(positions: Sequence[FloatArray]) -> FloatArray:
+    """Return positions (n, 3), the coordinates' median of all models' (n, 3), each rigidly aligned to it.
+
+    Starts with the model that the others are nearest to, so that an outlier does not determine the frame.
+    """
+
+    def distance(x: FloatArray) -> float:
+        return float(np.median([np.linalg.norm(laid_on(x, other)[0] - x) for other in positions]))
+
+    middle = min(positions, key=distance)
+    for _ in range(ROUNDS):
+        middle = np.median([laid_on(middle, x)[0] for x in positions], axis=0)
+    return middle
+
+
+@dataclass(frozen=True, eq=False)
+class _Figure:
+    """One figure of all robots: values and half widths (m,), NaN where a robot's pairs do not determine it."""
+
+    name: str
+    unit: str
+    values: FloatArray
+    half_widths: FloatArray
+
+
+def _figures(models: Sequence[Model]) -> list[_Figure]:
+    told: dict[tuple[str, str], dict[int, tuple[float, float]]] = {}
+    for k, model in enumerate(models):
+        found = model.calibration
+        if found is None:
+            continue
+        for joint, zero in found.zeros.items():
+            if zero is not None:
+                told.setdefault((f"zero of {joint}", "rad"), {})[k] = zero.value, zero.half_width
+        for axis, figure in zip("xyz", found.marker_xyz, strict=True):
+            told.setdefault((f"tool in {axis}", "m"), {})[k] = figure.learnt, figure.half_width
+    figures = []
+    for (name, unit), of_robots in told.items():
+        numbers = np.full((2, len(models)), np.nan)
+        for k, (value, half_width) in of_robots.items():
+            numbers[:, k] = value, half_width
+        if len(of_robots) >= FEWEST_TO_JUDGE:
+            figures.append(_Figure(name, unit, *numbers))
+    return figures
+
+
+def _odd(robot: int, figures: Sequence[_Figure]) -> tuple[Odd, ...]:
+    """Return the figures of the robot that stand out."""
+    tried = sum(int(np.isfinite(figure.values).sum()) for figure in figures)
+    found: list[tuple[float, Odd]] = []
+    for figure in figures:
+        own, others = figure.half_widths[robot], figure.half_widths[np.isfinite(figure.half_widths)]
+        difference = float(figure.values[robot] - np.nanmedian(figure.values))
+        half_width = math.hypot(own, MEDIAN_COSTS * float(np.median(others)) / math.sqrt(len(others)))
+        possible = math.hypot(half_width, norm.isf(0.025) * _spread(figure.values))
+        far = abs(difference) / possible if possible > 0.0 else 0.0
+        if far > norm.isf(0.5 * CHANCE / tried) / norm.isf(0.025):
+            found.append((far, Odd(figure.name, difference, half_width, figure.unit)))
+    return tuple(odd for _, odd in sorted(found, key=lambda each: -each[0]))
+
+
+def _spread(values: FloatArray) -> float:
+    """Return the robust 1-sigma of a figure among robots, from the median of their distances to the median."""
+    told = values[np.isfinite(values)]
+    return float(np.median(np.abs(told - np.median(told))) / norm.ppf(0.75))
+
+
+def _camera_moved(found: ChainCalibration | None) -> float | None:
+    if found is None:
+        return None
+    return 1e3 * math.dist([each.drawn for each in found.camera_xyz], [each.learnt for each in found.camera_xyz])
+
+
+def _camera_turned(found: ChainCalibration | None) -> float | None:
+    if found is None:
+        return None
+    drawn, learnt = (
+        Rotation.from_euler("xyz", [getattr(each, which) for each in found.camera_rpy]) for which in ("drawn", "learnt")
+    )
+    return math.degrees((drawn.inv() * learnt).magnitude())

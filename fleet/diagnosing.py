@@ -1,0 +1,232 @@
+"""Diagnosis of many recordings on Dask: on this machine's cores, or on the workers of a scheduler.
+
+The recording and the robot's description are read here and sent to the worker. It needs this package, but none of our
+files.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from bodyschema.cli.terminal.diagnosis_run import Asked, Found, Source, measured, require_writable, run, written
+from bodyschema.daemon.config import Config
+from bodyschema.diagnosis.result import DiagnosisFile
+from bodyschema.interfaces.errors import BodyschemaError, ConfigError
+from bodyschema.interfaces.interpreter import safe_children
+
+from .recordings import Job
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+# A diagnosis that ended this many workers (by running out of memory, for example) is not tried again.
+WORKERS_LOST = 1
+CONNECT_LIMIT_S = 10.0
+TOPIC = "bodyschema"
+
+
+@dataclass(frozen=True)
+class Diagnosed:
+    """Result for one recording.
+
+    Attributes:
+        job: the recording.
+        robot: name of its robot.
+        joints: of its robot; empty if its description could not be read.
+        file: the diagnosis; None if there is none.
+        timed: True if the recording has times.
+        error: the reason why there is none.
+    """
+
+    job: Job
+    robot: str
+    joints: tuple[str, ...]
+    file: DiagnosisFile | None = None
+    timed: bool = False
+    error: str | None = None
+
+
+@dataclass(frozen=True)
+class _Read:
+    """Recording that can be diagnosed."""
+
+    job: Job
+    config: Config
+    source: Source
+
+
+Told = Callable[[str, str], None]
+Done = Callable[[Diagnosed], None]
+
+
+def diagnose_all(
+    jobs: Sequence[Job],
+    asked: Asked,
+    out: Path | None,
+    cluster: Client,
+    told: Told,
+    done: Done,
+) -> list[Diagnosed]:
+    """Diagnose all recordings; a failed one is reported as such, and does not end the others.
+
+    Args:
+        jobs: the recordings.
+        asked: settings of the diagnoses.
+        out: a folder for each recording is written here.
+        cluster: a client of the scheduler; running work is cancelled if this ends early.
+        told: called with a recording's name and its current step.
+        done: called with each result as it comes.
+
+    Returns:
+        The results, in the order of the jobs.
+
+    Raises:
+        RecordingError: the folder cannot be written.
+    """
+    from distributed import as_completed
+
+    if out is not None:
+        require_writable(out)
+    results: dict[str, Diagnosed] = {}
+
+    def take(result: Diagnosed) -> None:
+        results[result.job.name] = result
+        done(result)
+
+    futures: dict[Future[Any], _Read] = {}
+    cluster.subscribe_topic(TOPIC, lambda event: told(*event[1]))
+    try:
+        for read in map(_read, jobs):
+            if isinstance(read, Diagnosed):
+                take(read)
+                continue
+            work = cluster.submit(_work, read, asked, out is not None, key=f"diagnose-{read.job.name}", pure=False)
+            futures[work] = read
+        for future in as_completed(list(futures), raise_errors=False):
+            take(_result(future, futures[future], out))
+    finally:
+        cluster.cancel(list(futures), force=True)
+        cluster.unsubscribe_topic(TOPIC)
+    return [results[job.name] for job in jobs]
+
+
+@contextmanager
+def workers(scheduler: str | None, jobs: int, count: int | None = None) -> Iterator[Client]:
+    """Yield a client of the scheduler at an address; without one, of processes on this machine.
+
+    Dask gives each process one thread of BLAS.
+
+    Args:
+        scheduler: its address; None starts processes here.
+        jobs: number of recordings.
+        count: of processes; None: one for each core, and no more than jobs.
+
+    Raises:
+        ConfigError: the scheduler does not answer, or has no workers.
+    """
+    from dask import config
+    from distributed import Client, LocalCluster
+
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors that matter are reported by the diagnoses
+    with safe_children(), config.set({"distributed.scheduler.allowed-failures": WORKERS_LOST}):
+        if scheduler is not None:
+            with _client_of(scheduler) as client:
+                yield client
+            return
+        with (
+            LocalCluster(
+                n_workers=count or min(os.cpu_count() or 1, jobs),
+                threads_per_worker=1,
+                processes=True,
+                dashboard_address=None,  # pyright: ignore[reportArgumentType]
+                silence_logs=logging.CRITICAL,
+            ) as local,
+            Client(local) as client,
+        ):
+            client.run(_leave_ctrl_c)
+            yield client
+
+
+def _client_of(scheduler: str) -> Client:
+    from distributed import Client
+
+    try:
+        client = Client(scheduler, timeout=CONNECT_LIMIT_S)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise ConfigError(
+            f"no Dask scheduler answers on {scheduler}",
+            remedy="Start one with `dask scheduler`, or leave --scheduler out: then this machine's cores do it",
+        ) from error
+    if not client.scheduler_info(n_workers=-1)["workers"]:
+        client.close()
+        raise ConfigError(
+            f"the Dask scheduler on {scheduler} has no workers", remedy=f"Start some: `dask worker {scheduler}`"
+        )
+    return client
+
+
+def _leave_ctrl_c() -> None:
+    """Ignore Ctrl-C on a worker of our terminal: the parent process handles it and ends the worker."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _read(job: Job) -> _Read | Diagnosed:
+    """Return the recording with its robot, or why it cannot be read."""
+    try:
+        config = Config.load(job.robot)
+    except BodyschemaError as error:
+        return Diagnosed(job, job.name, (), error=str(error))
+    try:
+        return _Read(job, config, measured(config, job.recording, live=False))
+    except BodyschemaError as error:
+        return Diagnosed(job, config.robot.name, config.robot.joints, error=str(error))
+
+
+def _work(read: _Read, asked: Asked, with_report: bool) -> tuple[bytes, Found | None] | str:
+    """Diagnose on a worker: return diagnosis.json, and the input of the other files if they are written.
+
+    Returns the reason as text if there is none: not every exception of ours can be unpickled.
+    """
+    from distributed import get_worker
+
+    worker = get_worker()
+    try:
+        found = run(read.config, read.source, asked, lambda said: worker.log_event(TOPIC, (read.job.name, said)))
+    except BodyschemaError as error:
+        return str(error)
+    return found.json.encode(), found if with_report else None
+
+
+def _result(future: Future[Any], read: _Read, out: Path | None) -> Diagnosed:
+    robot = read.config.robot
+    try:
+        answer = future.result()
+        if not isinstance(answer, str) and out is not None:
+            written(answer[1], out / read.job.name)
+    except Exception as error:  # a worker's error is reported in its row and does not concern the others
+        answer = _why(error)
+    if isinstance(answer, str):
+        return Diagnosed(read.job, robot.name, robot.joints, error=answer)
+    file = msgspec.json.decode(answer[0], type=DiagnosisFile)
+    return Diagnosed(read.job, robot.name, robot.joints, file, read.source.recording.t is not None)
+
+
+def _why(error: Exception) -> str:
+    from distributed import KilledWorker
+
+    if isinstance(error, BodyschemaError):
+        return str(error)
+    if isinstance(error, KilledWorker):
+        return "its worker was ended, by the system for its memory perhaps. Try fewer --workers"
+    if isinstance(error, ModuleNotFoundError):
+        return f"the worker has no module {error.name}: install the same bodyschema there"
+    return f"internal error, please report it: {type(error).__name__}: {error}"

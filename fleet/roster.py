@@ -1,0 +1,180 @@
+"""Roster of the fleet: robots found by their liveliness tokens, with the status of their processes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Self, TypeVar
+
+from bodyschema.daemon.config import Config
+from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.identity import SECURE, Route
+from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
+from bodyschema.daemon.transport.wire import decode
+from bodyschema.daemon.transport.zenoh_config import ENDPOINT, PROCESSES
+from bodyschema.interfaces.errors import BusError, RequestError
+
+ANSWER_LIMIT_S = 2.0
+EVERYBODY = "*"
+
+Status = TypeVar("Status", SamplerStatus, LearnerStatus)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Network route on which robots are looked for.
+
+    Attributes:
+        route: the route.
+        robots: names of the expected robots; others are found too if queries for all are permitted.
+    """
+
+    route: Route
+    robots: tuple[str, ...] = ()
+
+
+@dataclass(eq=False)
+class Member:
+    """Current state of one robot of the fleet.
+
+    Attributes:
+        name: of the robot.
+        alive: its processes that are alive.
+        sampler, learner: their status; None if one did not answer.
+        route: the learner's route, else the sampler's; None if neither was found.
+    """
+
+    name: str
+    alive: set[str] = field(default_factory=set)
+    sampler: SamplerStatus | None = None
+    learner: LearnerStatus | None = None
+    route: Route | None = None
+
+    @property
+    def joints(self) -> tuple[str, ...] | None:
+        """Names of its joints; None if no process reports them."""
+        if self.sampler is not None and self.sampler.coverage:
+            return tuple(self.sampler.coverage)
+        if self.learner is not None and self.learner.calibration is not None:
+            return tuple(self.learner.calibration.zeros)
+        return None
+
+    @property
+    def error_m(self) -> float | None:
+        """Recent mean distance between the answering model's predictions and the measurements [m]."""
+        return None if self.learner is None else self.learner.prequential_m.get(self.learner.answering)
+
+    @property
+    def health(self) -> list[str]:
+        """Problems, as sentences; empty if all is well."""
+        said = [sentence for status in (self.sampler, self.learner) if status is not None for sentence in status.health]
+        if not self.alive:
+            return ["neither its sampler nor its learner is alive"]
+        for process, status in zip(PROCESSES, (self.sampler, self.learner), strict=True):
+            if process in self.alive and status is None:
+                said.append(f"the {process} is alive and does not answer")
+        if "learner" not in self.alive:
+            said.append("its learner is not alive: nobody learns or answers")
+        return said
+
+
+def places(endpoints: Sequence[str], files: Sequence[Path]) -> list[Place]:
+    """Return the routes to search: endpoints of routers or processes, and those in descriptions of robots, each once.
+
+    Raises:
+        RequestError: something is not an endpoint, or it needs certificates, which only a description names.
+        ConfigError: a description is wrong.
+    """
+    found: dict[Route, set[str]] = {}
+    for endpoint in endpoints:
+        if not ENDPOINT.fullmatch(endpoint):
+            raise RequestError(f"--connect {endpoint}: this is no endpoint. Write one like tcp/127.0.0.1:7447")
+        if endpoint.startswith(SECURE):
+            raise RequestError(
+                f"--connect {endpoint} takes certificates. Give --robot with a robot.toml whose [zenoh] has this "
+                "router and them (docs/security.md)"
+            )
+        found.setdefault(Route((endpoint,)), set())
+    for file in files:
+        config = Config.load(file)
+        zenoh, identity = config.tables.zenoh, config.tables.zenoh.identity(file.parent)
+        for endpoint in [zenoh.router] if zenoh.router else [zenoh.learner, zenoh.sampler]:
+            found.setdefault(Route((endpoint,), identity), set()).add(config.robot.name)
+    return [Place(route, tuple(sorted(names))) for route, names in found.items()]
+
+
+class Fleet:
+    """Queries the status of all robots. Use as a context manager; robots and routes may come and go.
+
+    Attributes:
+        unreached: reasons why routes could not be queried the last time.
+    """
+
+    def __init__(self, places: Sequence[Place]) -> None:
+        self._places = places
+        self._sessions: dict[Route, Bus] = {}
+        self._open = ExitStack()
+        self.unreached: list[str] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._open.__exit__(kind, error, trace)
+
+    def look(self) -> list[Member]:
+        """Return the robots now, by name.
+
+        Raises:
+            BusError: none of the routes can be reached.
+        """
+        members = {name: Member(name) for place in self._places for name in place.robots}
+        self.unreached = []
+        for place in self._places:
+            try:
+                self._look_at(place, members)
+            except BusError as error:
+                self.unreached.append(str(error))
+        if len(self.unreached) == len(self._places):
+            raise BusError(self.unreached[0])
+        return [members[name] for name in sorted(members)]
+
+    def bus(self, route: Route) -> Bus:
+        """Return the session of a route; BusError if no process answers there."""
+        if route not in self._sessions:
+            self._sessions[route] = self._open.enter_context(Bus(connect=route, client=True))
+        return self._sessions[route]
+
+    def _look_at(self, place: Place, members: dict[str, Member]) -> None:
+        bus = self.bus(place.route)
+        asked = [EVERYBODY]
+        tokens = bus.alive(Keys(EVERYBODY).alive(EVERYBODY), timeout_s=ANSWER_LIMIT_S)
+        if not tokens:  # no process answers, or only queries by name are permitted
+            asked = list(place.robots)
+            tokens = [token for name in asked for token in bus.alive(Keys(name).alive(EVERYBODY))]
+        if not tokens:
+            return
+        for token in tokens:
+            _, name, _, process = token.split("/")
+            member = members.setdefault(name, Member(name))
+            member.alive.add(process)
+            if process == "learner" or member.route is None:
+                member.route = place.route
+        for who in asked:
+            for sampler in _states(bus, who, "sampler", SamplerStatus):
+                members.setdefault(sampler.robot, Member(sampler.robot)).sampler = sampler
+            for learner in _states(bus, who, "learner", LearnerStatus):
+                members.setdefault(learner.robot, Member(learner.robot)).learner = learner
+
+
+def _states(bus: Bus, robots: str, process: str, kind: type[Status]) -> Iterator[Status]:
+    for reply in bus.ask(Keys(robots).status(process), timeout_s=ANSWER_LIMIT_S):
+        if reply.error is None:
+            with suppress(RequestError):  # another version's message counts as no answer
+                yield decode(reply.payload, kind)

@@ -1,0 +1,136 @@
+"""Data outlook: the expected gain of further pairs, and the motion that gains most."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodyschema.daemon.transport.status import Outlook
+from bodyschema.interfaces.records import FloatArray
+from kbmaps import ChainBelief, ChainPosterior, ChainTolerances, candidate_motions, expected_gain, shared_by
+from kbmaps.planning.expected_gain import ALL, SAME
+from kbmaps.robust import OUTLIER_SIGMAS
+
+from .claims import Claim
+from .gate import MEDIAN_TO_SIGMA
+from .nominal import NominalModel
+from .snapshot import MEAN_OVER_RMS
+
+FURTHER = (100, 300)
+# Number of poses of a motion, and of the region where the arm is used. More would not make the figures steadier than
+# the posterior is.
+POSES = 100
+# A motion that gains this little more than continuing as so far is not reported.
+WORTH = 0.05
+# A gain below this share of the noise of a single measurement is not noticeable.
+NOTICED = 0.1
+# Lower bound of the noise [m]: no camera is better, and the formulas need a positive value.
+LEAST_NOISE_M = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Evidence for a data outlook at one moment.
+
+    Attributes:
+        nominal: the nominal model.
+        belief: posterior of the chain from the pairs with the current tool.
+        wide: the same without the selection of narrower tolerances.
+        tolerances: those of the first prior.
+        claim: uncertainty of the answering model.
+        solved: True if that model is a solution, whose error the belief describes.
+        pairs: number of learnt pairs with the current tool.
+        region: poses (m, d) [rad, m] that represent the data's region.
+        seen: poses (n, d) [rad, m] of some of them, evenly spread.
+        q, x: the newest that the solver knows, (m, d) [rad, m] and (m, 3) [m].
+    """
+
+    nominal: NominalModel
+    belief: ChainBelief
+    wide: ChainBelief
+    tolerances: ChainTolerances
+    claim: Claim
+    solved: bool
+    pairs: int
+    region: FloatArray
+    seen: FloatArray
+    q: FloatArray
+    x: FloatArray
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Scatter of the newest pairs around the most probable chain.
+
+    Attributes:
+        noise_m: 1-sigma of a measured coordinate [m], including errors that no chain explains.
+        outliers: number of pairs too far away for this noise.
+        shared: number of neighbours on the path that carry as much information as one pair.
+    """
+
+    noise_m: float
+    outliers: int
+    shared: float
+
+    @classmethod
+    def of(cls, known: Known) -> Scatter:
+        """Return the scatter of the newest pairs."""
+        predicted, variance = known.belief.predict_with_variance(known.q)
+        missed = known.x - predicted
+        distances = np.linalg.norm(missed, axis=1)
+        # The part of the residuals that the fit absorbs equals its uncertainty at the same places.
+        noise = math.hypot(MEDIAN_TO_SIGMA * float(np.median(distances)), math.sqrt(float(np.median(variance))))
+        noise = max(noise, LEAST_NOISE_M)
+        inliers = distances <= OUTLIER_SIGMAS * noise
+        return cls(noise, int((~inliers).sum()), shared_by(missed[inliers]))
+
+
+def foreseen(known: Known, scatter: Scatter, joints: tuple[str, ...]) -> Outlook:
+    """Return the expected gain of further pairs where the arm has been, for an answering solution.
+
+    The current error is the predicted one there. The forecast gives the factor by which it falls.
+
+    Args:
+        known: the evidence of the learner.
+        scatter: of the newest pairs.
+        joints: their names.
+    """
+    rng = np.random.default_rng(0)  # the same pairs have the same outlook
+    nominal, claim = known.nominal, known.claim
+    lower, upper = nominal.lower, np.maximum(nominal.upper, nominal.lower + LEAST_NOISE_M)
+    floor = float(np.sqrt(np.square(claim.inside).mean()))
+    noise = scatter.noise_m * math.sqrt(scatter.shared)
+    posterior = ChainPosterior.of_belief(known.belief, noise=max(noise, floor), floor=floor)
+    motions = candidate_motions(known.seen, lower, upper, rng, names=joints, count=POSES)
+    forecast = expected_gain(posterior, known.region[:POSES], motions, FURTHER, rng)
+    by_motion = {motion.motion: motion.errors for motion in forecast.motions}
+    best = forecast.motions[0].motion
+    if by_motion[best][-1] > (1.0 - WORTH) * by_motion[SAME][-1]:
+        best = SAME
+    claimed = _mean_error_m(claim, known.region)
+    scale = claimed / forecast.now if forecast.now > 0.0 else 1.0
+    gain = scale * (forecast.now - forecast.motions[0].errors[-1])
+    return Outlook(
+        pairs=known.pairs,
+        error_m=claimed,
+        least_error_m=scale * forecast.least,
+        anywhere_m=_mean_error_m(claim, rng.uniform(lower, upper, (POSES, nominal.joints))),
+        further_pairs=list(FURTHER),
+        like_so_far_m=[scale * error for error in by_motion[SAME]],
+        best_motion=_in_words(best),
+        best_motion_m=[scale * error for error in by_motion[best]],
+        enough=forecast.is_enough() or gain < NOTICED * scatter.noise_m,
+    )
+
+
+def _mean_error_m(claim: Claim, q: FloatArray) -> float:
+    """Return the expected mean distance to the truth [m] at q (n, d) [rad]."""
+    return MEAN_OVER_RMS * float(np.sqrt(claim.variance(q).sum(axis=1)).mean())
+
+
+def _in_words(motion: str) -> str:
+    return {SAME: "going on as so far", ALL: "moving all joints over their ranges"}.get(
+        motion, f"moving {motion} over its range"
+    )

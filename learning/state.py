@@ -1,0 +1,126 @@
+"""State of the learner as plain values and arrays: the contents of a checkpoint."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from bodyschema.daemon.transport.status import CurvePoint
+from bodyschema.interfaces.errors import BodyschemaError
+from bodyschema.interfaces.records import FARTHEST_M, LARGEST_Q, FloatArray
+
+from .change import ChangeRecord
+from .claims import ClaimsState
+from .members import PRIOR
+from .orientation import OrientationState
+
+# Prefix of the arrays of the state before a change.
+BEFORE = "before/"
+# Prefix of stored nets.
+NET = "net_"
+
+
+class StateError(BodyschemaError):
+    """A stored state does not fit this learner."""
+
+
+class Counters(msgspec.Struct, kw_only=True):
+    """All counters. `pairs` are learnt online, each once; `last_seq` is the newest of them.
+
+    Attributes:
+        store: identity of the store the pairs came from.
+        since_change: pairs since the last change, or since the beginning.
+        changes: changes of the tool, or of another part, that were reported or detected.
+        doubted: pairs that looked like gross outliers.
+        missed: pairs that the sampler no longer kept when they were requested.
+    """
+
+    store: str | None = None
+    pairs: int = 0
+    last_seq: int = 0
+    since_change: int = 0
+    replayed: int = 0
+    refused: int = 0
+    gaps_recovered: int = 0
+    changes: int = 0
+    doubted: int = 0
+    missed: int = 0
+
+
+class LearningHeader(msgspec.Struct, kw_only=True):
+    """Part of the state without arrays. Fields with a default belong to a regime.
+
+    Attributes:
+        fingerprint: of the nominal model and the tolerances it started from.
+        claims: uncertainties and errors of the models.
+        kept_of: number of pairs since the prior; the newest of them are kept.
+        next_fit: number of pairs at which an unknown frame, or the tool after a change, is fitted again; None for
+            never.
+        first_fit: True if that is the first one.
+        answering: the model that answers.
+        doubted_in_a_row: number of consecutive outliers up to now.
+        replays_due: replay steps that are still due.
+        replay_position: their position: epochs begun, pairs of the current one, and the number of these replayed.
+        belief: prior of the chain before the first of these pairs, as bytes; None before the alignment.
+        residual: prior of the arm beyond that, as bytes; None without any.
+        orientation: state of the orientation models; None in a checkpoint of an older version.
+        change: the last change; None if there was none.
+        before: the state before it, for rollback; None if there is none. Its arrays' names begin with `BEFORE`.
+    """
+
+    fingerprint: str
+    counters: Counters
+    claims: ClaimsState
+    curve: list[CurvePoint]
+    curve_stride: int
+    kept_of: int
+    next_fit: int | None
+    first_fit: bool
+    answering: str = PRIOR
+    doubted_in_a_row: int = 0
+    replays_due: float = 0.0
+    replay_position: tuple[int, int, int] = (0, 0, 0)
+    belief: bytes | None = None
+    residual: bytes | None = None
+    orientation: OrientationState | None = None
+    change: ChangeRecord | None = None
+    before: LearningHeader | None = None
+
+
+@dataclass(frozen=True)
+class LearningState:
+    """State of a learner.
+
+    `arrays` are the nets by model, the kept pairs, the consecutive outliers, the arrays of the uncertainties, and the
+    inputs of a tool fit.
+    """
+
+    header: LearningHeader
+    arrays: Mapping[str, FloatArray]
+
+    @property
+    def before(self) -> LearningState | None:
+        """State before the last change; None if there is none."""
+        if self.header.before is None:
+            return None
+        arrays = {name.removeprefix(BEFORE): each for name, each in self.arrays.items() if name.startswith(BEFORE)}
+        return LearningState(self.header.before, arrays)
+
+    def with_before(self, before: LearningState | None) -> LearningState:
+        """Return the same state with another one to roll back to."""
+        if before is None:
+            return self
+        header = msgspec.structs.replace(self.header, before=before.header)
+        return LearningState(header, {**self.arrays, **{BEFORE + name: each for name, each in before.arrays.items()}})
+
+    def poisoned(self) -> str | None:
+        """Return the name of a net, or of an array of pairs, with impossible values; None if all is well."""
+        nets = dict.fromkeys((name for name in self.arrays if name.startswith(NET)), np.inf)
+        limits = {**nets, "q": LARGEST_Q, "x": FARTHEST_M}
+        for name, limit in limits.items():
+            if not (np.isfinite(self.arrays[name]).all() and (np.abs(self.arrays[name]) <= limit).all()):
+                return name
+        return None

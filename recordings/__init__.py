@@ -1,0 +1,1 @@
+"""Pairs on disk: CSV, Parquet, MCAP, ROS bags, Rerun, and the store."""

@@ -1,0 +1,1 @@
+"""The store of pairs: a SQLite file with checksums, migrations and retention."""

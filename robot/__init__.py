@@ -1,0 +1,1 @@
+"""A robot as its files describe it: robot.toml and URDF."""

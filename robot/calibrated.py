@@ -1,0 +1,122 @@
+"""Express a learnt chain in terms of the robot's files: joint origins, camera pose, marker position.
+
+A chain is a product of transforms, of which a camera sees only the whole. How it is split into parts is a convention:
+
+- the camera's pose and the joint offsets are those of the learner;
+- each link moves with the axis of its own joint only, while all joints are at zero; so a mesh stays on the part that it
+  shows;
+- fixed joints, held joints, and everything off the path from camera to marker keep their origins.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from bodyschema.interfaces.records import FloatArray
+from kbmaps import RigidChain
+from kbmaps.rotations import exponentials
+
+from .description import RobotDescription
+from .urdf import UrdfJoint, inverse, standing
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedGeometry:
+    """Learnt values of the poses in the robot's files.
+
+    Attributes:
+        T_parent_joint: poses (4, 4) of the learnt joints' frames in their parent links, by joint; the axes in these
+            frames are unchanged.
+        T_parent_camera: pose (4, 4) of the measurement frame in the camera's parent link.
+        marker_xyz: the marker (3,) in its link [m].
+    """
+
+    T_parent_joint: dict[str, FloatArray]
+    T_parent_camera: FloatArray
+    marker_xyz: FloatArray
+
+    @classmethod
+    def of(
+        cls, robot: RobotDescription, chain: RigidChain, *, T_measured_nominal: FloatArray, zeros: FloatArray
+    ) -> Self:
+        """Return the geometry of `chain`, split as the module describes.
+
+        Args:
+            robot: the nominal model that the chain was learnt from.
+            chain: the learnt one, with the axes and joint types of the nominal one.
+            T_measured_nominal: camera displacement (4, 4), as in `kbmaps.ChainReport`.
+            zeros: joint offsets (d,) [rad, m], as in `kbmaps.ChainReport`.
+        """
+        way = _Way.of(robot)
+        at_zero = [_joint_motion(chain, k, value) for k, value in enumerate(zeros)]
+        frames = _moved_frames(chain, T_measured_nominal, at_zero)
+        drawn = _frames(robot.chain.fixed)
+        T_camera_parent = T_measured_nominal @ inverse(robot.camera.pose)
+        if way.upward[0]:
+            T_camera_parent = chain.fixed[0] @ inverse(way.between[0])
+        # The pose reached on the path, with all joints at zero and before the camera has moved. The link above
+        # a joint that is walked upward is the next joint's own if that leads up too; the topmost one keeps its
+        # nominal pose.
+        reached = inverse(T_measured_nominal) @ T_camera_parent @ way.between[0]
+        origins: dict[str, FloatArray] = {}
+        for k, joint in enumerate(way.joints):
+            if not way.upward[k]:
+                origins[joint.name] = inverse(reached) @ frames[k] @ at_zero[k]
+                reached = frames[k] @ way.between[k + 1]
+                continue
+            if k + 1 < len(way.joints) and way.upward[k + 1]:
+                T_zero_parent = frames[k + 1] @ inverse(way.between[k + 1])
+            else:
+                T_zero_parent = drawn[k] @ inverse(joint.T_parent_joint)
+            origins[joint.name] = inverse(T_zero_parent) @ frames[k] @ inverse(at_zero[k])
+            reached = T_zero_parent @ way.between[k + 1]
+        marker = inverse(reached) @ frames[-1]
+        return cls(origins, inverse(T_camera_parent), marker[:3, 3])
+
+
+@dataclass(frozen=True)
+class _Way:
+    """Path from the camera's link to the marker's: learnt joints (d), and fixed transforms between them (d+1)."""
+
+    joints: list[UrdfJoint]
+    upward: list[bool]
+    between: list[FloatArray]
+
+    @classmethod
+    def of(cls, robot: RobotDescription) -> Self:
+        way = cls([], [], [np.eye(4)])
+        for joint, upward in robot.tree.path(robot.camera.parent_link, robot.robot.marker_link):
+            if joint.name in robot.joints:
+                way.joints.append(joint)
+                way.upward.append(upward)
+                way.between.append(np.eye(4))
+            else:
+                held = robot.robot.held_at.get(joint.name, 0.0)
+                way.between[-1] = way.between[-1] @ standing(joint, upward, held)
+        return way
+
+
+def _moved_frames(chain: RigidChain, T_measured_nominal: FloatArray, at_zero: list[FloatArray]) -> list[FloatArray]:
+    """Return frames of the joints and the marker (d+1) with all joints at zero, in the nominal measurement frame."""
+    parts = [inverse(T_measured_nominal) @ chain.fixed[0]]
+    parts += [inverse(zero) @ fixed for zero, fixed in zip(at_zero, chain.fixed[1:], strict=True)]
+    return _frames(np.array(parts))
+
+
+def _frames(transforms: FloatArray) -> list[FloatArray]:
+    frames = [transforms[0]]
+    for transform in transforms[1:]:
+        frames.append(frames[-1] @ transform)
+    return frames
+
+
+def _joint_motion(chain: RigidChain, k: int, value: float) -> FloatArray:
+    motion = np.eye(4)
+    if chain.prismatic[k]:
+        motion[:3, 3] = value * chain.axes[k]
+    else:
+        motion[:3, :3] = exponentials((value * chain.axes[k])[None])[0][0]
+    return motion

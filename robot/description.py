@@ -1,0 +1,283 @@
+"""robot.toml and its URDF: which joints, which camera, which marker."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from bodyschema.interfaces.camera import LARGEST_SIDE_PX, StereoCalibration
+from bodyschema.interfaces.errors import ConfigError, RobotError
+from bodyschema.interfaces.records import FloatArray, frozen_array
+from kbmaps import RigidChain
+
+from .rpy import rotation_of, rpy_of
+from .toml_file import convert, line_of, read_toml
+from .urdf import MOVING, UrdfJoint, UrdfTree, chain_between
+
+Vector3 = tuple[float, float, float]
+Positive = Annotated[float, Meta(gt=0)]
+Side = Annotated[int, Meta(ge=1, le=LARGEST_SIDE_PX)]
+ImageSize = tuple[Side, Side]
+# Beyond these a number is of another unit: degrees, millimetres.
+LARGEST_TURN_RAD, LONGEST_TOOL_M, FARTHEST_CAMERA_M = 2.0 * math.pi, 2.0, 50.0
+# One chunk of a zenoh key: no separators, no wild cards, and not the @ that hides a chunk from wild cards.
+NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]*\Z"  # `$` would let a line break follow
+Name = Annotated[str, Meta(pattern=NAME)]
+
+
+class RobotSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [robot].
+
+    Attributes:
+        name: the robot's name, one chunk of its zenoh keys.
+        urdf: the URDF file, relative to robot.toml.
+        joints: the joints that are read and learnt, in the order of q.
+        marker_link: the link that carries the marker.
+        marker_xyz: the marker in that link [m].
+        marker_known: False when the marker's place is only roughly known: fitted first, and not a finding.
+        hold: who bears the arm's weight while recording.
+        held_at: positions [rad or m] of other joints between camera and marker, which stand still; 0 where not named.
+    """
+
+    name: Name
+    urdf: str
+    joints: Annotated[tuple[str, ...], Meta(min_length=1)]
+    marker_link: str
+    marker_xyz: Vector3 = (0.0, 0.0, 0.0)
+    marker_known: bool = True
+    hold: Literal["torque_free", "zero_force", "held"] = "torque_free"
+    held_at: dict[str, float] = {}
+
+
+class CameraSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [camera]: the measurement frame, and the stereo geometry where there is one.
+
+    Attributes:
+        parent_link: the link the cameras stand on or ride on.
+        xyz, rpy: pose of the left optical frame in it [m], [rad], URDF convention.
+        pose_known: False when the instrument stands anywhere: fitted first, and not a finding.
+        eyes: 2 of a stereo pair, 1 of one camera alone.
+        focal_px, principal_point_px, baseline_m, image_size_px: the rectified stereo pair; all or none. One camera
+            alone has no baseline_m.
+        pixel_sigma: 1-sigma of a marker centre's image coordinates [px].
+    """
+
+    parent_link: str
+    xyz: Vector3 = (0.0, 0.0, 0.0)
+    rpy: Vector3 = (0.0, 0.0, 0.0)
+    pose_known: bool = True
+    eyes: Literal[1, 2] = 2
+    focal_px: Positive | None = None
+    principal_point_px: tuple[float, float] | None = None
+    baseline_m: Positive | None = None
+    image_size_px: ImageSize | None = None
+    pixel_sigma: Positive = 0.2
+
+    @property
+    def pose(self) -> FloatArray:
+        """Pose of the left optical frame in the parent link, shape (4, 4)."""
+        T = np.eye(4)
+        T[:3, :3] = rotation_of(np.array(self.rpy))
+        T[:3, 3] = self.xyz
+        return T
+
+
+@dataclass(frozen=True)
+class RobotDescription:
+    """A robot as its files describe it: the nominal model.
+
+    Attributes:
+        file: robot.toml.
+        tree: the URDF.
+        chain: measurement frame to marker over `joints`.
+        lower, upper: joint limits [rad or m], shape (d,).
+        calibration: the stereo pair or the one camera, or None when [camera] describes neither.
+    """
+
+    file: Path
+    robot: RobotSection
+    camera: CameraSection
+    tree: UrdfTree
+    chain: RigidChain
+    lower: FloatArray
+    upper: FloatArray
+    calibration: StereoCalibration | None
+
+    @classmethod
+    def load(cls, file: Path) -> RobotDescription:
+        """Read robot.toml and its URDF; the tables other than [robot] and [camera] are the daemon's to check.
+
+        Raises:
+            ConfigError: robot.toml cannot be read, or has an unknown, missing or wrong key (with its line).
+            RobotError: URDF and robot.toml do not fit each other.
+        """
+        tables, text = read_toml(file)
+        return cls.from_tables(tables, text, file)
+
+    @classmethod
+    def from_tables(cls, tables: dict[str, Any], text: str, file: Path) -> RobotDescription:
+        """Build the description like `load`, from the tables and the text of robot.toml."""
+        for section in ("robot", "camera"):
+            if section not in tables:
+                raise ConfigError(
+                    f"the table [{section}] is missing", file=file, remedy="`bodyschema config init` shows one"
+                )
+        _check_name(tables["robot"], text, file)
+        robot = convert(tables["robot"], RobotSection, file=file, text=text, prefix=("robot",))
+        camera = convert(tables["camera"], CameraSection, file=file, text=text, prefix=("camera",))
+        return cls._assemble(robot, camera, text, file)
+
+    def with_placement(self, T_parent_camera: FloatArray, marker_xyz: FloatArray) -> RobotDescription:
+        """Return a copy with the camera at a pose (4, 4) in its parent link and the marker at (3,) [m] in its link."""
+        x, y, z = T_parent_camera[:3, 3].tolist()
+        roll, pitch, yaw = rpy_of(T_parent_camera[:3, :3]).tolist()
+        camera = msgspec.structs.replace(self.camera, xyz=(x, y, z), rpy=(roll, pitch, yaw))
+        robot = msgspec.structs.replace(self.robot, marker_xyz=tuple(marker_xyz.tolist()))
+        return replace(self, robot=robot, camera=camera, chain=_chain(self.tree, robot, camera))
+
+    @classmethod
+    def _assemble(cls, robot: RobotSection, camera: CameraSection, text: str, file: Path) -> RobotDescription:
+        blamed_on = partial(_blamed_on, file, text)
+        with blamed_on("robot", "joints"):
+            if len(set(robot.joints)) != len(robot.joints):
+                raise RobotError("joints names a joint twice", remedy="Name each once")
+        tree = UrdfTree.load(file.parent / robot.urdf)
+        limits = []
+        for name in robot.joints:
+            with blamed_on("robot", "joints", naming=name):
+                limits.append(_moving(tree, name))
+        for name in robot.held_at:
+            with blamed_on("robot", "held_at", name):
+                tree.joint(name)
+        with blamed_on("camera", "parent_link"):
+            tree.require_link(camera.parent_link)
+        with blamed_on("robot", "marker_link"):
+            tree.require_link(robot.marker_link)
+        _check_units(robot, camera, text, file)
+        with blamed_on("robot", "joints"):
+            chain = _chain(tree, robot, camera)
+        with blamed_on("camera"):
+            calibration = _calibration(camera)
+        return cls(
+            file=file,
+            robot=robot,
+            camera=camera,
+            tree=tree,
+            chain=chain,
+            lower=frozen_array([joint.lower for joint in limits]),
+            upper=frozen_array([joint.upper for joint in limits]),
+            calibration=calibration,
+        )
+
+    @property
+    def name(self) -> str:
+        """The robot's name."""
+        return self.robot.name
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints in the order of q."""
+        return self.robot.joints
+
+
+def _chain(tree: UrdfTree, robot: RobotSection, camera: CameraSection) -> RigidChain:
+    return chain_between(
+        tree,
+        robot.joints,
+        robot.held_at,
+        start=camera.parent_link,
+        end=robot.marker_link,
+        T_start_camera=camera.pose,
+        marker_xyz=np.array(robot.marker_xyz),
+    )
+
+
+def _check_name(table: Any, text: str, file: Path) -> None:
+    """ConfigError with words in the place of a pattern."""
+    name = table.get("name") if isinstance(table, dict) else None
+    if isinstance(name, str) and not re.match(NAME, name):
+        raise ConfigError(
+            f"robot.name: {name!r} is no name for zenoh keys",
+            file=file,
+            line=line_of(text, ("robot", "name")),
+            remedy="Take letters, digits, _ . and -, without spaces, and begin with a letter, a digit or _",
+        )
+
+
+def _check_units(robot: RobotSection, camera: CameraSection, text: str, file: Path) -> None:
+    """Raise ConfigError if a number looks like degrees or millimetres."""
+
+    def refuse(keys: tuple[str, str], value: object, unit: str, remedy: str) -> None:
+        what = f"{'.'.join(keys)} = {value}: this looks like {unit}"
+        raise ConfigError(what, file=file, line=line_of(text, keys), remedy=remedy)
+
+    if max(map(abs, camera.rpy)) > LARGEST_TURN_RAD:
+        refuse(("camera", "rpy"), list(camera.rpy), "degrees", "Give radians: a right angle is 1.5708")
+    for keys, length, largest in (
+        (("robot", "marker_xyz"), robot.marker_xyz, LONGEST_TOOL_M),
+        (("camera", "xyz"), camera.xyz, FARTHEST_CAMERA_M),
+        (("camera", "baseline_m"), (camera.baseline_m or 0.0,), LONGEST_TOOL_M),
+    ):
+        if math.hypot(*length) > largest:
+            refuse(keys, list(length) if len(length) > 1 else length[0], "millimetres", "Give metres")
+
+
+def _calibration(camera: CameraSection) -> StereoCalibration | None:
+    parts = {
+        "focal_px": camera.focal_px,
+        "principal_point_px": camera.principal_point_px,
+        "image_size_px": camera.image_size_px,
+    }
+    if camera.eyes == 2:
+        parts["baseline_m"] = camera.baseline_m
+    elif camera.baseline_m is not None:
+        raise RobotError("one eye alone has no baseline_m", remedy="Take out baseline_m, or eyes = 1")
+    missing = [name for name, value in parts.items() if value is None]
+    if len(missing) == len(parts):
+        return None
+    if missing:
+        what = "stereo camera" if camera.eyes == 2 else "camera"
+        alone = "; a camera without a second one is eyes = 1" if missing == ["baseline_m"] else ""
+        raise RobotError(
+            f"the {what} is described in part: {', '.join(missing)} missing", remedy=f"Give all or none{alone}"
+        )
+    return StereoCalibration(**{"baseline_m": 0.0} | parts, pixel_sigma=camera.pixel_sigma)  # pyright: ignore[reportArgumentType]
+
+
+def _moving(tree: UrdfTree, name: str) -> UrdfJoint:
+    joint = tree.joint(name)
+    if joint.kind not in MOVING:
+        raise RobotError(f"joint {name!r} is fixed", remedy="Take it out of joints")
+    return joint
+
+
+@contextmanager
+def _blamed_on(file: Path, text: str, *keys: str, naming: str | None = None) -> Iterator[None]:
+    """Add `file` and the line of the key, or of `naming` in its value, to RobotErrors that name no file."""
+    try:
+        yield
+    except RobotError as error:
+        if error.file is not None:
+            raise
+        line = line_of(text, keys)
+        if line is not None and naming is not None:
+            line = _line_naming(text, naming, line)
+        raise RobotError(error.what, file=file, line=line, remedy=error.remedy) from None
+
+
+def _line_naming(text: str, name: str, first: int) -> int:
+    """Return the number of the first line from `first` on with `name` in quotes; `first` if no line has it."""
+    for number, line in enumerate(text.splitlines()[first - 1 :], first):
+        if f'"{name}"' in line or f"'{name}'" in line:
+            return number
+    return first

@@ -1,0 +1,219 @@
+"""LeRobot's conventions: motors of its arms, calibration files, and the units of its readings.
+
+LeRobot (huggingface/lerobot, `motors/motors_bus.py`, v0.3 and later) keeps one JSON file an arm. For each motor it has
+the number that is written to the servo's homing offset register, and the two ends of its range as the servo then
+reports them:
+
+- Feetech: Present_Position = encoder − homing_offset. Dynamixel: Present_Position = encoder + homing_offset.
+- degrees = (ticks − (range_min + range_max) / 2) · 360 / (ticks of a turn − 1), whatever `drive_mode` says.
+- −100…100 and 0…100 are linear between the ends of the range and clipped there. With Feetech servos `drive_mode = 1`
+  turns them round; Dynamixel servos turn themselves round.
+
+So 0° is the middle of the recorded range, and its place in the arm is moved by the homing offset alone.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.records import FloatArray
+
+from .limited import read_at_most
+
+Unit = Literal["degrees", "range_m100_100", "range_0_100"]
+Make = Literal["feetech", "dynamixel"]
+
+TURN_TICKS = 4096  # of every servo in these arms
+RAD_PER_TICK = 2.0 * math.pi / TURN_TICKS
+GRIPPER = "gripper"
+# The largest homing offset that a servo keeps [ticks]: Feetech's STS has a sign bit and eleven more.
+LARGEST_OFFSET: Mapping[Make, int] = {"feetech": 2047, "dynamixel": 1_044_479}
+
+
+@dataclass(frozen=True, slots=True)
+class LeRobotArm:
+    """An arm that LeRobot knows.
+
+    Attributes:
+        make: of its servos.
+        models: of the motors, by their names in LeRobot; their IDs count from 1 in this order.
+    """
+
+    make: Make
+    models: Mapping[str, str]
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """The motors that move the hand."""
+        return tuple(name for name in self.models if name != GRIPPER)
+
+    def id(self, motor: str) -> int:
+        """Return the ID that LeRobot gives the motor."""
+        return list(self.models).index(motor) + 1
+
+
+_MOTORS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", GRIPPER)
+_STS = LeRobotArm("feetech", dict.fromkeys(_MOTORS, "STS3215"))
+# Sources: huggingface/lerobot, robots/so_follower, teleoperators/so_leader, robots/koch_follower,
+# teleoperators/koch_leader; moss: its configs/robot/moss.yaml, which went with version 0.3.
+ARMS: Mapping[str, LeRobotArm] = {
+    "so101": _STS,
+    "so100": _STS,
+    "moss": _STS,
+    "koch": LeRobotArm("dynamixel", dict(zip(_MOTORS, ("XL430-W250", "XL430-W250", *["XL330-M288"] * 4), strict=True))),
+    "koch_leader": LeRobotArm("dynamixel", dict.fromkeys(_MOTORS, "XL330-M077")),
+}
+
+
+class MotorCalibration(msgspec.Struct, frozen=True):
+    """LeRobot's calibration of one motor; all in ticks but `id` and `drive_mode`."""
+
+    id: int
+    drive_mode: int
+    homing_offset: int
+    range_min: int
+    range_max: int
+
+    @property
+    def middle(self) -> float:
+        """The position that LeRobot calls 0° [ticks]."""
+        return (self.range_min + self.range_max) / 2
+
+    def ticks(self, values: FloatArray, unit: Unit, make: Make) -> FloatArray:
+        """Return the servo's positions [ticks] for LeRobot's readings in `unit`, of the same shape."""
+        if unit == "degrees":
+            return values * ((TURN_TICKS - 1) / 360.0) + self.middle
+        turned = make == "feetech" and self.drive_mode != 0
+        share = (values + 100.0) / 200.0 if unit == "range_m100_100" else values / 100.0
+        return self.range_min + (1.0 - share if turned else share) * (self.range_max - self.range_min)
+
+    def readings(self, ticks: FloatArray, unit: Unit, make: Make) -> FloatArray:
+        """Return what LeRobot reads in `unit` where the servos are at `ticks`: the inverse of `ticks`."""
+        if unit == "degrees":
+            return (ticks - self.middle) * 360.0 / (TURN_TICKS - 1)
+        share = (np.clip(ticks, self.range_min, self.range_max) - self.range_min) / (self.range_max - self.range_min)
+        share = 1.0 - share if make == "feetech" and self.drive_mode != 0 else share
+        return 200.0 * share - 100.0 if unit == "range_m100_100" else 100.0 * share
+
+    def moved(self, ticks: int, make: Make) -> MotorCalibration:
+        """Return the calibration with which the servo reports `ticks` more where it stands; the range stays.
+
+        Homing offsets of whole turns more or less are the same to a servo that counts one turn.
+        """
+        offset = self.homing_offset - ticks if make == "feetech" else self.homing_offset + ticks
+        largest = LARGEST_OFFSET[make]
+        if abs(offset) > largest:
+            offset -= int(math.copysign(TURN_TICKS, offset))
+        return msgspec.structs.replace(self, homing_offset=min(max(offset, -largest), largest))
+
+
+Calibrations = Mapping[str, MotorCalibration]
+
+
+def read_calibration(file: Path, motors: Sequence[str] = ()) -> dict[str, MotorCalibration]:
+    """Read LeRobot's calibration of an arm, by motor.
+
+    Args:
+        motors: those that have to be there.
+
+    Raises:
+        ConfigError: it cannot be read, is of an older LeRobot, or a number in it cannot be.
+    """
+    again = "Let `lerobot-calibrate` write it again"
+    try:
+        found = msgspec.json.decode(read_at_most(file), type=dict[str, MotorCalibration])
+    except OSError as error:
+        raise ConfigError(f"cannot be read: {error.strerror}", file=file, remedy=where_calibrations_are()) from error
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        if _is_of_old_lerobot(file):
+            raise ConfigError(
+                "is a calibration of LeRobot before version 0.3, which counts angles in another way",
+                file=file,
+                remedy="Calibrate the arm with a present LeRobot",
+            ) from error
+        raise ConfigError(f"is no calibration of LeRobot: {error}", file=file, remedy=again) from error
+    for name, motor in found.items():
+        if motor.range_min >= motor.range_max:
+            what = f"{name}: range_min {motor.range_min} is not below range_max {motor.range_max}"
+            raise ConfigError(what, file=file, remedy=again)
+    missing = [name for name in motors if name not in found]
+    if missing:
+        raise ConfigError(
+            f"has no motor {', '.join(missing)}; it has {', '.join(found)}",
+            file=file,
+            remedy="Give the calibration of this arm",
+        )
+    return found
+
+
+def calibration_json(calibrations: Calibrations) -> str:
+    """Return the text of a calibration file, laid out as LeRobot writes it."""
+    return msgspec.json.format(msgspec.json.encode(calibrations), indent=4).decode()
+
+
+def where_calibrations_are() -> str:
+    """Return a sentence that tells where LeRobot keeps its calibration files."""
+    return "LeRobot keeps them in ~/.cache/huggingface/lerobot/calibration, in robots/ and teleoperators/"
+
+
+def _is_of_old_lerobot(file: Path) -> bool:
+    return re.search(rb'"(calib_mode|start_pos|motor_names)"', read_at_most(file)) is not None
+
+
+@dataclass(frozen=True, slots=True)
+class JointServo:
+    """Conversion of servo ticks to a joint angle by robot.toml: q = direction · (ticks − zero_ticks) · RAD_PER_TICK."""
+
+    joint: str
+    make: Make
+    direction: int
+    zero_ticks: float
+
+    def angles(self, ticks: FloatArray) -> FloatArray:
+        """Return the joint's angles [rad] where its servo is at `ticks`."""
+        return self.direction * (ticks - self.zero_ticks) * RAD_PER_TICK
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """A joint offset put into a motor's calibration.
+
+    Attributes:
+        offset_rad: to be added to the joint's readings.
+        ticks: the whole ticks nearest to it, which the servo reports more.
+    """
+
+    motor: str
+    offset_rad: float
+    ticks: int
+    before: MotorCalibration
+    after: MotorCalibration
+
+
+def corrections(
+    calibrations: Calibrations, servos: Sequence[JointServo], offsets_rad: Mapping[str, float]
+) -> list[Correction]:
+    """Return what becomes of the homing offsets when `offsets_rad` are added to the joints' readings.
+
+    The ends of the ranges stay, and so do LeRobot's 0° and −100…100: their places in the arm move by the offset.
+
+    Raises:
+        KeyError: a joint of `servos` with an offset is not among the motors.
+    """
+    found: list[Correction] = []
+    for servo in servos:
+        offset = offsets_rad.get(servo.joint)
+        if offset is None:
+            continue
+        ticks, before = round(servo.direction * offset / RAD_PER_TICK), calibrations[servo.joint]
+        found.append(Correction(servo.joint, offset, ticks, before, before.moved(ticks, servo.make)))
+    return found
