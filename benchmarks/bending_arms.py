@@ -20,7 +20,7 @@ from benchmarks.changes import TOLERANCES, pair_of, walk
 from benchmarks.rough_arm import rough_arm
 from benchmarks.rough_truths import JOINTS, TRUTHS
 from bodyschema.daemon.config import LearnerConfig
-from bodyschema.learning import DirectSolver, Learning, NominalModel
+from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner
 
 
 def stream(truth: str, seed: int, pairs: int, sigma: float, every: int) -> tuple[int, Counter[str]]:
@@ -32,7 +32,7 @@ def stream(truth: str, seed: int, pairs: int, sigma: float, every: int) -> tuple
     x = positions(q) + sigma * rng.normal(size=(pairs, 3))
     limit = np.full(JOINTS, np.pi)
     settings = LearnerConfig(replays_per_pair=0.0, solve_every=every)
-    learning = Learning(NominalModel(arm.drawing, -limit, limit, True, True), settings, DirectSolver())
+    learning = OnlineLearner(NominalModel(arm.drawing, -limit, limit, True, True), settings, DirectSolver())
     answered: Counter[str] = Counter()
     for k in range(pairs):
         learning.learn(pair_of(k, q[k], x[k], sigma**2 * np.eye(3)), k / 30.0)

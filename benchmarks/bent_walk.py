@@ -25,7 +25,7 @@ import numpy as np
 from benchmarks.humanoid_arm import guided_path
 from benchmarks.rough_arm import RoughArm, rough_arm
 from benchmarks.rough_truths import JOINTS, ROUGH, TRUTHS
-from bodyschema.learning.solver import fitted_belief
+from bodyschema.learning.solvers.solver import fitted_belief
 from kbmaps import (
     ChainBelief,
     ChainParameters,

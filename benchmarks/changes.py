@@ -33,12 +33,12 @@ import numpy as np
 from benchmarks.first_pairs import REACH
 from benchmarks.rough_arm import RoughArm, rough_arm
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
-from bodyschema.learning.adaptation import Origin
-from bodyschema.learning.arm import KnownArm
-from bodyschema.learning.change import ChangeRecord, KindOfChange
-from bodyschema.learning.claims import Claim
-from bodyschema.learning.solver import fitted_belief
-from bodyschema.learning.watch import LOOKED_BACK, Reference, Watch
+from bodyschema.learning.changes.adaptation import Origin
+from bodyschema.learning.changes.known_arm import KnownArm
+from bodyschema.learning.changes.monitor import LOOKED_BACK, ChangeMonitor, Reference
+from bodyschema.learning.changes.record import ChangeRecord, KindOfChange
+from bodyschema.learning.solvers.solver import fitted_belief
+from bodyschema.learning.uncertainty import PredictiveUncertainty
 from kbmaps import ChainBelief, ChainParameters, ChainTolerances, Explanation, learning_bases
 from kbmaps.changes.mixture import log_ratios
 from kbmaps.robust import OUTLIER_SIGMAS
@@ -156,7 +156,7 @@ def reference(arm: RoughArm, q: FloatArray, x: FloatArray, covs: FloatArray) -> 
     known, good = len(q), np.linalg.norm(x - belief.predict(q), axis=1) < OUTLIER_SIGMAS * belief.noise
     q, x, covs = (each[good][-LOOKED_BACK:] for each in (q, x, covs))
     variance = covs.diagonal(axis1=1, axis2=2).mean(axis=0)
-    return Reference(kbmap, kbmap, belief, belief, None, Claim(np.zeros(3)), known, q, x, variance)
+    return Reference(kbmap, kbmap, belief, belief, None, PredictiveUncertainty(np.zeros(3)), known, q, x, variance)
 
 
 def cusum_threshold(information: float) -> float:
@@ -189,7 +189,7 @@ def outcome(case: Case, joints: int, sigma: float, seed: int, known_pairs: int) 
     x[known_pairs + at :] += moved
     cov = sigma**2 * np.eye(3)
     known = reference(arm, q[:known_pairs], x[:known_pairs], np.broadcast_to(cov, (known_pairs, 3, 3)))
-    watch = Watch()
+    watch = ChangeMonitor()
     watch.asked()
     watch.offer(known)
     ratios = ((x - arm.positions(q))[known_pairs + at :] * moved).sum(axis=1) - 0.5 * np.square(moved).sum(axis=1)
@@ -232,7 +232,7 @@ def verdict(found: list[Explanation], case: Case, joint: int | None) -> str:
     return RIGHT if right else WRONG
 
 
-def statistics_if_told(watch: Watch, theta: FloatArray, case: Case, joint: int | None) -> tuple[float, float]:
+def statistics_if_told(watch: ChangeMonitor, theta: FloatArray, case: Case, joint: int | None) -> tuple[float, float]:
     """Return log statistics of detectors that know the change beforehand, computed with the watch's own model.
 
     The first is the greatest likelihood ratio over the onsets, given the change. The second is the sum of these ratios
@@ -282,7 +282,7 @@ def quiet(kind: str, joints: int, sigma: float, seed: int, pairs: int) -> int:
         q = TICK_RAD * np.round(q / TICK_RAD)
     wild = rng.random(len(q)) < OUTLIERS
     x[wild] += OUTLIER_M * rng.normal(size=(int(wild.sum()), 3))
-    alarms, watch = 0, Watch()
+    alarms, watch = 0, ChangeMonitor()
     for k in range(KNOWN, len(q)):
         if (k - KNOWN) % REFIT == 0:
             watch.asked()
@@ -291,7 +291,7 @@ def quiet(kind: str, joints: int, sigma: float, seed: int, pairs: int) -> int:
                 watch.offer(reference(arm, q[first:k], x[first:k], covs[first:k]))
         watch.add(pair_of(k, q[k], x[k], covs[k]), kept=not wild[k])
         if watch.alarmed:
-            first, alarms, watch = max(0, k - FITTED), alarms + 1, Watch()
+            first, alarms, watch = max(0, k - FITTED), alarms + 1, ChangeMonitor()
             watch.asked()
             watch.offer(reference(arm, q[first:k], x[first:k], covs[first:k]))
     return alarms

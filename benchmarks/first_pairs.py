@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.rough_arm import rough_arm
 from bodyschema.daemon.config import LearnerConfig
 from bodyschema.interfaces.records import Pair, frozen_array
-from bodyschema.learning import DirectSolver, Learning, NominalModel
+from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner
 from bodyschema.learning.nominal import chain_tolerances
 from kbmaps import RigidChain
 from kbmaps.arrays import FloatArray
@@ -102,7 +102,7 @@ def outcomes(case: Case, pairs: int) -> Iterator[Outcome]:
     arm = rough_arm(case.joints, rng, chain_tolerances(settings))
     built = elsewhere(arm.parameters.chain(case.drawing * arm.change), case.frame, rng)
     limit = np.full(case.joints, LIMIT)
-    learning = Learning(NominalModel(arm.drawing, -limit, limit, *FRAMES[case.frame]), settings, DirectSolver())
+    learning = OnlineLearner(NominalModel(arm.drawing, -limit, limit, *FRAMES[case.frame]), settings, DirectSolver())
     stages = [stage for stage in (KNOWN_STAGES if case.frame == "known" else STAGES) if stage <= pairs]
     q = guided(case.joints, stages[-1] + TOOL_STAGES[-1], rng)
     if 0 in stages:
@@ -120,7 +120,7 @@ def outcomes(case: Case, pairs: int) -> Iterator[Outcome]:
             yield from looked(learning, built, q[stages[-1] :][:count], f"+{count}", rng)
 
 
-def teach(learning: Learning, case: Case, built: RigidChain, q: FloatArray, rng: np.random.Generator) -> None:
+def teach(learning: OnlineLearner, case: Case, built: RigidChain, q: FloatArray, rng: np.random.Generator) -> None:
     seq = learning.counters.last_seq + 1
     x = built.positions(q) + case.noise_m * rng.normal(size=3)
     cov = frozen_array(case.noise_m**2 * np.eye(3))
@@ -130,7 +130,7 @@ def teach(learning: Learning, case: Case, built: RigidChain, q: FloatArray, rng:
 
 
 def looked(
-    learning: Learning, built: RigidChain, path: FloatArray, stage: str, rng: np.random.Generator
+    learning: OnlineLearner, built: RigidChain, path: FloatArray, stage: str, rng: np.random.Generator
 ) -> Iterator[Outcome]:
     snapshot, joints = learning.snapshot, path.shape[1]
     if snapshot.model is None:

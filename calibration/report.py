@@ -13,7 +13,7 @@ from bodyschema.calibration.plausibility.check import Plausibility
 from bodyschema.calibration.rigid_chain import Calibration, Trusted
 from bodyschema.calibration.tool_jump import tool_jump
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning.workmanship import WORKMANSHIP
+from bodyschema.learning.solvers.tolerance_selection import WORKMANSHIP
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.calibrated_files import CAMERA_LINK
 from bodyschema.robot.description import RobotDescription

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning.workmanship import WORKMANSHIP, probable
+from bodyschema.learning.solvers.tolerance_selection import WORKMANSHIP, probable
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.description import RobotDescription
 from kbmaps import (

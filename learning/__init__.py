@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from .learning import Learning
-from .learnt import LearntModel
-from .nominal import NominalModel
-from .snapshot import NoFrameError, Prediction, Snapshot
-from .solver import DirectSolver, Solved, Solver, Task
-from .state import LearningState, StateError
+from bodyschema.learning.learnt_model import LearntModel
+from bodyschema.learning.nominal import NominalModel
+from bodyschema.learning.online_learner import OnlineLearner
+from bodyschema.learning.snapshot import NoFrameError, Prediction, Snapshot
+from bodyschema.learning.solvers.solver import DirectSolver, Solved, Solver, Task
+from bodyschema.learning.state import LearningState, StateError
 
 __all__ = [
     "DirectSolver",
-    "Learning",
     "LearningState",
     "LearntModel",
     "NoFrameError",
     "NominalModel",
+    "OnlineLearner",
     "Prediction",
     "Snapshot",
     "Solved",

@@ -6,8 +6,7 @@ import numpy as np
 
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import FARTHEST_M, LARGEST_Q, Pair
-
-from .state import Counters
+from bodyschema.learning.state import Counters
 
 # As a share of a covariance's largest eigenvalue: rounding may push the smallest this far below zero.
 ROUNDING = 1e-6

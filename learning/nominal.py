@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from bodyschema.daemon.config import LearnerConfig
 from bodyschema.effects import Motion, Simulation
 from bodyschema.interfaces.records import FloatArray, frozen_array
+from bodyschema.learning.changes.known_arm import OTHER_TOOL_M
 from bodyschema.robot.description import RobotDescription
 from kbmaps import (
     ChainBelief,
@@ -25,8 +26,6 @@ from kbmaps import (
     learning_bases,
     with_refitted_tool,
 )
-
-from .arm import OTHER_TOOL_M
 
 # Number of pairs after a tool change at which the tool is first fitted; later fits follow at doubled numbers.
 PAIRS_TO_REFIT = 5

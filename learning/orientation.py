@@ -11,6 +11,10 @@ import msgspec
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning.error_memory import DISCOUNT
+from bodyschema.learning.model_bank import EXACT, PRIOR, RIGID
+from bodyschema.learning.solvers.orientation import OrientationSolution
+from bodyschema.learning.variance_terms import unexplained
 from kbmaps import (
     ChainBelief,
     ChainParameters,
@@ -23,11 +27,6 @@ from kbmaps import (
     rotation_matrices,
     rotation_vectors,
 )
-
-from .members import EXACT, PRIOR, RIGID
-from .orientation_solver import OrientationSolution
-from .scores import DISCOUNT
-from .unknowns import unexplained
 
 # Order of trust while errors do not decide.
 TRUSTED = (RIGID, EXACT, PRIOR)

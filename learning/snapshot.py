@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning.learnt_model import LearntModel
+from bodyschema.learning.orientation import OrientationModel
+from bodyschema.learning.solvers.solver import LARGEST_NET
+from bodyschema.learning.uncertainty import PredictiveUncertainty
+from bodyschema.learning.variance_terms import unexplained
 from kbmaps import KBMap, SupportSet, quaternions
-
-from .claims import Claim
-from .learnt import LearntModel
-from .orientation import OrientationModel
-from .solver import LARGEST_NET
-from .unknowns import unexplained
 
 # With a larger share of the prior's variance remaining, joint angles are not in the data's support.
 IN_SUPPORT = 0.25
@@ -66,7 +65,7 @@ class Snapshot:
     answering: str
     model: LearntModel | None
     map: KBMap | None
-    claim: Claim
+    claim: PredictiveUncertainty
     support: SupportSet | None
     pairs: int
     newest_utc: str | None

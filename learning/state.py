@@ -11,11 +11,10 @@ import numpy as np
 from bodyschema.daemon.transport.status import CurvePoint
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.records import FARTHEST_M, LARGEST_Q, FloatArray
-
-from .change import ChangeRecord
-from .claims import ClaimsState
-from .members import PRIOR
-from .orientation import OrientationState
+from bodyschema.learning.changes.record import ChangeRecord
+from bodyschema.learning.model_bank import PRIOR
+from bodyschema.learning.orientation import OrientationState
+from bodyschema.learning.uncertainty import UncertaintyState
 
 # Prefix of the arrays of the state before a change.
 BEFORE = "before/"
@@ -73,7 +72,7 @@ class LearningHeader(msgspec.Struct, kw_only=True):
 
     fingerprint: str
     counters: Counters
-    claims: ClaimsState
+    claims: UncertaintyState
     curve: list[CurvePoint]
     curve_stride: int
     kept_of: int

@@ -18,7 +18,7 @@ from benchmarks.rigid_learner import new_tool_error
 from benchmarks.rough_arm import ROUGH, RoughArm, rough_arm
 from bodyschema.daemon.config import LearnerConfig
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
-from bodyschema.learning import DirectSolver, Learning, NominalModel
+from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner
 from kbmaps import ChainTolerances
 
 _JOINTS = 6
@@ -39,7 +39,7 @@ class _Arm:
 
     arm: RoughArm
     sigma: float
-    learning: Learning
+    learning: OnlineLearner
     rng: np.random.Generator
 
     @classmethod
@@ -47,7 +47,7 @@ class _Arm:
         arm = rough_arm(joints, rng, tolerances)
         limit = np.full(joints, np.pi)
         nominal = NominalModel(arm.drawing, -limit, limit)
-        return cls(arm, sigma, Learning(nominal, LearnerConfig(), DirectSolver()), rng)
+        return cls(arm, sigma, OnlineLearner(nominal, LearnerConfig(), DirectSolver()), rng)
 
     def with_moved_marker(self, by_m: float) -> _Arm:
         direction = self.rng.normal(size=3)

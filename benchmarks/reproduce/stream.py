@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bodyschema.cli.terminal.progress import Say, counted
 from bodyschema.daemon.config import LearnerConfig
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
-from bodyschema.learning import DirectSolver, Learning, NominalModel
+from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner
 from kbmaps import NLMS, JointBasis, KBMap, RigidChain
 
 from .experiment import Curve, Tests, distances
@@ -92,7 +92,7 @@ def background(prior: KBMap, stream: Stream, say: Say) -> tuple[Curve, Curve]:
 def daemons_learner(nominal: RigidChain, stream: Stream, say: Say, *, tool_changed: bool) -> dict[str, Curve]:
     """Run the daemon's learner on the same pairs, each once and in order; it replays on its own."""
     limit = np.full(nominal.joints, np.pi)
-    learning = Learning(NominalModel(nominal, -limit, limit), LearnerConfig(), DirectSolver())
+    learning = OnlineLearner(NominalModel(nominal, -limit, limit), LearnerConfig(), DirectSolver())
     if tool_changed:
         learning.tool_changed()
     curves = {test: Curve(LEARNER, "tab:green") for test in stream.tests}

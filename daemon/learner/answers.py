@@ -17,7 +17,7 @@ from bodyschema.daemon.transport.wire import (
     joint_vector,
     position,
 )
-from bodyschema.learning import Learning, LearntModel
+from bodyschema.learning import LearntModel, OnlineLearner
 from bodyschema.robot.description import RobotDescription
 from kbmaps import InverseKinematics
 
@@ -26,7 +26,7 @@ class Answers:
     """Handlers for the learner's queries. They take no lock, so that learning never delays them."""
 
     def __init__(
-        self, learning: Learning, robot: RobotDescription, age_s: Callable[[str | None], float | None]
+        self, learning: OnlineLearner, robot: RobotDescription, age_s: Callable[[str | None], float | None]
     ) -> None:
         """Answer from the state of `learning`.
 

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 
 from bodyschema.daemon.transport.status import UNDECIDED, Change
-from bodyschema.learning.change import JOINT, ChangeRecord, KindOfChange
+from bodyschema.learning.changes.record import JOINT, ChangeRecord, KindOfChange
 
 log = logging.getLogger(__name__)
 

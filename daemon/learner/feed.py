@@ -15,7 +15,7 @@ from bodyschema.daemon.sampler.history import Page, Unreadable
 from bodyschema.daemon.transport.wire import PairMessage, decode, pair_from_wire
 from bodyschema.interfaces.errors import BusError, RequestError
 from bodyschema.interfaces.protocols import Clock
-from bodyschema.learning import Learning
+from bodyschema.learning import OnlineLearner
 
 log = logging.getLogger(__name__)
 
@@ -48,7 +48,7 @@ class PairFeed:
     """Feeds a `Learning`. `offer` and `wake` may be called from any thread, `step` from one only."""
 
     def __init__(
-        self, learning: Learning, history: History, clock: Clock, beat: Callable[[], None] = lambda: None
+        self, learning: OnlineLearner, history: History, clock: Clock, beat: Callable[[], None] = lambda: None
     ) -> None:
         """Continue after the pairs that `learning` has.
 

@@ -12,10 +12,10 @@ from bodyschema.calibration.chain_figures import ChainFigures, is_told, no_surer
 from bodyschema.calibration.plausibility.check import FEWEST_ROWS, ROWS, plausibility
 from bodyschema.daemon.transport.status import ChainCalibration, JointZero, LearntFigure, Outlook
 from bodyschema.interfaces.protocols import Clock
-from bodyschema.learning import Learning
-from bodyschema.learning.members import SOLVED
-from bodyschema.learning.outlook import Known, Scatter, foreseen
-from bodyschema.learning.workmanship import WORKMANSHIP, probable
+from bodyschema.learning import OnlineLearner
+from bodyschema.learning.data_outlook import LearnerEvidence, Scatter, forecast
+from bodyschema.learning.model_bank import SOLVED
+from bodyschema.learning.solvers.tolerance_selection import WORKMANSHIP, probable
 from bodyschema.robot.description import RobotDescription
 from kbmaps import ChainBelief, KBMapsError
 
@@ -49,7 +49,7 @@ class Findings:
 
     def __init__(
         self,
-        learning: Learning,
+        learning: OnlineLearner,
         robot: RobotDescription,
         clock: Clock,
         robots: int = 1,
@@ -129,13 +129,13 @@ class Findings:
         self._turns.took(begin, self._clock.now() - begin)
 
 
-def _found(robot: RobotDescription, known: Known) -> tuple[ChainCalibration, Outlook | None]:
+def _found(robot: RobotDescription, known: LearnerEvidence) -> tuple[ChainCalibration, Outlook | None]:
     scatter = Scatter.of(known)
-    outlook = foreseen(known, scatter, robot.joints) if known.solved else None
+    outlook = forecast(known, scatter, robot.joints) if known.solved else None
     return calibrated(robot, known, scatter), outlook
 
 
-def calibrated(robot: RobotDescription, known: Known, scatter: Scatter) -> ChainCalibration:
+def calibrated(robot: RobotDescription, known: LearnerEvidence, scatter: Scatter) -> ChainCalibration:
     """Return the chain in the terms of robot.toml."""
     found, workmanship = figures(robot, known)
     numbers = [
@@ -160,7 +160,7 @@ def calibrated(robot: RobotDescription, known: Known, scatter: Scatter) -> Chain
     )
 
 
-def figures(robot: RobotDescription, known: Known) -> tuple[ChainFigures, tuple[float, float] | None]:
+def figures(robot: RobotDescription, known: LearnerEvidence) -> tuple[ChainFigures, tuple[float, float] | None]:
     """Return the figures, and the estimated manufacturing tolerances: 1-sigma of axis tilt [rad] and axis shift [m].
 
     The tolerances are None where the pairs do not determine them.

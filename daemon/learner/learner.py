@@ -32,8 +32,8 @@ from bodyschema.daemon.transport.wire import OCTETS, CommandReply, CommandReques
 from bodyschema.daemon.wiring.wiring import open_marker_topic
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.protocols import Clock
-from bodyschema.learning import Learning, NominalModel
-from bodyschema.learning.solver import LARGEST_NET, Solver
+from bodyschema.learning import NominalModel, OnlineLearner
+from bodyschema.learning.solvers.solver import LARGEST_NET, Solver
 
 log = logging.getLogger(__name__)
 
@@ -81,7 +81,7 @@ class Learner:
         self._version = version("bodyschema")  # reads a file: once, while descriptors are available
         self._nominal = NominalModel.extended_by(config.simulation)
         self._learning, self._set_aside = go_on(
-            lambda: Learning(self._nominal, self._settings, solver, together_s=together_s(robots)),
+            lambda: OnlineLearner(self._nominal, self._settings, solver, together_s=together_s(robots)),
             config.checkpoint_file,
             config.robot.name,
         )

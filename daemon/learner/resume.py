@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from bodyschema.daemon.learner.checkpoint import CheckpointError, generations, read_checkpoint, set_aside
-from bodyschema.learning import Learning, StateError
+from bodyschema.learning import OnlineLearner, StateError
 from kbmaps import KBMapsError
 
 log = logging.getLogger(__name__)
@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 DOES_NOT_FIT = (ArithmeticError, LookupError, TypeError, ValueError)
 
 
-def go_on(new: Callable[[], Learning], checkpoint: Path, robot: str) -> tuple[Learning, str | None]:
+def go_on(new: Callable[[], OnlineLearner], checkpoint: Path, robot: str) -> tuple[OnlineLearner, str | None]:
     """Restore the learner from the newest usable checkpoint.
 
     Args:

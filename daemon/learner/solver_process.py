@@ -26,8 +26,8 @@ from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.interpreter import module_command
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning import DirectSolver, Solved, Task
-from bodyschema.learning.members import RESIDUAL
-from bodyschema.learning.orientation_solver import OrientationSolution
+from bodyschema.learning.model_bank import RESIDUAL
+from bodyschema.learning.solvers.orientation import OrientationSolution
 from kbmaps import ChainBelief, ChainTolerances, KBMap, OrientedChain, ResidualModel
 
 NICENESS = 5

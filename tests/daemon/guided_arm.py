@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from bodyschema.daemon.config import LearnerConfig
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
-from bodyschema.learning import DirectSolver, Learning, NominalModel
+from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner
 from kbmaps import RigidChain
 
 JOINTS = 4
@@ -79,11 +79,11 @@ def nominal_model(*, pose_known: bool = True, marker_known: bool = True) -> Nomi
     return NominalModel(nominal_chain(), -limit, limit, pose_known, marker_known)
 
 
-def new_learning(nominal: NominalModel | None = None, settings: LearnerConfig | None = None) -> Learning:
-    return Learning(nominal or nominal_model(), settings or LearnerConfig(), DirectSolver())
+def new_learning(nominal: NominalModel | None = None, settings: LearnerConfig | None = None) -> OnlineLearner:
+    return OnlineLearner(nominal or nominal_model(), settings or LearnerConfig(), DirectSolver())
 
 
-def teach(learning: Learning, pairs: Iterable[Pair], *, background: bool = True, every: int = 5) -> None:
+def teach(learning: OnlineLearner, pairs: Iterable[Pair], *, background: bool = True, every: int = 5) -> None:
     """Learn pairs, with all background work done after each `every` pairs and at the end."""
     for number, pair in enumerate(pairs, 1):
         learning.learn(pair, pair.t)
@@ -107,7 +107,7 @@ class Scene:
         chain, q = built_chain(rng), path(rng, count)
         return cls(chain, q, measured(chain, q, rng, sigma_m=sigma_m))
 
-    def error_m(self, learning: Learning, seed: int = 0) -> float:
+    def error_m(self, learning: OnlineLearner, seed: int = 0) -> float:
         """Return the mean distance between the learner's answers and the truth, near the path."""
         q = near(np.random.default_rng(seed), self.q)
         miss = learning.snapshot.predict(q).x - self.chain.positions(q)

@@ -23,7 +23,7 @@ from bodyschema.daemon.sampler.session import session_of
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import RecordingError
 from bodyschema.interfaces.records import MarkerFix
-from bodyschema.learning import DirectSolver, Learning, NominalModel
+from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner
 from bodyschema.recordings.files import of_robot
 from bodyschema.recordings.recording import Recording
 from bodyschema.recordings.store.store import PairStore
@@ -401,7 +401,7 @@ def robot_with_store(tmp_path) -> Path:
     robot.write_text(robot.read_text() + '\n[daemon]\nstate_dir = "state"\n')
     config = Config.load(robot, {})
     arm = retooled(5, 50, 0.05)
-    learning = Learning(NominalModel.of(config.robot), config.tables.learner, DirectSolver())
+    learning = OnlineLearner(NominalModel.of(config.robot), config.tables.learner, DirectSolver())
     with PairStore(config.store_file, session_of(config, SystemClock())) as store:
         for row in range(30, 80):
             if row == 50:

@@ -13,13 +13,13 @@ from scipy.spatial.transform import Rotation
 from bodyschema.daemon.config import LearnerConfig
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning import Learning, LearningState
-from bodyschema.learning.adaptation import Origin
-from bodyschema.learning.arm import KnownArm
-from bodyschema.learning.claims import Claim
+from bodyschema.learning import LearningState, OnlineLearner
+from bodyschema.learning.changes.adaptation import Origin
+from bodyschema.learning.changes.known_arm import KnownArm
+from bodyschema.learning.changes.monitor import DetectedChange, Reference
 from bodyschema.learning.nominal import chain_tolerances
 from bodyschema.learning.state import LearningHeader
-from bodyschema.learning.watch import Noticed, Reference
+from bodyschema.learning.uncertainty import PredictiveUncertainty
 from kbmaps import ChainBelief, ChainParameters, RigidChain, change_kinds, learning_bases
 
 SIGMA, TAUGHT, SINCE = 0.002, 180, 40
@@ -56,7 +56,7 @@ class Followed:
     """A learner before and after an unannounced change."""
 
     kind: str
-    learning: Learning
+    learning: OnlineLearner
     before: RigidChain
     after: RigidChain
     q: FloatArray
@@ -168,10 +168,10 @@ def test_a_model_that_predicts_new_pairs_no_better_does_not_take_the_old_one_s_p
     x = chain.with_tool([0.0, moved_m, 0.0]).positions(q) + SIGMA * rng.normal(size=(*q.shape[:1], 3))
     kbmap = chain.to_kbmap(learning_bases(np.full(4, -np.pi), np.full(4, np.pi), [False] * 4))
     variance = np.full(3, SIGMA**2)
-    reference = Reference(kbmap, kbmap, belief, belief, None, Claim(np.zeros(3)), 500, q, x, variance)
+    reference = Reference(kbmap, kbmap, belief, belief, None, PredictiveUncertainty(np.zeros(3)), 500, q, x, variance)
     kinds, turns = change_kinds(parameters, 1.0), np.full((20, 4), np.nan)
     seqs, kept = tuple(range(1, 21)), (True,) * 20
-    noticed = Noticed(reference, kinds, SIGMA, 1.0, 0, 0, 0, seqs, kept, q, x, turns)
+    noticed = DetectedChange(reference, kinds, SIGMA, 1.0, 0, 0, 0, seqs, kept, q, x, turns)
     origin = Origin(noticed, KnownArm(belief, tolerances))
     assert origin.is_better(origin.explain(q, x), q, x) == (moved_m > 0.0)
 

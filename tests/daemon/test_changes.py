@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from bodyschema.daemon.learner.changes import Changes
-from bodyschema.learning.change import ChangeRecord, KindOfChange
+from bodyschema.learning.changes.record import ChangeRecord, KindOfChange
 
 JOINTS = ("waist", "shoulder", "elbow")
 UNDECIDED = ChangeRecord(

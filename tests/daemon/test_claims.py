@@ -7,10 +7,10 @@ from guided_arm import JOINTS, REACH, built_chain, make_pair, measured, new_lear
 
 from bodyschema.daemon.config import LearnerConfig
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning.claims import Claims, ClaimsState
-from bodyschema.learning.members import INSTANT, PRIOR, RESIDUAL, RIGID
+from bodyschema.learning.model_bank import INSTANT, PRIOR, RESIDUAL, RIGID
 from bodyschema.learning.nominal import chain_tolerances
-from bodyschema.learning.unknowns import Where
+from bodyschema.learning.uncertainty import UncertaintyState, UncertaintyTracker
+from bodyschema.learning.variance_terms import QueryPoints
 from kbmaps import ChainBelief, ChainParameters, ChainTolerances
 
 NOISE = np.full(3, 1e-6)
@@ -21,21 +21,21 @@ TOLERANCES = chain_tolerances(LearnerConfig())
 DRAWN = NOMINAL.belief(NOMINAL.chain, TOLERANCES)
 
 
-def new_claims(belief: ChainBelief = DRAWN) -> Claims:
-    claims = Claims(NOMINAL.bases, 0.1)
+def new_claims(belief: ChainBelief = DRAWN) -> UncertaintyTracker:
+    claims = UncertaintyTracker(NOMINAL.bases, 0.1)
     claims.expect(belief)
     return claims
 
 
-def learnt(claims: Claims, q: FloatArray, prior_error_m: float, error_m: float = 0.0) -> None:
+def learnt(claims: UncertaintyTracker, q: FloatArray, prior_error_m: float, error_m: float = 0.0) -> None:
     """Learn pairs at q, where the prior errs by the first, the instant learner by the second error on each axis."""
     for row in q:
         x = MODEL.predict(row[None]) + prior_error_m
-        claims.predicted(Where(row[None]), x, {PRIOR: x - prior_error_m, INSTANT: x - error_m}, NOISE[None])
+        claims.predicted(QueryPoints(row[None]), x, {PRIOR: x - prior_error_m, INSTANT: x - error_m}, NOISE[None])
         claims.learnt(row[None])
 
 
-def sigma(claims: Claims, name: str, q: FloatArray) -> float:
+def sigma(claims: UncertaintyTracker, name: str, q: FloatArray) -> float:
     return float(np.sqrt(claims.of(name, MODEL.predict).variance(q)).mean())
 
 
@@ -147,7 +147,7 @@ def test_of_two_solutions_alike_the_one_that_answered_with_the_last_tool_answers
     for row in walk[:10]:
         x = MODEL.predict(row[None]) + alike
         missed = {PRIOR: far, INSTANT: far, RIGID: alike, RESIDUAL: alike}
-        claims.predicted(Where(row[None]), x, {name: x - miss for name, miss in missed.items()}, NOISE[None])
+        claims.predicted(QueryPoints(row[None]), x, {name: x - miss for name, miss in missed.items()}, NOISE[None])
     assert claims.best(PRIOR) == answered
 
 
@@ -157,7 +157,7 @@ def test_claims_are_the_same_after_a_restart(walk: FloatArray) -> None:
     claims.change_tool(0.1)
     claims.expect(DRAWN)
     learnt(claims, walk[:30], prior_error_m=0.01, error_m=0.02)
-    state = msgspec.msgpack.decode(msgspec.msgpack.encode(claims.state()), type=ClaimsState)
+    state = msgspec.msgpack.decode(msgspec.msgpack.encode(claims.state()), type=UncertaintyState)
     again.restore(state, claims.arrays())
     anywhere = np.vstack([walk, FAR])
     for name in (PRIOR, INSTANT):

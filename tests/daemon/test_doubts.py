@@ -6,43 +6,43 @@ import numpy as np
 from guided_arm import Scene, nominal_model
 
 from bodyschema.daemon.config import LearnerConfig
-from bodyschema.learning.arm import KnownArm
-from bodyschema.learning.claims import Claims
-from bodyschema.learning.doubts import Doubts
-from bodyschema.learning.era import Era
-from bodyschema.learning.gate import CHANGE
+from bodyschema.learning.changes.known_arm import KnownArm
+from bodyschema.learning.outlier_gate import OutlierGate
+from bodyschema.learning.outlier_limits import CHANGE
+from bodyschema.learning.regime import Regime
+from bodyschema.learning.uncertainty import UncertaintyTracker
 from kbmaps import ChainTolerances
 
 NEAR, LIMIT, FAR = 0.001, 0.01, 0.1
 
 
-def meet(doubts: Doubts, number: int, distance_m: float) -> None:
+def meet(doubts: OutlierGate, number: int, distance_m: float) -> None:
     """Add an outlier identified by its number."""
     doubts.doubt(np.full(1, float(number)), np.full(3, float(number)), distance_m, LIMIT)
 
 
-def run(doubts: Doubts) -> list[float]:
+def run(doubts: OutlierGate) -> list[float]:
     q, x = doubts.run()
     np.testing.assert_array_equal(x, np.repeat(q, 3, axis=1))
     return q[:, 0].tolist()
 
 
 def test_a_run_is_of_the_pairs_that_were_doubted_in_a_row() -> None:
-    doubts = Doubts(1)
+    doubts = OutlierGate(1)
     for number, distance in enumerate([FAR, FAR, NEAR, FAR, FAR, FAR]):
         meet(doubts, number, distance)
     assert (doubts.in_a_row, run(doubts)) == (3, [3.0, 4.0, 5.0])
 
 
 def test_a_pair_that_is_believed_ends_the_run() -> None:
-    doubts = Doubts(1)
+    doubts = OutlierGate(1)
     for number, distance in enumerate([FAR, FAR, NEAR]):
         meet(doubts, number, distance)
     assert (doubts.in_a_row, run(doubts)) == (0, [])
 
 
 def test_a_restored_run_goes_on() -> None:
-    doubts, again = Doubts(1), Doubts(1)
+    doubts, again = OutlierGate(1), OutlierGate(1)
     for number in range(2):
         meet(doubts, number, FAR)
     again.restore(*doubts.run(), doubts.in_a_row)
@@ -51,7 +51,7 @@ def test_a_restored_run_goes_on() -> None:
 
 
 def test_a_run_has_no_more_pairs_than_make_a_change() -> None:
-    doubts = Doubts(1)
+    doubts = OutlierGate(1)
     for number in range(CHANGE + 2):
         meet(doubts, number, FAR)
     assert run(doubts) == [float(number) for number in range(2, CHANGE + 2)]
@@ -61,7 +61,7 @@ def test_first_pairs_that_the_fitted_tool_contradicts_are_no_part_of_a_run() -> 
     nominal, scene = nominal_model(), Scene.draw(0, 8)
     tolerances = ChainTolerances(tool=0.03)
     arm = KnownArm(nominal.belief(nominal.chain, tolerances), tolerances)
-    era = Era(nominal.prior(), arm, Claims(nominal.bases, 0.1), LearnerConfig(), itertools.count())
+    era = Regime(nominal.prior(), arm, UncertaintyTracker(nominal.bases, 0.1), LearnerConfig(), itertools.count())
     x = np.array([pair.x for pair in scene.pairs])
     x[0] += 0.2  # with the old tool
     era.begin_with(scene.q[:6], x[:6])

@@ -10,12 +10,12 @@ from guided_arm import Scene, make_pair, nominal_model
 
 from bodyschema.daemon.config import LearnerConfig
 from bodyschema.learning import Solved
-from bodyschema.learning.arm import KnownArm
-from bodyschema.learning.claims import Claims
-from bodyschema.learning.era import Era
-from bodyschema.learning.learnt import LearntModel
-from bodyschema.learning.members import EXACT, PRIOR, RESIDUAL, RIGID
-from bodyschema.learning.solver import fitted_residual
+from bodyschema.learning.changes.known_arm import KnownArm
+from bodyschema.learning.learnt_model import LearntModel
+from bodyschema.learning.model_bank import EXACT, PRIOR, RESIDUAL, RIGID
+from bodyschema.learning.regime import Regime
+from bodyschema.learning.solvers.solver import fitted_residual
+from bodyschema.learning.uncertainty import UncertaintyTracker
 from kbmaps import ChainTolerances, KBMap
 
 NOMINAL = nominal_model()
@@ -30,28 +30,28 @@ def map_off_by(metres: float) -> KBMap:
     return SCENE.chain.with_tool([metres, 0.0, 0.0]).to_kbmap(NOMINAL.bases)
 
 
-def beside(era: Era) -> str:
+def beside(era: Regime) -> str:
     """Return the name of the published map."""
     return next(name for name, kbmap in era.members.maps.items() if kbmap is era.map)
 
 
-def take(era: Era, name: str, model: LearntModel) -> None:
+def take(era: Regime, name: str, model: LearntModel) -> None:
     """Give the regime a solution of all pairs up to now."""
     pairs = era.memory.count
     era.ask()
     era.take(Solved(era.task_number, pairs, name, model), model, pairs)
 
 
-def learn(era: Era, part: slice) -> None:
+def learn(era: Regime, part: slice) -> None:
     for pair in SCENE.pairs[part]:
         era.learn(pair)
 
 
 @pytest.fixture
-def era() -> Era:
+def era() -> Regime:
     """Return a regime with a chain and residual models; the rigid chain's map is the best of the maps."""
     arm = KnownArm(BELIEF, TOLERANCES)
-    era = Era(NOMINAL.prior(), arm, Claims(NOMINAL.bases, 0.1), LearnerConfig(), itertools.count())
+    era = Regime(NOMINAL.prior(), arm, UncertaintyTracker(NOMINAL.bases, 0.1), LearnerConfig(), itertools.count())
     learn(era, slice(0, 20))
     residual = fitted_residual(BELIEF, SCENE.q, X)
     assert residual is not None
@@ -61,17 +61,17 @@ def era() -> Era:
     return era
 
 
-def test_while_a_model_that_is_no_map_answers_the_map_beside_it_is_the_best_one(era: Era) -> None:
+def test_while_a_model_that_is_no_map_answers_the_map_beside_it_is_the_best_one(era: Regime) -> None:
     assert (era.answering, beside(era)) == (RESIDUAL, RIGID)
 
 
-def test_it_becomes_another_one_when_that_predicts_better(era: Era) -> None:
+def test_it_becomes_another_one_when_that_predicts_better(era: Regime) -> None:
     take(era, EXACT, map_off_by(0.001))
     learn(era, slice(40, 60))
     assert (era.answering, beside(era)) == (RESIDUAL, EXACT)
 
 
-def test_it_is_the_map_just_fitted_when_the_pairs_that_compared_them_are_set_aside(era: Era) -> None:
+def test_it_is_the_map_just_fitted_when_the_pairs_that_compared_them_are_set_aside(era: Regime) -> None:
     old_tool = make_pair(41, SCENE.q[0], X[0] + 0.2)
     era.begin_with(old_tool.q[None], old_tool.x[None])
     fitted = map_off_by(0.0)

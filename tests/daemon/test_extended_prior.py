@@ -12,7 +12,7 @@ from walked import DESK_ARM
 from bodyschema.daemon.config import Config, LearnerConfig
 from bodyschema.effects import Effect, Motion, Simulation, write_extended
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning import DirectSolver, Learning, NominalModel
+from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner
 from bodyschema.learning.nominal import chain_tolerances
 from bodyschema.robot.description import RobotDescription
 
@@ -38,7 +38,7 @@ def poses(robot: RobotDescription) -> FloatArray:
 def error_m(nominal: NominalModel, simulation: Simulation) -> float:
     """Return the mean error of the learner's answers before any pair."""
     q = poses(simulation.robot)
-    said = Learning(nominal, LearnerConfig(), DirectSolver()).snapshot.predict(q).x
+    said = OnlineLearner(nominal, LearnerConfig(), DirectSolver()).snapshot.predict(q).x
     return float(np.linalg.norm(said - simulation.positions(Motion.still(q)), axis=1).mean())
 
 

@@ -13,7 +13,7 @@ from bodyschema.daemon.sampler.history import Page, read_page
 from bodyschema.daemon.transport.wire import PairMessage, PairsReply, encode, pair_to_wire
 from bodyschema.interfaces.errors import BusError, RequestError
 from bodyschema.interfaces.records import Pair
-from bodyschema.learning import Learning
+from bodyschema.learning import OnlineLearner
 
 PAGE = 7
 PAIRS = Scene.draw(0, 40).pairs
@@ -64,7 +64,7 @@ class Fed:
     """A feed with what is around it."""
 
     def __init__(self, stored: int = 0) -> None:
-        self.learning: Learning = new_learning()
+        self.learning: OnlineLearner = new_learning()
         self.clock = HandClock()
         self.history = Store(PAIRS[:stored])
         self.feed = PairFeed(self.learning, self.history, self.clock)

@@ -17,8 +17,8 @@ from bodyschema.daemon.config import LearnerConfig
 from bodyschema.daemon.learner.findings import EVERY_S, SHARE, Findings, FindingTurns, figures
 from bodyschema.daemon.transport.status import Outlook
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning import DirectSolver, Learning, NominalModel
-from bodyschema.learning.outlook import Known, Scatter, foreseen
+from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner
+from bodyschema.learning.data_outlook import LearnerEvidence, Scatter, forecast
 from bodyschema.robot.description import RobotDescription
 from kbmaps import ChainParameters, ChainTolerances
 
@@ -57,7 +57,7 @@ class Planted:
     robot: RobotDescription
     parameters: ChainParameters
     change: FloatArray
-    learning: Learning
+    learning: OnlineLearner
 
     @classmethod
     def of(cls, seed: int, pairs: int) -> Planted:
@@ -68,7 +68,7 @@ class Planted:
         change = parameters.standard_deviations(made) * rng.normal(size=parameters.size)
         zeros = change[parameters.zeros]
         zeros[[0, -1]] = 0.0  # equivalent to a rotation of camera and marker in any motion
-        arm = cls(robot, parameters, change, Learning(NominalModel.of(robot), LearnerConfig(), DirectSolver()))
+        arm = cls(robot, parameters, change, OnlineLearner(NominalModel.of(robot), LearnerConfig(), DirectSolver()))
         arm.teach(rng, pairs)
         return arm
 
@@ -89,7 +89,7 @@ class Planted:
         while self.learning.work():
             pass
 
-    def known(self) -> Known:
+    def known(self) -> LearnerEvidence:
         known = self.learning.known()
         assert known is not None
         return known
@@ -190,20 +190,20 @@ def test_the_noise_is_the_scatter_of_the_pairs() -> None:
 # --- outlook
 
 
-def outlook_of(learning: Learning) -> Outlook:
+def outlook_of(learning: OnlineLearner) -> Outlook:
     known = learning.known()
     assert known is not None
-    return foreseen(known, Scatter.of(known), NAMES)
+    return forecast(known, Scatter.of(known), NAMES)
 
 
-def guided(seed: int, pairs: int) -> tuple[Learning, Scene]:
+def guided(seed: int, pairs: int) -> tuple[OnlineLearner, Scene]:
     scene, learning = Scene.draw(seed, pairs), new_learning()
     teach(learning, scene.pairs, every=NOW_AND_THEN)
     return learning, scene
 
 
 @pytest.fixture(scope="module")
-def after_60() -> list[tuple[Learning, Scene, Outlook]]:
+def after_60() -> list[tuple[OnlineLearner, Scene, Outlook]]:
     """Return learners that know the first 60 pairs of a path of 160, and their outlook then."""
     found = []
     for seed in range(4):
@@ -213,7 +213,7 @@ def after_60() -> list[tuple[Learning, Scene, Outlook]]:
     return found
 
 
-def true_error_m(learning: Learning, scene: Scene, pairs: int) -> float:
+def true_error_m(learning: OnlineLearner, scene: Scene, pairs: int) -> float:
     """Return the true error near the first `pairs` of the path."""
     q = near(np.random.default_rng(0), scene.q[:pairs])
     return float(np.linalg.norm(learning.snapshot.predict(q).x - scene.chain.positions(q), axis=1).mean())
@@ -269,7 +269,7 @@ def test_the_error_expected_over_the_whole_ranges_is_larger_than_where_the_arm_w
 
 def test_before_the_first_solution_nothing_is_told() -> None:
     robot = RobotDescription.load(DESK_ARM)
-    findings = Findings(Learning(NominalModel.of(robot), LearnerConfig(), DirectSolver()), robot, Ticking())
+    findings = Findings(OnlineLearner(NominalModel.of(robot), LearnerConfig(), DirectSolver()), robot, Ticking())
     findings.renew()
     assert (findings.calibration, findings.outlook) == (None, None)
 

@@ -36,7 +36,7 @@ from bodyschema.daemon.transport.bus import Request
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.effects import Simulation
 from bodyschema.interfaces.errors import BodyschemaError, ConfigError, RecordingError, RequestError
-from bodyschema.learning import DirectSolver, Learning, NominalModel, StateError
+from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner, StateError
 from bodyschema.recordings.recording import Recording, joints_in
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.lerobot import MotorCalibration, calibration_json, read_calibration
@@ -144,7 +144,7 @@ WILD = st.sampled_from([0.0, -0.0, 5e-324, 1e-308, 1e6, 1e155, -1e308, math.inf,
 def answers(tmp_path_factory) -> Answers:
     robot = RobotDescription.load(write_small_arm(tmp_path_factory.mktemp("answers")))
     nominal = NominalModel.extended_by(Simulation(robot, ()))
-    return Answers(Learning(nominal, LearnerConfig(), DirectSolver()), robot, lambda _: None)
+    return Answers(OnlineLearner(nominal, LearnerConfig(), DirectSolver()), robot, lambda _: None)
 
 
 @settings(quick, max_examples=12)

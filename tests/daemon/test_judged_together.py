@@ -10,13 +10,13 @@ from guided_arm import JOINTS, NOW_AND_THEN, Scene, built_chain, make_pair, meas
 
 from bodyschema.daemon.config import LearnerConfig
 from bodyschema.interfaces.records import Pair
-from bodyschema.learning import DirectSolver, Learning, NominalModel
-from bodyschema.learning.arm import KnownArm
-from bodyschema.learning.claims import Claims
-from bodyschema.learning.course import MOST_TOGETHER
-from bodyschema.learning.era import Era
-from bodyschema.learning.members import INSTANT
-from bodyschema.learning.scores import ErrorMemory
+from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner
+from bodyschema.learning.changes.known_arm import KnownArm
+from bodyschema.learning.core import MOST_TOGETHER
+from bodyschema.learning.error_memory import ErrorMemory
+from bodyschema.learning.model_bank import INSTANT
+from bodyschema.learning.regime import Regime
+from bodyschema.learning.uncertainty import UncertaintyTracker
 from kbmaps import NLMS, ChainTolerances
 
 TOGETHER_S = 1.0
@@ -25,11 +25,11 @@ NOMINAL = nominal_model()
 TOLERANCES = ChainTolerances(axes=0.05, points=0.015, zeros=0.05, tool=0.03)
 
 
-def new_learning(together_s: float = TOGETHER_S, nominal: NominalModel = NOMINAL) -> Learning:
-    return Learning(nominal, SETTINGS, DirectSolver(), together_s=together_s)
+def new_learning(together_s: float = TOGETHER_S, nominal: NominalModel = NOMINAL) -> OnlineLearner:
+    return OnlineLearner(nominal, SETTINGS, DirectSolver(), together_s=together_s)
 
 
-def taught(pairs: list[Pair], together_s: float) -> Learning:
+def taught(pairs: list[Pair], together_s: float) -> OnlineLearner:
     learning = new_learning(together_s)
     teach(learning, pairs, every=NOW_AND_THEN)
     return learning
@@ -42,10 +42,10 @@ def with_outliers(pairs: list[Pair], places: list[int]) -> list[Pair]:
 
 def test_the_instant_learner_knows_a_pair_before_it_is_judged() -> None:
     scene = Scene.draw(0, 20)
-    era = Era(
+    era = Regime(
         NOMINAL.prior(),
         KnownArm(NOMINAL.belief(NOMINAL.chain, TOLERANCES), TOLERANCES),
-        Claims(NOMINAL.bases, 0.1),
+        UncertaintyTracker(NOMINAL.bases, 0.1),
         SETTINGS,
         itertools.count(),
     )
@@ -125,7 +125,7 @@ def test_errors_that_come_together_weigh_as_one_after_the_other() -> None:
 
 def test_where_data_was_is_the_same_however_it_comes() -> None:
     q = path(np.random.default_rng(8), 120)
-    together, each = Claims(NOMINAL.bases, 0.1), Claims(NOMINAL.bases, 0.1)
+    together, each = UncertaintyTracker(NOMINAL.bases, 0.1), UncertaintyTracker(NOMINAL.bases, 0.1)
     together.learnt(q)
     for row in q:
         each.learnt(row[None])

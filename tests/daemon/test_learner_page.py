@@ -9,12 +9,12 @@ import msgspec
 import pytest
 
 from bodyschema.daemon.config import LARGEST_MAP, DaemonConfig, LearnerConfig
-from bodyschema.learning.gate import CHANGE, DOUBT, FEWEST_FOR_CHANGE
-from bodyschema.learning.learning import REGION_RAD
-from bodyschema.learning.members import TRUSTED
+from bodyschema.learning.model_bank import TRUSTED
 from bodyschema.learning.nominal import PAIRS_TO_REFIT
+from bodyschema.learning.online_learner import REGION_RAD
+from bodyschema.learning.outlier_limits import CHANGE, DOUBT, FEWEST_FOR_CHANGE
 from bodyschema.learning.snapshot import IN_SUPPORT
-from bodyschema.learning.solver import KEPT, LARGEST_NET, WINDOW
+from bodyschema.learning.solvers.solver import KEPT, LARGEST_NET, WINDOW
 from kbmaps.contest import CLEARLY, SHORTEST
 
 PAGE = (Path(__file__).parents[2] / "docs" / "learner.md").read_text(encoding="utf-8")

@@ -25,8 +25,8 @@ from hypothesis import strategies as st
 from bodyschema.daemon.config import LearnerConfig
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import Pair
-from bodyschema.learning import DirectSolver, Learning, Solved
-from bodyschema.learning.members import SOLVED
+from bodyschema.learning import DirectSolver, OnlineLearner, Solved
+from bodyschema.learning.model_bank import SOLVED
 from kbmaps import NLMS
 from kbmaps.contest import LISTED
 
@@ -35,7 +35,7 @@ MANY_SEEDS = range(4)
 HALF = 150
 
 
-def fingerprint(learning: Learning) -> tuple[object, ...]:
+def fingerprint(learning: OnlineLearner) -> tuple[object, ...]:
     """Return everything that a refused pair must not change."""
     state = learning.state()
     return (state.header, {name: array.tobytes() for name, array in state.arrays.items()})
@@ -94,7 +94,7 @@ class Taught:
     """An arm with a path of 300 pairs, and a learner trained on the first 150; tests continue with copies."""
 
     scene: Scene
-    learning: Learning
+    learning: OnlineLearner
 
     @classmethod
     @cache
@@ -112,7 +112,7 @@ class Taught:
         """Return the arm with the first `count` pairs."""
         return Scene(self.scene.chain, self.scene.q[:count], self.scene.pairs[:count])
 
-    def copy(self) -> Learning:
+    def copy(self) -> OnlineLearner:
         """Return another learner with the same data and solver state."""
         copy = new_learning()
         copy.restore(self.learning.state())
@@ -378,7 +378,7 @@ class SlowSolver(DirectSolver):
 
 def test_a_solution_that_comes_after_the_last_pair_answers_if_it_predicts_those_that_it_did_not_know() -> None:
     scene, solver = Scene.draw(0, 100), SlowSolver()
-    learning = Learning(nominal_model(), LearnerConfig(), solver)
+    learning = OnlineLearner(nominal_model(), LearnerConfig(), solver)
     teach(learning, scene.pairs[:40])
     teach(learning, scene.pairs[40:], background=False)
     before = learning.snapshot.answering

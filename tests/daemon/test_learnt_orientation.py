@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from bodyschema.daemon.learner.checkpoint import read_checkpoint, write_checkpoint
 from bodyschema.daemon.learner.solver_process import SolverProcess
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
-from bodyschema.learning import Learning
+from bodyschema.learning import OnlineLearner
 from kbmaps import RigidChain, rotation_vectors
 
 SIGMA_RAD = 0.01
@@ -31,13 +31,13 @@ def turned(pairs: Sequence[Pair], chain: RigidChain, seed: int = 0, sigma_rad: f
     ]
 
 
-def learnt(scene: Scene, learning: Learning | None = None) -> Learning:
+def learnt(scene: Scene, learning: OnlineLearner | None = None) -> OnlineLearner:
     learning = learning or new_learning()
     teach(learning, turned(scene.pairs, scene.chain), every=10)
     return learning
 
 
-def errors_rad(learning: Learning, chain: RigidChain, q: FloatArray) -> FloatArray:
+def errors_rad(learning: OnlineLearner, chain: RigidChain, q: FloatArray) -> FloatArray:
     """Return the orientation error of the answers about each axis (n, 3) [rad]."""
     answer = learning.snapshot.predict(q)
     assert answer.R is not None
@@ -51,7 +51,7 @@ def scene() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def taught(scene: Scene) -> Learning:
+def taught(scene: Scene) -> OnlineLearner:
     return learnt(scene)
 
 
@@ -161,7 +161,7 @@ def test_the_solver_in_its_own_process_finds_the_same_orientations() -> None:
     while direct.work():
         pass
     with SolverProcess() as solver:
-        apart = Learning(nominal_model(), direct._settings, solver)
+        apart = OnlineLearner(nominal_model(), direct._settings, solver)
         teach(apart, pairs, background=False)
         while not apart.at_rest:
             apart.work()

@@ -4,26 +4,26 @@ import numpy as np
 import pytest
 from guided_arm import Scene, nominal_model
 
-from bodyschema.learning.members import INSTANT, Members
+from bodyschema.learning.model_bank import INSTANT, ModelBank
 
 SCENE = Scene.draw(0, 20)
 X = np.array([pair.x for pair in SCENE.pairs])
 
 
 @pytest.fixture
-def members() -> Members:
-    members = Members(nominal_model().prior(), step_size=0.5)
+def members() -> ModelBank:
+    members = ModelBank(nominal_model().prior(), step_size=0.5)
     members.replay(SCENE.q, X)
     return members
 
 
-def test_the_instant_learner_predicts_the_same_before_and_after_somebody_takes_its_map(members: Members) -> None:
+def test_the_instant_learner_predicts_the_same_before_and_after_somebody_takes_its_map(members: ModelBank) -> None:
     before = members.predict(INSTANT, SCENE.q)
     np.testing.assert_array_equal(members.map(INSTANT).predict(SCENE.q), before)
     np.testing.assert_array_equal(members.predict(INSTANT, SCENE.q), before)
 
 
-def test_a_map_that_was_taken_does_not_follow_later_learning(members: Members) -> None:
+def test_a_map_that_was_taken_does_not_follow_later_learning(members: ModelBank) -> None:
     taken = members.map(INSTANT)
     before = taken.predict(SCENE.q)
     members.learn(SCENE.q[0], np.ones(3), np.inf)
@@ -32,7 +32,7 @@ def test_a_map_that_was_taken_does_not_follow_later_learning(members: Members) -
 
 
 @pytest.mark.parametrize("asked_for", ["prediction", "map"])
-def test_an_instant_learner_that_overflowed_begins_at_the_prior_again(members: Members, asked_for: str) -> None:
+def test_an_instant_learner_that_overflowed_begins_at_the_prior_again(members: ModelBank, asked_for: str) -> None:
     here = np.repeat(SCENE.q[:1], 4, axis=0)
     with np.errstate(all="ignore"):
         members.replay(here, 1.7e308 * np.array([1.0, -1.0, 1.0, -1.0])[:, None] * np.ones(3))

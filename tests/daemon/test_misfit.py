@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodyschema.learning.misfit import misfit
+from bodyschema.learning.model_discrepancy import model_discrepancy
 
 NONE = np.zeros(3)
 
@@ -17,14 +17,14 @@ def bent(n: int) -> np.ndarray:
 @pytest.mark.parametrize("claimed", [1e-12, 1e-4])
 def test_on_a_path_the_misfit_is_found_whatever_noise_is_claimed(claimed: float) -> None:
     noise = np.random.default_rng(0).normal(0.0, 0.002, (500, 3))
-    found = misfit(bent(500) + noise, np.full(3, claimed), NONE, neighbours=True)
+    found = model_discrepancy(bent(500) + noise, np.full(3, claimed), NONE, neighbours=True)
     np.testing.assert_allclose(found, 0.003, rtol=0.1)
 
 
 @pytest.mark.parametrize("neighbours", [True, False])
 def test_noise_alone_is_mostly_no_misfit(neighbours: bool) -> None:
     found = [
-        misfit(
+        model_discrepancy(
             np.random.default_rng(seed).normal(0.0, 0.002, (500, 3)),
             np.full(3, 0.002**2),
             NONE,
@@ -38,13 +38,13 @@ def test_noise_alone_is_mostly_no_misfit(neighbours: bool) -> None:
 def test_poses_far_apart_are_measured_against_the_claimed_noise() -> None:
     rng = np.random.default_rng(0)
     errors = rng.normal(0.0, np.hypot(0.003, 0.002), (500, 3))
-    np.testing.assert_allclose(misfit(errors, np.full(3, 0.002**2), NONE, neighbours=False), 0.003, rtol=0.1)
+    np.testing.assert_allclose(model_discrepancy(errors, np.full(3, 0.002**2), NONE, neighbours=False), 0.003, rtol=0.1)
 
 
 def test_while_pairs_are_few_the_misfit_with_the_last_tool_counts() -> None:
     before = np.full(3, 0.004)
-    few = misfit(np.zeros((2, 3)), np.full(3, 1e-6), before, neighbours=True)
-    many = misfit(np.zeros((50, 3)), np.full(3, 1e-6), before, neighbours=True)
+    few = model_discrepancy(np.zeros((2, 3)), np.full(3, 1e-6), before, neighbours=True)
+    many = model_discrepancy(np.zeros((50, 3)), np.full(3, 1e-6), before, neighbours=True)
     np.testing.assert_allclose([few, many], [np.sqrt(0.8) * before, NONE])
 
 
@@ -56,7 +56,7 @@ def test_what_the_solutions_own_numbers_took_from_the_errors_is_given_back(seed:
     missed = rng.normal(0.0, 0.003, (rows, 3))
     errors = missed - basis @ (basis.T @ missed)
     scatter = float(np.sqrt(np.square(errors).sum() / (3 * (rows - numbers))))
-    found = misfit(errors, np.full(3, 1e-8), NONE, neighbours=False, scatter=scatter)
+    found = model_discrepancy(errors, np.full(3, 1e-8), NONE, neighbours=False, scatter=scatter)
     np.testing.assert_allclose(np.sqrt(np.square(found).mean()), 0.003, rtol=0.2)
 
 
@@ -64,11 +64,11 @@ def test_what_the_solutions_own_numbers_took_from_the_errors_is_given_back(seed:
 def test_an_outlier_that_the_fit_left_out_is_no_misfit(neighbours: bool) -> None:
     errors = np.random.default_rng(0).normal(0.0, 0.002, (100, 3))
     errors[50] = 0.05
-    found = misfit(errors, np.full(3, 0.002**2), NONE, neighbours=neighbours, scatter=0.002)
+    found = model_discrepancy(errors, np.full(3, 0.002**2), NONE, neighbours=neighbours, scatter=0.002)
     np.testing.assert_array_equal(found, NONE)
 
 
 def test_a_fit_that_most_pairs_contradict_leaves_none_of_them_out() -> None:
     errors = np.random.default_rng(0).normal(0.0, 0.003, (100, 3))
-    found = misfit(errors, np.full(3, 1e-8), NONE, neighbours=False, scatter=1e-5)
+    found = model_discrepancy(errors, np.full(3, 1e-8), NONE, neighbours=False, scatter=1e-5)
     np.testing.assert_allclose(found, 0.003, rtol=0.2)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bodyschema.learning.memory import RUN, PairMemory
+from bodyschema.learning.replay_memory import RUN, PairMemory
 
 
 def filled(pairs: int, capacity: int) -> PairMemory:

@@ -19,7 +19,7 @@ from bodyschema.daemon.learner.findings import Findings
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import RecordingError
 from bodyschema.interfaces.records import Pair
-from bodyschema.learning import DirectSolver, Learning, NominalModel
+from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner
 from bodyschema.recordings.recording import Recording
 from kbmaps import ChainParameters, ChainTolerances, RigidChain
 
@@ -302,7 +302,7 @@ def test_real_recordings_are_not_doubted(name) -> None:
 @pytest.mark.parametrize("case", ["q3 counts the other way", None])
 def test_the_live_learner_names_a_wrong_reading(case) -> None:
     config, recording = misread_ur5(case)
-    learning = Learning(NominalModel.extended_by(config.simulation), config.tables.learner, DirectSolver())
+    learning = OnlineLearner(NominalModel.extended_by(config.simulation), config.tables.learner, DirectSolver())
     findings = Findings(learning, config.robot, SystemClock())
     for k in range(45):
         pair = Pair("s", k + 1, 1, float(k), "", recording.q[k], recording.x[k], 1e-8 * np.eye(3))

@@ -12,7 +12,7 @@ from guided_arm import NOW_AND_THEN, Scene, new_learning, nominal_model, teach
 from bodyschema.daemon.config import LearnerConfig
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import Pair, frozen_array
-from bodyschema.learning import DirectSolver, Learning, LearningState, StateError
+from bodyschema.learning import DirectSolver, LearningState, OnlineLearner, StateError
 
 TAUGHT = 40
 Spoil = Callable[[Pair], Pair]
@@ -94,4 +94,4 @@ def test_a_state_with_a_number_that_is_not_finite_is_not_gone_on_from(scene, nam
     state = learning.state()
     poisoned = LearningState(state.header, {**state.arrays, name: state.arrays[name] * np.nan})
     with pytest.raises(StateError, match=f"{name} is not finite"):
-        Learning(nominal_model(), LearnerConfig(), DirectSolver()).restore(poisoned)
+        OnlineLearner(nominal_model(), LearnerConfig(), DirectSolver()).restore(poisoned)

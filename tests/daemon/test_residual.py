@@ -8,8 +8,8 @@ from guided_arm import built_chain, make_pair, near, new_learning, nominal_model
 
 from bodyschema.daemon.learner.solver_process import SolverProcess
 from bodyschema.interfaces.records import FloatArray, Pair
-from bodyschema.learning import DirectSolver, Learning, LearntModel, Task
-from bodyschema.learning.members import RESIDUAL
+from bodyschema.learning import DirectSolver, LearntModel, OnlineLearner, Task
+from bodyschema.learning.model_bank import RESIDUAL
 from kbmaps import ChainTolerances, KBMap, ResidualModel, RigidChain
 
 SIGMA_M = 0.002
@@ -46,37 +46,37 @@ def arm() -> SaggingArm:
 
 
 @pytest.fixture(scope="module")
-def taught(arm: SaggingArm) -> Learning:
+def taught(arm: SaggingArm) -> OnlineLearner:
     learning = new_learning()
     teach(learning, arm.pairs(slice(0, PAIRS)), every=10)
     return learning
 
 
-def test_it_answers_for_an_arm_that_sags(arm: SaggingArm, taught: Learning) -> None:
+def test_it_answers_for_an_arm_that_sags(arm: SaggingArm, taught: OnlineLearner) -> None:
     assert taught.snapshot.answering == RESIDUAL
     snapshot = taught.snapshot
     assert arm.error_m(snapshot.require_model()) < 0.6 * arm.error_m(snapshot.require_map())
 
 
-def test_that_it_sags_is_no_change(taught: Learning) -> None:
+def test_that_it_sags_is_no_change(taught: OnlineLearner) -> None:
     assert taught.counters.changes == 0
 
 
-def test_its_claim_holds_near_the_path(arm: SaggingArm, taught: Learning) -> None:
+def test_its_claim_holds_near_the_path(arm: SaggingArm, taught: OnlineLearner) -> None:
     q = near(np.random.default_rng(1), arm.q[:PAIRS])
     prediction = taught.snapshot.predict(q)
     ratios = np.abs(prediction.x - arm.positions(q)) / prediction.sigma
     assert (ratios < 2.0).mean() > 0.9
 
 
-def test_the_file_to_publish_is_the_best_map_while_it_answers(taught: Learning) -> None:
+def test_the_file_to_publish_is_the_best_map_while_it_answers(taught: OnlineLearner) -> None:
     snapshot = taught.snapshot
     assert isinstance(snapshot.require_model(), ResidualModel)
     assert isinstance(snapshot.require_map(), KBMap)
     assert snapshot.digest == snapshot.require_model().digest != snapshot.require_map().digest
 
 
-def test_a_restored_learner_answers_with_it_bit_by_bit(arm: SaggingArm, taught: Learning) -> None:
+def test_a_restored_learner_answers_with_it_bit_by_bit(arm: SaggingArm, taught: OnlineLearner) -> None:
     restored = new_learning()
     restored.restore(taught.state())
     assert restored.snapshot.digest == taught.snapshot.digest
@@ -85,13 +85,13 @@ def test_a_restored_learner_answers_with_it_bit_by_bit(arm: SaggingArm, taught: 
     np.testing.assert_allclose(one.sigma, other.sigma, rtol=1e-9)
 
 
-def test_a_restored_learner_publishes_the_same_map(taught: Learning) -> None:
+def test_a_restored_learner_publishes_the_same_map(taught: OnlineLearner) -> None:
     restored = new_learning()
     restored.restore(taught.state())
     assert restored.snapshot.require_map().digest == taught.snapshot.require_map().digest
 
 
-def test_what_the_arm_yields_stays_known_with_another_tool(arm: SaggingArm, taught: Learning) -> None:
+def test_what_the_arm_yields_stays_known_with_another_tool(arm: SaggingArm, taught: OnlineLearner) -> None:
     learning = new_learning()
     learning.restore(taught.state())
     learning.tool_changed()
@@ -102,7 +102,7 @@ def test_what_the_arm_yields_stays_known_with_another_tool(arm: SaggingArm, taug
     assert arm.error_m(snapshot.require_model(), marker) < 0.6 * arm.error_m(snapshot.require_map(), marker)
 
 
-def test_another_tool_is_found_while_it_answers(arm: SaggingArm, taught: Learning) -> None:
+def test_another_tool_is_found_while_it_answers(arm: SaggingArm, taught: OnlineLearner) -> None:
     learning = new_learning()
     learning.restore(taught.state())
     teach(learning, arm.pairs(slice(PAIRS, PAIRS + 10), arm.chain.with_tool(TOOL)))

@@ -9,8 +9,8 @@ from guided_arm import NOW_AND_THEN, Scene, make_pair, measured, new_learning, n
 
 from bodyschema.daemon.config import LearnerConfig
 from bodyschema.interfaces.records import FloatArray, Pair
-from bodyschema.learning import DirectSolver, Learning, Solved, StateError
-from bodyschema.learning.memory import Permutations
+from bodyschema.learning import DirectSolver, OnlineLearner, Solved, StateError
+from bodyschema.learning.replay_memory import Permutations
 from bodyschema.learning.snapshot import Prediction
 
 TAUGHT, LATER = 100, 40
@@ -37,7 +37,7 @@ class Saved:
     def __init__(self, pairs: list[Pair], *, tool_changed_at: int | None = None, unknown: bool = False) -> None:
         solver, known = OnlyUntilSaved(), not unknown
         nominal = nominal_model(pose_known=known, marker_known=known)
-        self.learning = Learning(nominal, LearnerConfig(), solver)
+        self.learning = OnlineLearner(nominal, LearnerConfig(), solver)
         for number, pair in enumerate(pairs):
             if number == tool_changed_at:
                 self.learning.tool_changed()
@@ -48,7 +48,7 @@ class Saved:
         solver.saved = True
         again = OnlyUntilSaved()
         again.saved = True
-        self.restored = Learning(nominal, LearnerConfig(), again)
+        self.restored = OnlineLearner(nominal, LearnerConfig(), again)
         self.restored.restore(self.learning.state())
 
     def assert_same(self, q: FloatArray) -> None:

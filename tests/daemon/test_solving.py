@@ -5,9 +5,9 @@ import pytest
 from guided_arm import JOINTS, nominal_model
 
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning.members import RIGID
-from bodyschema.learning.solver import Solved, Task
-from bodyschema.learning.solving import Solving
+from bodyschema.learning.model_bank import RIGID
+from bodyschema.learning.solvers.client import SolverClient
+from bodyschema.learning.solvers.solver import Solved, Task
 from kbmaps import ChainTolerances
 
 NOMINAL = nominal_model()
@@ -43,20 +43,20 @@ def solver() -> ScriptedSolver:
 
 
 @pytest.fixture
-def solving(solver: ScriptedSolver) -> Solving:
-    solving = Solving(solver, solve_every=25)
+def solving(solver: ScriptedSolver) -> SolverClient:
+    solving = SolverClient(solver, solve_every=25)
     solving.begin(TASK)
     return solving
 
 
-def test_a_new_task_is_told_once(solver: ScriptedSolver, solving: Solving) -> None:
+def test_a_new_task_is_told_once(solver: ScriptedSolver, solving: SolverClient) -> None:
     assert not solving.begin(TASK)
     assert solver.told == [("start", 1)]
 
 
 @pytest.mark.parametrize(("solved_at", "not_yet", "due_at"), [(50, 54, 55), (1000, 1024, 1025)])
 def test_a_solution_is_due_after_a_tenth_more_pairs_but_never_later_than_configured(
-    solver: ScriptedSolver, solving: Solving, solved_at: int, not_yet: int, due_at: int
+    solver: ScriptedSolver, solving: SolverClient, solved_at: int, not_yet: int, due_at: int
 ) -> None:
     solving.feed(Q, X, solved_at)
     solving.ask()
@@ -68,7 +68,7 @@ def test_a_solution_is_due_after_a_tenth_more_pairs_but_never_later_than_configu
     assert (early, solving.due) == (False, True)
 
 
-def test_no_solution_is_due_without_new_pairs(solver: ScriptedSolver, solving: Solving) -> None:
+def test_no_solution_is_due_without_new_pairs(solver: ScriptedSolver, solving: SolverClient) -> None:
     solving.feed(Q, X, 25)
     solving.ask()
     solver.answer = Solved(1, 25, RIGID, PRIOR)
@@ -77,7 +77,7 @@ def test_no_solution_is_due_without_new_pairs(solver: ScriptedSolver, solving: S
     assert not solving.due
 
 
-def test_it_is_busy_until_the_last_answer(solver: ScriptedSolver, solving: Solving) -> None:
+def test_it_is_busy_until_the_last_answer(solver: ScriptedSolver, solving: SolverClient) -> None:
     solving.feed(Q, X, 25)
     solving.ask()
     busy = []
@@ -88,7 +88,7 @@ def test_it_is_busy_until_the_last_answer(solver: ScriptedSolver, solving: Solvi
     assert busy == [True, False]
 
 
-def test_it_is_busy_from_the_question_to_the_answer(solver: ScriptedSolver, solving: Solving) -> None:
+def test_it_is_busy_from_the_question_to_the_answer(solver: ScriptedSolver, solving: SolverClient) -> None:
     solving.feed(Q, X, 25)
     solving.ask()
     waiting = solving.busy, solving.poll(), solving.busy
@@ -97,7 +97,7 @@ def test_it_is_busy_from_the_question_to_the_answer(solver: ScriptedSolver, solv
     assert (waiting, solving.busy) == ((True, None, True), False)
 
 
-def test_a_solver_that_lost_everything_is_given_everything_again(solver: ScriptedSolver, solving: Solving) -> None:
+def test_a_solver_that_lost_everything_is_given_everything_again(solver: ScriptedSolver, solving: SolverClient) -> None:
     solving.feed(Q, X, 10)
     solving.restart()
     assert solving.begin(TASK)

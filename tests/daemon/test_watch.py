@@ -9,13 +9,13 @@ import pytest
 from guided_arm import NOW_AND_THEN, built_chain, measured, new_learning, path, teach
 
 from bodyschema.interfaces.records import Pair, frozen_array
-from bodyschema.learning.watch import MOST_WATCHED, Watch
+from bodyschema.learning.changes.monitor import MOST_WATCHED, ChangeMonitor
 
 COARSE_RAD = np.radians(1.0)
 
 
 def test_where_no_model_comes_the_newest_pairs_alone_are_kept() -> None:
-    watch, cov = Watch(), frozen_array(np.eye(3))
+    watch, cov = ChangeMonitor(), frozen_array(np.eye(3))
     for seq in range(1, MOST_WATCHED + 200):
         watch.add(
             Pair("simulated", seq, 1, 0.0, "", frozen_array(np.zeros(2)), frozen_array(np.zeros(3)), cov), kept=True

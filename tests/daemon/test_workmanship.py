@@ -10,9 +10,9 @@ from guided_arm import Scene, nominal_model
 
 from bodyschema.daemon.config import LearnerConfig
 from bodyschema.learning import Solved
-from bodyschema.learning.eras import Eras
-from bodyschema.learning.members import RIGID
-from bodyschema.learning.workmanship import Made, best_made
+from bodyschema.learning.model_bank import RIGID
+from bodyschema.learning.regimes import Regimes
+from bodyschema.learning.solvers.tolerance_selection import Tolerances, best_tolerances
 from kbmaps import ChainTolerances, RigidLearner
 
 NOMINAL, SCENE = nominal_model(), Scene.draw(0, 40)
@@ -28,12 +28,12 @@ def belief_in(tolerances: ChainTolerances):
 
 def test_the_drawing_is_not_held_to_where_it_is_improbable() -> None:
     wide = belief_in(WIDE)
-    found = best_made(wide, WIDE, [Made(WIDE, 0.9), Made(GOOD, 0.1)])
+    found = best_tolerances(wide, WIDE, [Tolerances(WIDE, 0.9), Tolerances(GOOD, 0.1)])
     np.testing.assert_allclose(found.mean, wide.mean)
 
 
 def test_pairs_with_another_tool_are_added_to_what_is_believed_of_any_workmanship() -> None:
-    eras = Eras.at_nominal(NOMINAL, LearnerConfig(), itertools.count())
+    eras = Regimes.at_nominal(NOMINAL, LearnerConfig(), itertools.count())
     era, wide = eras.present, belief_in(WIDE)
     assert era is not None
     narrow = wide.tightened(WIDE, GOOD)[0]

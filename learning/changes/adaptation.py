@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning.changes.known_arm import OTHER_TOOL_M, KnownArm
+from bodyschema.learning.changes.monitor import DetectedChange
+from bodyschema.learning.changes.record import NAMED, TOOL
+from bodyschema.learning.solvers.solver import fitted_belief
 from kbmaps import ChainBelief, ChangeKind, Explanation, KBMap, any_change, explanations
-
-from .arm import OTHER_TOOL_M, KnownArm
-from .change import NAMED, TOOL
-from .solver import fitted_belief
-from .watch import Noticed
 
 # An unnamed change widens every kind at least this probable.
 IMPROBABLE = 0.02
@@ -50,7 +49,7 @@ class Origin:
         arm: prior of the arm before the first pair of its regime; it supplies the tolerances.
     """
 
-    def __init__(self, noticed: Noticed, arm: KnownArm) -> None:
+    def __init__(self, noticed: DetectedChange, arm: KnownArm) -> None:
         self._noticed, self._reference = noticed, noticed.reference
         quiet = [k for k in range(min(noticed.earliest, noticed.first)) if noticed.kept[k]]
         q, x = noticed.q[quiet], noticed.x[quiet]

@@ -21,7 +21,7 @@ LIKELY = 1.0 / 3.0
 
 
 @dataclass(frozen=True)
-class Made:
+class Tolerances:
     """Candidate tolerances of an arm, with their probability.
 
     Attributes:
@@ -33,7 +33,7 @@ class Made:
     share: float
 
 
-def workmanship(belief: ChainBelief, tolerances: ChainTolerances) -> list[Made]:
+def workmanship(belief: ChainBelief, tolerances: ChainTolerances) -> list[Tolerances]:
     """Return the probable tolerances of the arm, from the evidence of its pairs.
 
     MacKay 1992, "Bayesian interpolation". The initial tolerances allow for an arm made by hand. Where the nominal chain
@@ -49,7 +49,7 @@ def workmanship(belief: ChainBelief, tolerances: ChainTolerances) -> list[Made]:
     """
     candidates = [tolerances, *(each for made in reversed(WORKMANSHIP) for each in _narrower(tolerances, *made))]
     kept, shares = probable(np.array([belief.tightened(tolerances, each)[1] for each in candidates]))
-    made = {int(k): Made(candidates[k], float(share)) for k, share in zip(kept, shares, strict=True)}
+    made = {int(k): Tolerances(candidates[k], float(share)) for k, share in zip(kept, shares, strict=True)}
     return [made[k] for k in sorted(made)]
 
 
@@ -65,7 +65,7 @@ def probable(evidence: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
     return kept, shares[kept] / shares[kept].sum()
 
 
-def best_made(belief: ChainBelief, tolerances: ChainTolerances, made: Sequence[Made]) -> ChainBelief:
+def best_tolerances(belief: ChainBelief, tolerances: ChainTolerances, made: Sequence[Tolerances]) -> ChainBelief:
     """Return the chain nearest to nominal that is not improbable, with the uncertainty of all candidates.
 
     Its covariance covers all candidate tolerances. Where these explain the pairs equally well, they differ only away

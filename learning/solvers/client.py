@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from bodyschema.interfaces.records import FloatArray
-
-from .solver import Solved, Solver, Task
+from bodyschema.learning.solvers.solver import Solved, Solver, Task
 
 # While pairs are few, a solution is cheap, and renewed after this growth of their number.
 GROWTH = 0.1
 
 
-class Solving:
+class SolverClient:
     """Keeps one solver up to date. For the background thread alone.
 
     Nothing is sent while the solver works: in a process of its own it does not read meanwhile, and the thread would

@@ -9,14 +9,13 @@ import numpy as np
 
 from bodyschema.daemon.transport.status import Outlook
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning.nominal import NominalModel
+from bodyschema.learning.outlier_limits import MEDIAN_TO_SIGMA
+from bodyschema.learning.snapshot import MEAN_OVER_RMS
+from bodyschema.learning.uncertainty import PredictiveUncertainty
 from kbmaps import ChainBelief, ChainPosterior, ChainTolerances, candidate_motions, expected_gain, shared_by
 from kbmaps.planning.expected_gain import ALL, SAME
 from kbmaps.robust import OUTLIER_SIGMAS
-
-from .claims import Claim
-from .gate import MEDIAN_TO_SIGMA
-from .nominal import NominalModel
-from .snapshot import MEAN_OVER_RMS
 
 FURTHER = (100, 300)
 # Number of poses of a motion, and of the region where the arm is used. More would not make the figures steadier than
@@ -31,7 +30,7 @@ LEAST_NOISE_M = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class LearnerEvidence:
     """Evidence for a data outlook at one moment.
 
     Attributes:
@@ -51,7 +50,7 @@ class Known:
     belief: ChainBelief
     wide: ChainBelief
     tolerances: ChainTolerances
-    claim: Claim
+    claim: PredictiveUncertainty
     solved: bool
     pairs: int
     region: FloatArray
@@ -75,7 +74,7 @@ class Scatter:
     shared: float
 
     @classmethod
-    def of(cls, known: Known) -> Scatter:
+    def of(cls, known: LearnerEvidence) -> Scatter:
         """Return the scatter of the newest pairs."""
         predicted, variance = known.belief.predict_with_variance(known.q)
         missed = known.x - predicted
@@ -87,7 +86,7 @@ class Scatter:
         return cls(noise, int((~inliers).sum()), shared_by(missed[inliers]))
 
 
-def foreseen(known: Known, scatter: Scatter, joints: tuple[str, ...]) -> Outlook:
+def forecast(known: LearnerEvidence, scatter: Scatter, joints: tuple[str, ...]) -> Outlook:
     """Return the expected gain of further pairs where the arm has been, for an answering solution.
 
     The current error is the predicted one there. The forecast gives the factor by which it falls.
@@ -125,7 +124,7 @@ def foreseen(known: Known, scatter: Scatter, joints: tuple[str, ...]) -> Outlook
     )
 
 
-def _mean_error_m(claim: Claim, q: FloatArray) -> float:
+def _mean_error_m(claim: PredictiveUncertainty, q: FloatArray) -> float:
     """Return the expected mean distance to the truth [m] at q (n, d) [rad]."""
     return MEAN_OVER_RMS * float(np.sqrt(claim.variance(q).sum(axis=1)).mean())
 

@@ -11,21 +11,20 @@ import numpy as np
 
 from bodyschema.daemon.config import LearnerConfig
 from bodyschema.interfaces.records import FloatArray, Pair
+from bodyschema.learning.changes.adaptation import Adapted, Origin
+from bodyschema.learning.changes.known_arm import KnownArm
+from bodyschema.learning.changes.monitor import LOOK_AGAIN, DetectedChange
+from bodyschema.learning.changes.record import NAMED_WITHIN, ChangeRecord, KindOfChange
+from bodyschema.learning.curve import Curve
+from bodyschema.learning.model_bank import PRIOR
+from bodyschema.learning.nominal import PAIRS_TO_REFIT, NominalModel, chain_tolerances
+from bodyschema.learning.outlier_limits import DOUBT, explained, sound
+from bodyschema.learning.regime import Regime
+from bodyschema.learning.replay_memory import PairMemory
+from bodyschema.learning.solvers.prior_fit import Fit, Fitting
+from bodyschema.learning.state import NET, Counters, LearningHeader, LearningState, StateError
+from bodyschema.learning.uncertainty import UncertaintyTracker
 from kbmaps import ChainBelief, ChainTolerances, Explanation, KBMap, RigidChain
-
-from .adaptation import Adapted, Origin
-from .arm import KnownArm
-from .change import NAMED_WITHIN, ChangeRecord, KindOfChange
-from .claims import Claims
-from .curve import Curve
-from .era import Era
-from .fitting import Fit, Fitting
-from .gate import DOUBT, explained, sound
-from .members import PRIOR
-from .memory import PairMemory
-from .nominal import PAIRS_TO_REFIT, NominalModel, chain_tolerances
-from .state import NET, Counters, LearningHeader, LearningState, StateError
-from .watch import LOOK_AGAIN, Noticed
 
 # Ordinary RMS distance between a nominal model and reality [m].
 EXPECTED_M = 0.1
@@ -33,7 +32,7 @@ EXPECTED_M = 0.1
 FEWEST_TO_ADAPT = 3
 
 
-class Eras:
+class Regimes:
     """Begins the first regime when the frame is known, and another one with each change.
 
     Args:
@@ -52,49 +51,49 @@ class Eras:
     def __init__(self, nominal: NominalModel, settings: LearnerConfig, task_numbers: Iterator[int]) -> None:
         self._nominal, self._settings, self._task_numbers = nominal, settings, task_numbers
         self._fingerprint = nominal.fingerprint(chain_tolerances(settings))
-        self.claims = Claims(nominal.bases, EXPECTED_M)
+        self.claims = UncertaintyTracker(nominal.bases, EXPECTED_M)
         self.fitting = Fitting(nominal, chain_tolerances(settings))
         self.waiting = PairMemory(nominal.joints, settings.replay_capacity)
-        self.present: Era | None = None
+        self.present: Regime | None = None
         self.change: ChangeRecord | None = None
         self._origin: Origin | None = None
         self._look_at = 0
 
     @classmethod
-    def at_nominal(cls, nominal: NominalModel, settings: LearnerConfig, task_numbers: Iterator[int]) -> Eras:
+    def at_nominal(cls, nominal: NominalModel, settings: LearnerConfig, task_numbers: Iterator[int]) -> Regimes:
         """Return the state before any pair."""
-        eras = cls(nominal, settings, task_numbers)
+        regimes = cls(nominal, settings, task_numbers)
         if nominal.frame_known:
-            eras.present = eras._era(nominal.prior(), eras._drawn(nominal.chain))
-        return eras
+            regimes.present = regimes._regime(nominal.prior(), regimes._drawn(nominal.chain))
+        return regimes
 
     @classmethod
     def restored(
         cls, state: LearningState, nominal: NominalModel, settings: LearnerConfig, task_numbers: Iterator[int]
-    ) -> Eras:
+    ) -> Regimes:
         """Return the regimes as they were when `state` was taken.
 
         Raises:
             StateError: it belongs to another nominal model, or to other tolerances, or has impossible numbers.
         """
         header, arrays = state.header, state.arrays
-        eras = cls(nominal, settings, task_numbers)
-        if header.fingerprint != eras._fingerprint:
+        regimes = cls(nominal, settings, task_numbers)
+        if header.fingerprint != regimes._fingerprint:
             raise StateError(
                 "it belongs to another nominal model or to other tolerances: robot.toml or the URDF has changed since"
             )
         if (poisoned := state.poisoned()) is not None:
             raise StateError(f"it is of no use: {poisoned} is not finite or too large")
-        eras.fitting.restore(header.next_fit, header.first_fit, arrays)
-        eras.claims.restore(header.claims, arrays)
-        eras.change = header.change
+        regimes.fitting.restore(header.next_fit, header.first_fit, arrays)
+        regimes.claims.restore(header.claims, arrays)
+        regimes.change = header.change
         if header.belief is None:
-            eras.waiting.restore(arrays["q"], arrays["x"], header.kept_of, arrays.get("turns"))
+            regimes.waiting.restore(arrays["q"], arrays["x"], header.kept_of, arrays.get("turns"))
         else:
-            arm = KnownArm.from_bytes(header.belief, eras._tolerances, header.residual)
-            eras.present = eras._era(KBMap(nominal.bases, arrays[NET + PRIOR]), arm)
-            eras.present.restore(header, arrays)
-        return eras
+            arm = KnownArm.from_bytes(header.belief, regimes._tolerances, header.residual)
+            regimes.present = regimes._regime(KBMap(nominal.bases, arrays[NET + PRIOR]), arm)
+            regimes.present.restore(header, arrays)
+        return regimes
 
     def state(self, counters: Counters, curve: Curve) -> LearningState:
         """Return everything that `restored` needs, with the counters."""
@@ -134,39 +133,39 @@ class Eras:
         state.header.counters.since_change -= self.memory.count - state.header.kept_of
         return LearningState(state.header, arrays)
 
-    def change_tool(self, era: Era) -> None:
+    def change_tool(self, regime: Regime) -> None:
         """Begin the regime of another tool, of which nothing is known, after `era`."""
-        self.present, self._origin = self._next(era, EXPECTED_M), None
+        self.present, self._origin = self._next(regime, EXPECTED_M), None
 
-    def follow_change(self, era: Era, pair: Pair) -> bool:
+    def follow_change(self, regime: Regime, pair: Pair) -> bool:
         """Begin the regime of another tool if the consecutive outliers of `era`, up to `pair`, are its first pairs."""
-        doubts = era.doubts
-        if not (doubts.changed or (doubts.perhaps_changed and self._moved_together(era, era.limit_m(pair) / DOUBT))):
+        gate = regime.gate
+        if not (gate.changed or (gate.perhaps_changed and self._moved_together(regime, regime.limit_m(pair) / DOUBT))):
             return False
-        q, x = doubts.run()
-        distances = np.linalg.norm(era.model.predict(q) - x, axis=1)
-        self.present = self._next(era, max(float(np.median(distances)), EXPECTED_M), first_fit=len(q))
+        q, x = gate.run()
+        distances = np.linalg.norm(regime.model.predict(q) - x, axis=1)
+        self.present = self._next(regime, max(float(np.median(distances)), EXPECTED_M), first_fit=len(q))
         self.present.begin_with(q, x)
         first = pair.seq - len(q) + 1
         self.change, self._origin = ChangeRecord.unnamed(first, pair.seq, self._nominal.joints), None
         return True
 
-    def noticed(self, era: Era, pair: Pair) -> Noticed | None:
+    def noticed(self, regime: Regime, pair: Pair) -> DetectedChange | None:
         """Return the change that the pairs of `era` show, `pair` the last of them; None if they show none."""
-        if not era.watch.ready:
+        if not regime.monitor.ready:
             return None
-        doubts = era.doubts
-        together = doubts.perhaps_changed and self._moved_together(era, era.limit_m(pair) / DOUBT)
-        noticed = era.watch.noticed(run=doubts.in_a_row if doubts.changed or together else 0)
+        gate = regime.gate
+        together = gate.perhaps_changed and self._moved_together(regime, regime.limit_m(pair) / DOUBT)
+        noticed = regime.monitor.noticed(run=gate.in_a_row if gate.changed or together else 0)
         return None if noticed is None or len(noticed.q) - noticed.first < FEWEST_TO_ADAPT else noticed
 
-    def adapt(self, era: Era, noticed: Noticed) -> bool:
+    def adapt(self, regime: Regime, noticed: DetectedChange) -> bool:
         """Begin the regime after a change, if that improves the held-out predictions of the pairs since."""
         q, x = noticed.q[noticed.first :], noticed.x[noticed.first :]
-        origin = Origin(noticed, era.arm)
+        origin = Origin(noticed, regime.arm)
         found = origin.explain(q, x)
         if not origin.is_better(found, q, x):
-            era.watch.refute()
+            regime.monitor.refute()
             return False
         self._look_at = int(LOOK_AGAIN * len(q)) + 1
         seqs = (*noticed.seqs, noticed.seqs[-1] + 1)
@@ -179,7 +178,7 @@ class Eras:
             kinds=_described(found),
             moved_m=found[0].moved_m,
         )
-        self._begin_adapted(era, origin.adapt(found, q, x), q, x, noticed.turns[noticed.first :])
+        self._begin_adapted(regime, origin.adapt(found, q, x), q, x, noticed.turns[noticed.first :])
         self._origin = origin
         return True
 
@@ -204,12 +203,12 @@ class Eras:
             self._origin = None
         return other
 
-    def _begin_adapted(self, era: Era, adapted: Adapted, q: FloatArray, x: FloatArray, turns: FloatArray) -> None:
+    def _begin_adapted(self, regime: Regime, adapted: Adapted, q: FloatArray, x: FloatArray, turns: FloatArray) -> None:
         """Begin the regime that keeps everything except the changed part, with pairs q (n, d), x (n, 3) since then."""
         belongs = sound(np.linalg.norm(x - adapted.prior.predict(q), axis=1), self.claims.noise_m)
         self.fitting.rest(adapted.belief.chain)
-        self.claims.change_tool(max(math.sqrt(3.0) * adapted.belief.noise, self.claims.noise_m), era.answering)
-        self.present = self._era(adapted.prior, adapted.arm)
+        self.claims.change_tool(max(math.sqrt(3.0) * adapted.belief.noise, self.claims.noise_m), regime.answering)
+        self.present = self._regime(adapted.prior, adapted.arm)
         self.present.learn_waiting(q[belongs], x[belongs], turns[belongs], adapted.belief)
 
     def fitted(self, fit: Fit | None, pairs: int) -> int:
@@ -229,24 +228,24 @@ class Eras:
         (q, x), turns = self.waiting.all(), self.waiting.turns_since(0)
         belongs = sound(np.linalg.norm(x - fit.prior.predict(q), axis=1), self.claims.noise_m)
         self.waiting.clear()
-        self.present = self._era(fit.prior, self._drawn(fit.chain))
+        self.present = self._regime(fit.prior, self._drawn(fit.chain))
         self.present.learn_waiting(q[belongs], x[belongs], turns[belongs], belief)
         return int((~belongs).sum())
 
-    def _next(self, era: Era, expected_m: float, first_fit: int = PAIRS_TO_REFIT) -> Era:
+    def _next(self, regime: Regime, expected_m: float, first_fit: int = PAIRS_TO_REFIT) -> Regime:
         """Return the regime of another tool, which begins where `era` ends."""
-        prior, arm = era.map, era.arm.updated(self.claims.wide, self.claims.residual)
+        prior, arm = regime.map, regime.arm.updated(self.claims.wide, self.claims.residual)
         self.fitting.change_tool(prior, self._hand, first_fit)
-        self.claims.change_tool(expected_m, era.answering)
-        return self._era(prior, arm.with_other_tool())
+        self.claims.change_tool(expected_m, regime.answering)
+        return self._regime(prior, arm.with_other_tool())
 
-    def _moved_together(self, era: Era, expected_m: float) -> bool:
+    def _moved_together(self, regime: Regime, expected_m: float) -> bool:
         """Return True if one other position of the marker on the hand explains the consecutive outliers."""
-        q, x = era.doubts.run()
-        answer = era.model.predict(q)
+        q, x = regime.gate.run()
+        answer = regime.model.predict(q)
         # Without the answering model's terms beyond the map: they hold for any tool.
-        of_map = x - (answer - era.map.predict(q))
-        moved = self._nominal.with_other_tool(era.map, self._hand, q, of_map)
+        of_map = x - (answer - regime.map.predict(q))
+        moved = self._nominal.with_other_tool(regime.map, self._hand, q, of_map)
         left = np.linalg.norm(of_map - moved.predict(q), axis=1)
         return explained(np.linalg.norm(x - answer, axis=1), left, expected_m)
 
@@ -256,8 +255,8 @@ class Eras:
         belief = self.claims.belief
         return self.fitting.chain if belief is None else belief.chain
 
-    def _era(self, prior: KBMap, arm: KnownArm) -> Era:
-        return Era(prior, arm, self.claims, self._settings, self._task_numbers)
+    def _regime(self, prior: KBMap, arm: KnownArm) -> Regime:
+        return Regime(prior, arm, self.claims, self._settings, self._task_numbers)
 
     def _drawn(self, chain: RigidChain) -> KnownArm:
         return KnownArm(self._nominal.belief(chain, chain_tolerances(self._settings)), self._tolerances)

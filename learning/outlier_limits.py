@@ -30,7 +30,7 @@ class Gate:
     def __init__(self, in_a_row: int = 0) -> None:
         self.in_a_row = in_a_row
 
-    def doubts(self, distance_m: float, limit_m: float) -> bool:
+    def gate(self, distance_m: float, limit_m: float) -> bool:
         """Return True if a pair that lies `distance_m` from its prediction is an outlier."""
         doubted = distance_m > limit_m
         self.in_a_row = self.in_a_row + 1 if doubted else 0

@@ -10,22 +10,21 @@ from numpy.typing import NDArray
 
 from bodyschema.daemon.config import LearnerConfig
 from bodyschema.interfaces.records import FloatArray, Pair
+from bodyschema.learning.changes.known_arm import KnownArm
+from bodyschema.learning.changes.monitor import LOOKED_BACK as KNOWN_PAIRS
+from bodyschema.learning.changes.monitor import ChangeMonitor, Reference
+from bodyschema.learning.learnt_model import LearntModel
+from bodyschema.learning.model_bank import EXACT, INSTANT, PRIOR, RESIDUAL, RIGID, ModelBank
+from bodyschema.learning.orientation import OrientationModel, Orientations
+from bodyschema.learning.outlier_gate import OutlierGate
+from bodyschema.learning.outlier_limits import DOUBT, limits_m, sound
+from bodyschema.learning.replay_memory import PairMemory, Permutations
+from bodyschema.learning.solvers.orientation import OrientationSolution
+from bodyschema.learning.solvers.solver import Solved, Task
+from bodyschema.learning.state import NET, LearningHeader
+from bodyschema.learning.uncertainty import UncertaintyTracker
+from bodyschema.learning.variance_terms import QueryPoints
 from kbmaps import ChainBelief, KBMap, Recent, follow_a_path
-
-from .arm import KnownArm
-from .claims import Claims
-from .doubts import Doubts
-from .gate import DOUBT, limits_m, sound
-from .learnt import LearntModel
-from .members import EXACT, INSTANT, PRIOR, RESIDUAL, RIGID, Members
-from .memory import PairMemory, Permutations
-from .orientation import OrientationModel, Orientations
-from .orientation_solver import OrientationSolution
-from .solver import Solved, Task
-from .state import NET, LearningHeader
-from .unknowns import Where
-from .watch import LOOKED_BACK as KNOWN_PAIRS
-from .watch import Reference, Watch
 
 # Number of learnt pairs on which a model's fit is assessed.
 LOOKED_BACK = 500
@@ -44,7 +43,7 @@ NO_TURN = (math.nan,) * 4
 BoolArray = NDArray[np.bool_]
 
 
-class Era:
+class Regime:
     """Learns the models of one tool side by side, and chooses the one that answers.
 
     It has no lock of its own. The results of earlier regimes come as `prior`, `arm` and `claims`.
@@ -68,13 +67,18 @@ class Era:
     """
 
     def __init__(
-        self, prior: KBMap, arm: KnownArm, claims: Claims, settings: LearnerConfig, task_numbers: Iterator[int]
+        self,
+        prior: KBMap,
+        arm: KnownArm,
+        claims: UncertaintyTracker,
+        settings: LearnerConfig,
+        task_numbers: Iterator[int],
     ) -> None:
-        self.members = Members(prior, settings.step_size)
+        self.models = ModelBank(prior, settings.step_size)
         self.memory = PairMemory(prior.joints, settings.replay_capacity)
-        self.doubts = Doubts(prior.joints)
+        self.gate = OutlierGate(prior.joints)
         self.orientations = Orientations(arm.chain.chain)
-        self.watch = Watch()
+        self.monitor = ChangeMonitor()
         self.arm = arm
         self.answering = self._answering_map = PRIOR
         self._claims, self._replays_per_pair = claims, settings.replays_per_pair
@@ -90,18 +94,18 @@ class Era:
     @property
     def model(self) -> LearntModel:
         """Answering model."""
-        return self.members.model(self.answering)
+        return self.models.model(self.answering)
 
     @property
     def map(self) -> KBMap:
         """Answering model if it is a KB-Map, else the best one."""
-        return self.members.map(self._answering_map)
+        return self.models.map(self._answering_map)
 
     @property
     def task(self) -> Task:
         """Current task of the solver."""
         known = self._solver_prior
-        prior = known or self.members.prior
+        prior = known or self.models.prior
         return Task(
             self.task_number,
             prior,
@@ -123,16 +127,16 @@ class Era:
 
     def limit_m(self, pair: Pair) -> float:
         """Return the distance from its prediction beyond which the pair is an outlier [m]."""
-        where = Where(pair.q[None])
-        predicted = self.members.predict(self.answering, where.q)
+        where = QueryPoints(pair.q[None])
+        predicted = self.models.predict(self.answering, where.q)
         return float(self._limits_m(where, predicted, np.diag(pair.cov)[None])[0])
 
     def learn(self, pair: Pair) -> bool:
         """Learn one pair, and judge it; return False if it is an outlier."""
-        predicted = self.members.predict(INSTANT, pair.q)
+        predicted = self.models.predict(INSTANT, pair.q)
         doubted = self._judged([pair], predicted[None])[0]
         # An outlier gets a step no longer than any other pair.
-        self.members.learn(pair.q, pair.x - predicted, self._limit_m / DOUBT if doubted else np.inf)
+        self.models.learn(pair.q, pair.x - predicted, self._limit_m / DOUBT if doubted else np.inf)
         return not doubted
 
     def meet(self, pair: Pair) -> None:
@@ -141,11 +145,11 @@ class Era:
         Whether it is an outlier is not known yet. If it seems one by the pairs before, its step is no longer than any
         other.
         """
-        predicted = self.members.predict(INSTANT, pair.q)
+        predicted = self.models.predict(INSTANT, pair.q)
         if not math.isfinite(self._limit_m):
             self._limit_m = self.limit_m(pair)
         far = float(np.linalg.norm(pair.x - self.map.predict(pair.q))) > self._limit_m
-        self.members.learn(pair.q, pair.x - predicted, self._limit_m / DOUBT if far else np.inf)
+        self.models.learn(pair.q, pair.x - predicted, self._limit_m / DOUBT if far else np.inf)
         self._met.append((pair, predicted))
 
     def judge(self) -> tuple[Sequence[Pair], BoolArray]:
@@ -165,21 +169,21 @@ class Era:
         """
         q, x = np.array([pair.q for pair in pairs]), np.array([pair.x for pair in pairs])
         variances = np.array([pair.cov.diagonal() for pair in pairs])
-        where, predictions = Where(q), self.members.predictions(q, instant)
+        where, predictions = QueryPoints(q), self.models.predictions(q, instant)
         limits = self._limits_m(where, predictions[self.answering], variances)
         doubted = self._doubted(q, x, np.linalg.norm(x - predictions[self.answering], axis=1), limits)
         self._limit_m = float(limits[: len(doubted)].max())
         rows = np.flatnonzero(~doubted)
         if len(rows):
-            delayed = None if self.members.delayed is None else self.members.delayed.predict(q[rows])
+            delayed = None if self.models.delayed is None else self.models.delayed.predict(q[rows])
             shown = {name: predicted[rows] for name, predicted in predictions.items()}
             self._claims.predicted(where.at(rows), x[rows], shown, variances[rows], delayed)
             self._choose()
             self._keep_judged([pairs[row] for row in rows.tolist()], q[rows], x[rows])
-        self.watch.add(*pairs[: len(doubted)], kept=~doubted)
+        self.monitor.add(*pairs[: len(doubted)], kept=~doubted)
         return doubted
 
-    def _limits_m(self, where: Where, predicted: FloatArray, variances: FloatArray) -> FloatArray:
+    def _limits_m(self, where: QueryPoints, predicted: FloatArray, variances: FloatArray) -> FloatArray:
         """Return the distance limits (n,) [m] of pairs from their predictions.
 
         Args:
@@ -194,8 +198,8 @@ class Era:
     def _doubted(self, q: FloatArray, x: FloatArray, distances_m: FloatArray, limits_m: FloatArray) -> BoolArray:
         doubted: list[bool] = []
         for pair in zip(q, x, distances_m.tolist(), limits_m.tolist(), strict=True):
-            doubted.append(self.doubts.doubt(*pair))
-            if doubted[-1] and self.doubts.perhaps_changed:
+            doubted.append(self.gate.doubt(*pair))
+            if doubted[-1] and self.gate.perhaps_changed:
                 break
         return np.array(doubted)
 
@@ -219,10 +223,10 @@ class Era:
         self._claims.fitted(belief)
         variances = np.full((1, 3), belief.noise**2)
         for row_q, row_x, turn in zip(q, x, turns, strict=True):
-            predicted = self.members.predict(INSTANT, row_q)
-            predictions = self.members.predictions(row_q[None], predicted[None])
-            self._claims.predicted(Where(row_q[None]), row_x[None], predictions, variances)
-            self.members.learn(row_q, row_x - predicted, np.inf)
+            predicted = self.models.predict(INSTANT, row_q)
+            predictions = self.models.predictions(row_q[None], predicted[None])
+            self._claims.predicted(QueryPoints(row_q[None]), row_x[None], predictions, variances)
+            self.models.learn(row_q, row_x - predicted, np.inf)
             self._learn_turn(row_q, turn)
             self._keep(row_q[None], row_x[None], turn[None])
         self._choose()
@@ -231,7 +235,7 @@ class Era:
     def begin_with(self, q: FloatArray, x: FloatArray) -> None:
         """Learn pairs, q (n, d) and x (n, 3), that were outliers until they began this regime."""
         self._keep(q, x)
-        self.members.replay(q, x)
+        self.models.replay(q, x)
 
     def replay(self) -> int:
         """Take some of the replay steps that are due; return their number."""
@@ -240,8 +244,8 @@ class Era:
         places = self._order.take(min(REPLAY_STEPS, int(self._replays_due)), len(self.memory))
         q, x = self.memory.at(places)
         seen = slice(LOOKED_BACK_IN_REPLAY)
-        self._claims.replayed(x[seen] - self.members.predict(INSTANT, q[seen]))
-        self.members.replay(q, x)
+        self._claims.replayed(x[seen] - self.models.predict(INSTANT, q[seen]))
+        self.models.replay(q, x)
         self._replays_due -= len(places)
         return len(places)
 
@@ -264,7 +268,7 @@ class Era:
     def change_prior(self, prior: KBMap) -> None:
         """Replace the prior by another one fitted to the same pairs."""
         q, x = self.memory.all()
-        self.members.start_again(prior, q, x)
+        self.models.start_again(prior, q, x)
         self._claims.prior_changed(x[-RECENT:] - prior.predict(q[-RECENT:]))
         self._choose_map()
         self._replays_due += self._replays_per_pair * min(len(q), RECENT)
@@ -272,19 +276,19 @@ class Era:
     def ask(self) -> None:
         """Record that the solver works on all pairs so far."""
         self._claims.solution_asked()
-        self.members.ask()
-        self.watch.asked()
+        self.models.ask()
+        self.monitor.asked()
 
     def take(self, solved: Solved, model: LearntModel, fed: int) -> None:
         """Take a solution of this regime's task, for one of the models; the solver has `fed` pairs."""
-        self.members.take(solved.name, model)
+        self.models.take(solved.name, model)
         q, x = self.memory.some(fed, LOOKED_BACK)
-        neighbours = follow_a_path(self.members.prior, q)
+        neighbours = follow_a_path(self.models.prior, q)
         errors = x - model.predict(q)
         self._claims.solution_taken(solved.name, errors, solved.belief, solved.wide, neighbours=neighbours)
         self._judge_late(solved.name, model, solved.pairs, fed)
         self._choose()
-        if self.watch.wants_reference and solved.pairs == fed:
+        if self.monitor.wants_reference and solved.pairs == fed:
             self._offer(fed)
 
     def _offer(self, known: int) -> None:
@@ -296,7 +300,7 @@ class Era:
         claim = self._claims.of(self.answering, self.model.predict)
         variance = self._claims.errors[PRIOR].noise_variance
         residual = self._claims.residual
-        self.watch.offer(Reference(self.model, self.map, belief, wide, residual, claim, known, q, x, variance))
+        self.monitor.offer(Reference(self.model, self.map, belief, wide, residual, claim, known, q, x, variance))
 
     def take_orientation(self, solution: OrientationSolution) -> None:
         """Take a solution of this regime's task for the orientations."""
@@ -309,29 +313,29 @@ class Era:
 
     def solve_from_what_is_known(self) -> None:
         """Let the last solutions stand for the pairs before them, if pairs are no longer kept."""
-        if EXACT in self.members.names and not self.memory.complete:
-            self._solver_prior = self.members.map(EXACT)
+        if EXACT in self.models.names and not self.memory.complete:
+            self._solver_prior = self.models.map(EXACT)
             self.arm = self.arm.updated(self._claims.wide, self._claims.residual)
 
     def store(self, header: LearningHeader) -> dict[str, FloatArray]:
         """Write the state for `restore` into `header`; return its arrays, without the kept pairs."""
         header.answering, header.replays_due = self.answering, self._replays_due
-        header.doubted_in_a_row = self.doubts.in_a_row
+        header.doubted_in_a_row = self.gate.in_a_row
         header.belief = self.arm.chain.to_bytes()
         header.residual = None if self.arm.residual is None else self.arm.residual.to_bytes()
         header.replay_position = self._order.position
         header.orientation = self.orientations.state()
-        q, x = self.doubts.run()
-        return {"doubted_q": q, "doubted_x": x} | {NET + name: net for name, net in self.members.nets().items()}
+        q, x = self.gate.run()
+        return {"doubted_q": q, "doubted_x": x} | {NET + name: net for name, net in self.models.nets().items()}
 
     def restore(self, header: LearningHeader, arrays: Mapping[str, FloatArray]) -> None:
         """Resume from a state of a regime with this prior and arm."""
         nets = {name.removeprefix(NET): net for name, net in arrays.items() if name.startswith(NET)}
-        self.members.restore(nets, self._claims.residual)
+        self.models.restore(nets, self._claims.residual)
         self.memory.restore(arrays["q"], arrays["x"], header.kept_of, arrays.get("turns"))
         if header.orientation is not None:
             self.orientations.restore(header.orientation)
-        self.doubts.restore(arrays["doubted_q"], arrays["doubted_x"], header.doubted_in_a_row)
+        self.gate.restore(arrays["doubted_q"], arrays["doubted_x"], header.doubted_in_a_row)
         self.answering, self._replays_due = header.answering, header.replays_due
         self._order.restore(header.replay_position)
         self._choose_map()
@@ -344,8 +348,8 @@ class Era:
             return
         instant = np.full(x.shape, math.nan)
         new = min(max(self.memory.count - fed, 0), len(q))
-        if new and self.members.delayed is not None:
-            instant[-new:] = x[-new:] - self.members.delayed.predict(q[-new:])
+        if new and self.models.delayed is not None:
+            instant[-new:] = x[-new:] - self.models.delayed.predict(q[-new:])
         anew = len(q) >= JUDGED_ANEW * pairs
         self._claims.predicted_late(name, model.predict, q, x - model.predict(q), instant, anew=anew)
 

@@ -9,14 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning.replay_memory import IntArray
 from kbmaps import ChainBelief, JointBasis, ResidualModel, SupportSet
-
-from .memory import IntArray
 
 Predict = Callable[[FloatArray], FloatArray]
 
 
-class Where:
+class QueryPoints:
     """Configurations q (n, d) [rad] at which several uncertainties are evaluated; common parts are computed once."""
 
     def __init__(self, q: FloatArray) -> None:
@@ -25,9 +24,9 @@ class Where:
         self._left_open: dict[int, tuple[SupportSet, FloatArray]] = {}
         self._chains: dict[int, tuple[ChainBelief | ResidualModel, tuple[FloatArray, FloatArray]]] = {}
 
-    def at(self, rows: IntArray) -> Where:
+    def at(self, rows: IntArray) -> QueryPoints:
         """Return the rows' configurations, with the results computed there."""
-        part = Where(self.q[rows])
+        part = QueryPoints(self.q[rows])
         part._left_open = {k: (of, left[rows]) for k, (of, left) in self._left_open.items()}
         part._chains = {k: (of, (x[rows], variance[rows])) for k, (of, (x, variance)) in self._chains.items()}
         return part
@@ -48,7 +47,7 @@ class Where:
 
 
 @dataclass(frozen=True)
-class Layer:
+class VarianceTerm:
     """Uncertainty away from data.
 
     Attributes:
@@ -59,24 +58,24 @@ class Layer:
     support: SupportSet | None
     sigma: float
 
-    def variance(self, where: Where) -> FloatArray:
+    def variance(self, where: QueryPoints) -> FloatArray:
         """Return the variance of a coordinate there, shape (n, 1) [m²]."""
         return where.unexplained(self.support)[:, None] * self.sigma**2
 
 
 @dataclass(frozen=True, eq=False)
-class ChainLayer:
+class ChainTerm:
     """Uncertainty of a chain after the data, rigid or with residual."""
 
     belief: ChainBelief | ResidualModel
 
-    def variance(self, where: Where) -> FloatArray:
+    def variance(self, where: QueryPoints) -> FloatArray:
         """Return the variance of each coordinate there, shape (n, 3) [m²]."""
         return where.chain(self.belief)[1]
 
 
 @dataclass(frozen=True, eq=False)
-class DepartureLayer:
+class DepartureTerm:
     """Distance of a model from the most probable chain: only the chain's uncertainty is known.
 
     Attributes:
@@ -89,7 +88,7 @@ class DepartureLayer:
     belief: ChainBelief
     support: SupportSet | None = None
 
-    def variance(self, where: Where) -> FloatArray:
+    def variance(self, where: QueryPoints) -> FloatArray:
         """Return the squared difference of each coordinate there, shape (n, 3) [m²]."""
         departure = self.predict(where.q) - where.chain(self.belief)[0]
         return where.unexplained(self.support)[:, None] * np.square(departure)

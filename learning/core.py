@@ -10,20 +10,19 @@ import numpy as np
 from bodyschema.daemon.config import LearnerConfig
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import Pair
-
-from .change import ChangeRecord
-from .curve import Curve
-from .era import BoolArray, Era
-from .eras import Eras
-from .incoming import check_pair
-from .nominal import NominalModel
-from .state import Counters, LearningState
+from bodyschema.learning.changes.record import ChangeRecord
+from bodyschema.learning.curve import Curve
+from bodyschema.learning.incoming import check_pair
+from bodyschema.learning.nominal import NominalModel
+from bodyschema.learning.regime import BoolArray, Regime
+from bodyschema.learning.regimes import Regimes
+from bodyschema.learning.state import Counters, LearningState
 
 # Maximum number of pairs judged together, absolute and as a share of the known ones: early pairs matter more.
 MOST_TOGETHER, TOGETHER = 25, 0.1
 
 
-class Course:
+class LearnerCore:
     """Everything learnt so far.
 
     Args:
@@ -45,7 +44,7 @@ class Course:
         self._met_at = 0.0
         self.counters, self.curve = Counters(), Curve()
         self.newest_utc: str | None = None
-        self.eras = self._at_nominal()
+        self.regimes = self._at_nominal()
 
     @property
     def can_roll_back(self) -> bool:
@@ -55,7 +54,7 @@ class Course:
     @property
     def settled(self) -> bool:
         """True if all pairs so far have been judged."""
-        return self.eras.present is None or not self.eras.present.met
+        return self.regimes.present is None or not self.regimes.present.met
 
     def learn(self, pair: Pair, now: float) -> None:
         """Learn one pair at once; if pairs are judged together, with the instant learner only.
@@ -68,16 +67,18 @@ class Course:
         self.counters.pairs += 1
         self.counters.since_change += 1
         self.newest_utc = pair.utc
-        era = self.eras.present
-        if era is None:
-            self.eras.waiting.append(pair.q[None], pair.x[None], None if pair.R is None else pair.R[None])
+        regime = self.regimes.present
+        if regime is None:
+            self.regimes.waiting.append(pair.q[None], pair.x[None], None if pair.R is None else pair.R[None])
         elif self._together_s == 0.0:
-            self._judged(era, [pair], np.array([not era.learn(pair)]))
+            self._judged(regime, [pair], np.array([not regime.learn(pair)]))
         else:
-            if not era.met:
+            if not regime.met:
                 self._met_at = now
-            era.meet(pair)
-            if len(era.met) >= min(MOST_TOGETHER, max(int(TOGETHER * era.memory.count), 1)) or self.judge_due(now):
+            regime.meet(pair)
+            if len(regime.met) >= min(MOST_TOGETHER, max(int(TOGETHER * regime.memory.count), 1)) or self.judge_due(
+                now
+            ):
                 self.judge()
 
     def judge_due(self, now: float) -> bool:
@@ -86,21 +87,21 @@ class Course:
 
     def judge(self) -> None:
         """Judge all waiting pairs: compare models, gate outliers, look for a change; and keep the pairs."""
-        while (era := self.eras.present) is not None and era.met:
-            self._judged(era, *era.judge())
-            if self.eras.present is not None and self.eras.present is not era:
-                for pair in era.met:
-                    self.eras.present.meet(pair)
+        while (regime := self.regimes.present) is not None and regime.met:
+            self._judged(regime, *regime.judge())
+            if self.regimes.present is not None and self.regimes.present is not regime:
+                for pair in regime.met:
+                    self.regimes.present.meet(pair)
 
     def tool_changed(self) -> None:
         """Start with another tool: drop the pairs so far, and continue from the learnt model."""
         self.judge()
-        if self.eras.present is None:
-            self.eras = self._at_nominal()
+        if self.regimes.present is None:
+            self.regimes = self._at_nominal()
         else:
-            self._before = self._state_before(self.eras.memory.count)
-            self.eras.change_tool(self.eras.present)
-        self.eras.change = ChangeRecord.told(self.counters.last_seq)
+            self._before = self._state_before(self.regimes.memory.count)
+            self.regimes.change_tool(self.regimes.present)
+        self.regimes.change = ChangeRecord.told(self.counters.last_seq)
         self.counters.changes += 1
         self.counters.since_change = 0
 
@@ -113,8 +114,8 @@ class Course:
         if self._before is None:
             raise RequestError("there was no change since learning began, so there is no older model to go back to")
         since_change = self._before.header.counters.since_change
-        eras = Eras.restored(self._before, self._nominal, self._settings, self._task_numbers)
-        self.eras, self._before, self.counters.since_change = eras, self._before.before, since_change
+        regimes = Regimes.restored(self._before, self._nominal, self._settings, self._task_numbers)
+        self.regimes, self._before, self.counters.since_change = regimes, self._before.before, since_change
 
     def reset_to_prior(self, *, forget_store: bool) -> None:
         """Forget the learnt model. With `forget_store`, pairs may come from another store, from its first one on."""
@@ -122,12 +123,12 @@ class Course:
             self.counters = Counters(refused=self.counters.refused)
             self.curve, self.newest_utc = Curve(), None
         self.counters.since_change = 0
-        self.eras, self._before = self._at_nominal(), None
+        self.regimes, self._before = self._at_nominal(), None
 
     def state(self) -> LearningState:
         """Return everything needed to resume."""
         self.judge()
-        return self.eras.state(self.counters, self.curve).with_before(self._before)
+        return self.regimes.state(self.counters, self.curve).with_before(self._before)
 
     def restore(self, state: LearningState) -> None:
         """Resume from a state.
@@ -135,40 +136,40 @@ class Course:
         Raises:
             StateError: it belongs to another nominal model, or to other tolerances; nothing is changed.
         """
-        eras, header = Eras.restored(state, self._nominal, self._settings, self._task_numbers), state.header
-        self.eras, self.counters, self._before = eras, header.counters, state.before
+        regimes, header = Regimes.restored(state, self._nominal, self._settings, self._task_numbers), state.header
+        self.regimes, self.counters, self._before = regimes, header.counters, state.before
         self.curve = Curve(header.curve, header.curve_stride)
 
-    def _at_nominal(self) -> Eras:
-        return Eras.at_nominal(self._nominal, self._settings, self._task_numbers)
+    def _at_nominal(self) -> Regimes:
+        return Regimes.at_nominal(self._nominal, self._settings, self._task_numbers)
 
-    def _judged(self, era: Era, pairs: Sequence[Pair], doubted: BoolArray) -> None:
+    def _judged(self, regime: Regime, pairs: Sequence[Pair], doubted: BoolArray) -> None:
         """Count the pairs that `era` has learnt or gated as outliers, and follow a change that they show."""
-        error_m = era.recent.means.get(era.answering)
-        first = self.counters.pairs - len(era.met) - len(pairs) + 1
+        error_m = regime.recent.means.get(regime.answering)
+        first = self.counters.pairs - len(regime.met) - len(pairs) + 1
         if error_m is not None:
             for place in np.flatnonzero(~doubted).tolist():
                 self.curve.add(first + place, error_m)
         self.counters.doubted += int(doubted.sum())
-        if self._followed(era, pairs[-1], learnt=not doubted[-1]):
+        if self._followed(regime, pairs[-1], learnt=not doubted[-1]):
             self.counters.changes += 1
-            self.counters.since_change = self.eras.memory.count + len(era.met)
+            self.counters.since_change = self.regimes.memory.count + len(regime.met)
 
-    def _followed(self, era: Era, pair: Pair, *, learnt: bool) -> bool:
+    def _followed(self, regime: Regime, pair: Pair, *, learnt: bool) -> bool:
         """Return True if the pairs up to this one show a change, and another regime has begun with it."""
-        noticed = self.eras.noticed(era, pair)
-        if noticed is None and (learnt or not era.doubts.perhaps_changed):
+        noticed = self.regimes.noticed(regime, pair)
+        if noticed is None and (learnt or not regime.gate.perhaps_changed):
             return False
         since = 0 if noticed is None else sum(noticed.kept[noticed.first :])
-        before = self._state_before(era.memory.count - since)
-        followed = noticed is not None and self.eras.adapt(era, noticed)
-        if not (followed or (not learnt and self.eras.follow_change(era, pair))):
+        before = self._state_before(regime.memory.count - since)
+        followed = noticed is not None and self.regimes.adapt(regime, noticed)
+        if not (followed or (not learnt and self.regimes.follow_change(regime, pair))):
             return False
         self._before = before
         return True
 
     def _state_before(self, first: int) -> LearningState:
         """Return the state without the current regime's pairs from number `first` on."""
-        state = self.eras.state_before(first, self.counters, self.curve)
-        state.header.counters.since_change -= 0 if self.eras.present is None else len(self.eras.present.met)
+        state = self.regimes.state_before(first, self.counters, self.curve)
+        state.header.counters.since_change -= 0 if self.regimes.present is None else len(self.regimes.present.met)
         return state

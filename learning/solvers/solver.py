@@ -11,6 +11,10 @@ from typing import Literal, Protocol
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning.learnt_model import LearntModel
+from bodyschema.learning.model_bank import EXACT, RESIDUAL, RIGID
+from bodyschema.learning.solvers.orientation import OrientationSolution, OrientationSolver
+from bodyschema.learning.solvers.tolerance_selection import Tolerances, best_tolerances, workmanship
 from kbmaps import (
     ChainBelief,
     ChainTolerances,
@@ -26,11 +30,6 @@ from kbmaps import (
     follow_a_path,
     shared_by,
 )
-
-from .learnt import LearntModel
-from .members import EXACT, RESIDUAL, RIGID
-from .orientation_solver import OrientationSolution, OrientationSolver
-from .workmanship import Made, best_made, workmanship
 
 log = logging.getLogger(__name__)
 
@@ -252,18 +251,18 @@ class DirectSolver:
         return self._folded_residual
 
 
-def _ways_made(wide: ChainBelief, task: Task) -> list[Made]:
+def _ways_made(wide: ChainBelief, task: Task) -> list[Tolerances]:
     return [] if task.tolerances is None else workmanship(wide, task.tolerances)
 
 
-def _solved_chain(task: Task, pairs: int, wide: ChainBelief, made: Sequence[Made]) -> Solved:
+def _solved_chain(task: Task, pairs: int, wide: ChainBelief, made: Sequence[Tolerances]) -> Solved:
     belief = _as_made(wide, task, made)
     return Solved(task.number, pairs, RIGID, belief.chain.to_kbmap(task.prior.bases), belief, wide=wide)
 
 
-def _as_made(belief: ChainBelief, task: Task, made: Sequence[Made]) -> ChainBelief:
+def _as_made(belief: ChainBelief, task: Task, made: Sequence[Tolerances]) -> ChainBelief:
     """Return the posterior of a chain averaged over these tolerances; unchanged if there are none."""
-    return belief if task.tolerances is None or not made else best_made(belief, task.tolerances, made)
+    return belief if task.tolerances is None or not made else best_tolerances(belief, task.tolerances, made)
 
 
 def fitted_belief(prior: ChainBelief, q: FloatArray, x: FloatArray) -> ChainBelief:

@@ -7,9 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning.learnt_model import LearntModel
 from kbmaps import NLMS, KBMap, NonFiniteError
-
-from .learnt import LearntModel
 
 PRIOR, INSTANT, RIGID, RESIDUAL, EXACT = "prior", "nlms", "rigid", "residual", "exact"
 # Stored net of the instant learner at the time when the current solutions were requested.
@@ -20,7 +19,7 @@ SOLVED = (RIGID, RESIDUAL, EXACT)
 TRUSTED = (RIGID, RESIDUAL, EXACT, PRIOR, INSTANT)
 
 
-class Members:
+class ModelBank:
     """KB-Maps in the bases of the prior, and a chain with residual.
 
     Between two solutions, the solved models stay as they are. Instant steps on top of them would follow the newest

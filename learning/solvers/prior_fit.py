@@ -6,10 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning.nominal import PAIRS_TO_REFIT, NominalModel
+from bodyschema.learning.solvers.solver import fitted_belief
 from kbmaps import ChainBelief, ChainTolerances, DegenerateDataError, KBMap, RigidChain
-
-from .nominal import PAIRS_TO_REFIT, NominalModel
-from .solver import fitted_belief
 
 
 @dataclass(frozen=True)

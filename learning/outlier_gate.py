@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning.outlier_limits import CHANGE, FEWEST_FOR_CHANGE, Gate
+from bodyschema.learning.replay_memory import PairMemory
 
-from .gate import CHANGE, FEWEST_FOR_CHANGE, Gate
-from .memory import PairMemory
 
-
-class Doubts:
+class OutlierGate:
     """Counts consecutive outliers, and keeps the newest of them: they may be the first pairs of another regime.
 
     Isolated outliers are never learnt later, so they are not kept.
@@ -35,7 +34,7 @@ class Doubts:
 
     def doubt(self, q: FloatArray, x: FloatArray, distance_m: float, limit_m: float) -> bool:
         """Return True if the pair at q (d,), x (3,), `distance_m` from its prediction, is an outlier."""
-        doubted = self._gate.doubts(distance_m, limit_m)
+        doubted = self._gate.gate(distance_m, limit_m)
         if doubted:
             self._memory.append(q[None], x[None])
         else:

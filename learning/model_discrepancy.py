@@ -15,7 +15,7 @@ CLEARLY = 2.0
 WARM = 10.0
 
 
-def misfit(
+def model_discrepancy(
     errors: FloatArray, noise_variance: FloatArray, before: FloatArray, *, neighbours: bool, scatter: float = 0.0
 ) -> FloatArray:
     """Return the model discrepancy, 1-sigma per axis (3,) [m], without the measurements' noise; 0 if due to chance.

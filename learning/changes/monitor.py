@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bodyschema.interfaces.records import FloatArray, Pair
+from bodyschema.learning.learnt_model import LearntModel
+from bodyschema.learning.uncertainty import PredictiveUncertainty
 from kbmaps import ChainBelief, ChangeDetector, ChangeKind, KBMap, ResidualModel, SharedNoise, Suspicion, WhiteNoise
 from kbmaps.changes.detector import MOST_SURPRISES
 from kbmaps.changes.white_noise import inverse_roots
-
-from .claims import Claim
-from .learnt import LearntModel
 
 # Minimum number of pairs of a reference model: with fewer it may be too far off.
 FEWEST_KNOWN = 100
@@ -57,7 +56,7 @@ class Reference:
     belief: ChainBelief
     wide: ChainBelief
     residual: ResidualModel | None
-    claim: Claim
+    claim: PredictiveUncertainty
     known: int
     q: FloatArray
     x: FloatArray
@@ -100,7 +99,7 @@ class Reference:
 
 
 @dataclass(frozen=True, eq=False)
-class Noticed:
+class DetectedChange:
     """Detected change.
 
     Attributes:
@@ -164,7 +163,7 @@ class _Shown:
         )
 
 
-class Watch:
+class ChangeMonitor:
     """Compares the pairs since a reference with it, and renews the reference while nothing changes.
 
     The distance of unknown pairs from a model can only be measured on such pairs: on its own pairs, a wrong chain looks
@@ -259,7 +258,7 @@ class Watch:
             if not self._change.alarm:
                 self.refute()
 
-    def noticed(self, run: int = 0) -> Noticed | None:
+    def noticed(self, run: int = 0) -> DetectedChange | None:
         """Return the change that the pairs show; None if they show none, or there is no reference.
 
         Args:
@@ -273,7 +272,7 @@ class Watch:
             first, (earliest, latest) = self._change.onset, self._change.interval()
         pairs = self._pairs
         variance = float(_traces(self._measured(reference, pairs)[2]).mean()) / 3.0
-        return Noticed(
+        return DetectedChange(
             reference,
             detector.kinds,
             float(np.sqrt(detector.noise.single * variance)),

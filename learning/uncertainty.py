@@ -9,18 +9,24 @@ import msgspec
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning.error_memory import ErrorMemory
+from bodyschema.learning.model_bank import INSTANT, PRIOR, RESIDUAL, RIGID, SOLVED, TRUSTED
+from bodyschema.learning.model_discrepancy import model_discrepancy
+from bodyschema.learning.variance_terms import (
+    ChainTerm,
+    DepartureTerm,
+    GrowingSupport,
+    Predict,
+    QueryPoints,
+    VarianceTerm,
+)
 from kbmaps import ChainBelief, Contest, JointBasis, Recent, ResidualModel, SupportSet
-
-from .members import INSTANT, PRIOR, RESIDUAL, RIGID, SOLVED, TRUSTED
-from .misfit import misfit
-from .scores import ErrorMemory
-from .unknowns import ChainLayer, DepartureLayer, GrowingSupport, Layer, Predict, Where
 
 _SUPPORT, _CONTEST = "support_q", "squares_"
 
 
 @dataclass(frozen=True)
-class Claim:
+class PredictiveUncertainty:
     """Predictive uncertainty of a model.
 
     Attributes:
@@ -30,26 +36,28 @@ class Claim:
     """
 
     inside: FloatArray
-    layers: tuple[Layer | ChainLayer | DepartureLayer, ...] = ()
+    layers: tuple[VarianceTerm | ChainTerm | DepartureTerm, ...] = ()
     surprise: float = 1.0
 
     def variance(self, q: FloatArray) -> FloatArray:
         """Return the variance per axis of predictions at q (n, d) [rad], shape (n, 3) [m²]."""
-        return self.variance_there(Where(q))
+        return self.variance_there(QueryPoints(q))
 
-    def variance_there(self, where: Where) -> FloatArray:
+    def variance_there(self, where: QueryPoints) -> FloatArray:
         """Return the variance as in `variance`."""
         left_open = sum((layer.variance(where) for layer in self.layers), np.zeros((len(where.q), 3)))
         return self.surprise**2 * (self.inside**2 + left_open)
 
     def beyond_chain(self, q: FloatArray) -> FloatArray:
         """Return the part that is not uncertainty of the chain's parameters, at q (n, d) [rad], shape (n, 3) [m²]."""
-        where = Where(q)
-        open_layers = (layer.variance(where) for layer in self.layers if isinstance(layer, Layer) and layer.sigma > 0.0)
+        where = QueryPoints(q)
+        open_layers = (
+            layer.variance(where) for layer in self.layers if isinstance(layer, VarianceTerm) and layer.sigma > 0.0
+        )
         return self.inside**2 + sum(open_layers, np.zeros((len(q), 3)))
 
 
-class ClaimsState(msgspec.Struct, kw_only=True):
+class UncertaintyState(msgspec.Struct, kw_only=True):
     """State of the uncertainties, without arrays.
 
     Attributes:
@@ -75,7 +83,7 @@ class ClaimsState(msgspec.Struct, kw_only=True):
     residual: bytes | None
 
 
-class Claims:
+class UncertaintyTracker:
     """Tracks the errors and the data support of all models since the prior was made.
 
     Args:
@@ -164,7 +172,7 @@ class Claims:
 
     def predicted(
         self,
-        where: Where,
+        where: QueryPoints,
         x: FloatArray,
         predictions: Mapping[str, FloatArray],
         variances: FloatArray,
@@ -227,7 +235,7 @@ class Claims:
         noise = self.errors[PRIOR].noise_variance
         before = self._misfits_before.get(name, self._misfits_before.get(RIGID, np.zeros(3)))
         scatter = 0.0 if belief is None else belief.noise
-        self._misfits[name] = misfit(errors, noise, before, neighbours=neighbours, scatter=scatter)
+        self._misfits[name] = model_discrepancy(errors, noise, before, neighbours=neighbours, scatter=scatter)
 
     def predicted_late(
         self, name: str, predict: Predict, q: FloatArray, errors: FloatArray, instant: FloatArray, *, anew: bool
@@ -263,7 +271,7 @@ class Claims:
         self._contest.forget(PRIOR)
         self.errors[PRIOR].add(errors, noise)
 
-    def of(self, name: str, predict: Predict | None = None) -> Claim:
+    def of(self, name: str, predict: Predict | None = None) -> PredictiveUncertainty:
         """Return the predictive uncertainty of one model.
 
         Args:
@@ -273,28 +281,30 @@ class Claims:
         memory = self.errors.get(name, ErrorMemory(self._expected_m))
         belief = self._belief or self._expected
         if belief is None or predict is None:
-            return Claim(memory.sigma)
+            return PredictiveUncertainty(memory.sigma)
         none = np.zeros(3)
         if name in SOLVED:
             chain = self._residual if name == RESIDUAL and self._residual is not None else belief
-            return Claim(self._misfits.get(name, none), (ChainLayer(chain), self._rest(name)), memory.surprise)
+            return PredictiveUncertainty(
+                self._misfits.get(name, none), (ChainTerm(chain), self._rest(name)), memory.surprise
+            )
         if name == PRIOR:
             # The prior is a chain too, or was learnt with the last tool; it has the discrepancy of such a chain.
             inside = self._misfits.get(RIGID, self._misfits_before.get(RIGID, none))
-            departure = DepartureLayer(predict, belief)
+            departure = DepartureTerm(predict, belief)
         else:
             inside = (memory if self._residuals is None else self._residuals).sigma
-            departure = DepartureLayer(predict, belief, self.support)
-        return Claim(inside, (ChainLayer(belief), departure, self._rest(RIGID)), memory.surprise)
+            departure = DepartureTerm(predict, belief, self.support)
+        return PredictiveUncertainty(inside, (ChainTerm(belief), departure, self._rest(RIGID)), memory.surprise)
 
-    def _rest(self, name: str) -> Layer:
+    def _rest(self, name: str) -> VarianceTerm:
         """Return the layer for the arm's deviation from the chain away from data: as large as seen at the data."""
         missed = self._misfits.get(RESIDUAL if name == RESIDUAL else RIGID, np.zeros(3))
-        return Layer(self._solved.get(name), float(np.sqrt(np.square(missed).mean())))
+        return VarianceTerm(self._solved.get(name), float(np.sqrt(np.square(missed).mean())))
 
-    def state(self) -> ClaimsState:
+    def state(self) -> UncertaintyState:
         """Return everything needed to resume, except `arrays`."""
-        return ClaimsState(
+        return UncertaintyState(
             errors=self.errors,
             judged=self._contest.pairs,
             trusted=self._trusted,
@@ -312,7 +322,7 @@ class Claims:
             _CONTEST + name: values.copy() for name, values in self._contest.errors.items()
         }
 
-    def restore(self, state: ClaimsState, arrays: Mapping[str, FloatArray]) -> None:
+    def restore(self, state: UncertaintyState, arrays: Mapping[str, FloatArray]) -> None:
         """Resume from a state and its `arrays`."""
         self._support.add(arrays[_SUPPORT])
         self.errors, self._residuals = dict(state.errors), state.residuals

@@ -1,0 +1,1 @@
+"""Detect changes of tool, camera and joint offsets, and adapt to them."""

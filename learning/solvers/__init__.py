@@ -1,0 +1,1 @@
+"""Models that need all pairs: solve them, and schedule that."""
