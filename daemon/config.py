@@ -12,27 +12,24 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import msgspec
-from msgspec import Meta
 
 from bodyschema.drivers.config import DriversConfig
 from bodyschema.effects import Simulation, simulation_of
 from bodyschema.interfaces.errors import ConfigError
+from bodyschema.learning.config import LearnerConfig
 from bodyschema.robot.calibrated_files import EXTENSIONS
 from bodyschema.robot.description import CameraSection, RobotDescription, RobotSection
 from bodyschema.robot.suggest import did_you_mean, hint_at, with_choices
 from bodyschema.robot.toml_file import convert, line_of, line_of_endless_key, read_toml
+from bodyschema.robot.toml_types import Count, Positive
 from bodyschema.sim_backend.config import SimConfig
 from bodyschema.vision.config import VisionConfig
 
 from .transport.identity import Route
 from .transport.zenoh_config import ZenohConfig
-
-NonNegative = Annotated[float, Meta(ge=0)]
-Positive = Annotated[float, Meta(gt=0)]
-Count = Annotated[int, Meta(ge=1)]
 
 ENVIRONMENT = "BODYSCHEMA_"
 # Control points of a map that the learner keeps up with: 12 joints that turn. Learning and replaying a pair take 25 ms
@@ -78,33 +75,6 @@ class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 # A larger radius is one of another unit [m].
 LARGEST_BALL_M = 0.5
-
-
-class LearnerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [learner].
-
-    Attributes:
-        step_size: μ0 of the normalised LMS rule, between 0 and 2.
-        replays_per_pair: how often stored pairs are learnt again, on average, for every new one.
-        replay_capacity: how many of the newest pairs are kept for replay.
-        solve_every: number of new pairs after which the rigid chain and the exact map are solved again.
-        angle_tolerance_deg: how far the real arm may be from its description, 1-sigma: each component of a joint's
-            axis, the zero of each joint, and each component of the cameras' orientation.
-        length_tolerance_m: the same for each coordinate of a joint's place, and for the zero of a sliding joint.
-        place_tolerance_m: the same for each coordinate of the marker on the hand and of the cameras' place.
-        checkpoint_every_s: time between checkpoints.
-        seed: of the replay's permutations.
-    """
-
-    step_size: Annotated[float, Meta(gt=0, lt=2)] = 0.5
-    replays_per_pair: Annotated[float, Meta(ge=0, le=1000)] = 8.0
-    replay_capacity: Annotated[int, Meta(ge=1, le=1_000_000)] = 20_000  # which take 0.1 GB with seven joints
-    solve_every: Count = 25
-    angle_tolerance_deg: Positive = 3.0
-    length_tolerance_m: Positive = 0.015
-    place_tolerance_m: Positive = 0.03
-    checkpoint_every_s: Positive = 5.0
-    seed: int = 0
 
 
 class Tables(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -8,13 +8,12 @@ import msgspec
 from msgspec import Meta
 
 from bodyschema.robot.plugins import PluginConfig
+from bodyschema.robot.toml_types import Fraction, Positive
 
 from .cameras.config import CamerasConfig
 from .tag_config import ClusterConfig, TagConfig
 
-Positive = Annotated[float, Meta(gt=0)]
 Ratio = Annotated[float, Meta(gt=1)]
-Fraction = Annotated[float, Meta(ge=0, le=1)]
 
 MarkerKind = Literal["ball", "bright_ball", "tag", "cluster", "plugin"]
 ColourName = Literal["red", "orange", "yellow", "green", "cyan", "blue", "magenta"]

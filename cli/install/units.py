@@ -161,7 +161,7 @@ class Installed:
     @classmethod
     def here(cls, systemd: int) -> Installed:
         """Return the running installation."""
-        folders = (Path(sys.prefix), Path(sys.base_prefix), Path(__file__).parents[2])
+        folders = (Path(sys.prefix), Path(sys.base_prefix), Path(__file__).parents[3])
         return cls(module_command("bodyschema"), folders, systemd)
 
 

@@ -25,7 +25,7 @@ from small_arm import JOINTS, URDF, write_small_arm
 from bodyschema.cli.install.router import RouterConfig
 from bodyschema.cli.servos.fitting import first_of, fit, read_scan, servo_tables
 from bodyschema.cli.servos.log import LoggedWrite, ServoLog
-from bodyschema.daemon.config import Config, LearnerConfig
+from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner import checkpoint
 from bodyschema.daemon.learner.answers import Answers
 from bodyschema.daemon.learner.checkpoint import CheckpointError
@@ -36,7 +36,11 @@ from bodyschema.daemon.transport.bus import Request
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.effects import Simulation
 from bodyschema.interfaces.errors import BodyschemaError, ConfigError, RecordingError, RequestError
-from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner, StateError
+from bodyschema.learning.config import LearnerConfig
+from bodyschema.learning.nominal import NominalModel
+from bodyschema.learning.online_learner import OnlineLearner
+from bodyschema.learning.solvers.solver import DirectSolver
+from bodyschema.learning.state import StateError
 from bodyschema.recordings.recording import Recording, joints_in
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.lerobot import MotorCalibration, calibration_json, read_calibration

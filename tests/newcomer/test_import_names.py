@@ -39,7 +39,7 @@ print(len(ours), [file for file, names in ours.items() if names > 1])
 
 @pytest.mark.parametrize("part", PARTS)
 def test_each_part_is_a_relative_link(part: str) -> None:
-    assert (ROOT / "bodyschema" / part).readlink() == Path("..", part)
+    assert (ROOT / "bodyschema" / part).readlink() in (Path("..", part), Path("..", "benchmarks", part))
 
 
 def test_no_file_is_loaded_under_two_names() -> None:

@@ -12,9 +12,8 @@ from msgspec import Meta
 from bodyschema.interfaces.camera import LARGEST_SIDE_PX
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.toml_file import line_of
+from bodyschema.robot.toml_types import NonNegative, Positive
 
-Positive = Annotated[float, Meta(gt=0)]
-NonNegative = Annotated[float, Meta(ge=0)]
 Side = Annotated[int, Meta(ge=16, le=LARGEST_SIDE_PX)]
 
 LAYOUTS = ("one", "two", "side_by_side", "images", "videos")
