@@ -66,7 +66,7 @@ def steps(config: Config) -> Iterator[Step]:
     if config.tables.drivers.ros2 is not None:
         yield "router", lambda: joint_state_checks(config)
     yield "disk", lambda: disk_checks(config.state_dir)
-    if config.store_file.exists():
+    if os.path.exists(config.store_file):  # a folder of another user has none
         yield "store", lambda: store_checks(config.store_file)
     yield "clock", clock_checks
     yield "service", unit_checks
@@ -162,7 +162,12 @@ def _of_the_sampler(config: Config) -> Iterator[Check]:
 
 def disk_checks(folder: Path) -> Iterator[Check]:
     """Yield checks of free space and write permission for the pairs in `folder`."""
-    there = next(path for path in (folder, *folder.parents) if path.exists())
+    try:
+        there = next(path for path in (folder, *folder.parents) if path.exists())
+    except PermissionError as error:
+        remedy = "bodyschema run --state-dir FOLDER    # one that you can write"
+        yield Check("disk", "wrong", f"{folder}, where pairs are to be kept, is not yours: {error.strerror}", remedy)
+        return
     if not os.access(there, os.W_OK):
         said = f"{there} cannot be written, and pairs are to be kept in {folder}"
         yield Check("disk", "wrong", said, f"sudo chown $USER {there}")
