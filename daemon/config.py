@@ -12,27 +12,24 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import msgspec
-from msgspec import Meta
 
-from bodyschema.drivers.config import DriversConfig
+from bodyschema.drivers.config import MARKER_SOURCE, AnySource, DriversConfig, source_tables
 from bodyschema.effects import Simulation, simulation_of
 from bodyschema.interfaces.errors import ConfigError
+from bodyschema.learning.config import LearnerConfig
 from bodyschema.robot.calibrated_files import EXTENSIONS
 from bodyschema.robot.description import CameraSection, RobotDescription, RobotSection
 from bodyschema.robot.suggest import did_you_mean, hint_at, with_choices
 from bodyschema.robot.toml_file import convert, line_of, line_of_endless_key, read_toml
+from bodyschema.robot.toml_types import Count, Positive
 from bodyschema.sim_backend.config import SimConfig
 from bodyschema.vision.config import VisionConfig
 
 from .transport.identity import Route
 from .transport.zenoh_config import ZenohConfig
-
-NonNegative = Annotated[float, Meta(ge=0)]
-Positive = Annotated[float, Meta(gt=0)]
-Count = Annotated[int, Meta(ge=1)]
 
 ENVIRONMENT = "BODYSCHEMA_"
 # Control points of a map that the learner keeps up with: 12 joints that turn. Learning and replaying a pair take 25 ms
@@ -80,33 +77,6 @@ class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 LARGEST_BALL_M = 0.5
 
 
-class LearnerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [learner].
-
-    Attributes:
-        step_size: μ0 of the normalised LMS rule, between 0 and 2.
-        replays_per_pair: how often stored pairs are learnt again, on average, for every new one.
-        replay_capacity: how many of the newest pairs are kept for replay.
-        solve_every: number of new pairs after which the rigid chain and the exact map are solved again.
-        angle_tolerance_deg: how far the real arm may be from its description, 1-sigma: each component of a joint's
-            axis, the zero of each joint, and each component of the cameras' orientation.
-        length_tolerance_m: the same for each coordinate of a joint's place, and for the zero of a sliding joint.
-        place_tolerance_m: the same for each coordinate of the marker on the hand and of the cameras' place.
-        checkpoint_every_s: time between checkpoints.
-        seed: of the replay's permutations.
-    """
-
-    step_size: Annotated[float, Meta(gt=0, lt=2)] = 0.5
-    replays_per_pair: Annotated[float, Meta(ge=0, le=1000)] = 8.0
-    replay_capacity: Annotated[int, Meta(ge=1, le=1_000_000)] = 20_000  # which take 0.1 GB with seven joints
-    solve_every: Count = 25
-    angle_tolerance_deg: Positive = 3.0
-    length_tolerance_m: Positive = 0.015
-    place_tolerance_m: Positive = 0.03
-    checkpoint_every_s: Positive = 5.0
-    seed: int = 0
-
-
 class Tables(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """All tables of robot.toml; `interfaces` checks [robot] and [camera], `effects` the last three."""
 
@@ -118,6 +88,7 @@ class Tables(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     vision: VisionConfig = VisionConfig()
     learner: LearnerConfig = LearnerConfig()
     sim: SimConfig = SimConfig()
+    marker_source: tuple[AnySource, ...] = ()
     effects: tuple[dict[str, Any], ...] = ()
     background: tuple[dict[str, Any], ...] = ()
     unexplained: dict[str, Any] | None = None
@@ -151,9 +122,11 @@ class Config:
             if name not in known:
                 line = line_of(text, (name,))
                 raise ConfigError(f"unknown table [{name}]", file=file, line=line, remedy=did_you_mean(name, known))
-        overridden = _override(raw, [name for name in known if name not in EXTENSIONS], environment)
+        overridden = _override(raw, [name for name in known if name not in (*EXTENSIONS, MARKER_SOURCE)], environment)
         robot = RobotDescription.from_tables(overridden, text, file)
         simulation = simulation_of(robot, overridden, text)
+        if MARKER_SOURCE in raw:
+            overridden[MARKER_SOURCE] = source_tables(raw[MARKER_SOURCE], file, text)
         tables = convert(overridden, Tables, file=file, text=text)
         if tables.daemon.min_step_deg >= tables.daemon.max_step_deg:
             line = line_of(text, ("daemon", "min_step_deg"))
@@ -163,6 +136,8 @@ class Config:
         _check_router(tables, file, text)
         if tables.vision.cameras is not None:
             tables.vision.cameras.check(file, text)
+            _require_colour(tables, file, text)
+        _check_further_cameras(tables, file, text)
         if tables.vision.radius_m > LARGEST_BALL_M:
             raise ConfigError(
                 f"vision.radius_m = {tables.vision.radius_m:g}: this looks like millimetres",
@@ -246,14 +221,48 @@ def state_home() -> Path:
 
 
 def _check_router(tables: Tables, file: Path, text: str) -> None:
-    """ConfigError when the ROS 2 robot's router, whose port is 7447 too, is where one of ours listens."""
-    ours = (tables.zenoh.sampler, tables.zenoh.learner)
-    if tables.drivers.ros2 is not None and tables.drivers.ros2.router in ours:
+    """ConfigError when another router, whose port is usually 7447 too, is where one of our processes listens."""
+    ros2 = tables.drivers.ros2
+    routers = {} if ros2 is None else {("drivers", "ros2"): ros2.router}
+    routers |= {(MARKER_SOURCE, table.label): table.endpoint for table in tables.marker_source}
+    for keys, router in routers.items():
+        if router in (tables.zenoh.sampler, tables.zenoh.learner):
+            whose = "ROS 2" if keys[0] == "drivers" else "marker source's"
+            raise ConfigError(
+                f"the {whose} router and a process of ours have the same endpoint {router}",
+                file=file,
+                line=line_of(text, keys),
+                remedy='Write in [zenoh]: sampler = "tcp/127.0.0.1:7457" and learner = "tcp/127.0.0.1:7458"',
+            )
+
+
+def _check_further_cameras(tables: Tables, file: Path, text: str) -> None:
+    """Raise ConfigError if further cameras are incomplete, uncalibrated, or the only ones."""
+    names = ["cameras", *(source.label for source in tables.marker_source)]
+    for cameras in tables.vision.further_cameras:
+        cameras.check(file, text, ("vision", "further_cameras"))
+        what = remedy = ""
+        if tables.vision.cameras is None:
+            what, remedy = "there are no first ones", "Name one of them as [vision.cameras]"
+        elif cameras.calibration is None and cameras.realsense is None:
+            what, remedy = "nothing says how they see", "Name the file of `bodyschema calibrate cameras` as calibration"
+        elif cameras.name in names:
+            what, remedy = f"the name {cameras.name!r} is taken", "Give each its own name"
+        if what:
+            line = line_of(text, ("vision", "further_cameras"))
+            raise ConfigError(f"vision.further_cameras: {what}", file=file, line=line, remedy=remedy)
+        names.append(cameras.name)
+
+
+def _require_colour(tables: Tables, file: Path, text: str) -> None:
+    """Raise ConfigError if infra-red eyes would have to look for a colour."""
+    cameras = tables.vision.cameras
+    if cameras is not None and cameras.realsense is not None and tables.vision.marker == "ball":
         raise ConfigError(
-            f"the ROS 2 router and a process of ours have the same endpoint {tables.drivers.ros2.router}",
+            "the infra-red eyes of a RealSense see no colours, and the marker is a coloured ball",
             file=file,
-            line=line_of(text, ("drivers", "ros2")),
-            remedy='Write in [zenoh]: sampler = "tcp/127.0.0.1:7457" and learner = "tcp/127.0.0.1:7458"',
+            line=line_of(text, ("vision", "cameras", "realsense")),
+            remedy='Write marker = "tag", "cluster" or "bright_ball" in [vision]',
         )
 
 

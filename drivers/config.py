@@ -4,22 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
 
 import msgspec
-from msgspec import Meta
 
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.plugins import PluginConfig
 from bodyschema.robot.toml_file import line_of
+from bodyschema.robot.toml_types import NonNegative, Positive
 
 from .dynamixel.config import DynamixelConfig
 from .feetech.config import FeetechConfig
+from .markers.config import TABLE as MARKER_SOURCE
+from .markers.config import AnySource, source_tables
 from .ros2.config import Ros2Config
 from .serial_lines.config import SerialLinesConfig
 
-NonNegative = Annotated[float, Meta(ge=0)]
-Positive = Annotated[float, Meta(gt=0)]
+__all__ = ["HARDWARE", "MARKER_SOURCE", "AnySource", "DriversConfig", "source_tables"]
 
 
 HARDWARE = {

@@ -3,6 +3,8 @@
 `diagnosis` fits the same effects that `sim_backend` applies.
 """
 
+from bodyschema.effects.simulation import Simulated
+
 from .corrected import corrected_file, write_corrected
 from .effect import Effect, Identity
 from .files import load_simulation, read_effects, read_unexplained, simulation_of, write_extended
@@ -11,7 +13,6 @@ from .kinds import KINDS, Kind
 from .live import LiveEncoders
 from .motion import Motion
 from .parameter import Parameter
-from .simulated import Simulated
 from .simulation import Residual, Simulation
 from .smooth_map import place_map, smooth_map
 from .unexplained import StoredModel, Unexplained

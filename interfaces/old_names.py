@@ -14,6 +14,21 @@ from types import ModuleType
 HOME = Path(__file__).resolve().parents[1]
 # the parts that docs/extending.md told plug-ins to import from
 PARTS = ("drivers", "effects", "interfaces", "vision")
+# modules of `interfaces` that are elsewhere now
+PLACES = {
+    **{
+        f"interfaces.{name}": f"bodyschema.robot.{name}"
+        for name in (
+            *("calibrated", "calibrated_files", "interval", "limited", "plugins"),
+            *("pointing", "rpy", "suggest", "toml_file", "toml_text", "urdf"),
+        )
+    },
+    "interfaces.robot": "bodyschema.robot.description",
+    "interfaces.recording": "bodyschema.recordings.recording",
+    "interfaces.recording_columns": "bodyschema.recordings.columns",
+    "interfaces.recording_csv": "bodyschema.recordings.csv_file",
+    "interfaces.recording_parquet": "bodyschema.recordings.parquet_file",
+}
 
 
 class OldNames(MetaPathFinder):
@@ -29,12 +44,13 @@ class OldNames(MetaPathFinder):
         part = fullname.partition(".")[0]
         if part not in PARTS or _is_anothers(part):
             return None
+        present = PLACES.get(fullname, f"bodyschema.{fullname}")
         warnings.warn(
-            f"a plug-in imports {fullname}, which is bodyschema.{fullname} now: the next release has no other name",
+            f"a plug-in imports {fullname}, which is {present} now: the next release has no other name",
             FutureWarning,
             stacklevel=2,
         )
-        return ModuleSpec(fullname, _Alias(f"bodyschema.{fullname}"))
+        return ModuleSpec(fullname, _Alias(present))
 
 
 class _Alias(Loader):

@@ -7,19 +7,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bodyschema.daemon.config import LearnerConfig
 from bodyschema.interfaces.errors import RequestError
-from bodyschema.interfaces.records import Pair
+from bodyschema.interfaces.records import FARTHEST_M, LARGEST_Q, Pair
 from bodyschema.learning.changes.record import ChangeRecord
-from bodyschema.learning.curve import Curve
-from bodyschema.learning.incoming import check_pair
+from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.nominal import NominalModel
 from bodyschema.learning.regime import BoolArray, Regime
 from bodyschema.learning.regimes import Regimes
-from bodyschema.learning.state import Counters, LearningState
+from bodyschema.learning.state import Counters, Curve, LearningState
 
 # Maximum number of pairs judged together, absolute and as a share of the known ones: early pairs matter more.
 MOST_TOGETHER, TOGETHER = 25, 0.1
+# As a share of a covariance's largest eigenvalue: rounding may push the smallest this far below zero.
+ROUNDING = 1e-6
 
 
 class LearnerCore:
@@ -31,7 +31,7 @@ class LearnerCore:
         together_s: maximum wait of pairs to be judged together [s].
 
     Attributes:
-        eras: the regimes and their models.
+        regimes: the regimes and their models.
         counters: all counters; readers outside the learner's own calls must copy them.
         curve: the error [m] of the answering model on the last pairs, at some numbers of pairs.
         newest_utc: storage time of the last learnt pair, ISO 8601; None before any.
@@ -144,7 +144,7 @@ class LearnerCore:
         return Regimes.at_nominal(self._nominal, self._settings, self._task_numbers)
 
     def _judged(self, regime: Regime, pairs: Sequence[Pair], doubted: BoolArray) -> None:
-        """Count the pairs that `era` has learnt or gated as outliers, and follow a change that they show."""
+        """Count the pairs that `regime` has learnt or gated as outliers, and follow a change that they show."""
         error_m = regime.recent.means.get(regime.answering)
         first = self.counters.pairs - len(regime.met) - len(pairs) + 1
         if error_m is not None:
@@ -173,3 +173,26 @@ class LearnerCore:
         state = self.regimes.state_before(first, self.counters, self.curve)
         state.header.counters.since_change -= 0 if self.regimes.present is None else len(self.regimes.present.met)
         return state
+
+
+def check_pair(pair: Pair, counters: Counters, joints: int) -> None:
+    """Raise RequestError if a pair is of another robot or store, not new, or not a measurement."""
+    if counters.store not in (None, pair.store):
+        raise RequestError(
+            f"pair {pair.seq} comes from the store {pair.store}, this learner learnt from {counters.store}"
+        )
+    if pair.seq <= counters.last_seq:
+        raise RequestError(f"pair {pair.seq} has been learnt already; the last one was {counters.last_seq}")
+    if len(pair.q) != joints:
+        raise RequestError(f"pair {pair.seq} has {len(pair.q)} joint angles, this robot has {joints}")
+    if not all(np.isfinite(part).all() for part in (pair.q, pair.x, pair.cov)):
+        raise RequestError(f"pair {pair.seq} has a number that is not finite")
+    if np.abs(pair.x).max() > FARTHEST_M:
+        raise RequestError(f"pair {pair.seq} lies {np.abs(pair.x).max():.0f} m away; positions are in metres")
+    if np.abs(pair.q).max() > LARGEST_Q:
+        raise RequestError(f"pair {pair.seq} has the joint angle {np.abs(pair.q).max():.3g}; angles are in radians")
+    if np.abs(pair.cov).max() > FARTHEST_M**2:
+        raise RequestError(f"pair {pair.seq} says that it may be {np.sqrt(np.abs(pair.cov).max()):.3g} m wrong")
+    spread = np.linalg.eigvalsh(pair.cov)
+    if spread[0] < -ROUNDING * max(spread[-1], 0.0):
+        raise RequestError(f"pair {pair.seq} has a cov that is no covariance: a variance of {spread[0]:.3g} m²")

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodyschema.daemon.transport.status import Outlook
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.nominal import NominalModel
-from bodyschema.learning.outlier_limits import MEDIAN_TO_SIGMA
+from bodyschema.learning.outlier_gate import MEDIAN_TO_SIGMA
 from bodyschema.learning.snapshot import MEAN_OVER_RMS
+from bodyschema.learning.status import Outlook
 from bodyschema.learning.uncertainty import PredictiveUncertainty
 from kbmaps import ChainBelief, ChainPosterior, ChainTolerances, candidate_motions, expected_gain, shared_by
 from kbmaps.planning.expected_gain import ALL, SAME
@@ -130,6 +130,6 @@ def _mean_error_m(claim: PredictiveUncertainty, q: FloatArray) -> float:
 
 
 def _in_words(motion: str) -> str:
-    return {SAME: "going on as so far", ALL: "moving all joints over their ranges"}.get(
+    return {SAME: "moving as so far", ALL: "moving all joints over their ranges"}.get(
         motion, f"moving {motion} over its range"
     )

@@ -10,10 +10,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyschema.daemon.config import LearnerConfig
 from bodyschema.effects import Motion, Simulation
 from bodyschema.interfaces.records import FloatArray, frozen_array
 from bodyschema.learning.changes.known_arm import OTHER_TOOL_M
+from bodyschema.learning.config import LearnerConfig
 from bodyschema.robot.description import RobotDescription
 from kbmaps import (
     ChainBelief,

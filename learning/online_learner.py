@@ -11,10 +11,9 @@ import threading
 
 import numpy as np
 
-from bodyschema.daemon.config import LearnerConfig
-from bodyschema.daemon.transport.status import CurvePoint, OrientationStatus
 from bodyschema.interfaces.records import FloatArray, Pair
 from bodyschema.learning.changes.record import ChangeRecord
+from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.core import LearnerCore
 from bodyschema.learning.data_outlook import LearnerEvidence
 from bodyschema.learning.model_bank import PRIOR, SOLVED
@@ -24,6 +23,7 @@ from bodyschema.learning.snapshot import Snapshot
 from bodyschema.learning.solvers.client import SolverClient
 from bodyschema.learning.solvers.solver import Solver
 from bodyschema.learning.state import Counters, LearningState
+from bodyschema.learning.status import CurvePoint, OrientationStatus
 from kbmaps import ChainBelief, Recent
 
 # Number of predicted pairs before a model's errors give an expected error.
@@ -36,7 +36,7 @@ REGION_SAMPLES = 256
 class OnlineLearner:
     """Learns the forward kinematics of one robot from pairs.
 
-    The models are in its `Eras`. This class counts, synchronises the two threads, and publishes.
+    The models are in its `Regimes`. This class counts, synchronises the two threads, and publishes.
     """
 
     def __init__(

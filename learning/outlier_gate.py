@@ -1,10 +1,28 @@
-"""Runs of consecutive outliers, which may be the start of a changed arm or tool."""
+"""Outlier gate: one gross outlier must not spoil the map, and a changed tool must be followed."""
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning.outlier_limits import CHANGE, FEWEST_FOR_CHANGE, Gate
 from bodyschema.learning.replay_memory import PairMemory
+
+# A pair is an outlier if it is this many times farther from the prediction than expected.
+DOUBT = 5.0
+# Median length of errors to their 1-sigma per axis, three equal axes: 1 / sqrt(2.366).
+MEDIAN_TO_SIGMA = 0.6501
+# No robot is this exact: an expected distance is never taken to be smaller [m].
+SMALLEST_M = 1e-3
+# This many consecutive outliers prove a change.
+CHANGE = 6
+# This many are enough if one other position of the marker explains them: their remaining distances are at most this
+# multiple of the expected ones, and at most this share of those from the prediction.
+FEWEST_FOR_CHANGE = 3
+TOGETHER = 2.0
+LEFT_OVER = 0.2
 
 
 class OutlierGate:
@@ -15,17 +33,17 @@ class OutlierGate:
 
     def __init__(self, joints: int) -> None:
         self._memory = PairMemory(joints, CHANGE)
-        self._gate = Gate()
+        self._in_a_row = 0
 
     @property
     def in_a_row(self) -> int:
         """Number of consecutive outliers up to now."""
-        return self._gate.in_a_row
+        return self._in_a_row
 
     @property
     def changed(self) -> bool:
         """True if the run of outliers is long enough to prove a change."""
-        return self._gate.changed
+        return self._in_a_row >= CHANGE
 
     @property
     def perhaps_changed(self) -> bool:
@@ -34,7 +52,8 @@ class OutlierGate:
 
     def doubt(self, q: FloatArray, x: FloatArray, distance_m: float, limit_m: float) -> bool:
         """Return True if the pair at q (d,), x (3,), `distance_m` from its prediction, is an outlier."""
-        doubted = self._gate.gate(distance_m, limit_m)
+        doubted = distance_m > limit_m
+        self._in_a_row = self._in_a_row + 1 if doubted else 0
         if doubted:
             self._memory.append(q[None], x[None])
         else:
@@ -48,4 +67,31 @@ class OutlierGate:
     def restore(self, q: FloatArray, x: FloatArray, in_a_row: int) -> None:
         """Resume from the run q (n, d), x (n, 3), of which `in_a_row` were counted."""
         self._memory.restore(q, x, in_a_row)
-        self._gate = Gate(in_a_row)
+        self._in_a_row = in_a_row
+
+
+def sound(distances_m: FloatArray, noise_m: float) -> NDArray[np.bool_]:
+    """Return True for each of a few pairs that fits the others, by distances (n,) [m] from a robust fit, shape (n,).
+
+    Args:
+        distances_m: distances (n,) [m] from the fit.
+        noise_m: RMS distance between measurement and truth.
+    """
+    rms = math.sqrt(3.0) * MEDIAN_TO_SIGMA * float(np.median(distances_m))
+    return np.asarray(distances_m <= DOUBT * max(math.hypot(rms, noise_m), SMALLEST_M))
+
+
+def explained(before_m: FloatArray, after_m: FloatArray, expected_m: float) -> bool:
+    """Return True if an explanation reduces a run's distances from `before_m` (n,) [m] to `after_m` (n,) [m]."""
+    before, after = (float(np.sqrt(np.square(distances).mean())) for distances in (before_m, after_m))
+    return after <= min(TOGETHER * expected_m, LEFT_OVER * before)
+
+
+def limits_m(inside_m: FloatArray, open_m: FloatArray) -> FloatArray:
+    """Return the distances from their predictions beyond which pairs are outliers (n,) [m].
+
+    Args:
+        inside_m: RMS distance of recent pairs from their predictions (n,).
+        open_m: RMS distance that the data so far leave where the pairs lie (n,).
+    """
+    return DOUBT * np.maximum(np.hypot(inside_m, open_m), SMALLEST_M)

@@ -9,20 +9,19 @@ from collections.abc import Iterator
 import msgspec
 import numpy as np
 
-from bodyschema.daemon.config import LearnerConfig
 from bodyschema.interfaces.records import FloatArray, Pair
 from bodyschema.learning.changes.adaptation import Adapted, Origin
 from bodyschema.learning.changes.known_arm import KnownArm
 from bodyschema.learning.changes.monitor import LOOK_AGAIN, DetectedChange
 from bodyschema.learning.changes.record import NAMED_WITHIN, ChangeRecord, KindOfChange
-from bodyschema.learning.curve import Curve
+from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.model_bank import PRIOR
 from bodyschema.learning.nominal import PAIRS_TO_REFIT, NominalModel, chain_tolerances
-from bodyschema.learning.outlier_limits import DOUBT, explained, sound
+from bodyschema.learning.outlier_gate import DOUBT, explained, sound
 from bodyschema.learning.regime import Regime
 from bodyschema.learning.replay_memory import PairMemory
 from bodyschema.learning.solvers.prior_fit import Fit, Fitting
-from bodyschema.learning.state import NET, Counters, LearningHeader, LearningState, StateError
+from bodyschema.learning.state import NET, Counters, Curve, LearningHeader, LearningState, StateError
 from bodyschema.learning.uncertainty import UncertaintyTracker
 from kbmaps import ChainBelief, ChainTolerances, Explanation, KBMap, RigidChain
 
@@ -134,11 +133,11 @@ class Regimes:
         return LearningState(state.header, arrays)
 
     def change_tool(self, regime: Regime) -> None:
-        """Begin the regime of another tool, of which nothing is known, after `era`."""
+        """Begin the regime of another tool, of which nothing is known, after `regime`."""
         self.present, self._origin = self._next(regime, EXPECTED_M), None
 
     def follow_change(self, regime: Regime, pair: Pair) -> bool:
-        """Begin the regime of another tool if the consecutive outliers of `era`, up to `pair`, are its first pairs."""
+        """Begin the regime of another tool if the outliers of `regime` in a row, up to `pair`, are its first pairs."""
         gate = regime.gate
         if not (gate.changed or (gate.perhaps_changed and self._moved_together(regime, regime.limit_m(pair) / DOUBT))):
             return False
@@ -151,7 +150,7 @@ class Regimes:
         return True
 
     def noticed(self, regime: Regime, pair: Pair) -> DetectedChange | None:
-        """Return the change that the pairs of `era` show, `pair` the last of them; None if they show none."""
+        """Return the change that the pairs of `regime` show, `pair` the last of them; None if they show none."""
         if not regime.monitor.ready:
             return None
         gate = regime.gate
@@ -233,7 +232,7 @@ class Regimes:
         return int((~belongs).sum())
 
     def _next(self, regime: Regime, expected_m: float, first_fit: int = PAIRS_TO_REFIT) -> Regime:
-        """Return the regime of another tool, which begins where `era` ends."""
+        """Return the regime of another tool, which begins where `regime` ends."""
         prior, arm = regime.map, regime.arm.updated(self.claims.wide, self.claims.residual)
         self.fitting.change_tool(prior, self._hand, first_fit)
         self.claims.change_tool(expected_m, regime.answering)

@@ -8,18 +8,22 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from bodyschema.daemon.transport.status import CurvePoint
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.records import FARTHEST_M, LARGEST_Q, FloatArray
 from bodyschema.learning.changes.record import ChangeRecord
 from bodyschema.learning.model_bank import PRIOR
 from bodyschema.learning.orientation import OrientationState
+from bodyschema.learning.status import CurvePoint
 from bodyschema.learning.uncertainty import UncertaintyState
 
 # Prefix of the arrays of the state before a change.
 BEFORE = "before/"
 # Prefix of stored nets.
 NET = "net_"
+
+
+# of the learning curve
+MOST_POINTS = 400
 
 
 class StateError(BodyschemaError):
@@ -123,3 +127,25 @@ class LearningState:
             if not (np.isfinite(self.arrays[name]).all() and (np.abs(self.arrays[name]) <= limit).all()):
                 return name
         return None
+
+
+class Curve:
+    """Points of the learning curve, at most `MOST_POINTS`, evenly spread over the pairs."""
+
+    def __init__(self, points: list[CurvePoint] | None = None, stride: int = 1) -> None:
+        self._points = list(points or [])
+        self.stride = stride
+
+    @property
+    def points(self) -> list[CurvePoint]:
+        """Copy of the curve so far."""
+        return list(self._points)
+
+    def add(self, pairs: int, error_m: float) -> None:
+        """Add the prequential error after this many pairs, unless the thinning skips it."""
+        if pairs % self.stride:
+            return
+        self._points.append(CurvePoint(pairs, error_m))
+        if len(self._points) > MOST_POINTS:
+            self.stride *= 2
+            self._points = [point for point in self._points if point.pairs % self.stride == 0]

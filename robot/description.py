@@ -18,6 +18,7 @@ from msgspec import Meta
 from bodyschema.interfaces.camera import LARGEST_SIDE_PX, StereoCalibration
 from bodyschema.interfaces.errors import ConfigError, RobotError
 from bodyschema.interfaces.records import FloatArray, frozen_array
+from bodyschema.robot.toml_types import Positive
 from kbmaps import RigidChain
 
 from .rpy import rotation_of, rpy_of
@@ -25,7 +26,6 @@ from .toml_file import convert, line_of, read_toml
 from .urdf import MOVING, UrdfJoint, UrdfTree, chain_between
 
 Vector3 = tuple[float, float, float]
-Positive = Annotated[float, Meta(gt=0)]
 Side = Annotated[int, Meta(ge=1, le=LARGEST_SIDE_PX)]
 ImageSize = tuple[Side, Side]
 # Beyond these a number is of another unit: degrees, millimetres.
@@ -129,9 +129,7 @@ class RobotDescription:
         """Build the description like `load`, from the tables and the text of robot.toml."""
         for section in ("robot", "camera"):
             if section not in tables:
-                raise ConfigError(
-                    f"the table [{section}] is missing", file=file, remedy="`bodyschema config init` shows one"
-                )
+                raise ConfigError(f"the table [{section}] is missing", file=file, remedy="`bodyschema init` shows one")
         _check_name(tables["robot"], text, file)
         robot = convert(tables["robot"], RobotSection, file=file, text=text, prefix=("robot",))
         camera = convert(tables["camera"], CameraSection, file=file, text=text, prefix=("camera",))

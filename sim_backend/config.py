@@ -8,9 +8,8 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-NonNegative = Annotated[float, Meta(ge=0)]
-Positive = Annotated[float, Meta(gt=0)]
-Fraction = Annotated[float, Meta(ge=0, le=1)]
+from bodyschema.robot.toml_types import Fraction, NonNegative, Positive
+
 Rate = Annotated[int, Meta(ge=1, le=1000)]
 # The ball where neither [sim.camera] nor [vision] describes one.
 BALL_RADIUS_M, BALL_RGB = 0.02, (0.86, 0.07, 0.06)

@@ -8,13 +8,12 @@ import msgspec
 from msgspec import Meta
 
 from bodyschema.robot.plugins import PluginConfig
+from bodyschema.robot.toml_types import Fraction, Positive
 
-from .cameras.config import CamerasConfig
+from .cameras.config import CamerasConfig, FurtherCameras
 from .tag_config import ClusterConfig, TagConfig
 
-Positive = Annotated[float, Meta(gt=0)]
 Ratio = Annotated[float, Meta(gt=1)]
-Fraction = Annotated[float, Meta(ge=0, le=1)]
 
 MarkerKind = Literal["ball", "bright_ball", "tag", "cluster", "plugin"]
 ColourName = Literal["red", "orange", "yellow", "green", "cyan", "blue", "magenta"]
@@ -68,6 +67,7 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         max_speed_m_s: faster than this the marker does not move; what is farther off is something else [m/s].
         max_candidates: at most this many patches per eye are looked at closely, the most disc-like first.
         cameras: where images come from; without it there are none.
+        further_cameras: others that see the same marker; their positions are fused.
         tag: the tag, or what the tags of a cluster have in common.
         cluster: where on the marker which tag is.
         plugin: the tracker of another package.
@@ -88,6 +88,7 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_speed_m_s: Positive = 3.0
     max_candidates: Annotated[int, Meta(ge=1, le=1000)] = 12
     cameras: CamerasConfig | None = None
+    further_cameras: tuple[FurtherCameras, ...] = ()
     tag: TagConfig = TagConfig()
     cluster: ClusterConfig = ClusterConfig()
     plugin: PluginConfig | None = None

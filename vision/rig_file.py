@@ -15,6 +15,7 @@ from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.toml_file import convert, line_of, read_toml
 from bodyschema.robot.toml_text import toml_text
+from bodyschema.robot.toml_types import Positive
 
 from .lens import DISTORTION_NAMES, Lens, Model
 from .rig import Made, OneEyeRig, Rig, StereoRig, parameter_names
@@ -23,7 +24,6 @@ FORMAT, FORMAT_OF_ONE = "bodyschema stereo rig 1", "bodyschema camera 1"
 _AGAIN = "Take the file from a copy, or calibrate again: `bodyschema calibrate cameras`"
 _SYMMETRY = 1e-6
 
-Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
 Pixels = Annotated[int, Meta(ge=16, le=LARGEST_SIDE_PX)]
 Turn = Annotated[float, Meta(ge=-3.2, le=3.2)]
@@ -114,7 +114,7 @@ def write_rig(rig: Rig, file: Path) -> None:
         os.replace(part, file)
     except OSError as error:
         part.unlink(missing_ok=True)
-        raise ConfigError(f"cannot be written: {error.strerror}", file=file, remedy="Mend folder or disk") from error
+        raise ConfigError(f"cannot be written: {error.strerror}", file=file, remedy="Fix folder or disk") from error
 
 
 def _text(rig: Rig) -> str:

@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-Positive = Annotated[float, Meta(gt=0)]
+from bodyschema.robot.toml_types import Positive
+
 # Of six by six modules: what is between the black borders. All are in every OpenCV from 4.11 on.
 Dictionary = Literal[
     "apriltag_36h11", "aruco_6x6_50", "aruco_6x6_100", "aruco_6x6_250", "aruco_6x6_1000", "aruco_mip_36h12"

@@ -12,13 +12,14 @@ import numpy as np
 
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.whole_files import write_whole
 from bodyschema.vision.board import Board
 from bodyschema.vision.board.board import Pattern
 from bodyschema.vision.board.page import page as board_page
 from bodyschema.vision.calibration.calibrate import Asked, Calibrated, ModelChoice, calibrate
 from bodyschema.vision.calibration.check import Check, check
 from bodyschema.vision.calibration.gather import Gathered, gathered, require_both
-from bodyschema.vision.calibration.images import ImagePair, PairFiles, pair_files, read_pairs, write_pair
+from bodyschema.vision.calibration.images import ImagePair, Images, read_pairs, write_pair
 from bodyschema.vision.calibration.live import LiveViews
 from bodyschema.vision.calibration.report import page as report_page
 from bodyschema.vision.calibration.view import EYES, ONE_EYE
@@ -38,32 +39,6 @@ AHEAD_M = 0.6
 _SQUARES = re.compile(r"(\d{1,9})\s*[xX×]\s*(\d{1,9})")
 
 Tell = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class Images:
-    """Location of the images.
-
-    Attributes:
-        folder: the folder.
-        left, right: patterns of the eyes' files.
-        side_by_side: each image shows both eyes.
-        one: all images are of one camera.
-    """
-
-    folder: Path
-    left: str | None = None
-    right: str | None = None
-    side_by_side: bool = False
-    one: bool = False
-
-    def files(self) -> list[PairFiles]:
-        """Return the files that belong together. Raise CalibrationError if there are none."""
-        if self.one and (self.right is not None or self.side_by_side):
-            raise ConfigError("--one is of one camera alone", remedy="Leave --right and --side-by-side away")
-        if (self.left is None) != (self.right is None) and not self.one:
-            raise ConfigError("--left and --right belong together", remedy="Give both patterns, or none")
-        return pair_files(self.folder, self.left, self.right, side_by_side=self.side_by_side, one=self.one)
 
 
 class Parameter(msgspec.Struct):
@@ -252,7 +227,7 @@ def write_calibrated_cameras(result: Calibrated, found: Gathered, out: Path) -> 
     """Write cameras.toml with its report beside it, and return the report's path."""
     write_rig(result.rig, out)
     report = out.with_name(f"{out.stem}_{REPORT}")
-    report.write_text(report_page(result, found), encoding="utf-8")
+    write_whole({report: report_page(result, found).encode()})
     return report
 
 

@@ -32,7 +32,7 @@ def joints(
     when you moved the last joint: if it went the other way, the sign is wrong. Angles beyond the URDF's limits are
     reported, too.
 
-    Needs: robot.toml with servos (`bodyschema robot new`), encoders or a ROS 2 robot, and no running sampler.
+    Needs: robot.toml with servos (`bodyschema init --from scan`), encoders or a ROS 2 robot, and no running sampler.
 
     Next: correct what the line below the table names; then `bodyschema run`.
     """
@@ -40,12 +40,13 @@ def joints(
     from rich.live import Live
 
     from bodyschema.cli.hardware.joints_view import as_json, screen
-    from bodyschema.cli.hardware.joints_watch import JointsWatch, ServoJoints
+    from bodyschema.cli.hardware.joints_watch import JointsWatch
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.sampler.powered import find_powered
     from bodyschema.daemon.service.signals import on_termination
     from bodyschema.daemon.wiring.wiring import open_joints
     from bodyschema.interfaces.clock import SystemClock
+    from bodyschema.interfaces.servos import ServoJoints
 
     clock = SystemClock()
     config = Config.load(robot)

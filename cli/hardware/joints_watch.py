@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Protocol, Self, runtime_checkable
+from typing import Self
 
 import msgspec
 import numpy as np
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.sampler.reconnect import Reopening
+from bodyschema.daemon.sampler.reconnect import ReconnectingSource
 from bodyschema.daemon.transport.status import JointRange
-from bodyschema.interfaces.protocols import Clock, JointSource
+from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.servos import EncoderJoints, ServoJoints
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.urdf import chain_between
 from kbmaps import RigidChain
@@ -30,48 +30,6 @@ STILL_S = 1.0
 BEYOND = 0.01  # [rad or m]: elasticity of a stop, resolution of an encoder
 SEEN_M = 0.01  # a marker that moved less shows no direction
 WORDS = (("forward", "back"), ("left", "right"), ("up", "down"))  # REP 103: x, y, z
-
-
-class Sample(Protocol):
-    """A servo's sample; see `drivers.dynamixel.channel.Sample`."""
-
-    @property
-    def velocity(self) -> float: ...
-    @property
-    def current(self) -> float | None: ...
-
-
-class Fitted(Protocol):
-    """An identified servo; see `bodyschema.drivers.servos.handshake.FittedServo`."""
-
-    @property
-    def id(self) -> int: ...
-    @property
-    def direction(self) -> int: ...
-
-
-class EncoderJoints(JointSource, Protocol):
-    """A real arm's encoders, which report their health.
-
-    See `bodyschema.drivers.serial_lines.joints.SerialLineJoints`.
-    """
-
-    @property
-    def health(self) -> tuple[str, ...]: ...
-
-
-@runtime_checkable
-class ServoJoints(EncoderJoints, Protocol):
-    """Encoders that are servos; see `bodyschema.drivers.servos.joints.ServoJoints`."""
-
-    @property
-    def servos(self) -> Sequence[Fitted]: ...
-
-    @property
-    def samples(self) -> Mapping[str, Sample | None]: ...
-    @property
-    def drives(self) -> Sequence[object]: ...
-    def temperature_c(self, joint: str) -> float | None: ...
 
 
 class JointState(msgspec.Struct, frozen=True):
@@ -130,7 +88,7 @@ class JointsWatch:
         self._servos = source if isinstance(source, ServoJoints) else None
         drivers = config.tables.drivers
         self._signs_in = signs_in(is_ros2=drivers.ros2 is not None, is_plugin=drivers.plugin is not None)
-        self._reading = Reopening(source, "the encoders", clock)
+        self._reading = ReconnectingSource(source, "the encoders", clock)
         self._opened = ExitStack()
         self._temperatures: dict[str, float | None] = dict.fromkeys(config.robot.joints)
         self._asked, self._next_s = 0, -math.inf

@@ -76,7 +76,7 @@ class SamplerRules:
             StoreError: the disk is full or broken.
         """
         with self._deciding:
-            deleted = self._store.trim(Keep.of(self._config.tables.daemon), self._wall.utc())
+            deleted = self._store.trim(_kept(self._config.tables.daemon), self._wall.utc())
         if deleted:
             log.info("the oldest %d pairs were deleted, as [daemon] keep_days and keep_mb say", deleted)
 
@@ -97,3 +97,7 @@ class SamplerRules:
             log.error("robot.toml was read again and is not followed: %s", error)
         finally:
             service.reloaded()
+
+
+def _kept(rules: DaemonConfig) -> Keep:
+    return Keep(rules.keep_days, None if rules.keep_mb is None else 1e6 * rules.keep_mb, rules.keep_newest)

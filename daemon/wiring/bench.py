@@ -32,6 +32,8 @@ from bodyschema.robot.limited import read_at_most
 from bodyschema.robot.toml_file import read_toml
 from bodyschema.robot.toml_text import toml_text
 
+from .simulation import simulation_settings
+
 PATH_S = 40.0  # of guided motion, played to and fro
 MARK = "# Written by `bodyschema bench`, which removes it when it ends."
 PSEUDO_TERMINALS = "/dev/pts/"
@@ -58,7 +60,7 @@ def require_on_ports(config: Config) -> OnPorts:
         "no servos are configured, and no encoders",
         file=config.file,
         remedy="Add the table [drivers.dynamixel], [drivers.feetech] or [drivers.serial_lines] (docs/hardware.md), "
-        "or let `bodyschema robot new` write it",
+        "or let `bodyschema init --from scan` write it",
     )
 
 
@@ -79,8 +81,6 @@ def bench_motion(config: Config, tell: Callable[[float], None]) -> Motion:
         angles = swinging(limits_of(config), monotonic())
         return Motion(dict(zip(joints, angles, strict=True)), f"each joint swings slowly by itself ({why})")
     from bodyschema.sim_backend.guided_path import guided_path
-
-    from .wiring import simulation_settings
 
     sim = simulation_settings(config)
     path = guided_path(config.robot, sim, PATH_S, config.simulation, lambda done_s: tell(done_s / PATH_S))

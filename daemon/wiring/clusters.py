@@ -11,10 +11,9 @@ import cv2
 import msgspec
 import numpy as np
 
-from bodyschema.cli.cameras.calibration import Images
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import ImageArray, Reason
-from bodyschema.vision.calibration.images import read_pairs
+from bodyschema.vision.calibration.images import Images, read_pairs
 from bodyschema.vision.cluster.measure import ClusterView, MeasuredCluster, measure_cluster
 from bodyschema.vision.cluster.tables import cluster_tables
 from bodyschema.vision.rectified import Rectification
@@ -175,7 +174,7 @@ def said(found: MeasuredCluster) -> str:
     text = (
         f"{len(found.tags)} tags in {found.views} pairs of images that show two or more to both eyes; what "
         f"is left is {found.misfit:.2f} times what the "
-        f"corners claim. Squares seem {100.0 * found.grown:+.2f} ± {100.0 * found.grown_sigma:.2f} % larger than told."
+        f"corners claim. Squares are {100.0 * found.grown:+.2f} ± {100.0 * found.grown_sigma:.2f} % larger."
     )
     if found.left_out:
         text += f" Left out: {', '.join(f'tag {id} in {name}' for name, id in found.left_out)}."

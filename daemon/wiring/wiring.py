@@ -4,18 +4,31 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from colorsys import hsv_to_rgb
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import msgspec
+import numpy as np
 
-from bodyschema.cli.hardware.joints_watch import EncoderJoints, ServoJoints
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.sampler.sources import Head, MarkerTopic, Powered, Sources, StampedJoints
+from bodyschema.daemon.sampler.reconnect import ReconnectingSource
+from bodyschema.daemon.sampler.sources import (
+    Head,
+    JoinedHealth,
+    MarkerTopic,
+    Powered,
+    Sources,
+    StampedJoints,
+    TellsHealth,
+)
+from bodyschema.drivers.checks import Check
 from bodyschema.drivers.dynamixel.config import DynamixelConfig
 from bodyschema.drivers.feetech.config import FeetechConfig
+from bodyschema.drivers.markers.checks import stream_checks
+from bodyschema.drivers.markers.fusing import FusedMarkers, Member
+from bodyschema.drivers.markers.opened import stream_of
+from bodyschema.drivers.markers.stream import MarkerStream
 from bodyschema.drivers.ros2.config import Ros2Config
 from bodyschema.drivers.serial_lines.config import SerialLinesConfig
 from bodyschema.drivers.serial_lines.joints import SerialLineJoints
@@ -23,28 +36,21 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, StoreError
 from bodyschema.interfaces.extras import require_extra
-from bodyschema.interfaces.protocols import Clock, JointSource
-from bodyschema.interfaces.records import MarkerFix, StereoFrame
-from bodyschema.interfaces.rejections import WORDS
+from bodyschema.interfaces.protocols import Clock, JointSource, MarkerSource
+from bodyschema.interfaces.servos import EncoderJoints, ServoJoints
 from bodyschema.recordings.store.store import PairReader
 from bodyschema.robot.plugins import PluginConfig, load
 from kbmaps import RigidChain
 
 from .bench import require_bench, through_bench
 from .powered import open_drives
+from .simulation import simulation_settings
 
 if TYPE_CHECKING:
     from bodyschema.drivers.ros2.joints import Ros2Joints
-    from bodyschema.sim_backend.config import CameraConfig, SimConfig, SimTag
-    from bodyschema.vision.config import VisionConfig
+    from bodyschema.vision.cameras.config import CamerasConfig
 
 log = logging.getLogger(__name__)
-
-# A painted ball: saturation, value; how far the room's hue gap exceeds the ball's band, and its minimum [deg].
-_SATURATION, _VALUE, _ROOM_DEG, _GAP_DEG = 0.93, 0.86, 6.0, 36.0
-# A ball detected by brightness glows; everything else is darker than half the threshold.
-_LAMP, _DIMMED = 0.9, 0.45
-_APART_S = 60.0  # a tracker has forgotten what it saw then
 
 Hardware = DynamixelConfig | FeetechConfig | SerialLinesConfig | Ros2Config | PluginConfig
 
@@ -164,10 +170,13 @@ def _require_source(config: Config, *, sim: bool) -> None:
             "an arm of your own: docs/hardware.md",
         )
     if config.tables.vision.cameras is None:
+        if config.tables.marker_source:
+            return
         raise ConfigError(
             "the joints have a driver, but nothing tells where the marker is: no cameras are configured",
             file=config.file,
-            remedy="Add the table [vision.cameras] (docs/cameras.md); or give --sim for the simulated robot",
+            remedy="Add the table [vision.cameras] (docs/cameras.md) or [marker_source] (docs/marker_sources.md); or "
+            "give --sim for the simulated robot",
         )
     from .cameras import require_usable
 
@@ -199,26 +208,113 @@ def demonstration_model() -> Path:
 
 
 def _real(config: Config) -> Sources:
+    clock = SystemClock()
+    joints = open_joints(config, clock)
+    marker, health, calibration = _open_marker(config, clock)
+    drives = joints.drives if isinstance(joints, ServoJoints) else ()
+    return Sources(
+        joints,
+        marker,
+        clock,
+        powered=tuple(drive for drive in drives if isinstance(drive, Powered)),
+        head=next((drive for drive in drives if isinstance(drive, Head)), None),
+        cameras=health,
+        seen_by=_seen_by(config),
+        calibration=calibration,
+        live=True,
+    )
+
+
+def _open_marker(config: Config, clock: Clock) -> tuple[MarkerSource, TellsHealth, StereoCalibration | None]:
+    """Return what sees the marker, not opened yet, what reports its health, and the cameras' calibration."""
+    tables = config.tables.marker_source
+    streams = [stream_of(table, clock) for table in tables]
+    if config.tables.vision.cameras is None and len(streams) == 1:
+        return streams[0], streams[0], None
+    members = [Member(table.label, stream, table.pose) for table, stream in zip(tables, streams, strict=True)]
+    calibration = None
+    healths: list[TellsHealth] = [*streams]
+    if config.tables.vision.cameras is not None:
+        cameras, eyes, calibration = _tracked_cameras(config, clock)
+        further = config.tables.vision.further_cameras
+        if not tables and not further:
+            return cameras, eyes, calibration
+        members.insert(0, Member("cameras", cameras, np.eye(4)))
+        healths.insert(0, eyes)
+        for place, table in enumerate(further, 1):
+            others, health, _ = _tracked_cameras(_seen_through(config, table), clock)
+            members.insert(place, Member(table.name, others, table.pose))
+            healths.insert(place, health)
+    for place, member in enumerate(members):
+        member.source = reopening = ReconnectingSource(member.source, f"the positions by {member.name}", clock)
+        healths[place] = JoinedHealth([reopening, healths[place]])
+    fused = FusedMarkers(members, clock)
+    return fused, JoinedHealth([fused, *healths]), calibration
+
+
+def _seen_through(config: Config, cameras: CamerasConfig) -> Config:
+    """Return the configuration with `cameras` as the only ones."""
+    vision = msgspec.structs.replace(config.tables.vision, cameras=cameras, further_cameras=())
+    return config.with_tables(msgspec.structs.replace(config.tables, vision=vision))
+
+
+def _seen_by(config: Config) -> str:
+    """Return the name in messages of what sees the marker."""
+    tables = config.tables
+    names = [*(table.name for table in tables.vision.further_cameras), *(table.label for table in tables.marker_source)]
+    if tables.vision.cameras is not None:
+        if not names:
+            return Sources.seen_by
+        names.insert(0, "cameras")
+    return f"the positions by {' and '.join(names)}"
+
+
+def _tracked_cameras(config: Config, clock: Clock) -> tuple[MarkerSource, TellsHealth, StereoCalibration]:
+    """Return the cameras of robot.toml with their tracker, not opened yet, their health and their calibration."""
+    from bodyschema.vision.cameras.realsense import RealsenseCamera
+    from bodyschema.vision.depth_check import DepthChecked
     from bodyschema.vision.tracked_camera import TrackedCamera
     from bodyschema.vision.trackers import tracker_of
 
     from .cameras import camera_of, open_eyes
 
-    clock = SystemClock()
-    joints = open_joints(config, clock)
     eyes = open_eyes(config, clock)
-    camera = camera_of(config, eyes)
-    drives = joints.drives if isinstance(joints, ServoJoints) else ()
-    return Sources(
-        joints,
-        TrackedCamera(camera, tracker_of(camera.calibration, config.tables.vision)),
-        clock,
-        powered=tuple(drive for drive in drives if isinstance(drive, Powered)),
-        head=next((drive for drive in drives if isinstance(drive, Head)), None),
-        cameras=eyes,
-        calibration=camera.calibration,
-        live=True,
-    )
+    camera, vision = camera_of(config, eyes), config.tables.vision
+    tracked = TrackedCamera(camera, tracker_of(camera.calibration, vision))
+    if eyes is not camera or not isinstance(eyes, RealsenseCamera):
+        return tracked, eyes, camera.calibration
+    checked = DepthChecked(tracked, eyes, vision.radius_m if vision.marker == "bright_ball" else 0.0)
+    return checked, JoinedHealth([eyes, checked]), camera.calibration
+
+
+def open_streams(config: Config, clock: Clock) -> list[MarkerStream]:
+    """Return the marker sources of robot.toml, not opened yet. Raise ConfigError if it has none."""
+    if not config.tables.marker_source:
+        raise ConfigError(
+            "no marker source is configured",
+            file=config.file,
+            remedy="Add the table [marker_source]: docs/marker_sources.md",
+        )
+    return [stream_of(table, clock) for table in config.tables.marker_source]
+
+
+def marker_source_checks(config: Config) -> Iterator[Check]:
+    """Yield checks of what each marker source of robot.toml sends. Open it for that."""
+    clock = SystemClock()
+    for stream in open_streams(config, clock):
+        yield from stream_checks(stream, clock)
+
+
+def marker_source_lines(config: Config) -> Iterator[str]:
+    """Describe in words where the marker's positions come from."""
+    for table in config.tables.marker_source:
+        body = "" if table.body is None else f", body {table.body}"
+        yield f"marker positions by {table.label} ({table.kind}) at {table.endpoint}{body}, in {table.unit}"
+        known = "" if table.latency_sigma_s is not None else ", not measured"
+        yield (
+            f"measured {1e3 * table.latency_s:.1f} ms before their time stamp ± {1e3 * table.sigma_s:.1f} ms{known}; "
+            f"1-sigma {1e3 * table.sigma_m:.2g} mm where none is sent"
+        )
 
 
 @contextmanager
@@ -236,69 +332,6 @@ def _simulated(config: Config) -> Iterator[Sources]:
         marker = TrackedCamera(world.camera, tracker_of(world.camera.calibration, config.tables.vision))
         joints = _through_bench(config, world.joints) if on_bench else world.joints
         yield Sources(joints, marker, world.clock, world)
-
-
-def simulation_settings(config: Config) -> SimConfig:
-    """Return the table [sim], with the marker that [vision] looks for in the hand unless [sim.camera] has another.
-
-    Raises:
-        ConfigError: the tracker does not find what the simulation would show.
-    """
-    from bodyschema.sim_backend.config import CameraConfig
-
-    sim, vision = config.tables.sim, config.tables.vision
-    usual, marker = CameraConfig(), {} if sim.camera.tags else _marker(vision)
-    unsaid = {name: value for name, value in marker.items() if getattr(sim.camera, name) == getattr(usual, name)}
-    camera = msgspec.structs.replace(sim.camera, **unsaid)
-    if vision.marker != "plugin" and config.robot.calibration is not None:
-        _require_found(config, config.robot.calibration, camera)
-    return msgspec.structs.replace(sim, camera=camera)
-
-
-def _marker(vision: VisionConfig) -> dict[str, Any]:
-    """Return the keys of [sim.camera] that show the marker of [vision]."""
-    if vision.marker in ("tag", "cluster"):
-        from bodyschema.vision.tag_dictionary import DICTIONARIES
-
-        return {"tags": _tags(vision), "tag_dictionary": DICTIONARIES[vision.tag.dictionary]}
-    ball = {"ball_radius_m": vision.radius_m}
-    if vision.marker == "bright_ball":
-        level = max(_LAMP, (1.0 + vision.min_brightness) / 2)
-        return {**ball, "ball_rgb": (level, level, level), "light": _DIMMED * vision.min_brightness}
-    band = vision.band
-    # A lit ball is darker on one side, and its highlight is paler.
-    saturation = max(_SATURATION, (1.0 + band.min_saturation) / 2)
-    value = _VALUE if band.min_value < _VALUE / 2 else 1.0
-    rgb = hsv_to_rgb(band.hue_deg / 360.0, saturation, value)
-    return {**ball, "ball_rgb": rgb, "clutter_gap_deg": max(_GAP_DEG, band.half_width_deg + _ROOM_DEG)}
-
-
-def _require_found(config: Config, calibration: StereoCalibration, camera: CameraConfig) -> None:
-    """Raise ConfigError if the tracker does not find the marker even alone before a plain wall."""
-    from bodyschema.sim_backend.eye import portraits
-    from bodyschema.vision.trackers import tracker_of
-
-    tracker, reasons = tracker_of(calibration, config.tables.vision), []
-    for t, images in enumerate(portraits(calibration, camera)):
-        seen = tracker.track(StereoFrame(_APART_S * t, images[0], images[1] if len(images) > 1 else None))
-        if isinstance(seen, MarkerFix):
-            return
-        reasons.append(seen.reason)
-    keys = {"ball": "[vision.colour] or [vision] radius_m", "bright_ball": "[vision] min_brightness"}
-    raise ConfigError(
-        "the tracker would not find the marker of [vision] in the simulation's images, not even alone before a plain "
-        f"wall: {WORDS[reasons[0]]}",
-        file=config.file,
-        remedy=f"Change {keys.get(config.tables.vision.marker, '[vision.tag]')}, or what [sim.camera] shows",
-    )
-
-
-def _tags(vision: VisionConfig) -> tuple[SimTag, ...]:
-    from bodyschema.sim_backend.config import SimTag
-    from bodyschema.vision.tag_config import PlacedTag
-
-    placed = (PlacedTag(id=vision.tag.id),) if vision.marker == "tag" else vision.cluster.tags
-    return tuple(SimTag(id=tag.id, xyz=tag.xyz, rpy=tag.rpy, side_m=tag.side_m or vision.tag.side_m) for tag in placed)
 
 
 def _through_bench(config: Config, joints: JointSource) -> JointSource:

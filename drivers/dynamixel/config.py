@@ -8,10 +8,11 @@ from typing import ClassVar, Literal
 
 import msgspec
 
-from bodyschema.drivers.servos.config import NonNegative, ServoConfig, ServosConfig
+from bodyschema.drivers.servos.config import ServoConfig, ServosConfig
 from bodyschema.drivers.servos.model import Model
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.toml_file import line_of
+from bodyschema.robot.toml_types import NonNegative
 
 from .models import BY_NAME, UNSUPPORTED
 from .powered_config import GazeConfig, ZeroForceConfig

@@ -9,9 +9,10 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from bodyschema.drivers.servos.config import Positive, ServoConfig
+from bodyschema.drivers.servos.config import ServoConfig
 from bodyschema.drivers.servos.model import Model
 from bodyschema.robot.suggest import did_you_mean
+from bodyschema.robot.toml_types import Positive
 
 from .torque_constants import torque_constant
 

@@ -7,8 +7,9 @@ from typing import ClassVar, Literal
 
 import msgspec
 
-from bodyschema.drivers.servos.config import NonNegative, ServoConfig, ServosConfig
+from bodyschema.drivers.servos.config import ServoConfig, ServosConfig
 from bodyschema.drivers.servos.model import Model
+from bodyschema.robot.toml_types import NonNegative
 
 from .models import BY_NAME
 

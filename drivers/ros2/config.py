@@ -13,8 +13,7 @@ from msgspec import Meta
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.suggest import did_you_mean
 from bodyschema.robot.toml_file import line_of
-
-Positive = Annotated[float, Meta(gt=0)]
+from bodyschema.robot.toml_types import Positive
 
 TABLE = ("drivers", "ros2")
 TOPIC = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")

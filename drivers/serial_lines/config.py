@@ -12,9 +12,8 @@ from msgspec import Meta
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.suggest import did_you_mean
 from bodyschema.robot.toml_file import line_in_entry, line_of
+from bodyschema.robot.toml_types import NonNegative, Positive
 
-Positive = Annotated[float, Meta(gt=0)]
-NonNegative = Annotated[float, Meta(ge=0)]
 TABLE = "drivers.serial_lines"
 
 

@@ -12,11 +12,9 @@ from msgspec import Meta
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.suggest import did_you_mean
 from bodyschema.robot.toml_file import line_in_entry, line_of
+from bodyschema.robot.toml_types import Positive
 
 from .model import Model, no_driver
-
-Positive = Annotated[float, Meta(gt=0)]
-NonNegative = Annotated[float, Meta(ge=0)]
 
 
 class AnyBus(Protocol):

@@ -5,9 +5,6 @@ from __future__ import annotations
 import sqlite3
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from typing import Self
-
-from bodyschema.daemon.config import DaemonConfig
 
 # Batch size: deleting this many takes a few milliseconds, so no new pair waits long.
 AT_ONCE = 500
@@ -27,11 +24,6 @@ class Keep:
     days: float | None
     size: float | None
     newest: int
-
-    @classmethod
-    def of(cls, rules: DaemonConfig) -> Self:
-        """Return the limits of the table [daemon]."""
-        return cls(rules.keep_days, None if rules.keep_mb is None else 1e6 * rules.keep_mb, rules.keep_newest)
 
     def last_to_delete(self, connection: sqlite3.Connection, utc: str, newest: int) -> int | None:
         """Return the newest pair that can be deleted now, with all before it; None to keep all.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-PARTS = {"interfaces", "drivers", "vision", "effects", "sim_backend", "diagnosis", "daemon"}
+PARTS = {link.name for link in (Path(__file__).parents[2] / "bodyschema").iterdir() if link.is_symlink()}
 FIRST_PARTY = {"bodyschema", "kbmaps"} | PARTS
 THIRD_PARTY = {"cv2", "cyclopts", "lxml", "msgspec", "numpy", "pybullet", "rich", "scipy", "serial", "uvicorn", "zenoh"}
 

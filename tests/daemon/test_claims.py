@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from guided_arm import JOINTS, REACH, built_chain, make_pair, measured, new_learning, nominal_model, path, teach
 
-from bodyschema.daemon.config import LearnerConfig
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.model_bank import INSTANT, PRIOR, RESIDUAL, RIGID
 from bodyschema.learning.nominal import chain_tolerances
 from bodyschema.learning.uncertainty import UncertaintyState, UncertaintyTracker

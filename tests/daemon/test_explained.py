@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodyschema.learning.outlier_limits import explained
+from bodyschema.learning.outlier_gate import explained
 
 
 @pytest.mark.parametrize(

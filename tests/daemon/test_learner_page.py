@@ -8,11 +8,12 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from bodyschema.daemon.config import LARGEST_MAP, DaemonConfig, LearnerConfig
+from bodyschema.daemon.config import LARGEST_MAP, DaemonConfig
+from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.model_bank import TRUSTED
 from bodyschema.learning.nominal import PAIRS_TO_REFIT
 from bodyschema.learning.online_learner import REGION_RAD
-from bodyschema.learning.outlier_limits import CHANGE, DOUBT, FEWEST_FOR_CHANGE
+from bodyschema.learning.outlier_gate import CHANGE, DOUBT, FEWEST_FOR_CHANGE
 from bodyschema.learning.snapshot import IN_SUPPORT
 from bodyschema.learning.solvers.solver import KEPT, LARGEST_NET, WINDOW
 from kbmaps.contest import CLEARLY, SHORTEST

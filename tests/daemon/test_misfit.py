@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodyschema.learning.model_discrepancy import model_discrepancy
+from bodyschema.learning.uncertainty import model_discrepancy
 
 NONE = np.zeros(3)
 

@@ -7,6 +7,7 @@ import pytest
 from small_arm import write_small_arm
 
 from bodyschema.daemon.config import Config
+from bodyschema.daemon.wiring.simulation import simulation_settings
 from bodyschema.daemon.wiring.wiring import (
     check_sources,
     demonstration_model,
@@ -14,7 +15,6 @@ from bodyschema.daemon.wiring.wiring import (
     open_postures,
     open_sources,
     require_simulation,
-    simulation_settings,
 )
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, RecordingError, SourceLost

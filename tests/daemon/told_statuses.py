@@ -2,16 +2,8 @@
 
 from __future__ import annotations
 
-from bodyschema.daemon.transport.status import (
-    ChainCalibration,
-    Change,
-    JointRange,
-    JointZero,
-    LearnerStatus,
-    LearntFigure,
-    Outlook,
-    SamplerStatus,
-)
+from bodyschema.daemon.transport.status import Change, JointRange, LearnerStatus, SamplerStatus
+from bodyschema.learning.status import ChainCalibration, JointZero, LearntFigure, Outlook
 
 SAMPLER = SamplerStatus(
     robot="arm",

@@ -32,7 +32,8 @@ RARELY_NEEDED = (
     "bodyschema.dashboard",
     "bodyschema.fleet",
     "bodyschema.reproduce",
-    "bodyschema.daemon.rerun",
+    "bodyschema.recordings.rerun",
+    "bodyschema.__main__",
 )
 PR_SET_PDEATHSIG = 1
 LONGEST_REQUEST = 1 << 17
@@ -125,9 +126,9 @@ def _server() -> socket.socket:
 
 
 def _import_all() -> None:
-    from bodyschema import daemon
+    import bodyschema
 
-    for module in pkgutil.walk_packages(daemon.__path__, "bodyschema.daemon."):
+    for module in pkgutil.walk_packages(bodyschema.__path__, "bodyschema."):
         if not module.name.startswith(RARELY_NEEDED):
             with suppress(ImportError):  # of an extra that is not installed
                 importlib.import_module(module.name)

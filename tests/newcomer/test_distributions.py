@@ -118,6 +118,6 @@ def test_it_lives_beside_another_daemon_and_outlives_it(
     own, other = request.getfixturevalue(source), wheel_of_another(tmp_path)
     for package in (own, other) if first == "bodyschema" else (other, own):
         pip(*install, package)
-    assert says().startswith(str(packages / "bodyschema" / "daemon" / "cli.py"))
+    assert says().startswith(str(packages / "bodyschema" / "cli" / "main.py"))
     pip("uninstall", "--yes", "other-daemon")
-    assert says().startswith(str(packages / "bodyschema" / "daemon" / "cli.py"))
+    assert says().startswith(str(packages / "bodyschema" / "cli" / "main.py"))

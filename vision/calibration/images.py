@@ -9,7 +9,9 @@ from pathlib import Path
 
 import cv2
 
+from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import ImageArray
+from bodyschema.interfaces.whole_files import write_whole
 from bodyschema.vision.image_file import read_image
 from bodyschema.vision.rig import CalibrationError
 
@@ -173,6 +175,32 @@ def write_pair(pair: ImagePair, folder: Path, number: int) -> None:
         file = folder / f"{name}{number:02d}.png"
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            file.write_bytes(cv2.imencode(file.suffix, image)[1].tobytes())
+            write_whole({file: cv2.imencode(file.suffix, image)[1].tobytes()})
         except OSError as error:
             raise CalibrationError(f"{file} cannot be written: {error.strerror}") from error
+
+
+@dataclass(frozen=True)
+class Images:
+    """Location of the images.
+
+    Attributes:
+        folder: the folder.
+        left, right: patterns of the eyes' files.
+        side_by_side: each image shows both eyes.
+        one: all images are of one camera.
+    """
+
+    folder: Path
+    left: str | None = None
+    right: str | None = None
+    side_by_side: bool = False
+    one: bool = False
+
+    def files(self) -> list[PairFiles]:
+        """Return the files that belong together. Raise CalibrationError if there are none."""
+        if self.one and (self.right is not None or self.side_by_side):
+            raise ConfigError("--one is of one camera alone", remedy="Leave --right and --side-by-side away")
+        if (self.left is None) != (self.right is None) and not self.one:
+            raise ConfigError("--left and --right belong together", remedy="Give both patterns, or none")
+        return pair_files(self.folder, self.left, self.right, side_by_side=self.side_by_side, one=self.one)
