@@ -415,13 +415,13 @@ def _parse(file: Path) -> Any:
         ) from error
     except OSError as error:
         raise RobotError(
-            f"cannot read the URDF: {error.strerror}", file=file, remedy="Mend [robot] urdf, or --urdf"
+            f"cannot read the URDF: {error.strerror}", file=file, remedy="Fix [robot] urdf, or --urdf"
         ) from error
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False)
     try:
         root = etree.fromstring(data, parser)
     except etree.XMLSyntaxError as error:
-        what = error.msg.removesuffix(f", line {error.lineno}, column {error.offset}")
+        what = " ".join(error.msg.removesuffix(f", line {error.lineno}, column {error.offset}").split())
         raise RobotError(f"not XML: {what}", file=file, line=error.lineno) from error
     if root.getroottree().docinfo.doctype:
         raise RobotError("a URDF with a DOCTYPE is not accepted", file=file, line=1, remedy="Delete the DOCTYPE")

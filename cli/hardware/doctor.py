@@ -15,7 +15,7 @@ import msgspec
 
 from bodyschema.cli.install.units import FOLDER
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import Bus, is_alive
+from bodyschema.daemon.transport.bus import ZenohSession, is_alive
 from bodyschema.daemon.transport.identity import Route
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import SamplerStatus
@@ -61,10 +61,12 @@ def steps(config: Config) -> Iterator[Step]:
         yield "encoders", lambda: _on_the_ports(config, encoder_checks)
     if config.tables.vision.cameras is not None:
         yield "cameras", lambda: _cameras(config)
+    if config.tables.marker_source:
+        yield "marker source", lambda: _marker_sources(config)
     if config.tables.drivers.ros2 is not None:
         yield "router", lambda: joint_state_checks(config)
     yield "disk", lambda: disk_checks(config.state_dir)
-    if config.store_file.exists():
+    if os.path.exists(config.store_file):  # a folder of another user has none
         yield "store", lambda: store_checks(config.store_file)
     yield "clock", clock_checks
     yield "service", unit_checks
@@ -83,9 +85,11 @@ def _description(config: Config) -> Iterator[Check]:
     )
     if config.tables.drivers.hardware is None:
         said = "no servos are configured, so none were looked at"
-        yield Check("robot.toml", "warning", said, "bodyschema robot new --from scan")
+        yield Check("robot.toml", "warning", said, "bodyschema init --urdf YOUR.urdf --from scan")
     cameras = config.tables.vision.cameras
     if cameras is not None and cameras.calibration is not None:
+        return
+    if cameras is None and config.tables.marker_source:
         return
     if config.robot.calibration is None:
         said = "[camera] does not describe how the cameras see: images cannot be used, recordings can"
@@ -104,9 +108,27 @@ def _cameras(config: Config) -> Iterator[Check]:
 
         yield from camera_checks(config)
         return
-    with Bus(connect=config.route("sampler"), client=True) as bus:
+    with ZenohSession(connect=config.route("sampler"), client=True) as bus:
         status = decode(bus.ask_one(Keys(config.robot.name).status("sampler")), SamplerStatus)
     yield Check("cameras", "ok", f"the running sampler takes {status.frames_per_s:.1f} stereo frames/s")
+
+
+def _marker_sources(config: Config) -> Iterator[Check]:
+    """Yield checks of what the marker sources send; a running sampler reads them, so its status is used instead."""
+    if not is_alive(config.route("sampler"), Keys(config.robot.name).alive("sampler"), open_timeout_s=OPEN_S):
+        from bodyschema.daemon.wiring.wiring import marker_source_checks
+
+        yield from marker_source_checks(config)
+        return
+    with ZenohSession(connect=config.route("sampler"), client=True) as bus:
+        status = decode(bus.ask_one(Keys(config.robot.name).status("sampler")), SamplerStatus)
+    yield Check("marker source", "ok", f"the running sampler takes {status.frames_per_s:.1f} positions/s")
+    names = [table.label for table in config.tables.marker_source]
+    for complaint in status.health:
+        name, _, rest = complaint.partition(": ")
+        if name in names:
+            what, _, remedy = rest.partition(": ")
+            yield Check(f"marker source {name}", "warning", what, remedy)
 
 
 def _on_the_ports(config: Config, look: Callable[[Config], Iterator[Check]]) -> Iterator[Check]:
@@ -131,7 +153,7 @@ def _of_the_sampler(config: Config) -> Iterator[Check]:
     if not is_alive(route, keys.alive("sampler"), open_timeout_s=OPEN_S):
         yield Check("servos", "warning", "not looked at: another program has the port")
         return
-    with Bus(connect=route, client=True) as bus:
+    with ZenohSession(connect=route, client=True) as bus:
         status = decode(bus.ask_one(keys.status("sampler")), SamplerStatus)
     yield Check("rate", "ok", f"the running sampler takes {status.readings_per_s:.0f} readings/s")
     for complaint in status.health:
@@ -140,7 +162,12 @@ def _of_the_sampler(config: Config) -> Iterator[Check]:
 
 def disk_checks(folder: Path) -> Iterator[Check]:
     """Yield checks of free space and write permission for the pairs in `folder`."""
-    there = next(path for path in (folder, *folder.parents) if path.exists())
+    try:
+        there = next(path for path in (folder, *folder.parents) if path.exists())
+    except PermissionError as error:
+        remedy = "bodyschema run --state-dir FOLDER    # one that you can write"
+        yield Check("disk", "wrong", f"{folder}, where pairs are to be kept, is not yours: {error.strerror}", remedy)
+        return
     if not os.access(there, os.W_OK):
         said = f"{there} cannot be written, and pairs are to be kept in {folder}"
         yield Check("disk", "wrong", said, f"sudo chown $USER {there}")
@@ -190,9 +217,9 @@ def unit_checks(root: Path = Path("/")) -> Iterator[Check]:
     files = [*(root / FOLDER).glob("bodyschema-*.service"), *(root / FOLDER).glob("bodyschema-*.service.d/*.conf")]
     for file in sorted(files):
         if OLD_UNIT.search(file.read_text(encoding="utf-8", errors="replace")):
-            mend = "install router" if "router" in file.name else "install service"
+            fix = "install router" if "router" in file.name else "install service"
             said = f"{file} starts `python -m daemon`, which this bodyschema does not have"
-            yield Check("service", "wrong", said, f'sudo "$(command -v bodyschema)" {mend}')
+            yield Check("service", "wrong", said, f'sudo "$(command -v bodyschema)" {fix}')
 
 
 def _is_synchronised() -> bool | None:
@@ -215,13 +242,11 @@ def _zenoh(config: Config) -> Iterator[Check]:
 def router_check(route: Route) -> Check:
     """Check that the router accepts our connection."""
     try:
-        with Bus(connect=route, client=True, open_timeout_s=OPEN_S):
+        with ZenohSession(connect=route, client=True, open_timeout_s=OPEN_S):
             return Check("zenoh", "ok", f"the router {route} takes our connection")
     except BusError as error:
         first, _, rest = str(error).partition(". ")
-        return Check(
-            "zenoh", "wrong", f"{first}: nobody on other machines sees this robot", rest or "see the router's log"
-        )
+        return Check("zenoh", "wrong", f"{first}: other machines do not see this robot", rest or "see the router's log")
 
 
 def zenoh_check(process: str, route: Route, token: str) -> Check:
@@ -251,7 +276,7 @@ def _is_listening(endpoint: str) -> bool:
 
 def _named(check: Check, file: Path) -> Check:
     """Return the check with the actual name of robot.toml in its command."""
-    return replace(check, mend=check.mend.replace("robot.toml", str(file)))
+    return replace(check, fix=check.fix.replace("robot.toml", str(file)))
 
 
 def run(config: Config, tell: Callable[[str], None]) -> list[Check]:

@@ -26,7 +26,7 @@ class Readable(Source, Protocol[R_co]):
     def read(self, timeout_s: float) -> R_co | None: ...
 
 
-class Reopening(Generic[R_co]):
+class ReconnectingSource(Generic[R_co]):
     """Reads a source. When the source is lost, report it once and try to reopen it at growing intervals.
 
     A source that is present but the wrong one (other cameras, another servo) is reported once more, and waited for. It
@@ -73,6 +73,11 @@ class Reopening(Generic[R_co]):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._opened.close()
+
+    @property
+    def health(self) -> tuple[str, ...]:
+        """The problem with the source, if there is one."""
+        return () if self.trouble is None else (self.trouble,)
 
     def read(self, timeout_s: float) -> R_co | None:
         """Read like the source's `read`; also return None while the source is lost.

@@ -38,6 +38,11 @@ from bodyschema.drivers.feetech.config import BusConfig as FeetechBus
 from bodyschema.drivers.feetech.config import FeetechConfig
 from bodyschema.drivers.feetech.joints import FeetechJoints
 from bodyschema.drivers.feetech.models import BY_NAME as FEETECH_MODELS
+from bodyschema.drivers.markers.config import UdpTable
+from bodyschema.drivers.markers.datagram import SCHEMA, decode_datagram
+from bodyschema.drivers.markers.fusing import FusedMarkers, Member
+from bodyschema.drivers.markers.report import Packet
+from bodyschema.drivers.markers.stream import MarkerStream
 from bodyschema.drivers.replay import Replay
 from bodyschema.drivers.ros2.bench.faults import Send, intact
 from bodyschema.drivers.ros2.bench.node import Node
@@ -70,7 +75,7 @@ from bodyschema.vision.trackers import tracker_of
 
 LIMIT_S = 500.0
 WAIT_S = 0.005
-SOME = 4
+SOME = 3
 ROWS = 60
 PICTURES = 50
 TIMES = np.cumsum(np.random.default_rng(1).uniform(0.01, 0.1, ROWS))
@@ -375,6 +380,42 @@ def encoders_that_fall_silent() -> AbstractContextManager[Rig]:
     return encoders_on_the_bench(lambda reply: reply if next(said) < 300 else replace(reply, data=b""))
 
 
+class SentPositions:
+    """A `Receiver` of a datagram every 10 ms, in virtual time."""
+
+    def __init__(self, clock: VirtualClock) -> None:
+        self._clock = clock
+
+    def open(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    def receive(self, until: float) -> Packet:
+        self._clock.wait_until(self._clock.now() + 0.01)
+        told = {"schema": SCHEMA, "position": (0.1, 0.2, 0.3), "stamp": self._clock.now()}
+        return Packet(msgspec.json.encode(told), "sender", self._clock.now())
+
+    def silence(self) -> str:
+        return ""
+
+
+def stream_in(clock: VirtualClock) -> MarkerStream:
+    return MarkerStream(UdpTable(), SentPositions(clock), decode_datagram, clock)
+
+
+@contextmanager
+def sent_positions() -> Iterator[Rig]:
+    yield Rig(stream_in(VirtualClock()))
+
+
+@contextmanager
+def fused_positions() -> Iterator[Rig]:
+    clock = VirtualClock()
+    yield Rig(FusedMarkers([Member(name, stream_in(clock), np.eye(4)) for name in "ab"], clock))
+
+
 def swinging(id: int) -> Callable[[float], float]:
     return lambda t: float(np.sin(t + id))
 
@@ -388,8 +429,10 @@ SILENT = [*SILENT_SERVOS, encoders_that_fall_silent, ros_2_robot_that_falls_sile
 CAMERAS = [pytest.param(camera, marks=SIMULATED) for camera in (simulated_camera, rectified_camera)]
 ENDING_EYES = [image_folder, video_files, side_by_side_video, ideal_camera]
 WAITING_EYES = [two_cameras, side_by_side_camera, image_folder_in_its_own_time]
-TRACKED = [pytest.param(make, marks=SIMULATED) for make in (tracked_camera, tracked_tags)]
-MARKERS = [replayed_marker, scripted_marker, *TRACKED]
+SENT = [sent_positions, fused_positions]
+MARKERS = [replayed_marker, scripted_marker, pytest.param(tracked_camera, marks=SIMULATED)]
+# They live as a tracked camera does.
+TAGS = pytest.param(tracked_tags, marks=SIMULATED)
 STANDING_STILL = [ENDING_JOINTS[2], *MARKERS[2:], *CAMERAS]
 Make = Callable[[], AbstractContextManager[Rig]]
 Shared = Callable[[Make], Rig]
@@ -402,7 +445,7 @@ def shared() -> Iterator[Shared]:
         yield cache(lambda make: stack.enter_context(make()))
 
 
-@pytest.fixture(params=[*JOINTS, *MARKERS, *CAMERAS, *ENDING_EYES, *WAITING_EYES])
+@pytest.fixture(params=[*JOINTS, *MARKERS, *SENT, *CAMERAS, *ENDING_EYES, *WAITING_EYES])
 def rig(request: pytest.FixtureRequest, shared: Shared) -> Rig:
     return shared(request.param)
 
@@ -459,9 +502,9 @@ def test_an_error_in_the_block_passes_through_the_closing(rig: Rig) -> None:
 def test_where_nothing_comes_in_time_none_is_returned(make: Make, shared: Shared) -> None:
     rig = shared(make)
     with rig.opened():
-        while rig.source.read(0.01) is not None:  # time stands still until the other source is read too
-            continue
-        assert rig.source.read(0.0) is None
+        for timeout_s in (0.01, 0.0):
+            while rig.source.read(timeout_s) is not None:  # time stands still until the other source is read too
+                continue
 
 
 # --- what is read
@@ -474,11 +517,12 @@ def joints(request: pytest.FixtureRequest, shared: Shared) -> Iterator[tuple[Joi
         yield rig.source, rig.read()
 
 
-@pytest.fixture(params=MARKERS)
-def seen(request: pytest.FixtureRequest, shared: Shared) -> Iterator[tuple[MarkerSource, list[Any]]]:
+@pytest.fixture(scope="module", params=[*MARKERS, TAGS])
+def seen(request: pytest.FixtureRequest, shared: Shared) -> tuple[MarkerSource, list[Any]]:
+    """Return a closed marker source and what was read of it."""
     rig = shared(request.param)
     with rig.opened():
-        yield rig.source, rig.read()
+        return rig.source, rig.read()
 
 
 @pytest.fixture(params=[*ENDING_EYES[:-1], *WAITING_EYES])

@@ -67,7 +67,7 @@ def test_every_command_on_the_page_is_understood(command: str) -> None:
 
 def test_init_writes_what_the_page_says_and_guesses_what_the_example_has(desk) -> None:
     (desk / "robot.toml").unlink()
-    command = "bodyschema config init --urdf desk_arm.urdf"
+    command = "bodyschema init --urdf desk_arm.urdf"
     assert typed(command, desk).stdout == output_of(command)
     guessed, example = Config.load(desk / "robot.toml", {}).robot, Config.load(EXAMPLE / "robot.toml", {}).robot
     assert (guessed.joints, guessed.robot.marker_link) == (example.joints, example.robot.marker_link)
