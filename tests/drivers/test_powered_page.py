@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from bodyschema.cli.main import command_line
 from bodyschema.drivers.dynamixel.powered_config import GazeConfig, ZeroForceConfig
 
 FILES = ("powered.py", "zero_force.py", "gaze.py", "guard.py")
@@ -53,4 +54,10 @@ def test_the_messages_that_are_shown_are_those_of_the_code() -> None:
     said = re.sub(r'"\s*\n\s*f?"', "", CODE)
     for part in parts:
         assert part in said, part
-    assert len(shown) >= 10
+    assert len(shown) >= 7
+
+
+@pytest.mark.parametrize("command", re.findall(r"^\$ (bodyschema .*)$", PAGE, re.MULTILINE))
+def test_every_command_on_the_page_is_understood(command: str) -> None:
+    words = command.split()[1:]
+    command_line(words[0]).parse_args(words, exit_on_error=False, print_error=False)
