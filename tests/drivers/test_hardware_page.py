@@ -86,4 +86,4 @@ def test_faults_listed_are_the_benches_faults() -> None:
 
 @pytest.mark.parametrize("series", [DYNAMIXEL_MODELS, FEETECH_MODELS])
 def test_every_supported_model_is_on_the_page(series) -> None:
-    assert [name for name in series if re.search(r"[A-Z]+", name)[0] not in PAGE] == []
+    assert [name for name in series if re.findall(r"[A-Z]+", name)[0] not in PAGE] == []
