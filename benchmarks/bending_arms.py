@@ -19,8 +19,10 @@ import numpy as np
 from benchmarks.changes import TOLERANCES, pair_of, walk
 from benchmarks.rough_arm import rough_arm
 from benchmarks.rough_truths import JOINTS, TRUTHS
-from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner
 from bodyschema.learning.config import LearnerConfig
+from bodyschema.learning.nominal import NominalModel
+from bodyschema.learning.online_learner import OnlineLearner
+from bodyschema.learning.solvers.solver import DirectSolver
 
 
 def stream(truth: str, seed: int, pairs: int, sigma: float, every: int) -> tuple[int, Counter[str]]:

@@ -24,9 +24,10 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.rough_arm import rough_arm
 from bodyschema.interfaces.records import Pair, frozen_array
-from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner
 from bodyschema.learning.config import LearnerConfig
-from bodyschema.learning.nominal import chain_tolerances
+from bodyschema.learning.nominal import NominalModel, chain_tolerances
+from bodyschema.learning.online_learner import OnlineLearner
+from bodyschema.learning.solvers.solver import DirectSolver
 from kbmaps import RigidChain
 from kbmaps.arrays import FloatArray
 

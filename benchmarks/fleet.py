@@ -33,7 +33,7 @@ from pathlib import Path
 import numpy as np
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import Bus, Request, client
+from bodyschema.daemon.transport.bus import Request, ZenohSession, client
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.wire import JointsRequest, PairMessage, PairsReply, PredictReply, decode, encode
 from bodyschema.interfaces.errors import BodyschemaError
@@ -181,7 +181,7 @@ def measure(robots: int, course: Course, processes: int) -> str:
         ]
         walks = [Walk(Config.load(file), k) for k, file in enumerate(files)]
         command = module_command("bodyschema", "learner", "--robot", str(folder), "--processes", str(processes))
-        with Bus(listen=sampler) as bus:
+        with ZenohSession(listen=sampler) as bus:
             publish = [bus.publisher(Keys(f"arm_{k}").pair, cache=256) for k in range(robots)]
             for k, walk in enumerate(walks):
                 bus.answer(Keys(f"arm_{k}").pairs, walk.history)

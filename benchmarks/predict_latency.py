@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import Bus, Request, client
+from bodyschema.daemon.transport.bus import Request, ZenohSession, client
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import LearnerStatus
 from bodyschema.daemon.transport.wire import JointsRequest, PairMessage, PairsReply, decode, encode
@@ -151,7 +151,7 @@ def measure(robot_file: Path) -> tuple[FloatArray, FloatArray]:
     config = Config.load(robot_file)
     keys, endpoints = Keys(config.robot.name), config.tables.zenoh
     sampler = StandInSampler(config, STORED_PAIRS + int(PAIRS_PER_S * (PHASE_S + 60.0)))
-    with Bus(listen=endpoints.sampler) as bus, running_learner(robot_file, endpoints.learner):
+    with ZenohSession(listen=endpoints.sampler) as bus, running_learner(robot_file, endpoints.learner):
         bus.answer(keys.pairs, sampler.history)
         idle = asked(robot_file)
         sampler.stored = STORED_PAIRS
@@ -174,7 +174,7 @@ def measure(robot_file: Path) -> tuple[FloatArray, FloatArray]:
     return idle, busy
 
 
-def feed(bus: Bus, keys: Keys, sampler: StandInSampler, stop: threading.Event) -> None:
+def feed(bus: ZenohSession, keys: Keys, sampler: StandInSampler, stop: threading.Event) -> None:
     """Publish pairs at their rate until told to stop."""
     publish = bus.publisher(keys.pair)
     while not stop.wait(1.0 / PAIRS_PER_S):

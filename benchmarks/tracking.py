@@ -26,7 +26,7 @@ from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler.sampler import Sampler
 from bodyschema.daemon.sampler.session import session_of
 from bodyschema.daemon.sampler.sources import Sources
-from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import SourceEnded
@@ -99,7 +99,10 @@ def sample(config: Config, sources: Sources) -> str:
     """Run a sampler with a store of its own until the sources are through; what became of the frames."""
     with tempfile.TemporaryDirectory() as folder:
         mine = config.with_state_dir(Path(folder))
-        with PairStore(mine.store_file, session_of(mine, SystemClock())) as store, Bus(listen=_endpoint()) as bus:
+        with (
+            PairStore(mine.store_file, session_of(mine, SystemClock())) as store,
+            ZenohSession(listen=_endpoint()) as bus,
+        ):
             sampler = Sampler(mine, sources, bus, store, exit_at_end=True)
             sampler.run()
             status = sampler.status()

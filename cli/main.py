@@ -6,6 +6,7 @@ import errno
 import os
 import resource
 import sys
+from collections.abc import Sequence
 from typing import NoReturn
 
 import cyclopts
@@ -18,8 +19,8 @@ from bodyschema.interfaces.extras import missing_module
 GROUPS = {
     "Start": {
         "demo": "Learn a simulated arm from scratch, in about a minute.",
-        "config": "Write, check or show robot.toml: begin here.",
-        "robot": "Write robot.toml for the servos that a scan found.",
+        "init": "Write robot.toml: begin here.",
+        "config": "Check or show robot.toml.",
         "doctor": "Check ports, servos, disk, clock and network.",
     },
     "Calibrate and diagnose": {
@@ -55,10 +56,12 @@ GROUPS = {
         "record": "Save the running sampler's pairs to a file.",
         "export": "Convert pairs or a robot: CSV, Parquet, MCAP, MJCF, URDF.",
         "backup": "Save pairs, checkpoint and robot.toml to one file.",
-        "restore": "Restore a backup; nothing is overwritten unasked.",
+        "restore": "Restore a backup; existing files are kept.",
         "fleet": "Monitor and diagnose many robots.",
     },
 }
+# Names of earlier releases, for one more.
+RENAMED = {("config", "init"): ("init",), ("robot", "new"): ("init", "--from", "scan")}
 COMMANDS = {name: summary for group in GROUPS.values() for name, summary in group.items()}
 # One object each: commands that are apps keep theirs, and two of the same name are refused.
 _SECTIONS = {title: cyclopts.Group(title, sort_key=place) for place, title in enumerate(GROUPS)}
@@ -93,6 +96,16 @@ def command_line(called: str | None = None) -> cyclopts.App:
             own = None if name == called else summary
             line.command(f"bodyschema.cli.commands.{name}:{name}", name=name, help=own, group=group, sort_key=order)
     return line
+
+
+def present_names(arguments: Sequence[str]) -> list[str]:
+    """Return the arguments with the command's present name, and print it where an earlier one was given."""
+    for earlier, present in RENAMED.items():
+        if tuple(arguments[: len(earlier)]) == earlier:
+            rest = list(arguments[len(earlier) :])
+            print(f"bodyschema {' '.join(earlier)} is now: bodyschema {' '.join(present)}", file=sys.stderr)  # noqa: T201
+            return [present[0], *([] if "--from" in rest else present[1:]), *rest]
+    return list(arguments)
 
 
 def _version() -> str:
@@ -134,7 +147,7 @@ def main() -> None:
     # OpenCV would allocate 3 GiB for a malicious PNG of a few kilobytes; the largest cameras have 100 megapixels.
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**27))
     end_with_parent()
-    arguments = sys.argv[1:]
+    arguments = present_names(sys.argv[1:])
     try:
         allow_enough_files()
         command_line(arguments[0] if arguments else None)(arguments)

@@ -13,7 +13,7 @@ from typing import Self
 from bodyschema.cli.recordings.recorder import History
 from bodyschema.cli.terminal.findings_view import outlook_sentence
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.command_names import CommandName
 from bodyschema.daemon.transport.identity import Route
 from bodyschema.daemon.transport.keys import Keys
@@ -49,7 +49,7 @@ class Watch:
         routes: dict[Process, Route] = {"sampler": config.route("sampler"), "learner": config.route("learner")}
         self._sampler = Heard(SamplerStatus, str(routes["sampler"]), self._clock)
         self._learner = Heard(LearnerStatus, str(routes["learner"]), self._clock)
-        self._sessions = {process: Bus(connect=route) for process, route in routes.items()}
+        self._sessions = {process: ZenohSession(connect=route) for process, route in routes.items()}
         self._series, self._course = Series(), Course()
         self._recent = RecentPairs()
         self._history: History | None = None

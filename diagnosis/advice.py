@@ -34,7 +34,7 @@ def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
                     "a longer recording of the same kind would show whether it does."
                 )
             elif rival.effect is not None:
-                told.append(f"No motion tells {describe(cause)} from {rival.described}: mend whichever is easier.")
+                told.append(f"No motion tells {describe(cause)} from {rival.described}: fix whichever is easier.")
             if isinstance(rival.instead, Nameless):
                 told.append(f"Watch whether {rival.described}: {_WATCH[rival.instead.kind]}.")
     if diagnosis.left.is_there:

@@ -243,7 +243,7 @@ def _limitations(diagnosis: Diagnosis) -> tuple[str, ...]:
     if unknown_side > MOST_DOUBTFUL:
         joints = ", ".join(str(cause.where) for cause in diagnosis.causes if cause.name == "backlash")
         told.append(
-            f"At {100.0 * unknown_side:.0f} % of the pairs nobody knows on which side of its play {joints} stands: "
+            f"At {100.0 * unknown_side:.0f} % of the pairs it is unknown on which side of its backlash {joints} rests: "
             "few runs cross it. What seems to jump or to change with time there may be that. Record longer runs, "
             "and move the joint to and fro in each."
         )

@@ -28,13 +28,13 @@ class Check:
         subject: what was checked.
         state: "wrong" prevents reading the arm, "warning" degrades it.
         said: what was found.
-        mend: the command to type, or what to do; empty if nothing needs doing.
+        fix: the command to type, or what to do; empty if nothing needs doing.
     """
 
     subject: str
     state: State
     said: str
-    mend: str = ""
+    fix: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +95,7 @@ def port_checks(name: str, port: str, root: Path = ROOT, *, ours: Collection[int
     for holder in others:
         yield Check(subject, "wrong", f"{port} is open in process {holder.pid}: {holder.command}", f"kill {holder.pid}")
     if not others:
-        who = "the running sampler has it open" if found else "nobody else has it open"
+        who = "the running sampler has it open" if found else "no other program has it open"
         yield Check(subject, "ok", f"{port} is there, and {who}")
     yield from _naming(subject, port, root)
     yield from _latency(port, root)

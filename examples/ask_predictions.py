@@ -33,7 +33,7 @@ def ask(session: zenoh.Session, key: str, request: object) -> dict:
             return json.loads(reply.ok.payload.to_bytes())
         if reply.err is not None:
             raise RuntimeError(reply.err.payload.to_string())
-    raise RuntimeError(f"nobody answers under {key}")
+    raise RuntimeError(f"nothing answers under {key}")
 
 
 def main(robot: str, endpoint: str, *angles: str) -> None:

@@ -34,7 +34,7 @@ def stored(session: zenoh.Session, prefix: str, first: int) -> dict:
             return json.loads(reply.ok.payload.to_bytes())
         if reply.err is not None:
             raise RuntimeError(reply.err.payload.to_string())
-    raise RuntimeError(f"nobody answers under {prefix}/pairs")
+    raise RuntimeError(f"nothing answers under {prefix}/pairs")
 
 
 def follow(session: zenoh.Session, prefix: str, first: int) -> Iterator[dict]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import norm
 
 from bodyschema.calibration.comparison import Distances, laid_on
 from bodyschema.daemon.transport.status import JointRange
@@ -28,6 +28,8 @@ CHANCE = 0.05
 ROUNDS = 20
 # Standard error of a median of normal numbers, over that of their mean.
 MEDIAN_COSTS = math.sqrt(math.pi / 2.0)
+
+_quantile = NormalDist().inv_cdf
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +116,7 @@ def common_poses(coverages: Sequence[Mapping[str, JointRange]], joints: tuple[st
     """
     ranges = [[(each[joint].low, each[joint].high) for joint in joints] for each in coverages]
     if not ranges:
-        raise RequestError("no sampler of these robots answers, so nobody knows where their joints have been")
+        raise RequestError("no sampler of these robots answers, so the ranges of their joints are unknown")
     low, high = np.sort(np.median(np.array(ranges), axis=0), axis=1).T
     return np.random.default_rng(seed).uniform(low, high, (POSES, len(joints)))
 
@@ -200,9 +202,9 @@ def _odd(robot: int, figures: Sequence[_Figure]) -> tuple[Odd, ...]:
         own, others = figure.half_widths[robot], figure.half_widths[np.isfinite(figure.half_widths)]
         difference = float(figure.values[robot] - np.nanmedian(figure.values))
         half_width = math.hypot(own, MEDIAN_COSTS * float(np.median(others)) / math.sqrt(len(others)))
-        possible = math.hypot(half_width, norm.isf(0.025) * _spread(figure.values))
+        possible = math.hypot(half_width, _quantile(0.975) * _spread(figure.values))
         far = abs(difference) / possible if possible > 0.0 else 0.0
-        if far > norm.isf(0.5 * CHANCE / tried) / norm.isf(0.025):
+        if far > _quantile(1.0 - 0.5 * CHANCE / tried) / _quantile(0.975):
             found.append((far, Odd(figure.name, difference, half_width, figure.unit)))
     return tuple(odd for _, odd in sorted(found, key=lambda each: -each[0]))
 
@@ -210,7 +212,7 @@ def _odd(robot: int, figures: Sequence[_Figure]) -> tuple[Odd, ...]:
 def _spread(values: FloatArray) -> float:
     """Return the robust 1-sigma of a figure among robots, from the median of their distances to the median."""
     told = values[np.isfinite(values)]
-    return float(np.median(np.abs(told - np.median(told))) / norm.ppf(0.75))
+    return float(np.median(np.abs(told - np.median(told))) / _quantile(0.75))
 
 
 def _camera_moved(found: ChainCalibration | None) -> float | None:

@@ -33,7 +33,7 @@ def sentences(comparison: TypeComparison) -> list[str]:
         "model laid on their median as a whole."
     ]
     if len(units) < FEWEST_TO_JUDGE:
-        return [*said, "Of two robots nobody can say which is the odd one."]
+        return [*said, "Of two robots, it is not possible to say which is the odd one."]
     off = [unit for unit in units if unit.is_off]
     if not off:
         said.append("None is farther from the others than the models claim to be wrong, and no figure stands out.")

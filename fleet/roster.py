@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import Self, TypeVar
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.identity import SECURE, Route
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
@@ -78,7 +78,7 @@ class Member:
             if process in self.alive and status is None:
                 said.append(f"the {process} is alive and does not answer")
         if "learner" not in self.alive:
-            said.append("its learner is not alive: nobody learns or answers")
+            said.append("its learner is not alive: nothing learns or answers")
         return said
 
 
@@ -116,7 +116,7 @@ class Fleet:
 
     def __init__(self, places: Sequence[Place]) -> None:
         self._places = places
-        self._sessions: dict[Route, Bus] = {}
+        self._sessions: dict[Route, ZenohSession] = {}
         self._open = ExitStack()
         self.unreached: list[str] = []
 
@@ -145,10 +145,10 @@ class Fleet:
             raise BusError(self.unreached[0])
         return [members[name] for name in sorted(members)]
 
-    def bus(self, route: Route) -> Bus:
+    def bus(self, route: Route) -> ZenohSession:
         """Return the session of a route; BusError if no process answers there."""
         if route not in self._sessions:
-            self._sessions[route] = self._open.enter_context(Bus(connect=route, client=True))
+            self._sessions[route] = self._open.enter_context(ZenohSession(connect=route, client=True))
         return self._sessions[route]
 
     def _look_at(self, place: Place, members: dict[str, Member]) -> None:
@@ -173,7 +173,7 @@ class Fleet:
                 members.setdefault(learner.robot, Member(learner.robot)).learner = learner
 
 
-def _states(bus: Bus, robots: str, process: str, kind: type[Status]) -> Iterator[Status]:
+def _states(bus: ZenohSession, robots: str, process: str, kind: type[Status]) -> Iterator[Status]:
     for reply in bus.ask(Keys(robots).status(process), timeout_s=ANSWER_LIMIT_S):
         if reply.error is None:
             with suppress(RequestError):  # another version's message counts as no answer

@@ -46,7 +46,7 @@ class NonFiniteError(KBMapsError):
     """A number is NaN or infinite; nothing was changed."""
 
     def __init__(self, name: str) -> None:
-        super().__init__(f"{name} holds NaN or infinite values; drop or mend these samples before passing them on")
+        super().__init__(f"{name} holds NaN or infinite values; drop or fix these samples before passing them on")
 
 
 class BasisError(KBMapsError):

@@ -146,7 +146,7 @@ def rotation_matrices(name: str, values: ArrayLike) -> FloatArray:
             if given.size
             else np.empty((0, 3, 3))
         )
-    mended = nearest_rotation(given)
-    if given.size and np.abs(mended - given).max() > _TOLERANCE:
+    fixed = nearest_rotation(given)
+    if given.size and np.abs(fixed - given).max() > _TOLERANCE:
         raise RotationError(name, "a matrix is no proper rotation (orthonormal, determinant 1)")
-    return mended
+    return fixed

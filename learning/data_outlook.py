@@ -130,6 +130,6 @@ def _mean_error_m(claim: PredictiveUncertainty, q: FloatArray) -> float:
 
 
 def _in_words(motion: str) -> str:
-    return {SAME: "going on as so far", ALL: "moving all joints over their ranges"}.get(
+    return {SAME: "moving as so far", ALL: "moving all joints over their ranges"}.get(
         motion, f"moving {motion} over its range"
     )

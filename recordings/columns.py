@@ -39,7 +39,7 @@ EXTRA_PREFIXES = ("current_", "temperature_")
 QUATERNION_TOLERANCE = 1e-3
 LARGEST_SEGMENT = 2.0**53
 SMALLEST_SIGMA_M, LARGEST_SIGMA_M = 1e-100, 1e100  # their squares are still numbers
-_MEND_ROW = "Mend or delete the row"
+_MEND_ROW = "Fix or delete the row"
 # More columns than any arm needs, and ten hours at 100 samples/s with 27 columns.
 MOST_COLUMNS, MOST_NUMBERS = 1000, 100_000_000
 LONGEST_NAME = 200

@@ -172,7 +172,7 @@ def _wrong_width(lines: list[str], index: int, names: tuple[str, ...], whole: bo
         return Fault("the line is empty", row=index, remedy="Delete the line")
     what = f"{width} field{'s' if width > 1 else ''} where the header names {len(names)}"
     column = names[width] if width < len(names) else None
-    return Fault(what, row=index, column=column, remedy="Mend or delete the line")
+    return Fault(what, row=index, column=column, remedy="Fix or delete the line")
 
 
 def _number(text: str) -> float | None:

@@ -107,7 +107,7 @@ def _check_kind(arrow: Any, name: str, kind: Any) -> None:
 def _column(name: str, column: Any) -> np.ndarray:
     if column.null_count:
         row = int(np.flatnonzero(column.is_null().to_numpy())[0])
-        raise Fault("the value is missing", row=row, column=name, remedy="Mend or delete the row")
+        raise Fault("the value is missing", row=row, column=name, remedy="Fix or delete the row")
     return column.to_numpy().astype(np.float64)
 
 

@@ -285,7 +285,7 @@ def _unreadable(file: Path, error: OSError) -> RecordingError:
         return RecordingError("there is no such file", file=file, remedy="Name a recording that is there")
     if isinstance(error, IsADirectoryError):
         return RecordingError("a folder, not a file", file=file, remedy="Name the recording in it")
-    return RecordingError(f"cannot be read: {error.strerror or error}", file=file, remedy="Mend its permissions")
+    return RecordingError(f"cannot be read: {error.strerror or error}", file=file, remedy="Fix its permissions")
 
 
 def _located(fault: Fault, file: Path | None) -> RecordingError:

@@ -129,9 +129,7 @@ class RobotDescription:
         """Build the description like `load`, from the tables and the text of robot.toml."""
         for section in ("robot", "camera"):
             if section not in tables:
-                raise ConfigError(
-                    f"the table [{section}] is missing", file=file, remedy="`bodyschema config init` shows one"
-                )
+                raise ConfigError(f"the table [{section}] is missing", file=file, remedy="`bodyschema init` shows one")
         _check_name(tables["robot"], text, file)
         robot = convert(tables["robot"], RobotSection, file=file, text=text, prefix=("robot",))
         camera = convert(tables["camera"], CameraSection, file=file, text=text, prefix=("camera",))

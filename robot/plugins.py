@@ -57,7 +57,7 @@ def load(group: Group, name: str) -> Any:
         return _entry(group, name).load()
     except (ImportError, AttributeError) as error:
         raise ConfigError(
-            f"the plugin {name!r} cannot be loaded: {error}", remedy="Mend or reinstall the package that it is in"
+            f"the plugin {name!r} cannot be loaded: {error}", remedy="Fix or reinstall the package that it is in"
         ) from error
 
 

@@ -34,7 +34,7 @@ _PLACE = re.compile(r"(?P<what>.*?) - at `\$(?P<path>[^`]*)`$", re.DOTALL)
 
 
 def read_toml(
-    file: Path, *, written_by: str = "`bodyschema config init` writes one", damaged: str = ""
+    file: Path, *, written_by: str = "`bodyschema init` writes one", damaged: str = ""
 ) -> tuple[dict[str, Any], str]:
     """Return the tables of `file` and its text. Raise ConfigError with the line when it cannot be read.
 
@@ -52,7 +52,7 @@ def read_toml(
     except UnfitFile as error:
         raise ConfigError(str(error.strerror), file=file, remedy=damaged or "Name a robot.toml") from error
     except OSError as error:
-        raise ConfigError(f"cannot be read: {error.strerror}", file=file, remedy="Mend its permissions") from error
+        raise ConfigError(f"cannot be read: {error.strerror}", file=file, remedy="Fix its permissions") from error
     text = _decoded(data, file, damaged or "Name a robot.toml, or save it as UTF-8")
     if (line := line_of_endless_key(text)) is not None:
         raise ConfigError(f"a key has more than {MOST_PARTS} parts", file=file, line=line, remedy="Delete it")

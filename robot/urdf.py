@@ -415,7 +415,7 @@ def _parse(file: Path) -> Any:
         ) from error
     except OSError as error:
         raise RobotError(
-            f"cannot read the URDF: {error.strerror}", file=file, remedy="Mend [robot] urdf, or --urdf"
+            f"cannot read the URDF: {error.strerror}", file=file, remedy="Fix [robot] urdf, or --urdf"
         ) from error
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False)
     try:

@@ -230,13 +230,13 @@ class _Writer:
         meshes = self._meshes
         if meshes.missing:
             yield (
-                f"missing meshes: {_some(meshes.missing)}. The simulation goes on without{drawn}. It only looks "
+                f"missing meshes: {_some(meshes.missing)}. The simulation continues without{drawn}. It only looks "
                 f"different. To see the robot's shape, put its meshes beside {self._file}"
             )
             drawn = ""
         if meshes.unusable:
             faults = [f"{name}: {why}" for name, why in meshes.unusable.items()]
-            yield f"meshes that cannot be used: {_some(faults, '; ')}. The simulation goes on without{drawn}"
+            yield f"meshes that cannot be used: {_some(faults, '; ')}. The simulation continues without{drawn}"
         if self._left_out:
             yield f"the simulation leaves out what it cannot take of {self._file}: {_some(list(self._left_out), '; ')}"
 

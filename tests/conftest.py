@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 from collections.abc import Callable, Generator, Iterator
@@ -40,6 +41,18 @@ def pytest_xdist_auto_num_workers() -> int:
     return (3 * len(os.sched_getaffinity(0)) + 1) // 2
 
 
+def pytest_collection(session: pytest.Session) -> None:
+    """Collect no garbage among thousands of tests, which are none."""
+    gc.disable()
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Leave what was collected out of every later search for garbage."""
+    gc.collect()
+    gc.freeze()
+    gc.enable()
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Move files of many quick tests to the end, so that no worker is left with a long one."""
     items.sort(key=lambda item: item.nodeid.startswith(QUICK))
@@ -55,6 +68,14 @@ def free_endpoint() -> Callable[[], str]:
 def endpoint(free_endpoint: Callable[[], str]) -> str:
     """Return an unused zenoh endpoint on this machine."""
     return free_endpoint()
+
+
+@pytest.fixture
+def patient_host(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait for a servo's answer as long as a full machine may hold up the bench that gives it."""
+    monkeypatch.setattr("bodyschema.drivers.servos.bus.HOST_MARGIN_S", 1.0)
+    monkeypatch.setattr("bodyschema.drivers.servos.scan.HOST_S", 1.0)
+    monkeypatch.setattr("bodyschema.drivers.dynamixel.scan.HOST_S", 1.0)
 
 
 @pytest.fixture

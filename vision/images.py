@@ -17,14 +17,14 @@ def check_images(frame: StereoFrame, calibration: StereoCalibration) -> None:
     if len(frame.images) != len(calibration.eyes_m):
         raise SourceError(
             f"frames with {len(frame.images)} images for each instant, but the calibration is of "
-            f"{len(calibration.eyes_m)}. Mend [camera] eyes, or [vision.cameras]"
+            f"{len(calibration.eyes_m)}. Fix [camera] eyes, or [vision.cameras]"
         )
     names = ("left image", "right image") if calibration.is_stereo else ("image",)
     for name, image in zip(names, frame.images, strict=True):
         if image.shape != (height, width, 3) or image.dtype != np.uint8:
             raise SourceError(
                 f"the {name} is {_described(image)}; the calibration is for {width}x{height} pixels of three "
-                "colours (uint8, BGR). Set the camera to that size, or mend [camera] image_size_px"
+                "colours (uint8, BGR). Set the camera to that size, or fix [camera] image_size_px"
             )
 
 

@@ -110,11 +110,11 @@ class Lens:
 
     def _undistorted(self, start: FloatArray, px: FloatArray) -> FloatArray:
         found = start
+        h = 1e-6
+        shifts = h * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
         for _ in range(_ITERATIONS):
             ahead = np.column_stack([found, np.ones(len(found))])
-            h = 1e-6
-            shifts = h * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-            value, right, down = (self.project(ahead + shift) for shift in shifts)
+            value, right, down = self.project((ahead + shifts[:, None]).reshape(-1, 3)).reshape(3, -1, 2)
             (a, c), (b, d) = ((right - value) / h).T, ((down - value) / h).T
             u, v = (value - px).T
             # Where a lens folds the image over there is no direction; the step is kept short, and says nothing.

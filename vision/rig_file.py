@@ -114,7 +114,7 @@ def write_rig(rig: Rig, file: Path) -> None:
         os.replace(part, file)
     except OSError as error:
         part.unlink(missing_ok=True)
-        raise ConfigError(f"cannot be written: {error.strerror}", file=file, remedy="Mend folder or disk") from error
+        raise ConfigError(f"cannot be written: {error.strerror}", file=file, remedy="Fix folder or disk") from error
 
 
 def _text(rig: Rig) -> str:

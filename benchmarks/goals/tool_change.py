@@ -17,8 +17,10 @@ from benchmarks.peers.tasks import Trial
 from benchmarks.rigid_learner import new_tool_error
 from benchmarks.rough_arm import ROUGH, RoughArm, rough_arm
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
-from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner
 from bodyschema.learning.config import LearnerConfig
+from bodyschema.learning.nominal import NominalModel
+from bodyschema.learning.online_learner import OnlineLearner
+from bodyschema.learning.solvers.solver import DirectSolver
 from kbmaps import ChainTolerances
 
 _JOINTS = 6

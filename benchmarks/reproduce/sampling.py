@@ -14,7 +14,7 @@ from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler.sampler import Sampler
 from bodyschema.daemon.sampler.session import session_of
 from bodyschema.daemon.sampler.sources import Sources
-from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import SourceEnded, SourceError
 from bodyschema.interfaces.protocols import MarkerSource
@@ -55,7 +55,7 @@ def sampled(config: Config, sources: Sources, count: int, say: Say) -> tuple[Flo
         SourceError: the sources ended too early.
         StoreError: the store cannot be written.
     """
-    with Bus() as bus, PairStore(config.store_file, session_of(config, SystemClock())) as store:
+    with ZenohSession() as bus, PairStore(config.store_file, session_of(config, SystemClock())) as store:
         counted = replace(sources, marker=_Enough(sources.marker, store.reader, count, say))
         Sampler(config, counted, bus, store, exit_at_end=True).run()
         pairs = store.reader.read()

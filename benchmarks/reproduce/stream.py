@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from bodyschema.cli.terminal.progress import Say, counted
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
-from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner
 from bodyschema.learning.config import LearnerConfig
+from bodyschema.learning.nominal import NominalModel
+from bodyschema.learning.online_learner import OnlineLearner
+from bodyschema.learning.solvers.solver import DirectSolver
 from kbmaps import NLMS, JointBasis, KBMap, RigidChain
 
 from .experiment import Curve, Tests, distances

@@ -22,7 +22,7 @@ from bodyschema.robot.description import RobotDescription
 from kbmaps import DegenerateDataError, RigidChain, align
 from kbmaps.chains.placement import place
 
-from .limits import KNOWN_TOOL_M, MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD, reach_m, spread_m
+from .limits import A_RADIAN_M, KNOWN_TOOL_M, MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD, reach_m, spread_m
 from .reading import QUARTER, Reading
 
 # Number of rows to be read in other ways, evenly spread. Twice as many cost twice the time and change no verdict of the
@@ -41,6 +41,9 @@ ENOUGH_AS_IT_IS, ENOUGH = 0.03, 0.01
 MUCH_BETTER, AS_GOOD = 1.5, 1.15
 # ... and if it is more probable by this much [nats], less a penalty for each change of the reading.
 CERTAIN, A_CHANGE = 10.0, 3.0
+# Rows on the way from one pose to another say together what one says: errors of links change slowly along a path. They
+# count as one within this distance, of the joint that moved farthest.
+APART_RAD = math.radians(10.0)
 # A fit with residuals above these shares of the positions' spread and of the arm's reach is not of this arm.
 UNEXPLAINED, OF_REACH = 0.25, 0.02
 # ... and above this multiple of the known noise.
@@ -50,9 +53,11 @@ NOISES = 5.0
 NAMED = 0.12
 # A joint offset above this is mentioned: that of one in 300 generated arms with offsets of up to 10°.
 FAR_ZERO_RAD = math.radians(20.0)
+# ... unless the pairs fit about as well with half of it.
+NEAR_ZERO_RAD = FAR_ZERO_RAD / 2.0
 # A known camera pose is not off by this much.
 TURNED_RAD = math.radians(30.0)
-# Share of its tolerance that is left to a joint offset kept at nominal.
+# Share of its tolerance that is left to a joint offset that is held.
 HELD = 1e-3
 # A zero of the last joint this far off is not fitted where the marker is known: its quarter turns are tried instead.
 LAST_ZERO_RAD = math.radians(3.0)
@@ -181,10 +186,10 @@ def plausibility(
             found = Plausibility(warnings=(f"perhaps {text.removeprefix('it seems that ')}{either}",))
     else:
         far = [
-            f"with the links as drawn, the zero of {name} comes out {math.degrees(zero):+.0f}°: it is wrong, or the "
+            f"with the nominal links, the zero of {name} comes out {math.degrees(zero):+.0f}°: it is wrong, or the "
             "URDF is of another arm"
-            for name, zero, slides in zip(names, fit.zeros, chain.prismatic, strict=True)
-            if not slides and abs(zero) > FAR_ZERO_RAD and search.held_error() > MUCH_BETTER * fit.error
+            for joint, (name, zero, slides) in enumerate(zip(names, fit.zeros, chain.prismatic, strict=True))
+            if not slides and abs(zero) > FAR_ZERO_RAD and search.nearer_is_worse(joint, fit)
         ]
         if fit.error > max(NAMED * spread, noise):
             far.append(f"{_drawn_arm_misses(_mm(before))}: they may be of another robot, or their columns misread")
@@ -216,7 +221,7 @@ def _hardly(before: str, after: str, nearest: str) -> Plausibility:
 
 
 def _drawn_arm_misses(before: str) -> str:
-    return f"placed as well as it can be, the drawn arm misses the pairs by {before}"
+    return f"placed as well as it can be, the nominal arm misses the pairs by {before}"
 
 
 def _nameable(reading: Reading, fit: _Fit, spread: float) -> bool:
@@ -267,6 +272,7 @@ class _Search:
     def __init__(self, chain: RigidChain, q: FloatArray, x: FloatArray, exact_m: float, pose_known: bool) -> None:
         self._chain, self._q, self._x, self._exact_m, self._pose_known = chain, q, x, exact_m, pose_known
         self._std = np.where(chain.prismatic, SLIDES_M, ZEROS_RAD)
+        self._poses = _poses_apart(q / np.where(chain.prismatic, A_RADIAN_M, 1.0))
         self._tried: set[Reading] = set()
         self.fits: dict[Reading, _Fit] = {}
 
@@ -314,10 +320,15 @@ class _Search:
         except DegenerateDataError:
             return np.zeros((1, 3))
 
-    def held_error(self) -> float:
-        """Return the RMS distance [m] of the nearest pairs with columns unchanged and joint offsets kept at nominal."""
-        held = place(self._chain, self._q[None], self._x[None], zeros_std=HELD * self._std, tool_std=TOOL_M)
-        return float(held.errors(MEASURED)[0])
+    def nearer_is_worse(self, joint: int, fit: _Fit) -> bool:
+        """Return True if the unchanged columns fit clearly worse than `fit` with a joint's zero `NEAR_ZERO_RAD` off."""
+        q, here = self._q.copy(), np.arange(self._chain.joints) == joint
+        q[:, joint] += math.copysign(NEAR_ZERO_RAD, fit.zeros[joint])
+        held = place(
+            self._chain, q[None], self._x[None], zeros_std=np.where(here, HELD, 1.0) * self._std, tool_std=TOOL_M
+        )
+        ratio = max(float(held.errors(MEASURED)[0]), self._exact_m) / fit.error
+        return ratio > MUCH_BETTER and 3.0 * MEASURED * self._poses * math.log(ratio) > CERTAIN
 
     def with_marker_known(self, reading: Reading) -> tuple[Reading, _Fit] | None:
         """Return the reading with the last joint off by quarter turns, and its fit, if the known marker shows it.
@@ -409,7 +420,7 @@ class _Search:
         if self._pose_known:
             turns = Rotation.from_matrix(placed.rotations).magnitude()
             cost += [0.0 if r.mirrored else 0.5 * (turn / TURNED_RAD) ** 2 for r, turn in zip(new, turns, strict=True)]
-        nats = 3.0 * MEASURED * len(self._x) * np.log(errors) + cost
+        nats = 3.0 * MEASURED * self._poses * np.log(errors) + cost
         fits: dict[Reading, _Fit] = {}
         for k, reading in enumerate(new):
             found = reading.turned(quarters[k].tolist())
@@ -417,6 +428,16 @@ class _Search:
             if found not in fits or fit.nats < fits[found].nats:
                 fits[found] = fit
         return fits
+
+
+def _poses_apart(q: FloatArray) -> int:
+    """Return how many of the poses q (n, d) are `APART_RAD` from each other, in at least one joint."""
+    apart = np.abs(q[:, None] - q).max(axis=2) > APART_RAD
+    kept: list[int] = []
+    for pose, far in enumerate(apart):
+        if far[kept].all():
+            kept.append(pose)
+    return len(kept)
 
 
 def _mm(distance_m: float) -> str:

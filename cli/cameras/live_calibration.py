@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
-from bodyschema.daemon.sampler.reconnect import Reopening
+from bodyschema.daemon.sampler.reconnect import ReconnectingSource
 from bodyschema.interfaces.errors import SourceEnded, SourceError
 from bodyschema.interfaces.protocols import Clock, StereoEyes
 from bodyschema.interfaces.records import StereoFrame
@@ -138,7 +138,7 @@ class LiveCalibration:
             keep: called with the images of every view taken and its number, from 1 on.
         """
         self._eyes, self._calibrated, self._show, self._keep = eyes, calibrated, show, keep
-        self._source = Reopening(RequiredEyes(eyes, SameAsFirst()), "the cameras", clock)
+        self._source = ReconnectingSource(RequiredEyes(eyes, SameAsFirst()), "the cameras", clock)
         self._views = views
         self._refusal = ""
         self._next_try = 0
@@ -210,7 +210,7 @@ def checked_live(
     """
     rig, last = pair_in(calibration), ""
     until = clock.now() + longest_s
-    with Reopening(RequiredEyes(eyes, rig.require), "the cameras", clock) as source, suppress(SourceEnded):
+    with ReconnectingSource(RequiredEyes(eyes, rig.require), "the cameras", clock) as source, suppress(SourceEnded):
         while clock.now() < until:
             frame = source.read(READ_S)
             look = None if frame is None else views.look(frame)

@@ -41,7 +41,7 @@ def bench(
     each joint swings slowly. PORT.toml is written next to PORT for the other commands: your robot.toml with the
     emulator's port and a state of its own. Both files are removed at the end.
 
-    Needs: robot.toml with servos (`bodyschema robot new`) or encoders, no hardware.
+    Needs: robot.toml with servos (`bodyschema init --from scan`) or encoders, no hardware.
 
     Next: in another terminal `bodyschema scan`, `doctor` or `joints`, each with --robot PORT.toml.
     """

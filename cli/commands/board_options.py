@@ -21,7 +21,7 @@ class DrawnBoard:
     """The board as it is drawn."""
 
     squares: Annotated[str, Parameter(help="Columns and rows of the board's squares, as in 8x6.")] = "8x6"
-    square_mm: Annotated[float, Parameter(help="Side of a square as drawn [mm].", validator=Number(gt=0))] = 30.0
+    square_mm: Annotated[float, Parameter(help="Nominal side of a square [mm].", validator=Number(gt=0))] = 30.0
     marker_mm: Annotated[
         float | None, Parameter(help="Side of a marker [mm]; else 0.75 of a square.", show_default=False)
     ] = None

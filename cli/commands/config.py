@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import cyclopts
-from cyclopts import Parameter
 
-from bodyschema.cli.commands.options import HERE, RobotFile, flag, several
+from bodyschema.cli.commands.options import HERE, RobotFile
 
 if TYPE_CHECKING:
     from bodyschema.daemon.config import Config
@@ -19,62 +17,20 @@ if TYPE_CHECKING:
 
 config = cyclopts.App(
     name="config",
-    help="""Write, check or show robot.toml.
+    help="""Check or show robot.toml.
 
-    Needs: the URDF of your robot; `config init --sim` needs nothing.
+    Needs: robot.toml (`bodyschema init`) and the URDF that it names.
 
-    Next: `bodyschema config init`, then `bodyschema config check`.
+    Next: `bodyschema config check`, then `bodyschema run`, or `bodyschema replay` for a recording.
     """,
 )
-
-
-@config.command(sort_key=1)
-def init(
-    *,
-    robot: Annotated[Path, Parameter(help="The file to write.")] = HERE,
-    urdf: Annotated[Path | None, Parameter(help="Your robot's URDF: joints and links are taken from it.")] = None,
-    sim: Annotated[bool, flag("A whole example: the simulated upper body.")] = False,
-    lerobot: Annotated[
-        str | None, Parameter(help="An arm of LeRobot: so101, so100, moss, koch or koch_leader; with its URDF.")
-    ] = None,
-    calibration: Annotated[Path | None, Parameter(help="LeRobot's calibration of this arm, a JSON file.")] = None,
-    port: Annotated[
-        tuple[str, ...], several("Where the arm's servos are; of several, and without any, it is found")
-    ] = (),
-) -> None:
-    """Write a commented robot.toml. Never replaces a file.
-
-    With --urdf the longest chain of joints is filled in; without it, the names are examples. With --lerobot the servos
-    are filled in as well, with IDs, directions and zeros from LeRobot's calibration: one robot.toml for a leader,
-    another one for a follower. Nothing is written to any servo.
-
-    Needs: your robot's URDF; with --sim nothing at all; with --lerobot also LeRobot's calibration of the arm.
-
-    Next: correct what is marked CHECK, then `bodyschema config check`. With --sim nothing is left to correct:
-    `bodyschema run --sim`. With --lerobot: `bodyschema joints`.
-    """
-    from bodyschema.interfaces.errors import ConfigError
-
-    try:
-        if sim:
-            _copy_model(robot)
-        elif lerobot is not None:
-            write_new(robot, _of_lerobot(lerobot, urdf, robot, calibration, port))
-        else:
-            from bodyschema.cli.hardware.robot_template import EXAMPLE, guess_from, robot_toml
-
-            write_new(robot, robot_toml(EXAMPLE if urdf is None else guess_from(urdf, robot)))
-    except OSError as error:
-        raise ConfigError(f"cannot be written: {error.strerror}", file=robot, remedy="Give another --robot") from error
-    following = "run --sim" if sim else "config check" if lerobot is None else "joints"
-    say(f"{robot} written. Next: `bodyschema {following} --robot {robot}`")
 
 
 @config.command(sort_key=2)
 def check(*, robot: RobotFile = HERE) -> None:
     """Check robot.toml: print what was understood, or the line to correct.
 
-    Needs: robot.toml (`bodyschema config init`) and the URDF that it names.
+    Needs: robot.toml (`bodyschema init`) and the URDF that it names.
 
     Next: `bodyschema replay` for a recording that you have; `bodyschema run`.
     """
@@ -122,7 +78,7 @@ def check(*, robot: RobotFile = HERE) -> None:
 def show(*, robot: RobotFile = HERE) -> None:
     """Print all settings as they are in force, defaults and environment included, as JSON.
 
-    Needs: robot.toml (`bodyschema config init`) and the URDF that it names.
+    Needs: robot.toml (`bodyschema init`) and the URDF that it names.
 
     Next: change a setting in the file, or for once as `BODYSCHEMA_TABLE_KEY=value bodyschema COMMAND`.
     """
@@ -135,29 +91,6 @@ def show(*, robot: RobotFile = HERE) -> None:
     tables["robot"] = msgspec.to_builtins(checked.robot.robot)
     tables["camera"] = msgspec.to_builtins(checked.robot.camera)
     say(msgspec.json.format(msgspec.json.encode(tables)).decode())
-
-
-def _of_lerobot(name: str, urdf: Path | None, robot: Path, calibration: Path | None, ports: Sequence[str]) -> str:
-    """Return a robot.toml for an arm of LeRobot."""
-    from bodyschema.cli.hardware.lerobot_robot import lerobot_arm, lerobot_port, lerobot_robot_toml
-    from bodyschema.daemon.wiring import servos as servo_wiring
-    from bodyschema.daemon.wiring.wiring import connected_cameras
-    from bodyschema.interfaces.errors import ConfigError
-    from bodyschema.robot.lerobot import where_calibrations_are
-
-    arm = lerobot_arm(name)
-    if urdf is None:
-        raise ConfigError(
-            "--lerobot needs the arm's URDF", remedy="Give it with --urdf; SO-ARM100 has one in Simulation/"
-        )
-    if calibration is None:
-        raise ConfigError(
-            "--lerobot needs the arm's calibration", remedy=f"Give --calibration. {where_calibrations_are()}"
-        )
-    if len(ports) != 1:
-        ports = servo_wiring.ports_to_scan(ports, None)
-        ports = [lerobot_port(arm, lambda bauds: servo_wiring.scan(ports, bauds, lambda _: None))]
-    return lerobot_robot_toml(arm, urdf, robot, calibration, ports[0], connected_cameras())
 
 
 def _effect_line(effect: Effect) -> str:
@@ -193,23 +126,3 @@ def say(text: str) -> None:
     from rich.console import Console
 
     Console(highlight=False, soft_wrap=True).print(text, markup=False)
-
-
-def write_new(file: Path, text: str) -> None:
-    """Write a new file. Raise ConfigError if it exists."""
-    from bodyschema.interfaces.errors import ConfigError
-
-    try:
-        with file.open("x", encoding="utf-8") as stream:
-            stream.write(text)
-    except FileExistsError as error:
-        raise ConfigError("is there already", file=file, remedy="Give another --robot, or move it away") from error
-
-
-def _copy_model(robot: Path) -> None:
-    from bodyschema.daemon.wiring.wiring import demonstration_model
-
-    model = demonstration_model()
-    write_new(robot, model.read_text(encoding="utf-8"))
-    for urdf in model.parent.glob("*.urdf"):
-        write_new(robot.parent / urdf.name, urdf.read_text(encoding="utf-8"))

@@ -30,7 +30,7 @@ def demo(
     marker: Annotated[
         Literal["ball", "tag", "cluster"] | None,
         Parameter(
-            help="In the hand: a red ball, one AprilTag (which --camera mono has unless told), or a cube of six, which "
+            help="In the hand: a red ball, one AprilTag (which --camera mono has by default), or a cube of six, which "
             "the cameras see from all sides.",
             show_default=False,
         ),
@@ -55,7 +55,7 @@ def demo(
 
     Needs: the extra `sim` (`pip install 'bodyschema[sim]'`), and no hardware.
 
-    Next: `bodyschema replay` on the recording of the first tool; `bodyschema config init` for a robot of your own.
+    Next: `bodyschema replay` on the recording of the first tool; `bodyschema init` for a robot of your own.
     """
     import numpy as np
     from rich.console import Console

@@ -14,7 +14,7 @@ def doctor(*, robot: RobotFile = HERE, json: Annotated[bool, flag("As JSON.")] =
     The servos are queried for identity and health, and read at full speed for a moment. Nothing is written to them, and
     torque stays as it is. While the sampler runs, its status is used instead. Exit code 1 if there is a problem.
 
-    Needs: robot.toml (`bodyschema config init`).
+    Needs: robot.toml (`bodyschema init`).
 
     Next: the commands in the last column; `bodyschema scan` if a servo is missing.
     """

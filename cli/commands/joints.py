@@ -32,7 +32,7 @@ def joints(
     when you moved the last joint: if it went the other way, the sign is wrong. Angles beyond the URDF's limits are
     reported, too.
 
-    Needs: robot.toml with servos (`bodyschema robot new`), encoders or a ROS 2 robot, and no running sampler.
+    Needs: robot.toml with servos (`bodyschema init --from scan`), encoders or a ROS 2 robot, and no running sampler.
 
     Next: correct what the line below the table names; then `bodyschema run`.
     """

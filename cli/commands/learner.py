@@ -32,7 +32,7 @@ def learner(
     learnt. With several robots, each pair is learnt as it arrives, and less urgent work is done in turns
     (docs/fleet.md).
 
-    Needs: robot.toml (`bodyschema config init`), and for new pairs `bodyschema sampler`.
+    Needs: robot.toml (`bodyschema init`), and for new pairs `bodyschema sampler`.
 
     Next: `bodyschema predict`, `bodyschema status`; for several robots `bodyschema fleet list`.
     """
@@ -44,7 +44,7 @@ def learner(
     from bodyschema.daemon.learner.host import run_learners
     from bodyschema.daemon.service import logs
     from bodyschema.daemon.service.notify import Notifier
-    from bodyschema.daemon.service.signals import Wishes, on_termination
+    from bodyschema.daemon.service.signals import SignalFlags, on_termination
     from bodyschema.fleet.hosting import configs_of, descriptions, spread
     from bodyschema.interfaces.clock import SystemClock
     from bodyschema.interfaces.extras import require_extra
@@ -57,7 +57,7 @@ def learner(
     if min(processes, len(files)) > 1:
         spread(configs, processes, ["--verbose"] if verbose else [])
         return
-    notifier, wishes = Notifier.of_environment(), Wishes()
+    notifier, wishes = Notifier.of_environment(), SignalFlags()
     # In a terminal SIGHUP means that the terminal was closed.
     reload = wishes.reload if notifier.is_heard else None
     with shown(files[0]) if view else nullcontext(), on_termination(wishes.end, reload=reload):

@@ -34,7 +34,7 @@ def record(
 
     from bodyschema.cli.recordings.recorder import History, copy_history, follow_history
     from bodyschema.daemon.config import Config
-    from bodyschema.daemon.service.signals import Wishes, on_termination
+    from bodyschema.daemon.service.signals import SignalFlags, on_termination
     from bodyschema.daemon.transport.bus import client
     from bodyschema.recordings import files as recordings
 
@@ -45,7 +45,7 @@ def record(
     with client(config.route("sampler")) as bus:
         history = History(bus, config.robot, from_seq)
         if follow:
-            wishes = Wishes()
+            wishes = SignalFlags()
             with on_termination(wishes.end):
                 console.print(f"writing pairs to {out} as they come; Ctrl-C ends it", markup=False)
                 count = follow_history(history, joints, out, lambda: wishes.ending)

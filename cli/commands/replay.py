@@ -76,7 +76,7 @@ def replay(
     from bodyschema.cli.replay.steps import Steps, require_path
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.transport.wire import encode
-    from bodyschema.learning import NominalModel
+    from bodyschema.learning.nominal import NominalModel
 
     config = Config.load(robot_file(robot, recording))
     config.require_learnable()

@@ -46,5 +46,5 @@ def restore(
     for aside in done.aside:
         console.print(f"  what was there before is {aside}", markup=False)
     for origin, target in done.elsewhere.items():
-        console.print(f"  robot.toml names {origin}: put {target} there, or mend robot.toml", markup=False)
+        console.print(f"  robot.toml names {origin}: put {target} there, or fix robot.toml", markup=False)
     console.print("A learner on another machine takes the pairs as those of another store: tell it reset_to_prior.")

@@ -29,7 +29,7 @@ def router(
     from bodyschema.cli.install.router import RouterConfig, run_router
     from bodyschema.daemon.service import logs
     from bodyschema.daemon.service.notify import Notifier
-    from bodyschema.daemon.service.signals import Wishes, on_termination
+    from bodyschema.daemon.service.signals import SignalFlags, on_termination
     from bodyschema.interfaces.clock import SystemClock
 
     config = RouterConfig.load(file)
@@ -37,6 +37,6 @@ def router(
         print(config.as_zenohd())  # noqa: T201
         return
     logs.set_up(verbose=verbose)
-    wishes = Wishes()
+    wishes = SignalFlags()
     with on_termination(wishes.end):
         run_router(config, lambda: wishes.ending, Notifier.of_environment(), SystemClock())

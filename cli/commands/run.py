@@ -20,7 +20,7 @@ def run(
 ) -> None:
     """Start sampler and learner as separate processes, and restart one that dies. Ctrl-C ends both.
 
-    Needs: robot.toml (`bodyschema config init`), and --sim or a recording named in its table [drivers].
+    Needs: robot.toml (`bodyschema init`), and --sim or a recording named in its table [drivers].
 
     Next: in another terminal, `bodyschema status --watch`, `bodyschema view` and `bodyschema predict`.
     """

@@ -23,7 +23,7 @@ def sampler(
     Each pair is stored before it is published. While the store cannot be written (the disk is full), the status reports
     it and no pairs are taken.
 
-    Needs: robot.toml (`bodyschema config init`) with joints and cameras or a recording; or --sim.
+    Needs: robot.toml (`bodyschema init`) with joints and cameras or a recording; or --sim.
 
     Next: `bodyschema learner`, `bodyschema status --watch`.
     """
@@ -35,7 +35,7 @@ def sampler(
     from bodyschema.daemon.service.notify import Notifier
     from bodyschema.daemon.service.service import Service
     from bodyschema.daemon.service.signals import on_termination
-    from bodyschema.daemon.transport.bus import Bus
+    from bodyschema.daemon.transport.bus import ZenohSession
     from bodyschema.daemon.wiring.wiring import open_sources
     from bodyschema.interfaces.clock import SystemClock
     from bodyschema.recordings.store.store import PairStore
@@ -47,7 +47,7 @@ def sampler(
         config = config.with_state_dir(state_dir)
     with (  # the store comes last, so that an earlier failure leaves no trace
         open_sources(config, sim=sim) as sources,
-        Bus(listen=config.tables.zenoh.sampler, settings=config.zenoh_settings("sampler")) as bus,
+        ZenohSession(listen=config.tables.zenoh.sampler, settings=config.zenoh_settings("sampler")) as bus,
         PairStore(config.store_file, session_of(config, SystemClock()), working=notifier.starting) as store,
     ):
         service = Service(notifier, LOOPS, SystemClock(), devices=devices_of(config))

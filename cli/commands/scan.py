@@ -30,7 +30,7 @@ def scan(
 
     Needs: powered servos, and permission to open the port (`bodyschema doctor` checks it).
 
-    Next: `bodyschema robot new --from scan`; `bodyschema doctor`.
+    Next: `bodyschema init --urdf YOUR.urdf --from scan`; `bodyschema doctor`.
     """
     from rich.console import Console
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import Bus, client
+from bodyschema.daemon.transport.bus import ZenohSession, client
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode
 from bodyschema.interfaces.errors import BusError, RequestError
@@ -30,17 +30,17 @@ def main(robot_file: str, seed: str) -> None:
             print(json.dumps(_one_second(bus, config, rng)), flush=True)  # noqa: T201
 
 
-def _patient_client(endpoint: str) -> Bus:
+def _patient_client(endpoint: str) -> ZenohSession:
     for _ in range(100):
         try:
             with client(endpoint):
-                return Bus(connect=endpoint, client=True)
+                return ZenohSession(connect=endpoint, client=True)
         except BusError:
             time.sleep(0.2)
-    raise BusError(f"nobody listens on {endpoint}")
+    raise BusError(f"nothing listens on {endpoint}")
 
 
-def _one_second(bus: Bus, config: Config, rng: np.random.Generator) -> dict[str, float | int]:
+def _one_second(bus: ZenohSession, config: Config, rng: np.random.Generator) -> dict[str, float | int]:
     key, robot = Keys(config.robot.name).predict, config.robot
     took: list[float] = []
     unanswered = refused = 0

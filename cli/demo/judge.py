@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.wire import JointsRequest, PairsReply, PredictReply, decode, encode
 from bodyschema.interfaces.records import FloatArray
@@ -46,7 +46,7 @@ class Verdict:
 class Judge:
     """Compares the learner's answers with the simulated ground truth."""
 
-    def __init__(self, robot: RobotDescription, sampler: Bus, learner: Bus, seed: int) -> None:
+    def __init__(self, robot: RobotDescription, sampler: ZenohSession, learner: ZenohSession, seed: int) -> None:
         self._robot, self._sampler, self._learner = robot, sampler, learner
         self._keys = Keys(robot.name)
         self._rng = np.random.default_rng(seed)

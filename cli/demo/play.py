@@ -12,7 +12,7 @@ import numpy as np
 
 from bodyschema.cli.terminal.screen import rejected
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import CommandRequest, decode, encode
@@ -93,8 +93,8 @@ def play(scene: Scene, *, first: int, second: int, seed: int, show: Callable[[Sn
         daemon = stack.enter_context(started_daemon(scene))
         daemon.wait_for(endpoints.sampler, keys.alive("sampler"))
         daemon.wait_for(endpoints.learner, keys.alive("learner"))
-        sampler = stack.enter_context(Bus(connect=endpoints.sampler, client=True))
-        learner = stack.enter_context(Bus(connect=endpoints.learner, client=True))
+        sampler = stack.enter_context(ZenohSession(connect=endpoints.sampler, client=True))
+        learner = stack.enter_context(ZenohSession(connect=endpoints.learner, client=True))
         asker = stack.enter_context(started_asker(scene, seed))
         stage = _Stage(config, daemon, sampler, learner, asker, show, seed)
         before = stage.learn(first, f"guided by hand, {first} pairs with the first tool", first, first + second)
@@ -114,8 +114,8 @@ def stalled(sampler: SamplerStatus) -> str:
 class _Stage:
     config: Config
     daemon: Daemon
-    sampler: Bus
-    learner: Bus
+    sampler: ZenohSession
+    learner: ZenohSession
     asker: Asker
     show: Callable[[Snapshot], None]
     seed: int

@@ -44,7 +44,7 @@ class Daemon:
             self.check()
             if time.monotonic() > limit:
                 raise BusError(
-                    f"nobody is alive on {endpoint} after {START_LIMIT_S:.0f} s; {self._scene.log_file} says why"
+                    f"nothing runs on {endpoint} after {START_LIMIT_S:.0f} s; {self._scene.log_file} says why"
                 )
             time.sleep(0.1)
 

@@ -152,7 +152,7 @@ def show_outcome(console: Console, outcome: Outcome, scene: Scene) -> None:
     console.print()
     console.print(
         f"Next: `bodyschema replay {_short(scene.first_tool_file)}` learns it again;\n"
-        "`bodyschema config init` begins with a robot of your own.",
+        "`bodyschema init` begins with a robot of your own.",
         soft_wrap=True,
     )
 

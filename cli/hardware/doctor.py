@@ -15,7 +15,7 @@ import msgspec
 
 from bodyschema.cli.install.units import FOLDER
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import Bus, is_alive
+from bodyschema.daemon.transport.bus import ZenohSession, is_alive
 from bodyschema.daemon.transport.identity import Route
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import SamplerStatus
@@ -83,7 +83,7 @@ def _description(config: Config) -> Iterator[Check]:
     )
     if config.tables.drivers.hardware is None:
         said = "no servos are configured, so none were looked at"
-        yield Check("robot.toml", "warning", said, "bodyschema robot new --from scan")
+        yield Check("robot.toml", "warning", said, "bodyschema init --urdf YOUR.urdf --from scan")
     cameras = config.tables.vision.cameras
     if cameras is not None and cameras.calibration is not None:
         return
@@ -104,7 +104,7 @@ def _cameras(config: Config) -> Iterator[Check]:
 
         yield from camera_checks(config)
         return
-    with Bus(connect=config.route("sampler"), client=True) as bus:
+    with ZenohSession(connect=config.route("sampler"), client=True) as bus:
         status = decode(bus.ask_one(Keys(config.robot.name).status("sampler")), SamplerStatus)
     yield Check("cameras", "ok", f"the running sampler takes {status.frames_per_s:.1f} stereo frames/s")
 
@@ -131,7 +131,7 @@ def _of_the_sampler(config: Config) -> Iterator[Check]:
     if not is_alive(route, keys.alive("sampler"), open_timeout_s=OPEN_S):
         yield Check("servos", "warning", "not looked at: another program has the port")
         return
-    with Bus(connect=route, client=True) as bus:
+    with ZenohSession(connect=route, client=True) as bus:
         status = decode(bus.ask_one(keys.status("sampler")), SamplerStatus)
     yield Check("rate", "ok", f"the running sampler takes {status.readings_per_s:.0f} readings/s")
     for complaint in status.health:
@@ -190,9 +190,9 @@ def unit_checks(root: Path = Path("/")) -> Iterator[Check]:
     files = [*(root / FOLDER).glob("bodyschema-*.service"), *(root / FOLDER).glob("bodyschema-*.service.d/*.conf")]
     for file in sorted(files):
         if OLD_UNIT.search(file.read_text(encoding="utf-8", errors="replace")):
-            mend = "install router" if "router" in file.name else "install service"
+            fix = "install router" if "router" in file.name else "install service"
             said = f"{file} starts `python -m daemon`, which this bodyschema does not have"
-            yield Check("service", "wrong", said, f'sudo "$(command -v bodyschema)" {mend}')
+            yield Check("service", "wrong", said, f'sudo "$(command -v bodyschema)" {fix}')
 
 
 def _is_synchronised() -> bool | None:
@@ -215,13 +215,11 @@ def _zenoh(config: Config) -> Iterator[Check]:
 def router_check(route: Route) -> Check:
     """Check that the router accepts our connection."""
     try:
-        with Bus(connect=route, client=True, open_timeout_s=OPEN_S):
+        with ZenohSession(connect=route, client=True, open_timeout_s=OPEN_S):
             return Check("zenoh", "ok", f"the router {route} takes our connection")
     except BusError as error:
         first, _, rest = str(error).partition(". ")
-        return Check(
-            "zenoh", "wrong", f"{first}: nobody on other machines sees this robot", rest or "see the router's log"
-        )
+        return Check("zenoh", "wrong", f"{first}: other machines do not see this robot", rest or "see the router's log")
 
 
 def zenoh_check(process: str, route: Route, token: str) -> Check:
@@ -251,7 +249,7 @@ def _is_listening(endpoint: str) -> bool:
 
 def _named(check: Check, file: Path) -> Check:
     """Return the check with the actual name of robot.toml in its command."""
-    return replace(check, mend=check.mend.replace("robot.toml", str(file)))
+    return replace(check, fix=check.fix.replace("robot.toml", str(file)))
 
 
 def run(config: Config, tell: Callable[[str], None]) -> list[Check]:

@@ -24,8 +24,8 @@ def show(console: Console, checks: Sequence[Check]) -> None:
         line.add_column(overflow="fold")
         line.add_row(MARKS[check.state], Text(check.subject), Text(as_typed(check.said)))
         console.print(line)
-        if check.mend:  # not wrapped here, so that it can be copied
-            console.print(Text(f"{INDENT}{as_typed(check.mend)}", "bold"), soft_wrap=True)
+        if check.fix:  # not wrapped here, so that it can be copied
+            console.print(Text(f"{INDENT}{as_typed(check.fix)}", "bold"), soft_wrap=True)
     console.print(_sum(checks))
 
 

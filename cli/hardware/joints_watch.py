@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.sampler.reconnect import Reopening
+from bodyschema.daemon.sampler.reconnect import ReconnectingSource
 from bodyschema.daemon.transport.status import JointRange
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray
@@ -88,7 +88,7 @@ class JointsWatch:
         self._servos = source if isinstance(source, ServoJoints) else None
         drivers = config.tables.drivers
         self._signs_in = signs_in(is_ros2=drivers.ros2 is not None, is_plugin=drivers.plugin is not None)
-        self._reading = Reopening(source, "the encoders", clock)
+        self._reading = ReconnectingSource(source, "the encoders", clock)
         self._opened = ExitStack()
         self._temperatures: dict[str, float | None] = dict.fromkeys(config.robot.joints)
         self._asked, self._next_s = 0, -math.inf

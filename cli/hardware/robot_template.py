@@ -1,14 +1,15 @@
-"""The robot.toml that `bodyschema config init` writes."""
+"""The robot.toml that `bodyschema init` writes."""
 
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from bodyschema.robot.urdf import UrdfTree
+    from bodyschema.robot.urdf import UrdfJoint, UrdfTree
 
 
 class Guess(NamedTuple):
@@ -21,10 +22,11 @@ class Guess(NamedTuple):
     camera_link: str
 
 
+_FINGER = re.compile(r"gripper|finger|jaw|knuckle", re.IGNORECASE)
 EXAMPLE = Guess("my_robot", "my_robot.urdf", ["joint_1", "joint_2"], "hand", "base_link")
 
 _TEMPLATE = """\
-# A robot for bodyschema. Mend what is marked CHECK, then type `bodyschema config check`.
+# A robot for bodyschema. Fix what is marked CHECK, then type `bodyschema config check`.
 
 [robot]
 # Part of the zenoh keys: letters, digits, _ . -
@@ -127,32 +129,58 @@ def quoted(text: str) -> str:
     return f'"{escaped}"'
 
 
-def guess_from(urdf: Path, robot: Path) -> Guess:
-    """Guess the chain with the most moving joints in `urdf`, from its root to the last link fixed to its end.
+def guess_from(urdf: Path, robot: Path, *, marker_link: str | None = None, camera_link: str | None = None) -> Guess:
+    """Guess the chain with the most moving joints in `urdf`, without fingers and joints that mimic others.
 
     Args:
+        urdf: the URDF.
         robot: path of the robot.toml to be written; the URDF is named relative to it.
+        marker_link: the link with the marker; by default the last link fixed to the end of the chain.
+        camera_link: the link that the cameras stand on; by default the root.
 
     Raises:
         RobotError: the URDF cannot be read.
+        ConfigError: it has no such link.
     """
-    from bodyschema.robot.urdf import MOVING, UrdfTree
+    from bodyschema.robot.urdf import UrdfTree
 
     tree = UrdfTree.load(urdf)
-    root = _root(tree)
-    paths = {link: [joint for joint, _ in tree.path(root, link)] for link in tree.links}
-    moving = {link: sum(joint.kind in MOVING for joint in path) for link, path in paths.items()}
-    end = max(tree.links, key=lambda link: (moving[link], len(paths[link])))
-    return guess_of(tree, os.path.relpath(urdf, robot.parent), end)
+    for link in (marker_link, camera_link):
+        _require_link(tree, link, urdf)
+    if marker_link is None:
+        root = camera_link or _root(tree)
+        paths = {link: [joint for joint, _ in tree.path(root, link)] for link in tree.links}
+        whole = {link: path for link, path in paths.items() if not any(map(_is_finger, path))}
+        marker_link = max(whole, key=lambda link: (len(_moving(whole[link])), len(whole[link])))
+    return guess_of(tree, os.path.relpath(urdf, robot.parent), marker_link, camera_link)
 
 
-def guess_of(tree: UrdfTree, urdf: str, end: str) -> Guess:
-    """Return the chain of moving joints from the root of `tree` to the link `end`."""
+def guess_of(tree: UrdfTree, urdf: str, end: str, root: str | None = None) -> Guess:
+    """Return the chain of moving joints from a link of `tree`, by default its root, to the link `end`."""
+    root = root or _root(tree)
+    joints = _moving([joint for joint, _ in tree.path(root, end)])
+    return Guess(key_name(tree.name), urdf, joints, end, root)
+
+
+def _moving(path: Sequence[UrdfJoint]) -> list[str]:
     from bodyschema.robot.urdf import MOVING
 
-    root = _root(tree)
-    joints = [joint.name for joint, _ in tree.path(root, end) if joint.kind in MOVING]
-    return Guess(key_name(tree.name), urdf, joints, end, root)
+    return [joint.name for joint in path if joint.kind in MOVING]
+
+
+def _is_finger(joint: UrdfJoint) -> bool:
+    """Return True for a joint that mimics another one, and for one of a gripper by its name."""
+    from bodyschema.robot.urdf import MOVING
+
+    return joint.mimics or (joint.kind in MOVING and bool(_FINGER.search(joint.name)))
+
+
+def _require_link(tree: UrdfTree, link: str | None, urdf: Path) -> None:
+    from bodyschema.interfaces.errors import ConfigError
+    from bodyschema.robot.suggest import did_you_mean
+
+    if link is not None and link not in tree.links:
+        raise ConfigError(f"has no link {link!r}", file=urdf, remedy=did_you_mean(link, tree.links))
 
 
 def key_name(text: str) -> str:

@@ -60,7 +60,7 @@ class JointFinding:
     Attributes:
         state: "ok", "missing", "wrong model", "not known" (it does not report its model), "another rate", "another
             port" or "double".
-        mend: remedy; empty if the state is ok.
+        fix: remedy; empty if the state is ok.
         servo: the servo that answered; None if there was no answer.
     """
 
@@ -69,7 +69,7 @@ class JointFinding:
     id: int
     model: str
     state: str
-    mend: str = ""
+    fix: str = ""
     servo: Servo | None = None
 
 
@@ -114,8 +114,8 @@ def report_of(ports: Sequence[ScannedPort], config: Config | None) -> ScanReport
     for entry in servos.servos:
         bus = servos.bus_of(entry)
         wanted = servos.buses[bus]
-        state, mend, servo = _place(found, entry.id, entry.model, wanted.port, wanted.baud)
-        joints.append(JointFinding(entry.joint, bus, entry.id, entry.model, state, mend, servo))
+        state, fix, servo = _place(found, entry.id, entry.model, wanted.port, wanted.baud)
+        joints.append(JointFinding(entry.joint, bus, entry.id, entry.model, state, fix, servo))
     known = {id(joint.servo) for joint in joints}
     own = {os.path.realpath(bus.port) for bus in servos.buses.values()}
     strangers = [servo for servo in found if id(servo) not in known and os.path.realpath(servo.port) in own]
@@ -133,7 +133,7 @@ def _place(found: Sequence[Servo], id: int, model: str, port: str, baud: int) ->
     if here and here[0].baud != baud:
         return "another rate", f"give the servo {baud:,} bit/s, or set baud = {here[0].baud} in robot.toml", here[0]
     if here and here[0].model is None:
-        return "not known", "it does not tell its model: mend what is said of it", here[0]
+        return "not known", "it does not report its model: correct its entry", here[0]
     if here:
         return "wrong model", _for_model(here[0].model, model), here[0]
     elsewhere = [servo for servo in found if servo.id == id and servo.model == model]

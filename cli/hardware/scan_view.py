@@ -22,7 +22,7 @@ def show(console: Console, report: ScanReport) -> None:
         if port.servos:
             console.print(_table(port.servos, joints, named=report.joints is not None))
         elif port.trouble is None:
-            console.print("  nobody answers, at no rate")
+            console.print("  no answer at any rate")
         if port.trouble is not None:
             console.print(Text(f"  {port.trouble}", style="red"), soft_wrap=True)
     for camera in report.cameras:
@@ -66,7 +66,7 @@ def _troubles(report: ScanReport) -> Iterator[str]:
             yield f"ID {servo.id}: {trouble}"
     for joint in report.joints or ():
         if joint.state not in ("ok", "double"):
-            yield f"joint {joint.joint} (ID {joint.id}, {joint.model}): {joint.state}: {joint.mend}"
+            yield f"joint {joint.joint} (ID {joint.id}, {joint.model}): {joint.state}: {joint.fix}"
     for servo in report.strangers:
         yield f"ID {servo.id} ({servo.model or '?'}) is on a port of robot.toml, but not in it"
 
@@ -77,7 +77,7 @@ def _verdict(report: ScanReport, troubles: Sequence[str]) -> str:
     if not count:
         return "No servo answers. Look at the supply, the cable, and whether another program holds the port."
     if report.joints is None:
-        return f"{servos} found. `bodyschema robot new --from scan` writes a robot.toml with them."
+        return f"{servos} found. `bodyschema init --urdf YOUR.urdf --from scan` writes a robot.toml with them."
     if report.is_well:
         return f"{servos}: those of robot.toml, all of them{', with troubles' if troubles else ''}."
     right = sum(joint.state == "ok" for joint in report.joints)

@@ -19,7 +19,7 @@ import msgspec
 from bodyschema.daemon.service.notify import Notifier
 from bodyschema.daemon.service.service import Service
 from bodyschema.daemon.transport.access import EVERY_ROBOT, ROLES, Names, Subjects, access_control
-from bodyschema.daemon.transport.bus import LARGEST_REPLY_BYTES, LEASE_MS, Bus
+from bodyschema.daemon.transport.bus import LARGEST_REPLY_BYTES, LEASE_MS, ZenohSession
 from bodyschema.daemon.transport.identity import SECURE, Identity, TlsConfig
 from bodyschema.daemon.transport.zenoh_config import ENDPOINT, HOW_TO
 from bodyschema.interfaces.errors import ConfigError
@@ -79,9 +79,9 @@ class RouterConfig:
             if robot != EVERY_ROBOT and not re.match(NAME, robot):
                 refuse(f"access: {robot!r} is no robot's name", 'Write one, or "*" for every robot', "access", robot)
             if not any(getattr(names, role) for role in ROLES):
-                refuse(f"access.{robot}: nobody has a role", f"Known are: {', '.join(ROLES)}", "access", robot)
+                refuse(f"access.{robot}: no one has a role", f"Known are: {', '.join(ROLES)}", "access", robot)
         if not tables.access:
-            refuse("access: nobody may do anything", 'Begin with [access."*"] and viewer = ["a name"]', "access")
+            refuse("access: no one may do anything", 'Begin with [access."*"] and viewer = ["a name"]', "access")
         try:
             identity = Identity.of(tables.tls, None, tables.users_file, file.parent)
         except ConfigError as error:
@@ -124,7 +124,7 @@ def run_router(config: RouterConfig, stopping: Callable[[], bool], notifier: Not
     Raises:
         BusError: the port is in use, or zenoh cannot use the certificates.
     """
-    with Bus(listen=config.tables.listen, settings=config.settings()):
+    with ZenohSession(listen=config.tables.listen, settings=config.settings()):
         robots = ", ".join(config.tables.access)
         log.info("the router takes connections on %s; it has roles for: %s", config.tables.listen, robots)
         service = Service(notifier, (PASSING_ON,), clock)

@@ -29,7 +29,7 @@ ADAPTERS = (
     ("2341", "0043", "Arduino Uno"),
 )
 _LATENCY = """\
-# Adapters of FTDI keep bytes back for 16 ms, unless they are told otherwise.
+# Adapters of FTDI keep bytes back for 16 ms, unless configured otherwise.
 ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"
 """
 RELOAD = (("udevadm", "control", "--reload-rules"), ("udevadm", "trigger", "--subsystem-match=tty", "--action=add"))

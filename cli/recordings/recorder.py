@@ -8,7 +8,7 @@ from pathlib import Path
 from threading import Event
 from typing import TextIO
 
-from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.wire import PairsReply, decode, pair_from_wire
 from bodyschema.interfaces.errors import BusError, RecordingError
@@ -33,7 +33,7 @@ class History:
         missing: numbers between the pairs so far that the sampler does not have.
     """
 
-    def __init__(self, bus: Bus, robot: RobotDescription, from_seq: int) -> None:
+    def __init__(self, bus: ZenohSession, robot: RobotDescription, from_seq: int) -> None:
         self._bus, self._joints, self._keys = bus, robot.joints, Keys(robot.name)
         self._news = Event()
         self._store: str | None = None

@@ -128,7 +128,7 @@ def as_text(report: ReplayReport, width: int = 80) -> str:
         f"{report.within_sigma_share:.0%} of the held-out coordinates (68 % is right); "
         f"{report.in_support_share:.0%} of the held-out rows lie where data was",
         *([] if report.outlook is None else [outlook_sentence(report.outlook)]),
-        f"{report.replayed} replay steps, {report.doubted} pairs doubted, {report.learning_s:.1f} s",
+        f"{report.replayed} replay steps, {report.doubted} pairs rejected as outliers, {report.learning_s:.1f} s",
         *([] if report.doubt is None else ["", f"Warning: {report.doubt}"]),
     ]
     return "\n".join(_wrapped(line, width) for line in lines)

@@ -13,7 +13,7 @@ import numpy as np
 
 from bodyschema.calibration.evaluate import ErrorFigures, Split, aligned_chain, coverage
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import Bus, client
+from bodyschema.daemon.transport.bus import ZenohSession, client
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode
@@ -161,7 +161,7 @@ def _angles(held_out: Recording, prediction: PredictReply, learner: LearnerStatu
 
 
 class _Live:
-    def __init__(self, job: Job, sampler: tuple[Process, Bus], learner: tuple[Process, Bus]) -> None:
+    def __init__(self, job: Job, sampler: tuple[Process, ZenohSession], learner: tuple[Process, ZenohSession]) -> None:
         self._keys = Keys(job.config.robot.name)
         (self._sampler, self._sampler_bus), (self._learner, self._learner_bus) = sampler, learner
         self._recording = job.recording
@@ -249,7 +249,7 @@ def _running(job: Job) -> Iterator[_Live]:
 
 
 @contextmanager
-def _connected(process: Process, endpoint: str, token: str) -> Iterator[Bus]:
+def _connected(process: Process, endpoint: str, token: str) -> Iterator[ZenohSession]:
     process.wait_for(endpoint, token)
     with client(endpoint) as bus:
         yield bus

@@ -38,7 +38,7 @@ def sentences(report: CalibrationReport) -> list[str]:
     """Return the report as sentences."""
     said = [_expected(report)] if report.expected_mm is not None else []
     said += [
-        f"Mean distance to the pairs: {report.drawn_error_mm:.3f} mm for the drawn arm in its best place, "
+        f"Mean distance to the pairs: {report.drawn_error_mm:.3f} mm for the nominal arm in its best place, "
         f"{report.learnt_error_mm:.3f} mm for the learnt one. {_noise(report)} {_outliers(report)}",
         _workmanship(report),
     ]
@@ -50,8 +50,8 @@ def sentences(report: CalibrationReport) -> list[str]:
     hidden = [zero.joint for zero in report.zeros if zero.half_width is None]
     if hidden and report.trusted != "urdf":
         said.append(
-            f"Left as drawn: {', '.join(hidden)}. Nothing that was measured tells {_such_zeros(hidden)} from a turn of "
-            "the camera, of the marker, or of a neighbouring joint, and nothing needs to: the positions are the same. "
+            f"Kept at nominal: {', '.join(hidden)}. The measurements cannot tell {_such_zeros(hidden)} from a turn of "
+            "the camera, of the marker, or of a neighbouring joint. They need not: the positions are the same. "
             "The other figures are given that."
         )
     if report.undirected:
@@ -66,7 +66,7 @@ def sentences(report: CalibrationReport) -> list[str]:
     if report.misfit > MISFIT:
         said.append(
             f"The residuals are {report.misfit:.1f} times what the noise explains: the arm is not quite a rigid chain "
-            "(it sags, its encoders are eccentric), or the noise is larger than told. The intervals are wider for it."
+            "(it sags, its encoders are eccentric), or the noise is larger than stated. The intervals are wider for it."
         )
     if report.doubt is not None:
         said.insert(0, report.doubt)
@@ -77,7 +77,7 @@ def two_tools(report: CalibrationReport) -> str:
     """Return advice for a recording made with two different tools."""
     return (
         f"From number {report.other_tool_from} on the marker sits about {report.other_tool_mm:.0f} mm elsewhere on the "
-        "hand: these are pairs of two tools, and no figure is right for both. Calibrate them apart: "
+        "hand: these are pairs of two tools, and no figure is right for both. Calibrate them separately: "
         f"--first {report.other_tool_from}, or --last {(report.other_tool_from or 0) - 1}."
     )
 
@@ -86,7 +86,7 @@ def _noise(report: CalibrationReport) -> str:
     scatter = f"Noise of a coordinate, as the pairs scatter: {report.noise_mm:.3f} mm"
     if report.told_noise_mm is None:
         return f"{scatter}."
-    return f"{scatter}; as was told with them: {report.told_noise_mm:.3f} mm, on which the intervals rest."
+    return f"{scatter}; as stated with them: {report.told_noise_mm:.3f} mm, on which the intervals rest."
 
 
 def _expected(report: CalibrationReport) -> str:

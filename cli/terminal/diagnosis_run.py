@@ -31,7 +31,7 @@ from bodyschema.diagnosis.words import modelled
 from bodyschema.effects import KINDS, write_corrected, write_extended
 from bodyschema.interfaces.errors import BodyschemaError, RecordingError, RequestError
 from bodyschema.interfaces.records import Pair
-from bodyschema.learning import NominalModel
+from bodyschema.learning.nominal import NominalModel
 from bodyschema.recordings import files as recordings
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.calibrated_files import CAMERA_LINK

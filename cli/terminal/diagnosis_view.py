@@ -60,7 +60,7 @@ def view(diagnosis: DiagnosisFile, remedies: Sequence[str], *, timed: bool) -> G
     if diagnosis.tolerances is not None:
         parts.append(Text(made_to(diagnosis.tolerances)))
     if rivals := [line for cause in diagnosis.causes for line in rival_lines(cause)]:
-        parts.append(_list("Not told apart", rivals))
+        parts.append(_list("Not distinguished", rivals))
     if diagnosis.rejected:
         parts.append(_rejected(diagnosis))
     if alike := beside_geometry(diagnosis.rms_mm, diagnosis.alike):

@@ -62,7 +62,7 @@ def calibration_table(calibration: ChainCalibration, slides: Collection[str] = (
         zeros = ", ".join(f"{name} {_zero(zero, slides=name in slides)}" for name, zero in shown.items())
         facts.add_row("zeros to add", zeros)
     if drawn:
-        facts.add_row("left as drawn", f"{', '.join(drawn)}: no motion shows {_such_zeros(drawn)}")
+        facts.add_row("kept at nominal", f"{', '.join(drawn)}: no motion shows {_such_zeros(drawn)}")
     facts.add_row("arm made to", _workmanship(calibration))
     facts.add_row("noise", f"{mm(calibration.noise_m)} a coordinate, {_outliers(calibration.outliers)}")
     return Group(
@@ -74,7 +74,7 @@ def calibration_table(calibration: ChainCalibration, slides: Collection[str] = (
 
 def _workmanship(calibration: ChainCalibration) -> str:
     if calibration.axes_rad is None or calibration.points_m is None:
-        return "not told by these pairs"
+        return "not determined by these pairs"
     return f"about {_DEG * calibration.axes_rad:.2g}° and {1e3 * calibration.points_m:.2g} mm"
 
 

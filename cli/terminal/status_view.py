@@ -16,7 +16,7 @@ from rich.text import Text
 from bodyschema.cli.servos.servos_view import servos_table
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.service.remedies import as_typed
-from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.identity import Route
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import UNDECIDED, BusStatus, LearnerStatus, SamplerStatus
@@ -51,7 +51,7 @@ class Watcher:
     def __init__(self, config: Config) -> None:
         self._keys = Keys(config.robot.name)
         self._routes = {process: config.route(process) for process in PROCESSES}
-        self._sessions: dict[str, Bus] = {}
+        self._sessions: dict[str, ZenohSession] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -79,7 +79,7 @@ class Watcher:
     def _ask(self, process: str) -> bytes | None:
         try:
             if process not in self._sessions:
-                self._sessions[process] = Bus(connect=self._routes[process], client=True).__enter__()
+                self._sessions[process] = ZenohSession(connect=self._routes[process], client=True).__enter__()
             return self._sessions[process].ask_one(self._keys.status(process), timeout_s=ANSWER_LIMIT_S)
         except (BusError, RequestError):
             self._leave(process)
@@ -169,7 +169,7 @@ def _change(status: LearnerStatus) -> Iterator[str]:
     since, change = f"{status.pairs_since_change} pairs since", status.last_change
     if change is None:
         # Rolled back, or learning was restarted.
-        yield f"none in force of {status.changes} told or found; {status.pairs_since_change} pairs count"
+        yield f"none in force of {status.changes} reported or detected; {status.pairs_since_change} pairs count"
         return
     when = f"at pair {change.first_seq}"
     if change.earliest_seq < change.latest_seq:

@@ -17,7 +17,8 @@ from bodyschema.daemon.transport.wire import (
     joint_vector,
     position,
 )
-from bodyschema.learning import LearntModel, OnlineLearner
+from bodyschema.learning.learnt_model import LearntModel
+from bodyschema.learning.online_learner import OnlineLearner
 from bodyschema.robot.description import RobotDescription
 from kbmaps import InverseKinematics
 

@@ -56,7 +56,7 @@ class Changes:
 
     def _sentence(self, change: ChangeRecord) -> str:
         if not change.found:
-            return f"tool changed before pair {change.first_seq}, as told by the command tool_changed"
+            return f"tool changed before pair {change.first_seq}, as reported by the command tool_changed"
         moved = "" if change.moved_m is None else f", marker moved by {1e3 * change.moved_m:.1f} mm"
         return (
             f"change found at pair {change.first_seq} ({change.earliest_seq} to {change.latest_seq}, noticed at "

@@ -28,8 +28,7 @@ import numpy as np
 
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning import LearningState
-from bodyschema.learning.state import LearningHeader
+from bodyschema.learning.state import LearningHeader, LearningState
 from bodyschema.recordings.kept_files import sync_folder, unused_name
 from bodyschema.robot.limited import read_at_most
 
@@ -182,13 +181,13 @@ def _checksum(body: bytes) -> bytes:
 
 def _unwritable(file: Path, error: OSError) -> str:
     if error.errno == errno.ENOSPC:
-        return f"the checkpoint {file} could not be written: the disk is full. Free some space; learning goes on"
+        return f"the checkpoint {file} could not be written: the disk is full. Free some space; learning continues"
     if isinstance(error, (FileExistsError, NotADirectoryError)):
         return (
-            f"the checkpoint {file} could not be written: {file.parent} is not a folder. Learning goes on; "
+            f"the checkpoint {file} could not be written: {file.parent} is not a folder. Learning continues; "
             "give a folder as state_dir in the table [daemon] of robot.toml, or with --state-dir"
         )
     return (
-        f"the checkpoint {file} could not be written: {error.strerror}. Learning goes on; "
+        f"the checkpoint {file} could not be written: {error.strerror}. Learning continues; "
         "give a --state-dir that can be written"
     )

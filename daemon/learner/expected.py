@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
-from bodyschema.daemon.sampler.reconnect import Reopening
+from bodyschema.daemon.sampler.reconnect import ReconnectingSource
 from bodyschema.daemon.sampler.sources import MarkerTopic, StampedJoints
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import Clock
@@ -74,14 +74,16 @@ class ExpectedMarker:
             try:
                 with ExitStack() as stack:
                     stack.enter_context(self._topic)
-                    self._follow(stack.enter_context(Reopening(self._joints, "the robot's joints", self._clock)))
+                    self._follow(
+                        stack.enter_context(ReconnectingSource(self._joints, "the robot's joints", self._clock))
+                    )
             except SourceError as error:
                 if not said:
                     log.warning("the expected marker position is not published: %s; trying again", error)
                 said = True
                 self._stop.wait(RETRY_S)
 
-    def _follow(self, joints: Reopening[JointReading]) -> None:
+    def _follow(self, joints: ReconnectingSource[JointReading]) -> None:
         while not self._stop.is_set():
             reading = joints.read(READ_TIMEOUT_S)
             if reading is not None:

@@ -15,7 +15,7 @@ from bodyschema.daemon.sampler.history import Page, Unreadable
 from bodyschema.daemon.transport.wire import PairMessage, decode, pair_from_wire
 from bodyschema.interfaces.errors import BusError, RequestError
 from bodyschema.interfaces.protocols import Clock
-from bodyschema.learning import OnlineLearner
+from bodyschema.learning.online_learner import OnlineLearner
 
 log = logging.getLogger(__name__)
 
@@ -248,7 +248,7 @@ class PairFeed:
         if missing > 0:
             log.warning(
                 "the sampler has no pairs %d to %d any more: they were deleted ([daemon] keep_days, keep_mb) or its "
-                "disk changed them (its health tells); learning goes on with the next",
+                "disk changed them (see its health); learning continues with the next",
                 self._cursor + 1,
                 self._cursor + missing,
             )

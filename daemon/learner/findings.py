@@ -11,9 +11,9 @@ import numpy as np
 from bodyschema.calibration.chain_figures import ChainFigures, is_told, no_surer_than_possible
 from bodyschema.calibration.plausibility.check import FEWEST_ROWS, ROWS, plausibility
 from bodyschema.interfaces.protocols import Clock
-from bodyschema.learning import OnlineLearner
 from bodyschema.learning.data_outlook import LearnerEvidence, Scatter, forecast
 from bodyschema.learning.model_bank import SOLVED
+from bodyschema.learning.online_learner import OnlineLearner
 from bodyschema.learning.solvers.tolerance_selection import WORKMANSHIP, probable
 from bodyschema.learning.status import ChainCalibration, JointZero, LearntFigure, Outlook
 from bodyschema.robot.description import RobotDescription

@@ -19,14 +19,14 @@ from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner.background import Background
 from bodyschema.daemon.learner.findings import FindingTurns
 from bodyschema.daemon.learner.learner import LISTENING, LOOPS, Learner, more_rarely, status_line
-from bodyschema.daemon.learner.solver_pool import SharedSolver
+from bodyschema.daemon.learner.solver_pool import SolverPool
 from bodyschema.daemon.learner.solver_process import SolverProcess
 from bodyschema.daemon.service.notify import Notifier
 from bodyschema.daemon.service.service import Service
-from bodyschema.daemon.service.signals import Wishes
+from bodyschema.daemon.service.signals import SignalFlags
 from bodyschema.daemon.service.thread_names import show_name
 from bodyschema.daemon.transport.access import Names, Subjects, access_control
-from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.identity import SECURE
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.wire import encode
@@ -43,7 +43,7 @@ SHARED_WORK = 0.3
 SWITCH_INTERVAL_S = 2e-4
 
 
-def run_learners(configs: Sequence[Config], clock: Clock, wishes: Wishes, notifier: Notifier) -> None:
+def run_learners(configs: Sequence[Config], clock: Clock, wishes: SignalFlags, notifier: Notifier) -> None:
     """Learn and answer for all robots until `wishes` requests the end.
 
     Args:
@@ -59,7 +59,7 @@ def run_learners(configs: Sequence[Config], clock: Clock, wishes: Wishes, notifi
     service = Service(notifier, loops, clock)
     with ExitStack() as stack:
         process = stack.enter_context(SolverProcess())
-        bus = stack.enter_context(Bus(settings=session_settings(configs)))
+        bus = stack.enter_context(ZenohSession(settings=session_settings(configs)))
         learners = _learners(configs, process, bus, clock, service)
         gc.collect()
         gc.freeze()  # objects of the start-up need not be scanned again
@@ -112,11 +112,11 @@ def _loop(config: Config) -> str:
 
 
 def _learners(
-    configs: Sequence[Config], process: SolverProcess, bus: Bus, clock: Clock, service: Service
+    configs: Sequence[Config], process: SolverProcess, bus: ZenohSession, clock: Clock, service: Service
 ) -> list[Learner]:
     if len(configs) == 1:
         return [Learner(configs[0], process, bus, clock, service)]
-    shared, turns = SharedSolver(process), FindingTurns()
+    shared, turns = SolverPool(process), FindingTurns()
     return [
         Learner(config, shared.seat(), bus, clock, service, loop=_loop(config), robots=len(configs), turns=turns)
         for config in configs
@@ -149,7 +149,7 @@ def _working(learners: Sequence[Learner], service: Service, clock: Clock) -> Ite
 def attend(
     learners: Sequence[Learner],
     publishers: Sequence[Any],
-    wishes: Wishes,
+    wishes: SignalFlags,
     service: Service,
     failed: Sequence[Exception],
 ) -> None:

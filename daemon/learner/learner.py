@@ -25,14 +25,15 @@ from bodyschema.daemon.sampler.history import Page, read_page
 from bodyschema.daemon.service.reload import reload
 from bodyschema.daemon.service.service import Service, with_health
 from bodyschema.daemon.service.thread_names import show_name
-from bodyschema.daemon.transport.bus import Bus, Request
+from bodyschema.daemon.transport.bus import Request, ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import LearnerStatus
 from bodyschema.daemon.transport.wire import OCTETS, CommandReply, CommandRequest, decode, encode
 from bodyschema.daemon.wiring.wiring import open_marker_topic
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.protocols import Clock
-from bodyschema.learning import NominalModel, OnlineLearner
+from bodyschema.learning.nominal import NominalModel
+from bodyschema.learning.online_learner import OnlineLearner
 from bodyschema.learning.solvers.solver import LARGEST_NET, Solver
 
 log = logging.getLogger(__name__)
@@ -57,7 +58,7 @@ class Learner:
         self,
         config: Config,
         solver: Solver,
-        bus: Bus,
+        bus: ZenohSession,
         clock: Clock,
         service: Service | None = None,
         *,

@@ -7,7 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from bodyschema.daemon.learner.checkpoint import CheckpointError, generations, read_checkpoint, set_aside
-from bodyschema.learning import OnlineLearner, StateError
+from bodyschema.learning.online_learner import OnlineLearner
+from bodyschema.learning.state import StateError
 from kbmaps import KBMapsError
 
 log = logging.getLogger(__name__)

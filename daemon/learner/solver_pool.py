@@ -7,10 +7,10 @@ from collections.abc import Callable
 
 from bodyschema.daemon.learner.solver_process import SolverLostError, SolverProcess
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning import Solved, Task
+from bodyschema.learning.solvers.solver import Solved, Task
 
 
-class SharedSolver:
+class SolverPool:
     """Gives a process one robot's orders at a time. Single-threaded.
 
     A robot's orders wait here for its turn, because the process does not read while it solves.
@@ -18,13 +18,13 @@ class SharedSolver:
 
     def __init__(self, process: SolverProcess) -> None:
         self._process = process
-        self._seats: list[Seat] = []
-        self._solving: Seat | None = None
+        self._seats: list[PooledSolver] = []
+        self._solving: PooledSolver | None = None
         self._turn = 0
 
-    def seat(self) -> Seat:
+    def seat(self) -> PooledSolver:
         """Add a robot, and return its solver."""
-        seat = Seat(self, self._process, len(self._seats))
+        seat = PooledSolver(self, self._process, len(self._seats))
         self._seats.append(seat)
         return seat
 
@@ -57,7 +57,7 @@ class SharedSolver:
         self._solving = seat
 
 
-class Seat:
+class PooledSolver:
     """A `Solver` of one robot, in a process shared with others.
 
     Attributes:
@@ -65,7 +65,7 @@ class Seat:
         answers: answers not fetched yet.
     """
 
-    def __init__(self, shared: SharedSolver, process: SolverProcess, robot: int) -> None:
+    def __init__(self, shared: SolverPool, process: SolverProcess, robot: int) -> None:
         self._shared, self._process, self._robot = shared, process, robot
         self._orders: deque[Callable[[], None]] = deque()
         self._pairs = self._new = self._had_turn = 0

@@ -25,9 +25,9 @@ import numpy as np
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.interpreter import module_command
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning import DirectSolver, Solved, Task
 from bodyschema.learning.model_bank import RESIDUAL
 from bodyschema.learning.solvers.orientation import OrientationSolution
+from bodyschema.learning.solvers.solver import DirectSolver, Solved, Task
 from kbmaps import ChainBelief, ChainTolerances, KBMap, OrientedChain, ResidualModel
 
 NICENESS = 5

@@ -18,7 +18,7 @@ NEWEST_FRAMES, FEWEST_FRAMES, NEARLY_ALL = 300, 30, 0.9
 _NO_COMPLAINT = frozenset({Reason.TOO_NEAR, Reason.PAUSED, Reason.NOT_STORED, Reason.NOT_BORNE})
 
 
-class Tally:
+class SamplerCounters:
     """Counters with one writer each, read from any thread.
 
     Attributes:

@@ -12,7 +12,7 @@ from typing import Self
 
 import numpy as np
 
-from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode
 from bodyschema.interfaces.errors import BusError, ConfigError, RequestError
@@ -114,7 +114,7 @@ class GazeLoop:
             log.exception("the gaze failed; the head stands still")
 
 
-def gaze_of(robot: RobotDescription, sources: Sources, bus: Bus, wall: Clock) -> GazeLoop | None:
+def gaze_of(robot: RobotDescription, sources: Sources, bus: ZenohSession, wall: Clock) -> GazeLoop | None:
     """Return the gaze loop of a robot that has a head, with its cameras as calibrated; None if it has none."""
     if sources.head is None:
         return None

@@ -26,7 +26,7 @@ class Readable(Source, Protocol[R_co]):
     def read(self, timeout_s: float) -> R_co | None: ...
 
 
-class Reopening(Generic[R_co]):
+class ReconnectingSource(Generic[R_co]):
     """Reads a source. When the source is lost, report it once and try to reopen it at growing intervals.
 
     A source that is present but the wrong one (other cameras, another servo) is reported once more, and waited for. It

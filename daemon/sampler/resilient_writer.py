@@ -21,7 +21,7 @@ SLOW_TOLD_S = 60.0
 T = TypeVar("T")
 
 
-class Storing:
+class ResilientWriter:
     """Appends pairs to a store. A pair that cannot be written is dropped, and the next one is tried."""
 
     def __init__(self, store: PairStore, wall: Clock) -> None:

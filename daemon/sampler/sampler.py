@@ -13,7 +13,7 @@ import numpy as np
 
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.service.service import Service, with_health
-from bodyschema.daemon.transport.bus import Bus, Request
+from bodyschema.daemon.transport.bus import Request, ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import SamplerStatus
 from bodyschema.daemon.transport.wire import CommandReply, CommandRequest, decode, encode, pair_to_wire
@@ -25,14 +25,14 @@ from bodyschema.recordings.store.file import disk_free
 from bodyschema.recordings.store.store import PairStore
 
 from .align import JointBuffer
-from .counters import Tally
+from .counters import SamplerCounters
 from .devices import DeviceWatch
 from .gate import Accepted, Gate
 from .gaze_loop import gaze_of
 from .history import answer_pairs
 from .powered import asked
-from .reconnect import Reopening
-from .resilient_writer import Storing
+from .reconnect import ReconnectingSource
+from .resilient_writer import ResilientWriter
 from .rules import SamplerRules
 from .servo_status import accept_turns, buses_of, complaints_of, servos_of
 from .simulation import answer_simulation
@@ -62,7 +62,7 @@ class Sampler:
         self,
         config: Config,
         sources: Sources,
-        bus: Bus,
+        bus: ZenohSession,
         store: PairStore,
         *,
         exit_at_end: bool = False,
@@ -97,14 +97,14 @@ class Sampler:
         self._cameras = sources.cameras
         self._gaze = gaze_of(config.robot, sources, bus, self._wall)
         self._simulation, self._source_clock = sources.simulation, sources.clock
-        self._joints = Reopening(sources.joints, "the encoders", self._wall, forbidden=self._service.forbidden)
+        self._joints = ReconnectingSource(sources.joints, "the encoders", self._wall, forbidden=self._service.forbidden)
         self._encoders, self._devices = sources.joints, DeviceWatch(sources.joints, store, self._wall)
-        self._marker = Reopening(sources.marker, "the cameras", self._wall, forbidden=self._service.forbidden)
+        self._marker = ReconnectingSource(sources.marker, "the cameras", self._wall, forbidden=self._service.forbidden)
         rules, prismatic = config.tables.daemon, config.robot.chain.prismatic
         self._buffer = JointBuffer(prismatic, rules.max_reading_gap_s, live=sources.live, kept_s=AROUND_S)
         self._gate = Gate(rules, prismatic, store.last())
-        self._storing = Storing(store, self._wall)
-        self._tally = Tally(config.robot, self._wall, store.audit.joint_ranges)
+        self._storing = ResilientWriter(store, self._wall)
+        self._tally = SamplerCounters(config.robot, self._wall, store.audit.joint_ranges)
         self._seq = store.audit.newest
         self._publish = bus.publisher(self._keys.pair, cache=PAIR_CACHE)
         self._publish_status = bus.publisher(self._keys.status("sampler"))

@@ -11,7 +11,7 @@ from bodyschema.daemon.transport.wire import SCHEMA, CommandReply, decode, encod
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.protocols import Clock
 
-from .sources import Simulation
+from .sources import GroundTruth
 
 # A longer tool is a mistake of units.
 LONGEST_TOOL_M = 2.0
@@ -42,7 +42,7 @@ class TruthReply(msgspec.Struct, frozen=True):
     schema: int = SCHEMA
 
 
-def answer_simulation(world: Simulation, clock: Clock, request: Request) -> bytes:
+def answer_simulation(world: GroundTruth, clock: Clock, request: Request) -> bytes:
     """Answer an empty request with the ground truth; change the tool on a `ToolRequest`.
 
     Raises:

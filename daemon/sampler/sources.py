@@ -13,7 +13,7 @@ from bodyschema.interfaces.records import FloatArray
 from kbmaps import RigidChain
 
 
-class Simulation(Protocol):
+class GroundTruth(Protocol):
     """A simulated world, with access to its ground truth."""
 
     def change_tool(self, marker_xyz: tuple[float, float, float]) -> float:
@@ -106,7 +106,7 @@ class Sources:
     joints: JointSource
     marker: MarkerSource
     clock: Clock
-    simulation: Simulation | None = None
+    simulation: GroundTruth | None = None
     powered: tuple[Powered, ...] = ()
     head: Head | None = None
     cameras: TellsHealth | None = None

@@ -81,7 +81,7 @@ class Notifier:
                 sending.sendto(state.encode(), self._address)
         except OSError as error:
             if not self._failed:
-                log.warning("systemd cannot be told %s: %s", state.partition("=")[0], error.strerror or error)
+                log.warning("cannot notify systemd of %s: %s", state.partition("=")[0], error.strerror or error)
             self._failed = True
         else:
             self._failed = False

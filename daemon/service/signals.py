@@ -29,7 +29,7 @@ def end_with_parent() -> None:
         sys.exit(1)
 
 
-class Wishes:
+class SignalFlags:
     """Requests that came by signals: plain attributes, which a signal handler may set."""
 
     ending = reloading = False

@@ -22,7 +22,7 @@ import zenoh.ext
 from bodyschema.interfaces.errors import BodyschemaError, BusError, RequestError
 
 from .identity import Route
-from .query_limiter import Reception
+from .query_limiter import QueryLimiter
 from .unreached import unreached
 from .wire import JSON, MSGPACK, ErrorReply, decode, encode
 
@@ -62,7 +62,7 @@ class Reply:
     error: str | None
 
 
-class Bus:
+class ZenohSession:
     """A zenoh session of this process.
 
     Use as a context manager; leaving it undeclares everything and ends the handler threads.
@@ -89,7 +89,7 @@ class Bus:
         self._open_timeout_s = open_timeout_s
         self._session: zenoh.Session | None = None
         self._declared: list[object] = []  # a token without a reference is undeclared
-        self._receptions: list[Reception[zenoh.Query]] = []
+        self._receptions: list[QueryLimiter[zenoh.Query]] = []
         self._threads: list[threading.Thread] = []
         self._refusals: queue.Queue[tuple[zenoh.Query, str] | None] = queue.Queue(REFUSALS)
 
@@ -147,7 +147,7 @@ class Bus:
             encoding: encoding of the answers; None: that of the request.
         """
 
-        reception: Reception[zenoh.Query] = Reception()
+        reception: QueryLimiter[zenoh.Query] = QueryLimiter()
 
         def receive(query: zenoh.Query) -> None:
             try:
@@ -202,11 +202,11 @@ class Bus:
             process = "sampler" if key.split("/")[-1].startswith(("sampler", "pairs", "simulation")) else "learner"
             if self._route is not None and self._route.secured:
                 raise BusError(
-                    f"nobody answers under {key}: the {process} does not run, or your certificate or name has no role "
+                    f"nothing answers under {key}: the {process} does not run, or your certificate or name has no role "
                     "that may ask this (docs/security.md)"
                 )
             raise BusError(
-                f"nobody answers under {key}. Is the {process} running? Start it with `bodyschema {process}`"
+                f"nothing answers under {key}. Is the {process} running? Start it with `bodyschema {process}`"
             )
         if replies[0].error is not None:
             raise RequestError(replies[0].error)
@@ -253,7 +253,7 @@ class Bus:
                 f"the port of {listen} is in use. Stop the other bodyschema, "
                 "or give another endpoint in the table [zenoh] of robot.toml"
             )
-        return f"cannot open zenoh on {listen}: {message.split(' at /')[0]}. Mend the table [zenoh] of robot.toml"
+        return f"cannot open zenoh on {listen}: {message.split(' at /')[0]}. Fix the table [zenoh] of robot.toml"
 
     def _start(self, work: Callable[[], None]) -> None:
         thread = threading.Thread(target=work, name="answers")
@@ -287,7 +287,7 @@ class Bus:
     def _answer(
         self,
         key: str,
-        reception: Reception[zenoh.Query],
+        reception: QueryLimiter[zenoh.Query],
         handler: Callable[[Request], bytes],
         encoding: str | None,
     ) -> None:
@@ -338,9 +338,9 @@ def _source(query: zenoh.Query) -> str:
 
 
 @contextmanager
-def client(route: str | Route, open_timeout_s: float = OPEN_TIMEOUT_S) -> Iterator[Bus]:
+def client(route: str | Route, open_timeout_s: float = OPEN_TIMEOUT_S) -> Iterator[ZenohSession]:
     """Open a short-lived session to a process. BusError if it cannot be reached."""
-    with Bus(connect=route, client=True, open_timeout_s=open_timeout_s) as bus:
+    with ZenohSession(connect=route, client=True, open_timeout_s=open_timeout_s) as bus:
         yield bus
 
 

@@ -56,7 +56,7 @@ class _Source(Generic[T]):
     waiting: deque[tuple[float, int, T]] = field(default_factory=deque)
 
 
-class Reception(Generic[T]):
+class QueryLimiter(Generic[T]):
     """The queries under one key until they are taken; many threads add them, one takes them."""
 
     def __init__(self, limits: Limits = LIMITS, now: Callable[[], float] = time.monotonic) -> None:

@@ -14,8 +14,8 @@ def unreached(route: Route) -> str:
     last = route.endpoints[-1]
     if not _accepts(last):
         return (
-            f"nobody listens on {route}. Start the daemon with `bodyschema run`, "
-            "or mend the table [zenoh] of robot.toml"
+            f"nothing listens on {route}. Start the daemon with `bodyschema run`, "
+            "or fix the table [zenoh] of robot.toml"
         )
     if route.secured:
         return (

@@ -91,7 +91,7 @@ class ZenohConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if self.tls is None or self.tls.certificate is None:
             refuse(name, f": to listen on {endpoint} takes a certificate", f"Name it in [zenoh.tls]; {HOW_TO}")
         if self.access is None:
-            refuse(name, f": nobody may do anything on {endpoint}", f"Say who may in [zenoh.access]; {HOW_TO}")
+            refuse(name, f": no one may do anything on {endpoint}", f"Say who may in [zenoh.access]; {HOW_TO}")
 
     def _check_identity(self, file: Path, text: str) -> None:
         if self.tls is None and (self.login is not None or self.users_file is not None):
@@ -132,7 +132,7 @@ class ZenohConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def _naked(endpoint: str) -> str:
     protocol = endpoint.partition("/")[0]
-    return f"{endpoint} is open to the network, and {protocol} asks nobody who he is and hides nothing"
+    return f"{endpoint} is open to the network, and {protocol} neither authenticates nor encrypts"
 
 
 def _instead(name: str, endpoint: str) -> str:

@@ -60,7 +60,7 @@ def require_on_ports(config: Config) -> OnPorts:
         "no servos are configured, and no encoders",
         file=config.file,
         remedy="Add the table [drivers.dynamixel], [drivers.feetech] or [drivers.serial_lines] (docs/hardware.md), "
-        "or let `bodyschema robot new` write it",
+        "or let `bodyschema init --from scan` write it",
     )
 
 

@@ -174,7 +174,7 @@ def said(found: MeasuredCluster) -> str:
     text = (
         f"{len(found.tags)} tags in {found.views} pairs of images that show two or more to both eyes; what "
         f"is left is {found.misfit:.2f} times what the "
-        f"corners claim. Squares seem {100.0 * found.grown:+.2f} ± {100.0 * found.grown_sigma:.2f} % larger than told."
+        f"corners claim. Squares are {100.0 * found.grown:+.2f} ± {100.0 * found.grown_sigma:.2f} % larger."
     )
     if found.left_out:
         text += f" Left out: {', '.join(f'tag {id} in {name}' for name, id in found.left_out)}."

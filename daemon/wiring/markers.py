@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from bodyschema.daemon.sampler.reconnect import Reopening
+from bodyschema.daemon.sampler.reconnect import ReconnectingSource
 from bodyschema.interfaces.errors import SourceEnded
 from bodyschema.interfaces.protocols import Clock, StereoEyes
 from bodyschema.interfaces.records import ImageArray
@@ -41,7 +41,7 @@ def moving_colour_table(eyes: StereoEyes, clock: Clock, seconds: float, tell: Ca
     from bodyschema.vision.colour_model import colour_of_the_moving, colour_table
 
     shown: list[ImageArray] = []
-    source = Reopening(eyes, "the cameras", clock)
+    source = ReconnectingSource(eyes, "the cameras", clock)
     with source, suppress(SourceEnded):
         began, next_t = clock.now(), -float("inf")
         tell(f"move the ball across the view for {seconds:g} s; keep the cameras still")

@@ -28,7 +28,7 @@ def holding_torques(robot: RobotDescription) -> Callable[[FloatArray], FloatArra
     load = GravityLoad(robot)
     if not load.known:
         raise ConfigError(
-            "the URDF states no masses, so nobody knows the arm's weight",
+            "the URDF states no masses, so the arm's weight is unknown",
             file=robot.tree.file,
             remedy="Give its links <inertial> with mass and origin, or take [drivers.dynamixel.zero_force] out",
         )

@@ -61,7 +61,7 @@ def require_servos(config: Config) -> Servos:
             "no servos are configured",
             file=config.file,
             remedy="Add the table [drivers.dynamixel] or [drivers.feetech] (docs/hardware.md), "
-            "or let `bodyschema robot new` write it",
+            "or let `bodyschema init --from scan` write it",
         )
     return servos
 

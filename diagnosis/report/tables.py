@@ -53,7 +53,7 @@ def numbers(cause: Cause, *, timed: bool) -> str:
     """Return all numbers of a cause, one per line, and name those that are not identifiable."""
     every = numbers_of(cause, timed=timed)
     hidden = ", ".join(n.label for n in every if not n.is_told)
-    untold = f"<br><small>not told by this motion: {escape(hidden)}</small>" if hidden else ""
+    untold = f"<br><small>not determined by this motion: {escape(hidden)}</small>" if hidden else ""
     return f"{_lines(n for n in every if n.is_told)}{untold}"
 
 

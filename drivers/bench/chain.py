@@ -59,7 +59,7 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
     """
 
     overhead: int
-    """Bytes of a status packet besides its data."""
+    """Bytes of a status packet apart from its data."""
 
     def __init__(self, servos: Iterable[ServoT], faults: Faults = no_faults) -> None:
         """Create a chain with its power on."""

@@ -160,7 +160,7 @@ class Guard:
             fast, most = math.degrees(speed[worst]), math.degrees(self._limits.max_speed[worst])
             raise Drop(
                 f"joint {self._limits.joints[worst]!r} turned at {fast:.0f}°/s ({how}; {most:.0f}°/s are allowed). "
-                "If nobody moved it so fast: look at direction, torque_constant and the URDF's masses"
+                "If no one moved it so fast: look at direction, torque_constant and the URDF's masses"
             )
 
     def _check_currents(self, t: float, current: FloatArray) -> None:

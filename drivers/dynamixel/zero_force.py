@@ -110,7 +110,7 @@ class ZeroForce(PoweredJoints):
     def _said_on(self) -> str:
         return (
             f"zero_force is on: within {self._ramp_s:.1f} s {', '.join(self._joints)} bear the arm. Hold it until "
-            "then, and stay ready to hold it: whatever is in doubt switches torque off"
+            "then, and stay ready to hold it: any doubt switches torque off"
         )
 
     @staticmethod

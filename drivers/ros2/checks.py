@@ -68,8 +68,8 @@ def _parted(complaints: Sequence[str]) -> tuple[str, str]:
     """Split a complaint into what was found and its last part, what to do."""
     if not complaints:
         return "too few joint states come", "let the robot's nodes publish more often"
-    *said, mend = LAST_PART.split(complaints[0])
-    return "".join(said), mend
+    *said, fix = LAST_PART.split(complaints[0])
+    return "".join(said), fix
 
 
 def _rate(rate_hz: float) -> Check:

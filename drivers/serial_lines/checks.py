@@ -30,8 +30,8 @@ def encoder_checks(
             counts = encoders.counts
             yield _troubles(counts.lines, counts.garbled + counts.missing)
             for complaint in encoders.health:
-                said, _, mend = complaint.rpartition(": ")
-                yield Check("encoders", "wrong", said, mend)
+                said, _, fix = complaint.rpartition(": ")
+                yield Check("encoders", "wrong", said, fix)
     except SourceError as error:
         yield Check("encoders", "wrong", str(error))
 

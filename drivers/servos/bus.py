@@ -41,7 +41,7 @@ class Trouble(StrEnum):
     WRONG_LENGTH = "an answer of another length"
     EARLY = "an answer before it could have come"
     REFUSED = "an error in answer"
-    NOISE = "noise while nobody was asked"
+    NOISE = "noise while no request was pending"
 
 
 @dataclass(frozen=True, slots=True)

@@ -86,8 +86,8 @@ def _health(make: Make, bus: Bus, servo: FittedServo) -> Iterator[Check]:
     bits = layout.value("hardware_error", status.data, layout.state.address) if has_register else status.error
     for bit, text in make.errors.items():
         if bits & bit:
-            said, _, mend = text.partition(": ")
-            yield Check(TYPE, "wrong", f"joint {servo.joint} (ID {servo.id}): {said}", mend)
+            said, _, fix = text.partition(": ")
+            yield Check(TYPE, "wrong", f"joint {servo.joint} (ID {servo.id}): {said}", fix)
     if has_torque:
         yield Check(TYPE, "ok", f"joint {servo.joint} holds its place: `bodyschema run` switches its torque off")
 

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import binomtest
 
 from .judge import FEWEST_FALSE_FIXES, TOLD
 from .judgement import CauseJudged, Crash, Judgement, TruthJudged, written
@@ -37,6 +36,8 @@ class Rate:
     def __str__(self) -> str:
         if not self.of:
             return "–"
+        from scipy.stats import binomtest  # it takes a second to import
+
         low, high = binomtest(self.hits, self.of).proportion_ci(method="exact")
         return f"{100 * self.hits / self.of:.1f} % ({100 * low:.0f} to {100 * high:.0f}), {self.hits} of {self.of}"
 

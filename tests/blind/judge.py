@@ -300,7 +300,7 @@ def judged_numbers(truth: Truth, named: Named, index: int) -> tuple[tuple[Number
         if given is None or parameter.name not in meaning.told:
             left_out[parameter.name] = "the mechanism has no such number" if given else "not stated"
         elif parameter.is_amount and np.ptp(given.ci95) > TELLS_LITTLE * parameter.usual:
-            left_out[parameter.name] = "not told by this motion"
+            left_out[parameter.name] = "not determined by this motion"
         else:
             low, high = _between_rows(truth.scene.motion, given) if parameter.name == "t0" else given.ci95
             numbers.append(Number(parameter.name, float(value), given.value, (low, high)))

@@ -226,7 +226,7 @@ def test_a_moment_between_the_right_rows_is_right(truth_of: Hide) -> None:
 
 def test_a_number_that_the_motion_does_not_tell_is_left_out(truth_of: Hide) -> None:
     _, causes, _ = compared(truth_of(ELBOW), _file(_cause(ELBOW, offset_rad=Interval(0.0, (-3.0, 3.0)))))
-    assert (causes[0].numbers, causes[0].left_out) == ((), {"offset_rad": "not told by this motion"})
+    assert (causes[0].numbers, causes[0].left_out) == ((), {"offset_rad": "not determined by this motion"})
 
 
 def test_false_fixes_that_are_not_named_are_missed(truth_of: Hide) -> None:

@@ -9,8 +9,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
-from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner
 from bodyschema.learning.config import LearnerConfig
+from bodyschema.learning.nominal import NominalModel
+from bodyschema.learning.online_learner import OnlineLearner
+from bodyschema.learning.solvers.solver import DirectSolver
 from kbmaps import RigidChain
 
 JOINTS = 4
@@ -83,7 +85,7 @@ def new_learning(nominal: NominalModel | None = None, settings: LearnerConfig | 
     return OnlineLearner(nominal or nominal_model(), settings or LearnerConfig(), DirectSolver())
 
 
-def teach(learning: OnlineLearner, pairs: Iterable[Pair], *, background: bool = True, every: int = 5) -> None:
+def teach(learning: OnlineLearner, pairs: Iterable[Pair], *, background: bool = True, every: int = 10) -> None:
     """Learn pairs, with all background work done after each `every` pairs and at the end."""
     for number, pair in enumerate(pairs, 1):
         learning.learn(pair, pair.t)

@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from bodyschema.daemon.sampler.sources import Simulation, Sources
+from bodyschema.daemon.sampler.sources import GroundTruth, Sources
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import SourceEnded, SourceError
 from bodyschema.interfaces.records import FloatArray, JointReading, MarkerFix, MarkerMiss, frozen_array
@@ -115,5 +115,5 @@ class World:
         return np.eye(3)
 
 
-def simulated(sources: Sources, world: Simulation) -> Sources:
+def simulated(sources: Sources, world: GroundTruth) -> Sources:
     return Sources(sources.joints, sources.marker, sources.clock, world)

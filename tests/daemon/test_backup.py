@@ -27,12 +27,12 @@ from bodyschema.cli.main import command_line
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner.checkpoint import read_checkpoint, write_checkpoint
 from bodyschema.daemon.sampler.session import session_of
-from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import StoreError
 from bodyschema.interfaces.records import MarkerFix, frozen_array
-from bodyschema.learning import LearningState
+from bodyschema.learning.state import LearningState
 from bodyschema.recordings.store.store import PairReader, PairStore
 
 UTC = "2026-11-21T12:00:00.000+00:00"
@@ -200,7 +200,7 @@ def put_back_in_another_process(file: Path, config: Config) -> None:
 
 
 def test_a_running_learner_is_to_be_stopped_first(config, backed_up, elsewhere) -> None:
-    with Bus(listen=config.tables.zenoh.learner) as bus:
+    with ZenohSession(listen=config.tables.zenoh.learner) as bus:
         bus.token(Keys("arm").alive("learner"))
         assert "the learner of arm runs. Nothing was changed. Stop it first" in refused(backed_up, elsewhere)
 

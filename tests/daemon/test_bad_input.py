@@ -21,7 +21,7 @@ from small_arm import ROBOT, URDF, write_long_arm, write_small_arm
 
 from bodyschema.cli.main import main
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import Bus, client
+from bodyschema.daemon.transport.bus import ZenohSession, client
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import LearnerStatus
 from bodyschema.daemon.transport.wire import decode
@@ -85,7 +85,7 @@ def robot(tmp_path: Path, free_endpoint: Callable[[], str]) -> Path:
     return write_small_arm(tmp_path, tables + '[drivers]\nrecording = "walk.csv"\nspeed = 0\n')
 
 
-def mend(file: Path, right: str, wrong: str) -> None:
+def fix(file: Path, right: str, wrong: str) -> None:
     text = file.read_text()
     assert right in text
     file.write_text(text.replace(right, wrong))
@@ -97,20 +97,20 @@ def mend(file: Path, right: str, wrong: str) -> None:
 @pytest.mark.parametrize(
     ("command", "right", "wrong", "line", "said"),
     [
-        ("sampler", '"arm.urdf"', '"leg.urdf"', None, "cannot read the URDF: No such file or directory. Mend [robot]"),
-        ("learner", '"arm.urdf"', '"leg.urdf"', None, "cannot read the URDF: No such file or directory. Mend [robot]"),
+        ("sampler", '"arm.urdf"', '"leg.urdf"', None, "cannot read the URDF: No such file or directory. Fix [robot]"),
+        ("learner", '"arm.urdf"', '"leg.urdf"', None, "cannot read the URDF: No such file or directory. Fix [robot]"),
         ("sampler", '"waist", ', '"wrist", ', 4, "there is no joint 'wrist' in arm.urdf. Did you mean 'waist'?"),
         ("run", '"waist", ', '"wrist", ', 4, "there is no joint 'wrist' in arm.urdf. Did you mean 'waist'?"),
         ("learner", '"hand"', '"hnd"', 5, "there is no link 'hnd' in arm.urdf. Did you mean 'hand'?"),
         ("sampler", "state_dir", "statedir", 12, "unknown key 'statedir' in [daemon]. Did you mean 'state_dir'?"),
         ("learner", "state_dir", "statedir", 12, "unknown key 'statedir' in [daemon]. Did you mean 'state_dir'?"),
-        ("replay", '"arm.urdf"', '"leg.urdf"', None, "cannot read the URDF: No such file or directory. Mend [robot]"),
+        ("replay", '"arm.urdf"', '"leg.urdf"', None, "cannot read the URDF: No such file or directory. Fix [robot]"),
         ("predict", '"waist", ', '"wrist", ', 4, "there is no joint 'wrist' in arm.urdf. Did you mean 'waist'?"),
         ("status", "state_dir", "statedir", 12, "unknown key 'statedir' in [daemon]. Did you mean 'state_dir'?"),
     ],
 )
 def test_nothing_starts_with_a_wrong_description(robot, command, right, wrong, line, said) -> None:
-    mend(robot, right, wrong)
+    fix(robot, right, wrong)
     message = refused(command, *(["walk.csv"] if command == "replay" else []), cwd=robot.parent)
     assert message.startswith("leg.urdf: " if line is None else f"robot.toml, line {line}: ")
     assert said in message
@@ -162,7 +162,7 @@ def test_a_recording_that_is_not_there_is_refused(robot) -> None:
 
 
 def test_a_sampler_of_an_unreadable_recording_leaves_no_store(robot) -> None:
-    mend(robot.parent / "walk.csv", "0.03,", "0.03x,")
+    fix(robot.parent / "walk.csv", "0.03,", "0.03x,")
     assert "walk.csv, line 2, column waist: '0.03x' is not a number" in refused("sampler", cwd=robot.parent)
 
 
@@ -194,7 +194,7 @@ def test_a_letter_among_the_joint_angles_is_named(robot) -> None:
 @pytest.mark.parametrize("process", ["sampler", "learner"])
 def test_a_port_in_use_is_named_and_leaves_no_trace(robot, process) -> None:
     endpoint = getattr(Config.load(robot, {}).tables.zenoh, process)
-    with Bus(listen=endpoint):
+    with ZenohSession(listen=endpoint):
         said = refused(process, cwd=robot.parent)
     assert said == (
         f"the port of {endpoint} is in use. Stop the other bodyschema, "
@@ -225,7 +225,7 @@ def test_a_folder_that_cannot_be_written_ends_the_sampler(robot, state_dir, said
 def process_running(config: Config, process: str, by: tuple[str, ...] = DAEMON) -> Iterator[None]:
     """Run a process and stop it when the context ends."""
     up = threading.Event()
-    with tempfile.TemporaryFile() as log, Bus(connect=getattr(config.tables.zenoh, process)) as bus:
+    with tempfile.TemporaryFile() as log, ZenohSession(connect=getattr(config.tables.zenoh, process)) as bus:
         words = (*by, process, "--robot", config.file)
         child = (
             warm.Child(*words, stderr=log) if by == DAEMON else subprocess.Popen([sys.executable, *words], stderr=log)
@@ -336,14 +336,14 @@ def test_a_target_that_is_no_position_is_refused_in_words(lonely_learner) -> Non
 
 def test_recording_without_a_sampler_is_refused(lonely_learner) -> None:
     said = refused("record", "a.csv", cwd=lonely_learner.file.parent)
-    assert said.startswith(f"nobody listens on {lonely_learner.tables.zenoh.sampler}. Start")
+    assert said.startswith(f"nothing listens on {lonely_learner.tables.zenoh.sampler}. Start")
 
 
 def test_a_checkpoint_that_cannot_be_written_is_an_error_reply_and_learning_goes_on(lonely_learner) -> None:
     said = refused("command", "checkpoint", cwd=lonely_learner.file.parent)
     assert said == (
         f"the checkpoint {lonely_learner.checkpoint_file} could not be written: Permission denied. "
-        "Learning goes on; give a --state-dir that can be written"
+        "Learning continues; give a --state-dir that can be written"
     )
     assert said in learner_status(lonely_learner).health
 
@@ -357,5 +357,5 @@ def test_a_sampler_without_a_learner_goes_on_and_predictions_name_what_to_start(
         done = run_here("predict", "0.1", "0.2", cwd=robot.parent)
         pairs = json.loads(bus.ask_one(KEYS.status("sampler")))["pairs"]
     assert done.returncode == 1
-    assert f"nobody listens on {config.tables.zenoh.learner}. Start the daemon with `bodyschema run`" in done.stderr
+    assert f"nothing listens on {config.tables.zenoh.learner}. Start the daemon with `bodyschema run`" in done.stderr
     assert pairs == 8

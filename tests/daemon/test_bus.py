@@ -8,7 +8,7 @@ from queue import Queue
 
 import pytest
 
-from bodyschema.daemon.transport.bus import Bus, Request, client
+from bodyschema.daemon.transport.bus import Request, ZenohSession, client
 from bodyschema.daemon.transport.identity import Route
 from bodyschema.daemon.transport.wire import JSON, MSGPACK, ErrorReply, decode
 from bodyschema.interfaces.errors import BusError, RequestError
@@ -18,13 +18,13 @@ KEY = "bodyschema/arm/status/sampler"
 
 
 @pytest.fixture
-def server(endpoint: str) -> Iterator[Bus]:
-    with Bus(listen=endpoint) as bus:
+def server(endpoint: str) -> Iterator[ZenohSession]:
+    with ZenohSession(listen=endpoint) as bus:
         yield bus
 
 
 @pytest.fixture
-def asking(server: Bus, endpoint: str) -> Iterator[Bus]:
+def asking(server: ZenohSession, endpoint: str) -> Iterator[ZenohSession]:
     with client(endpoint) as bus:
         yield bus
 
@@ -116,19 +116,19 @@ def test_an_answer_that_does_not_come_in_time_is_an_error(server, asking) -> Non
 
 
 def test_a_client_without_a_server_is_told_at_once(endpoint) -> None:
-    with pytest.raises(BusError, match=f"nobody listens on {endpoint}. Start the daemon"), client(endpoint):
+    with pytest.raises(BusError, match=f"nothing listens on {endpoint}. Start the daemon"), client(endpoint):
         pass
 
 
 def test_a_port_in_use_is_named_with_the_remedy(server, endpoint) -> None:
-    second = Bus(listen=endpoint)
+    second = ZenohSession(listen=endpoint)
     with pytest.raises(BusError, match=f"the port of {endpoint} is in use.*another endpoint in the table"), second:
         pass
 
 
 def test_an_endpoint_that_cannot_be_is_named() -> None:
-    with pytest.raises(BusError, match=r"cannot open zenoh on carrier/pigeon.*Mend the table \[zenoh\]"):
-        Bus(listen="carrier/pigeon").__enter__()
+    with pytest.raises(BusError, match=r"cannot open zenoh on carrier/pigeon.*Fix the table \[zenoh\]"):
+        ZenohSession(listen="carrier/pigeon").__enter__()
 
 
 def test_who_is_alive_is_found(server, asking) -> None:
@@ -146,7 +146,7 @@ def test_who_is_alive_already_is_told_to_who_watches(server, asking) -> None:
 
 def test_who_ends_is_no_longer_alive(endpoint) -> None:
     changes: Queue[bool] = Queue()
-    with Bus(listen=endpoint) as server:
+    with ZenohSession(listen=endpoint) as server:
         server.token("bodyschema/arm/alive/sampler")
         with client(endpoint) as asking:
             asking.watch("bodyschema/arm/alive/sampler", changes.put)
@@ -160,9 +160,9 @@ def test_who_is_linked_to_a_process_and_to_the_router_hears_everything_once(endp
     heard: Queue[bytes] = Queue()
     behind = {"mode": "router"}
     with (
-        Bus(listen=meeting, settings=behind),
-        Bus(listen=endpoint, connect=meeting, settings=behind) as process,
-        Bus(connect=Route((endpoint, meeting))) as onlooker,
+        ZenohSession(listen=meeting, settings=behind),
+        ZenohSession(listen=endpoint, connect=meeting, settings=behind) as process,
+        ZenohSession(connect=Route((endpoint, meeting))) as onlooker,
     ):
         say = process.publisher("said")
         onlooker.subscribe("said", heard.put)
@@ -179,7 +179,7 @@ def test_who_is_linked_to_a_process_and_to_the_router_hears_everything_once(endp
 
 def test_a_closed_session_says_so(endpoint) -> None:
     with pytest.raises(BusError, match="not open"):
-        Bus(listen=endpoint).publisher(KEY)
+        ZenohSession(listen=endpoint).publisher(KEY)
 
 
 def test_a_process_ends_although_its_handlers_are_still_declared(endpoint) -> None:

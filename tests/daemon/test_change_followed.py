@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning import LearningState, OnlineLearner
 from bodyschema.learning.changes.adaptation import Origin
 from bodyschema.learning.changes.known_arm import KnownArm
 from bodyschema.learning.changes.monitor import DetectedChange, Reference
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.nominal import chain_tolerances
-from bodyschema.learning.state import LearningHeader
+from bodyschema.learning.online_learner import OnlineLearner
+from bodyschema.learning.state import LearningHeader, LearningState
 from bodyschema.learning.uncertainty import PredictiveUncertainty
 from kbmaps import ChainBelief, ChainParameters, RigidChain, change_kinds, learning_bases
 

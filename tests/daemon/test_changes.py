@@ -50,7 +50,7 @@ def test_a_change_is_one_line_when_it_is_noticed_and_one_when_it_is_named(change
 
 def test_a_told_change_is_logged_as_such(changes: Changes, caplog) -> None:
     changes.note(ChangeRecord.told(20))
-    assert logged(caplog) == ["tool changed before pair 21, as told by the command tool_changed"]
+    assert logged(caplog) == ["tool changed before pair 21, as reported by the command tool_changed"]
 
 
 def test_a_rollback_is_logged(changes: Changes, caplog) -> None:

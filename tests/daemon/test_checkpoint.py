@@ -20,7 +20,7 @@ from bodyschema.daemon.learner.checkpoint import (
     write_checkpoint,
 )
 from bodyschema.daemon.learner.resume import go_on
-from bodyschema.learning import LearningState
+from bodyschema.learning.state import LearningState
 
 UTC = "2026-11-21T12:00:00.000+00:00"
 
@@ -115,13 +115,13 @@ def test_a_full_disk_is_named_and_leaves_the_old_checkpoint(written, old, new) -
 
 def test_a_file_in_the_place_of_the_folder_is_named(tmp_path, old) -> None:
     (tmp_path / "state").touch()
-    with pytest.raises(CheckpointError, match=r"state is not a folder. Learning goes on; give a folder as state_dir"):
+    with pytest.raises(CheckpointError, match=r"state is not a folder. Learning continues; give a folder as state_dir"):
         write(tmp_path / "state" / "learner.ckpt", old)
 
 
 def test_a_read_only_disk_is_named(mount_small_disk, old) -> None:
     file = mount_small_disk("ro,size=512k") / "learner.ckpt"
-    with pytest.raises(CheckpointError, match=r"Read-only file system. Learning goes on; give a --state-dir"):
+    with pytest.raises(CheckpointError, match=r"Read-only file system. Learning continues; give a --state-dir"):
         write(file, old)
 
 

@@ -12,7 +12,7 @@ import warm
 from cyclopts import CycloptsError
 from small_arm import URDF, write_small_arm
 
-from bodyschema.cli.main import COMMANDS, app, command_line
+from bodyschema.cli.main import COMMANDS, app, command_line, present_names
 from bodyschema.cli.terminal.screen import two_digits
 from bodyschema.daemon.config import Config
 from bodyschema.interfaces.errors import BusError, ConfigError
@@ -51,9 +51,7 @@ def test_help_names_every_command(tmp_path) -> None:
     assert [name for name in COMMANDS if f" {name} " not in text] == []
 
 
-@pytest.mark.parametrize(
-    "command", [*COMMANDS, "config init", "config check", "config show", "install udev", "robot new"]
-)
+@pytest.mark.parametrize("command", [*COMMANDS, "init", "config check", "config show", "install udev", "robot new"])
 def test_each_command_says_what_it_needs_and_what_is_next(command, capsys) -> None:
     # As in a process of its own: a summary given to the same page before would be shown in its place.
     sys.modules.pop(f"bodyschema.cli.commands.{command.split()[0]}", None)
@@ -71,7 +69,7 @@ def test_help_fits_a_terminal_of_80_columns(tmp_path) -> None:
 def test_a_mistake_of_the_user_is_one_line_and_exit_code_1(tmp_path) -> None:
     done = run("sampler", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr == "bodyschema: robot.toml: there is no such file. `bodyschema config init` writes one\n"
+    assert done.stderr == "bodyschema: robot.toml: there is no such file. `bodyschema init` writes one\n"
 
 
 def test_robot_toml_may_be_named_in_the_environment(tmp_path, robot) -> None:
@@ -85,7 +83,7 @@ def test_robot_toml_may_be_named_in_the_environment(tmp_path, robot) -> None:
 
 
 def test_the_example_that_init_writes_is_in_order_once_the_urdf_fits(tmp_path, capsys) -> None:
-    called("config", "init", "--robot", tmp_path / "robot.toml")
+    called("init", "--robot", tmp_path / "robot.toml")
     urdf = URDF.replace("waist", "joint_1").replace("shoulder", "joint_2").replace('"base"', '"base_link"')
     (tmp_path / "my_robot.urdf").write_text(urdf)
     called("config", "check", "--robot", tmp_path / "robot.toml")
@@ -94,26 +92,67 @@ def test_the_example_that_init_writes_is_in_order_once_the_urdf_fits(tmp_path, c
 
 def test_init_with_a_urdf_fills_in_what_the_urdf_says(tmp_path) -> None:
     write_small_arm(tmp_path)
-    called("config", "init", "--robot", tmp_path / "new.toml", "--urdf", tmp_path / "arm.urdf")
+    called("init", "--robot", tmp_path / "new.toml", "--urdf", tmp_path / "arm.urdf")
     robot = Config.load(tmp_path / "new.toml", {}).robot
     assert (robot.name, robot.joints, robot.robot.marker_link) == ("arm", ("waist", "shoulder"), "hand")
 
 
-def test_init_with_sim_leaves_nothing_to_mend(tmp_path) -> None:
-    called("config", "init", "--sim", "--robot", tmp_path / "robot.toml")
+def test_init_with_sim_leaves_nothing_to_correct(tmp_path) -> None:
+    called("init", "--sim", "--robot", tmp_path / "robot.toml")
     assert Config.load(tmp_path / "robot.toml", {}).robot.calibration is not None
 
 
 def test_init_replaces_no_file(robot) -> None:
     before = robot.read_text()
     with pytest.raises(ConfigError, match=r"is there already\. Give another --robot"):
-        called("config", "init", "--robot", robot)
+        called("init", "--robot", robot)
     assert robot.read_text() == before
 
 
 def test_init_says_when_it_cannot_write(tmp_path) -> None:
     with pytest.raises(ConfigError, match="cannot be written: No such file or directory"):
-        called("config", "init", "--robot", tmp_path / "nowhere" / "robot.toml")
+        called("init", "--robot", tmp_path / "nowhere" / "robot.toml")
+
+
+GRIPPER = """
+  <link name="finger_a"/><link name="finger_b"/>
+  <joint name="gripper" type="revolute">
+    <parent link="hand"/><child link="finger_a"/><limit lower="0" upper="1" effort="1" velocity="1"/>
+  </joint>
+  <joint name="other" type="revolute">
+    <parent link="hand"/><child link="finger_b"/><limit lower="0" upper="1" effort="1" velocity="1"/>
+    <mimic joint="gripper"/>
+  </joint>
+</robot>"""
+
+
+def test_init_leaves_a_gripper_and_what_mimics_it_out(tmp_path) -> None:
+    write_small_arm(tmp_path)
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(urdf.read_text().replace("</robot>", GRIPPER))
+    called("init", "--robot", tmp_path / "new.toml", "--urdf", urdf)
+    robot = Config.load(tmp_path / "new.toml", {}).robot
+    assert (robot.joints, robot.robot.marker_link) == (("waist", "shoulder"), "hand")
+
+
+def test_init_takes_the_links_that_are_given(tmp_path) -> None:
+    write_small_arm(tmp_path)
+    links = "--marker-link", "upper", "--camera-link", "base"
+    called("init", "--robot", tmp_path / "new.toml", "--urdf", tmp_path / "arm.urdf", *links)
+    robot = Config.load(tmp_path / "new.toml", {}).robot
+    assert (robot.joints, robot.robot.marker_link, robot.camera.parent_link) == (("waist",), "upper", "base")
+
+
+def test_init_refuses_a_link_that_the_urdf_has_not(tmp_path) -> None:
+    write_small_arm(tmp_path)
+    with pytest.raises(ConfigError, match=r"has no link 'hnad'\. Did you mean 'hand'"):
+        called("init", "--robot", tmp_path / "new.toml", "--urdf", tmp_path / "arm.urdf", "--marker-link", "hnad")
+
+
+def test_the_earlier_names_answer_with_the_present_one(capsys) -> None:
+    assert present_names(["robot", "new", "--urdf", "a"]) == ["init", "--from", "scan", "--urdf", "a"]
+    assert present_names(["config", "init", "--sim"]) == ["init", "--sim"]
+    assert "bodyschema config init is now: bodyschema init\n" in capsys.readouterr().err
 
 
 def test_check_says_what_was_understood(robot, capsys) -> None:
@@ -132,7 +171,7 @@ def test_show_prints_the_settings_in_force(tmp_path, robot, capsys, monkeypatch)
 
 
 def test_the_written_example_explains_every_key_in_place(tmp_path) -> None:
-    called("config", "init", "--robot", tmp_path / "robot.toml")
+    called("init", "--robot", tmp_path / "robot.toml")
     text = (tmp_path / "robot.toml").read_text()
     assert tomllib.loads(text)["robot"]["marker_known"] is False
     assert text.count("CHECK") >= 4
@@ -143,7 +182,7 @@ def test_the_written_example_explains_every_key_in_place(tmp_path) -> None:
 
 def test_a_command_to_nobody_says_what_to_start(robot) -> None:
     with pytest.raises(
-        BusError, match=r"nobody listens on tcp/127\.0\.0\.1:[0-9]+\. Start the daemon with `bodyschema run`"
+        BusError, match=r"nothing listens on tcp/127\.0\.0\.1:[0-9]+\. Start the daemon with `bodyschema run`"
     ):
         called("command", "pause", "--robot", robot)
 

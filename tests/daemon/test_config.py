@@ -98,7 +98,7 @@ def test_an_unknown_key_in_the_environment_is_refused(tmp_path) -> None:
 
 
 def test_a_missing_file_names_the_command_that_writes_one(tmp_path) -> None:
-    with pytest.raises(ConfigError, match=r"there is no such file\. `bodyschema config init` writes one"):
+    with pytest.raises(ConfigError, match=r"there is no such file\. `bodyschema init` writes one"):
         Config.load(tmp_path / "robot.toml", {})
 
 

@@ -21,7 +21,7 @@ from bodyschema.cli.main import main
 from bodyschema.cli.terminal.diagnosis_run import Asked, Source, run
 from bodyschema.cli.terminal.diagnosis_view import view
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import Bus, Request
+from bodyschema.daemon.transport.bus import Request, ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.wire import PairsReply, encode, pair_to_wire
 from bodyschema.diagnosis.result import DiagnosisFile, Indistinguishable, Unexplained
@@ -229,7 +229,7 @@ def test_effects_that_are_excluded_are_not_looked_for(file) -> None:
 class Sampler:
     """A fake sampler that serves its pairs."""
 
-    def __init__(self, bus: Bus, name: str, recording: Recording) -> None:
+    def __init__(self, bus: ZenohSession, name: str, recording: Recording) -> None:
         assert recording.t is not None
         rows = zip(recording.t, recording.q, recording.x, strict=True)
         self.pairs = [Pair("one", k, 1, float(t), "utc", q, x, np.eye(3) * 9e-8) for k, (t, q, x) in enumerate(rows, 1)]
@@ -250,7 +250,7 @@ def live_robot(tmp_path, endpoint, robot) -> Path:
 
 
 def test_the_running_samplers_pairs_are_diagnosed(live_robot, endpoint, recording) -> None:
-    with Bus(listen=endpoint) as bus:
+    with ZenohSession(listen=endpoint) as bus:
         Sampler(bus, "desk_arm", recording)
         ended = diagnose("--live", "--robot", live_robot, *FEW, "--json")
     contents = json.loads(ended.out)
@@ -259,13 +259,13 @@ def test_the_running_samplers_pairs_are_diagnosed(live_robot, endpoint, recordin
 
 
 def test_a_sampler_without_pairs_is_said_to_have_none(live_robot, endpoint, recording) -> None:
-    with Bus(listen=endpoint) as bus:
+    with ZenohSession(listen=endpoint) as bus:
         Sampler(bus, "desk_arm", recording).pairs.clear()
         assert "the sampler has no pairs yet" in refused("--live", "--robot", live_robot)
 
 
 def test_a_sampler_that_does_not_run_is_said_not_to(live_robot) -> None:
-    assert "nobody listens on" in refused("--live", "--robot", live_robot)
+    assert "nothing listens on" in refused("--live", "--robot", live_robot)
 
 
 # --- refusals

@@ -64,8 +64,8 @@ def test_first_pairs_that_the_fitted_tool_contradicts_are_no_part_of_a_run() -> 
     x = np.array([pair.x for pair in scene.pairs])
     x[0] += 0.2  # with the old tool
     era.begin_with(scene.q[:6], x[:6])
-    era.doubts.doubt(scene.q[6], x[6], FAR, LIMIT)
+    era.gate.doubt(scene.q[6], x[6], FAR, LIMIT)
     era.set_aside(scene.chain.to_kbmap(nominal.bases))
-    era.doubts.doubt(scene.q[7], x[7], FAR, LIMIT)
-    np.testing.assert_array_equal(era.doubts.run()[0], scene.q[6:])
+    era.gate.doubt(scene.q[7], x[7], FAR, LIMIT)
+    np.testing.assert_array_equal(era.gate.run()[0], scene.q[6:])
     np.testing.assert_array_equal(era.memory.all()[0], scene.q[1:6])

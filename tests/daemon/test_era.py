@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from guided_arm import Scene, make_pair, nominal_model
 
-from bodyschema.learning import Solved
 from bodyschema.learning.changes.known_arm import KnownArm
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.learnt_model import LearntModel
 from bodyschema.learning.model_bank import EXACT, PRIOR, RESIDUAL, RIGID
 from bodyschema.learning.regime import Regime
-from bodyschema.learning.solvers.solver import fitted_residual
+from bodyschema.learning.solvers.solver import Solved, fitted_residual
 from bodyschema.learning.uncertainty import UncertaintyTracker
 from kbmaps import ChainTolerances, KBMap
 
@@ -32,7 +31,7 @@ def map_off_by(metres: float) -> KBMap:
 
 def beside(era: Regime) -> str:
     """Return the name of the published map."""
-    return next(name for name, kbmap in era.members.maps.items() if kbmap is era.map)
+    return next(name for name, kbmap in era.models.maps.items() if kbmap is era.map)
 
 
 def take(era: Regime, name: str, model: LearntModel) -> None:

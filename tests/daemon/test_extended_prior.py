@@ -12,9 +12,10 @@ from walked import DESK_ARM
 from bodyschema.daemon.config import Config
 from bodyschema.effects import Effect, Motion, Simulation, write_extended
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner
 from bodyschema.learning.config import LearnerConfig
-from bodyschema.learning.nominal import chain_tolerances
+from bodyschema.learning.nominal import NominalModel, chain_tolerances
+from bodyschema.learning.online_learner import OnlineLearner
+from bodyschema.learning.solvers.solver import DirectSolver
 from bodyschema.robot.description import RobotDescription
 
 LINK, TURN = [0.005, 0.003, -0.004, 0.02, 0.01, -0.02], [0.03, 0.02]

@@ -13,7 +13,7 @@ from bodyschema.daemon.sampler.history import Page, read_page
 from bodyschema.daemon.transport.wire import PairMessage, PairsReply, encode, pair_to_wire
 from bodyschema.interfaces.errors import BusError, RequestError
 from bodyschema.interfaces.records import Pair
-from bodyschema.learning import OnlineLearner
+from bodyschema.learning.online_learner import OnlineLearner
 
 PAGE = 7
 PAIRS = Scene.draw(0, 40).pairs

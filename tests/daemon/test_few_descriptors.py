@@ -15,7 +15,7 @@ from bodyschema.cli import main as cli
 from bodyschema.cli.main import allow_enough_files
 from bodyschema.daemon.learner.solver_process import SolverLostError, SolverProcess
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.learning import Task
+from bodyschema.learning.solvers.solver import Task
 from kbmaps import ChainTolerances
 
 NOMINAL = nominal_model()

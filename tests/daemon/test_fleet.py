@@ -16,7 +16,7 @@ from small_arm import write_small_arm
 from told_statuses import LEARNER, SAMPLER
 
 from bodyschema.cli.main import app
-from bodyschema.daemon.transport.bus import Bus, Request
+from bodyschema.daemon.transport.bus import Request, ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import JointRange, LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode
@@ -71,7 +71,7 @@ def positions(q: FloatArray, waist: float) -> FloatArray:
 @contextmanager
 def robots(endpoint: str, waists: dict[str, float], *, learners: bool = True) -> Iterator[None]:
     """Serve robots at one endpoint, each with its own waist offset."""
-    with Bus(listen=endpoint) as bus:
+    with ZenohSession(listen=endpoint) as bus:
 
         def stand(name: str, waist: float) -> None:
             def predict(request: Request) -> bytes:
@@ -127,18 +127,18 @@ def test_a_described_robot_that_is_absent_is_in_the_list(tmp_path: Path, free_en
     file = write_small_arm(tmp_path, f'[zenoh]\nsampler = "{elsewhere}"\nlearner = "{here}"\n')
     with robots(here, {"left": 0.0}), Fleet(places([], [file])) as found:
         members = {member.name: member for member in found.look()}
-        assert f"nobody listens on {elsewhere}" in found.unreached[0]
+        assert f"nothing listens on {elsewhere}" in found.unreached[0]
     assert members["arm"].health == ["neither its sampler nor its learner is alive"]
     assert members["left"].alive == {"sampler", "learner"}
 
 
 def test_a_place_where_nobody_listens_is_an_error_with_its_address(endpoint: str) -> None:
-    with pytest.raises(BusError, match=f"nobody listens on {endpoint}"):
+    with pytest.raises(BusError, match=f"nothing listens on {endpoint}"):
         fleet("list", "--connect", endpoint)
 
 
 def test_a_place_without_robots_is_an_error(endpoint: str) -> None:
-    with Bus(listen=endpoint), pytest.raises(BusError, match=f"no robot is alive on {endpoint}"):
+    with ZenohSession(listen=endpoint), pytest.raises(BusError, match=f"no robot is alive on {endpoint}"):
         fleet("list", "--connect", endpoint)
 
 

@@ -6,6 +6,7 @@ import contextlib
 import io
 import json
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from unittest import mock
 
@@ -21,7 +22,9 @@ from bodyschema.fleet.summary_view import sentences
 from bodyschema.interfaces.errors import RecordingError, RequestError
 from bodyschema.robot.description import RobotDescription
 
-pytest.importorskip("distributed")
+pytestmark = pytest.mark.skipif(
+    find_spec("distributed") is None, reason="no Dask; to run it: pip install -e '.[fleet]'"
+)
 
 
 def fleet(*words: object) -> tuple[object, str, str]:
@@ -51,7 +54,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def told(folder: Path) -> tuple[object, str, str]:
     few = ("--effects", "joint_scale,backlash")
-    return fleet("diagnose", "--from", folder, "--robot", DESK_ARM, "--out", folder / "out", *few, "--json")
+    return fleet(
+        "diagnose", "--from", folder, "--robot", DESK_ARM, "--out", folder / "out", *few, "--workers", "1", "--json"
+    )
 
 
 @pytest.fixture(scope="module")

@@ -33,8 +33,11 @@ from bodyschema.daemon.transport.bus import Request
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.effects import Simulation
 from bodyschema.interfaces.errors import BodyschemaError, ConfigError, RecordingError, RequestError
-from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner, StateError
 from bodyschema.learning.config import LearnerConfig
+from bodyschema.learning.nominal import NominalModel
+from bodyschema.learning.online_learner import OnlineLearner
+from bodyschema.learning.solvers.solver import DirectSolver
+from bodyschema.learning.state import StateError
 from bodyschema.recordings.recording import Recording, joints_in
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.urdf import UrdfTree

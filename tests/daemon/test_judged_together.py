@@ -9,13 +9,15 @@ import pytest
 from guided_arm import JOINTS, NOW_AND_THEN, Scene, built_chain, make_pair, measured, nominal_model, path, teach
 
 from bodyschema.interfaces.records import Pair
-from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner
 from bodyschema.learning.changes.known_arm import KnownArm
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.core import MOST_TOGETHER
 from bodyschema.learning.error_memory import ErrorMemory
 from bodyschema.learning.model_bank import INSTANT
+from bodyschema.learning.nominal import NominalModel
+from bodyschema.learning.online_learner import OnlineLearner
 from bodyschema.learning.regime import Regime
+from bodyschema.learning.solvers.solver import DirectSolver
 from bodyschema.learning.uncertainty import UncertaintyTracker
 from kbmaps import NLMS, ChainTolerances
 
@@ -54,7 +56,7 @@ def test_the_instant_learner_knows_a_pair_before_it_is_judged() -> None:
         era.meet(pair)
         reference.learn(pair.q, pair.x)
     assert era.memory.count == 0
-    np.testing.assert_allclose(era.members.map(INSTANT).net, reference.map.net, atol=1e-10)
+    np.testing.assert_allclose(era.models.map(INSTANT).net, reference.map.net, atol=1e-10)
 
 
 def test_together_the_same_pairs_are_doubted_as_one_by_one() -> None:
@@ -91,7 +93,7 @@ def test_the_solver_is_given_the_pairs_that_waited() -> None:
     assert learning.at_rest
 
 
-@pytest.mark.parametrize("moved_m", [0.025, 0.3])
+@pytest.mark.parametrize("moved_m", [0.025, pytest.param(0.3, marks=pytest.mark.soak)])
 def test_a_change_is_followed_as_soon_as_the_pairs_with_it_are_judged(moved_m: float) -> None:
     rng, before = np.random.default_rng(5), 150
     chain, q = built_chain(rng), path(rng, 200)

@@ -59,7 +59,7 @@ def test_a_recording_and_the_simulation_are_not_both_taken(tmp_path) -> None:
 def test_the_simulated_robot_has_no_latency(tmp_path, monkeypatch, capsys) -> None:
     pytest.importorskip("pybullet")
     monkeypatch.chdir(tmp_path)
-    app(["config", "init", "--sim"], exit_on_error=False, result_action="return_value")
+    app(["init", "--sim"], exit_on_error=False, result_action="return_value")
     capsys.readouterr()
     words = ["calibrate", "latency", "--sim", "--json", "--seconds", "3"]
     app(words, exit_on_error=False, result_action="return_value")

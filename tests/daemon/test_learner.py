@@ -13,7 +13,7 @@ from small_arm import write_small_arm
 
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner.learner import Learner
-from bodyschema.daemon.transport.bus import Bus, Request
+from bodyschema.daemon.transport.bus import Request, ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import LearnerStatus
 from bodyschema.daemon.transport.wire import (
@@ -28,7 +28,7 @@ from bodyschema.daemon.transport.wire import (
 )
 from bodyschema.interfaces.errors import BusError
 from bodyschema.interfaces.records import Pair
-from bodyschema.learning import DirectSolver
+from bodyschema.learning.solvers.solver import DirectSolver
 
 KEYS = Keys("arm")
 
@@ -84,7 +84,7 @@ def pair(seq: int) -> Pair:
 def learner(tmp_path: Path) -> tuple[Learner, Wire]:
     config = Config.load(write_small_arm(tmp_path, '[daemon]\nstate_dir = "state"\n'), {})
     wire = Wire([pair(seq) for seq in range(1, 6)])
-    learner = Learner(config, DirectSolver(), cast(Bus, wire), Still())
+    learner = Learner(config, DirectSolver(), cast(ZenohSession, wire), Still())
     learner._declare()
     learner._feed.step(0.0)
     wire.handlers[KEYS.alive("sampler")](True)

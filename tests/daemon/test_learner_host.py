@@ -18,11 +18,11 @@ from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner.background import Background
 from bodyschema.daemon.learner.host import attend, run_learners, session_settings
 from bodyschema.daemon.learner.learner import Learner
-from bodyschema.daemon.learner.solver_pool import SharedSolver
+from bodyschema.daemon.learner.solver_pool import SolverPool
 from bodyschema.daemon.learner.solver_process import SolverLostError
 from bodyschema.daemon.service.notify import Notifier
 from bodyschema.daemon.service.service import Service
-from bodyschema.daemon.service.signals import Wishes
+from bodyschema.daemon.service.signals import SignalFlags
 from bodyschema.daemon.transport.bus import client
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import LearnerStatus
@@ -30,7 +30,7 @@ from bodyschema.daemon.transport.wire import decode
 from bodyschema.fleet.hosting import configs_of, descriptions, shares
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import BusError, ConfigError
-from bodyschema.learning import Solved, Task
+from bodyschema.learning.solvers.solver import Solved, Task
 from kbmaps import ChainTolerances
 
 NOMINAL = nominal_model()
@@ -64,7 +64,7 @@ def asked(endpoint: str, robot: str) -> LearnerStatus:
 
 
 def test_every_robot_is_answered_for_by_the_one_process(robots: list[Config]) -> None:
-    wishes = Wishes()
+    wishes = SignalFlags()
     host = threading.Thread(target=run_learners, args=(robots, SystemClock(), wishes, Notifier()))
     host.start()
     try:
@@ -79,7 +79,7 @@ def test_every_robot_is_answered_for_by_the_one_process(robots: list[Config]) ->
 class Attended:
     """A learner that receives a request while it is served, and whose process ends two rounds later."""
 
-    def __init__(self, wishes: Wishes, wishing: bool) -> None:
+    def __init__(self, wishes: SignalFlags, wishing: bool) -> None:
         self.wishes, self.wishing, self.rounds, self.reloads = wishes, wishing, 0, 0
 
     def status(self) -> LearnerStatus:
@@ -98,7 +98,7 @@ class Attended:
 
 
 def test_a_reload_that_is_wished_for_in_mid_round_is_done_once_for_every_robot() -> None:
-    wishes, clock = Wishes(), SystemClock()
+    wishes, clock = SignalFlags(), SystemClock()
     learners = [Attended(wishes, wishing) for wishing in (False, True, False)]
     service = Service(Notifier(), (), clock)
     attend(cast("list[Learner]", learners), [lambda _: None] * 3, wishes, service, [])
@@ -180,8 +180,8 @@ def process() -> ScriptedProcess:
 
 
 @pytest.fixture
-def shared(process: ScriptedProcess) -> SharedSolver:
-    return SharedSolver(process)  # type: ignore[arg-type]
+def shared(process: ScriptedProcess) -> SolverPool:
+    return SolverPool(process)  # type: ignore[arg-type]
 
 
 def pairs(count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -189,7 +189,7 @@ def pairs(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_what_a_robot_tells_waits_while_the_process_solves_for_another(
-    shared: SharedSolver, process: ScriptedProcess
+    shared: SolverPool, process: ScriptedProcess
 ) -> None:
     first, second = shared.seat(), shared.seat()
     for seat in (first, second):
@@ -204,7 +204,7 @@ def test_what_a_robot_tells_waits_while_the_process_solves_for_another(
     assert first.poll() is not None
 
 
-def test_the_robot_whose_pairs_grew_most_has_the_next_turn(shared: SharedSolver, process: ScriptedProcess) -> None:
+def test_the_robot_whose_pairs_grew_most_has_the_next_turn(shared: SolverPool, process: ScriptedProcess) -> None:
     busy, old, new = (shared.seat() for _ in range(3))
     for seat, count in ((busy, 10), (old, 10), (new, 10)):
         seat.learn(*pairs(count))
@@ -223,7 +223,7 @@ def test_the_robot_whose_pairs_grew_most_has_the_next_turn(shared: SharedSolver,
     assert process.told[-1] == ("solve", 2)
 
 
-def test_a_lost_process_leaves_no_order_behind(shared: SharedSolver, process: ScriptedProcess) -> None:
+def test_a_lost_process_leaves_no_order_behind(shared: SolverPool, process: ScriptedProcess) -> None:
     first, second = shared.seat(), shared.seat()
     second.learn(*pairs(5))
     first.learn(*pairs(5))

@@ -24,9 +24,10 @@ from hypothesis import strategies as st
 
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import Pair
-from bodyschema.learning import DirectSolver, OnlineLearner, Solved
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.model_bank import SOLVED
+from bodyschema.learning.online_learner import OnlineLearner
+from bodyschema.learning.solvers.solver import DirectSolver, Solved
 from kbmaps import NLMS
 from kbmaps.contest import LISTED
 

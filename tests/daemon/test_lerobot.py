@@ -15,7 +15,7 @@ import pytest
 from bodyschema.cli.hardware.lerobot_offsets import CorrectedCalibration
 from bodyschema.cli.main import command_line
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.sampler.reconnect import Reopening
+from bodyschema.daemon.sampler.reconnect import ReconnectingSource
 from bodyschema.daemon.wiring.wiring import open_joints
 from bodyschema.drivers.bench.pty_shell import PtyShell
 from bodyschema.drivers.dynamixel.bench.servo import Servo as DynamixelServo
@@ -45,7 +45,7 @@ READ_BY_LEROBOT = [
 
 
 def config(*arguments: object) -> None:
-    words = ["config", "init", "--lerobot", "so101", *arguments]
+    words = ["init", "--lerobot", "so101", *arguments]
     if "--urdf" not in words:
         words += ["--urdf", SO101 / "so101.urdf"]
     command_line("config")(list(map(str, words)), exit_on_error=False, result_action="return_value")
@@ -79,7 +79,7 @@ def both_arms(folder: Path) -> Iterator[dict[str, Path]]:
 
 def read(config: Config) -> np.ndarray:
     clock = SystemClock()
-    with Reopening(open_joints(config, clock), "the arm", clock) as joints:
+    with ReconnectingSource(open_joints(config, clock), "the arm", clock) as joints:
         for _ in range(60):
             if (reading := joints.read(1.0)) is not None:
                 return reading.q

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from bodyschema.calibration.plausibility.check import Plausibility, plausibility
@@ -19,7 +22,9 @@ from bodyschema.daemon.learner.findings import Findings
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import RecordingError
 from bodyschema.interfaces.records import Pair
-from bodyschema.learning import DirectSolver, NominalModel, OnlineLearner
+from bodyschema.learning.nominal import NominalModel
+from bodyschema.learning.online_learner import OnlineLearner
+from bodyschema.learning.solvers.solver import DirectSolver
 from bodyschema.recordings.recording import Recording
 from kbmaps import ChainParameters, ChainTolerances, RigidChain
 
@@ -82,6 +87,20 @@ def pairs(
     return Pairs(q, parameters.positions(change, q) + noise * rng.normal(size=(count, 3)))
 
 
+def guided(seed: int, *, steps: int) -> Pairs:
+    """Return pairs of an arm made to 0.6° and 5 mm, guided in steps of 1.7°, all joints at once."""
+    rng = np.random.default_rng(seed)
+    parameters = ChainParameters(arm())
+    made = ChainTolerances(axes=0.01, points=0.005, tool=0.02)
+    change = parameters.standard_deviations(made) * rng.normal(size=parameters.size)
+    change[parameters.zeros] = np.radians(3.0) * rng.normal(size=6)
+    waypoints = np.array([0.3, -0.8, 1.2, 0.4, 0.9, 0.0]) + rng.uniform(-1.2, 1.2, (4, 6))
+    path = CubicSpline(range(4), waypoints)(np.linspace(0.0, 3.0, 2000))
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    q = path[np.searchsorted(way, np.radians(1.7) * np.arange(steps))]
+    return Pairs(q, parameters.positions(change, q) + 0.0003 * rng.normal(size=(steps, 3)))
+
+
 PLAIN = Reading.plain(6)
 MISREAD = {
     "q3 counts the other way": replace(PLAIN, signs=(1, 1, -1, 1, 1, 1)),
@@ -101,6 +120,17 @@ MISREAD = {
 }
 
 
+@cache
+def misread(said: str) -> Plausibility:
+    """Return what is told of a recording that is read so."""
+    return pairs().read(MISREAD[said]).seen()
+
+
+def rarely(seeds: range) -> list[Any]:
+    """Return seeds for `make soak` alone."""
+    return [pytest.param(seed, marks=pytest.mark.soak) for seed in seeds]
+
+
 # `make soak` tests two columns misread alike, and more than two.
 RARELY = (
     "q2 and q5 count the other way",
@@ -113,13 +143,19 @@ RARELY = (
     "said", [pytest.param(said, marks=[pytest.mark.soak] if said in RARELY else []) for said in MISREAD]
 )
 def test_a_wrong_reading_is_refused_and_named(said) -> None:
-    found = pairs().read(MISREAD[said]).seen()
+    found = misread(said)
     assert found.misread
     assert said in (found.refusal or "")
 
 
 @pytest.mark.parametrize(
-    ("unit", "factor"), [("millimetres", 1000), ("centimetres", 100), ("inches", 39.37), ("feet", 3.281)]
+    ("unit", "factor"),
+    [
+        ("millimetres", 1000),
+        ("feet", 3.281),
+        pytest.param("centimetres", 100, marks=pytest.mark.soak),
+        pytest.param("inches", 39.37, marks=pytest.mark.soak),
+    ],
 )
 def test_a_unit_of_length_is_named(unit, factor) -> None:
     right = pairs()
@@ -145,16 +181,27 @@ def test_degrees_are_named_however_small() -> None:
 
 
 def test_a_refusal_gives_both_errors_and_the_remedy() -> None:
-    found = pairs().read(MISREAD["the zero of q2 is about 90° off"]).seen()
+    found = misread("the zero of q2 is about 90° off")
     assert "the pairs then fit to" in (found.refusal or "")
     assert "and as they are to" in (found.refusal or "")
     assert found.remedy.startswith("Add -90° to the readings of q2")
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [0, 1, 2, *rarely(range(3, 6))])
 def test_a_right_recording_is_not_doubted(seed) -> None:
     noise, zeros, tool = ((0.00003, 10.0, 0.02), (0.01, 3.0, 0.02), (0.0005, 10.0, 0.2))[seed % 3]
     assert pairs(seed, noise=noise, zeros_deg=zeros, tool=tool, count=40 + 100 * seed).seen().sentences == ()
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_right_recording_of_a_short_path_is_not_doubted(seed) -> None:
+    """Along a path the errors of neighbouring pairs are alike, and a wrong reading may fit them by chance."""
+    assert guided(seed, steps=120).seen().sentences == ()
+
+
+def test_a_wrong_reading_of_a_short_path_is_named() -> None:
+    found = guided(0, steps=90).read(MISREAD["q3 counts the other way"]).seen()
+    assert "q3 counts the other way" in (found.refusal or "")
 
 
 def test_outliers_are_no_reason_to_doubt() -> None:
@@ -209,7 +256,7 @@ def test_exchanged_positions_are_named_where_the_pose_is_known() -> None:
 LAST = PLAIN.turned((0, 0, 0, 0, 0, 1))
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *rarely(range(1, 4))])
 def test_a_zero_of_the_last_joint_is_named_where_the_marker_is_known(seed) -> None:
     right = replace(pairs(seed, tool=0.003), marker_known=True)
     assert right.seen().sentences == ()
@@ -225,11 +272,12 @@ def test_a_zero_of_the_last_joint_is_named_beside_another_fault() -> None:
     assert "q3 counts the other way and the zero of q6 is about 90° off" in (found.refusal or "")
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *rarely(range(1, 4))])
 def test_a_marker_elsewhere_is_no_zero_of_the_last_joint(seed) -> None:
     assert replace(pairs(seed, tool=0.05), marker_known=True).seen().sentences == ()
 
 
+@pytest.mark.soak
 def test_what_no_simple_reading_explains_gets_no_name() -> None:
     many = replace(PLAIN, order=(2, 0, 1, 4, 3, 5), signs=(1, -1, 1, 1, -1, 1), quarters=(0, 1, -1, 0, 1, 0))
     found = pairs().read(many).seen()
@@ -242,7 +290,7 @@ def test_a_reading_that_fits_as_well_is_told_too() -> None:
     assert "These pairs fit as well if " in found.remedy
 
 
-@pytest.mark.parametrize("off", [45, -45])
+@pytest.mark.parametrize("off", [45, pytest.param(-45, marks=pytest.mark.soak)])
 def test_a_zero_half_a_quarter_turn_off_is_told(off) -> None:
     right = pairs()
     found = replace(right, q=right.q - np.radians([0.0, 0.0, off, 0.0, 0.0, 0.0])).seen()
@@ -250,7 +298,7 @@ def test_a_zero_half_a_quarter_turn_off_is_told(off) -> None:
 
 
 def test_force_turns_a_refusal_into_a_warning() -> None:
-    found = pairs().read(MISREAD["q3 counts the other way"]).seen()
+    found = misread("q3 counts the other way")
     assert "q3 counts the other way" in found.require("pairs.csv", force=True)[0]
     with pytest.raises(RecordingError, match=r"pairs.csv: it seems that q3 counts the other way.* with --force"):
         found.require("pairs.csv", force=False)
@@ -268,6 +316,9 @@ CASES = {
     "the zero of q2 is about 90° off": (range(6), [1] * 6, np.pi / 2, [0, 1, 2]),
 }
 
+# On simulated arms `make test` names these, too.
+ALSO_PLANTED = ("the columns q5 and q6 are exchanged", "the positions are mirrored")
+
 
 def misread_ur5(case: str | None) -> tuple[Config, Recording]:
     config = Config.load(UR5 / "robot.toml", {})
@@ -278,7 +329,9 @@ def misread_ur5(case: str | None) -> tuple[Config, Recording]:
 
 
 @real
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=[pytest.mark.soak] if case in ALSO_PLANTED else []) for case in CASES]
+)
 def test_a_misread_recording_of_a_real_arm_is_named(case) -> None:
     config, recording = misread_ur5(case)
     assert case in (plausibility(config.robot, recording.q, recording.x).refusal or "")

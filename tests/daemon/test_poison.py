@@ -11,8 +11,10 @@ from guided_arm import NOW_AND_THEN, Scene, new_learning, nominal_model, teach
 
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import Pair, frozen_array
-from bodyschema.learning import DirectSolver, LearningState, OnlineLearner, StateError
 from bodyschema.learning.config import LearnerConfig
+from bodyschema.learning.online_learner import OnlineLearner
+from bodyschema.learning.solvers.solver import DirectSolver
+from bodyschema.learning.state import LearningState, StateError
 
 TAUGHT = 40
 Spoil = Callable[[Pair], Pair]

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from bodyschema.daemon.transport.query_limiter import EVERYBODYS, LIMITS, Limits, Reception
+from bodyschema.daemon.transport.query_limiter import EVERYBODYS, LIMITS, Limits, QueryLimiter
 from bodyschema.interfaces.errors import RequestError
 
 
@@ -19,11 +19,11 @@ class Watch:
         return self.t
 
 
-def reception(watch: Watch | None = None, **limits: float) -> Reception[str]:
-    return Reception(replace(LIMITS, **limits), watch or Watch())
+def reception(watch: Watch | None = None, **limits: float) -> QueryLimiter[str]:
+    return QueryLimiter(replace(LIMITS, **limits), watch or Watch())
 
 
-def taken(desk: Reception[str], count: int) -> list[str]:
+def taken(desk: QueryLimiter[str], count: int) -> list[str]:
     return [turn[0] for turn in (desk.take() for _ in range(count)) if turn is not None]
 
 
@@ -70,7 +70,7 @@ def test_a_request_that_is_too_large_is_told_the_largest() -> None:
 
 def test_what_waits_takes_no_more_room_than_is_said() -> None:
     limits = Limits(waiting_bytes=100, request_bytes=100)
-    desk: Reception[str] = Reception(limits, Watch())
+    desk: QueryLimiter[str] = QueryLimiter(limits, Watch())
     for name in range(EVERYBODYS):
         desk.admit(str(name), 100, "full")
     with pytest.raises(RequestError, match="100 bytes of queries of the source 0 wait already, and 100 are the most"):

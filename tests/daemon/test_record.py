@@ -14,7 +14,7 @@ from small_arm import JOINTS, write_small_arm
 
 from bodyschema.cli.main import app
 from bodyschema.cli.recordings.recorder import History, follow_history
-from bodyschema.daemon.transport.bus import Bus, Request, client
+from bodyschema.daemon.transport.bus import Request, ZenohSession, client
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.wire import PairsReply, encode, pair_to_wire
 from bodyschema.interfaces.errors import BusError, RecordingError
@@ -33,7 +33,7 @@ def pair(seq: int, store: str = "one") -> Pair:
 class FakeSampler:
     """A fake sampler that serves `pairs`, a page at a time."""
 
-    def __init__(self, bus: Bus) -> None:
+    def __init__(self, bus: ZenohSession) -> None:
         self.pairs: list[Pair] = []
         self.store = "one"
         bus.answer(Keys("arm").pairs, self._answer)
@@ -52,7 +52,7 @@ def robot(tmp_path: Path, endpoint: str) -> Path:
 
 @pytest.fixture
 def sampler(endpoint: str) -> Iterator[FakeSampler]:
-    with Bus(listen=endpoint) as bus:
+    with ZenohSession(listen=endpoint) as bus:
         yield FakeSampler(bus)
 
 

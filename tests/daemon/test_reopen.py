@@ -8,7 +8,7 @@ from board_renderer import webcams
 from scripted_sources import Scripted
 from shown_board import SIZE, known_rig
 
-from bodyschema.daemon.sampler.reconnect import Reopening
+from bodyschema.daemon.sampler.reconnect import ReconnectingSource
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.records import JointReading, StereoFrame, frozen_array
 from bodyschema.vision.rectified import RectifiedCamera
@@ -32,12 +32,12 @@ class SteppedClock:
         self.t += seconds
 
 
-def reopening(source: Scripted) -> Reopening[JointReading]:
+def reopening(source: Scripted) -> ReconnectingSource[JointReading]:
     clock = SteppedClock()
-    return Reopening(source, "the encoders", clock, clock.sleep)
+    return ReconnectingSource(source, "the encoders", clock, clock.sleep)
 
 
-def read_until_reading(source: Reopening[JointReading], timeout_s: float = 0.25) -> int:
+def read_until_reading(source: ReconnectingSource[JointReading], timeout_s: float = 0.25) -> int:
     """Count the empty reads before the first that returns a reading."""
     for nothing in range(10_000):
         if source.read(timeout_s) is not None:
@@ -67,7 +67,7 @@ def test_the_waits_double_up_to_half_a_minute() -> None:
     failures = [SourceLost("still away")] * 8
     script = Scripted([SourceLost("unplugged"), READING], openings=[None, *failures])
     clock = SteppedClock()
-    with Reopening(script, "the encoders", clock, clock.sleep) as source:
+    with ReconnectingSource(script, "the encoders", clock, clock.sleep) as source:
         read_until_reading(source)
     # Exact: the waits are 0.5, 1, 2, 4, 8, 16, and then 30 each.
     assert clock.t - 100.0 == pytest.approx(0.5 + 1 + 2 + 4 + 8 + 16 + 30 + 30 + 30)
@@ -84,7 +84,7 @@ def test_a_loss_is_logged_once_however_long_it_lasts(caplog) -> None:
 
 def test_a_source_that_opens_but_cannot_be_read_is_tried_less_and_less_often() -> None:
     clock, script = SteppedClock(), Scripted([*[SourceLost("dead")] * 5, READING])
-    with Reopening(script, "the encoders", clock, clock.sleep) as source:
+    with ReconnectingSource(script, "the encoders", clock, clock.sleep) as source:
         read_until_reading(source)
     assert clock.t - 100.0 == pytest.approx(0.5 + 1 + 2 + 4 + 8)
 
@@ -124,7 +124,7 @@ def test_a_source_that_can_be_looked_for_cheaply_is_opened_again_sooner() -> Non
     gone = SourceLost("unplugged", retry_s=0.2)
     script = Scripted([gone, READING], openings=[None, *[gone] * 20])
     clock = SteppedClock()
-    with Reopening(script, "the encoders", clock, clock.sleep) as source:
+    with ReconnectingSource(script, "the encoders", clock, clock.sleep) as source:
         read_until_reading(source)
     assert clock.t == pytest.approx(100.0 + 21 * 0.2)
 
@@ -132,7 +132,7 @@ def test_a_source_that_can_be_looked_for_cheaply_is_opened_again_sooner() -> Non
 def test_what_only_a_new_process_may_open_ends_this_one() -> None:
     clock = SteppedClock()
     script = Scripted([SourceLost("unplugged"), READING], openings=[None, SourceLost("not permitted")])
-    source = Reopening(script, "the encoders", clock, clock.sleep, forbidden=lambda: "/dev/ttyUSB1")
+    source = ReconnectingSource(script, "the encoders", clock, clock.sleep, forbidden=lambda: "/dev/ttyUSB1")
     with source, pytest.raises(SourceError, match="/dev/ttyUSB1 came back as another device, which only a new start"):
         read_until_reading(source)
 
@@ -177,7 +177,7 @@ def test_other_cameras_are_told_of_and_the_calibrated_ones_waited_for(other, sai
     eyes = Exchanged([right, other, other, right])
     camera = RectifiedCamera(eyes, known_rig(webcams(np.random.default_rng(6))))
     clock, troubles = SteppedClock(), set()
-    with Reopening(camera, "the cameras", clock, clock.sleep) as source, caplog.at_level(logging.WARNING):
+    with ReconnectingSource(camera, "the cameras", clock, clock.sleep) as source, caplog.at_level(logging.WARNING):
         assert source.read(0.1) is not None
         while source.read(0.25) is None:
             troubles.add(source.trouble)

@@ -113,7 +113,7 @@ def test_a_folder_to_keep_is_never_overwritten(tmp_path: Path, robot: Path) -> N
 
 def test_without_robot_toml_the_remedy_is_named(tmp_path: Path) -> None:
     poses().write_csv(tmp_path / "a.csv")
-    with pytest.raises(ConfigError, match="config init"):
+    with pytest.raises(ConfigError, match="init"):
         replay(tmp_path / "a.csv", "--robot", tmp_path / "robot.toml")
 
 

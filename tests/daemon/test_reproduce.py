@@ -27,9 +27,9 @@ from bodyschema.reproduce.fig7 import fig7
 from bodyschema.reproduce.measured import Measured, guided_walk, postures
 from bodyschema.reproduce.models import WITH_DRAWING, Contender, Knowledge, learn_all
 from bodyschema.reproduce.show import show
-from bodyschema.reproduce.stream import in_stages
+from bodyschema.reproduce.stream import RULE, Stream, bernstein_map, in_stages, papers_rule
 from bodyschema.reproduce.walk import walk
-from kbmaps import ChainTolerances, NonFiniteError
+from kbmaps import ChainTolerances, NonFiniteError, RigidChain
 
 PAGE = Path(__file__).parents[2] / "docs" / "reproduced.md"
 # Small variants, so that every curve and table is made in seconds.
@@ -230,6 +230,7 @@ def test_measured_curves_without_pybullet_name_what_to_install(tmp_path, monkeyp
 
 def test_figure_5_simulates_in_the_very_postures_that_were_measured(monkeypatch) -> None:
     monkeypatch.setattr("bodyschema.reproduce.fig5.postures", planted)
+    monkeypatch.setattr("bodyschema.reproduce.fig5._models", lambda *_: {})  # only least squares is asked here
     found = fig5(a_run(real=True), train=300, test=30)
     assert [curve.name for curve in found.panels[0].curves] == ["measured", "simulated, σ = 20 mm"]
     # The tracker's noise planted is a twentieth of the simulated one.
@@ -237,7 +238,17 @@ def test_figure_5_simulates_in_the_very_postures_that_were_measured(monkeypatch)
     assert 10.0 < ratio < 40.0
 
 
+def by_the_rule_and_a_rigid_chain(
+    stream: Stream, nominal: RigidChain, known: Knowledge, say: Callable[[str], None], *, tool_changed: bool
+) -> dict[str, dict[str, Curve]]:
+    """Run two models on one stream, in the place of all."""
+    assert not tool_changed
+    rule = {RULE: papers_rule(bernstein_map(nominal), stream, say)}
+    return rule | learn_all(WITH_DRAWING[:1], known, (stream.q, stream.x), [stream.online], stream.tests)
+
+
 def test_figure_7_tests_on_measured_points_and_on_the_truth(monkeypatch) -> None:
+    monkeypatch.setattr("bodyschema.reproduce.fig7.learn_stream", by_the_rule_and_a_rigid_chain)
     monkeypatch.setattr("bodyschema.reproduce.fig7.guided_walk", planted)
     found = fig7(a_run(real=True), online=32, cycles=64, held_out=20, onward=20)
     of_truth = error(found, "rigid chain", "measured", "held out, true", "at 32")

@@ -8,10 +8,12 @@ import pytest
 from guided_arm import NOW_AND_THEN, Scene, make_pair, measured, new_learning, nominal_model, teach
 
 from bodyschema.interfaces.records import FloatArray, Pair
-from bodyschema.learning import DirectSolver, OnlineLearner, Solved, StateError
 from bodyschema.learning.config import LearnerConfig
+from bodyschema.learning.online_learner import OnlineLearner
 from bodyschema.learning.replay_memory import Permutations
 from bodyschema.learning.snapshot import Prediction
+from bodyschema.learning.solvers.solver import DirectSolver, Solved
+from bodyschema.learning.state import StateError
 
 TAUGHT, LATER = 100, 40
 

@@ -20,7 +20,7 @@ from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler.sampler import Sampler
 from bodyschema.daemon.sampler.session import session_of
 from bodyschema.daemon.sampler.sources import Sources
-from bodyschema.daemon.transport.bus import Bus, client
+from bodyschema.daemon.transport.bus import ZenohSession, client
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import SamplerStatus
 from bodyschema.daemon.transport.wire import MSGPACK, CommandRequest, PairMessage, PairsReply, decode, encode
@@ -48,7 +48,7 @@ def config(tmp_path: Path, endpoint: str) -> Config:
 def sampling(config: Config, sources: Sources, *, exit_at_end: bool = False) -> Iterator[Sampler]:
     with (
         PairStore(config.store_file, session_of(config, SystemClock())) as store,
-        Bus(listen=config.tables.zenoh.sampler) as bus,
+        ZenohSession(listen=config.tables.zenoh.sampler) as bus,
     ):
         yield Sampler(config, sources, bus, store, exit_at_end=exit_at_end)
 
@@ -61,7 +61,7 @@ def sample(config: Config, sources: Sources) -> tuple[list[Pair], SamplerStatus]
 
 
 @contextmanager
-def running(config: Config, sources: Sources) -> Iterator[Bus]:
+def running(config: Config, sources: Sources) -> Iterator[ZenohSession]:
     """Yield a client of a sampler that runs in a thread until the block ends."""
     with sampling(config, sources) as sampler:
         thread = threading.Thread(target=sampler.run)
@@ -78,7 +78,7 @@ def running(config: Config, sources: Sources) -> Iterator[Bus]:
     assert not thread.is_alive()
 
 
-def status_when(bus: Bus, true: Callable[[SamplerStatus], bool]) -> SamplerStatus:
+def status_when(bus: ZenohSession, true: Callable[[SamplerStatus], bool]) -> SamplerStatus:
     """Return the first published status for which `true` holds."""
     published: Queue[bytes] = Queue()
     bus.subscribe(KEYS.status("sampler"), published.put)
@@ -88,7 +88,7 @@ def status_when(bus: Bus, true: Callable[[SamplerStatus], bool]) -> SamplerStatu
     return status
 
 
-def command(bus: Bus, name: str) -> str:
+def command(bus: ZenohSession, name: str) -> str:
     return json.loads(bus.ask_one(KEYS.command("sampler"), encode(CommandRequest(name))))["message"]
 
 
@@ -230,7 +230,7 @@ def test_pairs_that_a_full_disk_does_not_take_are_not_published_and_told(config,
     walk, published = Walk(config.robot, 3000, step_deg=1.0005), []
     with (
         PairStore(file, session_of(config, SystemClock())) as store,
-        Bus(listen=config.tables.zenoh.sampler) as bus,
+        ZenohSession(listen=config.tables.zenoh.sampler) as bus,
     ):
         sampler = Sampler(config, walk.sources(), bus, store, exit_at_end=True)
         sampler._publish = published.append
@@ -279,7 +279,7 @@ def test_pairs_are_published_in_order(config) -> None:
 
 
 @pytest.fixture(scope="module")
-def ended(tmp_path_factory, free_endpoint) -> Iterator[Bus]:
+def ended(tmp_path_factory, free_endpoint) -> Iterator[ZenohSession]:
     """Yield a client of a sampler whose 1,200 pairs are all stored."""
     config = small_arm(tmp_path_factory.mktemp("ended"), free_endpoint())
     walk = Walk(config.robot, 1200, step_deg=1.01)
@@ -411,7 +411,7 @@ def test_a_tool_that_cannot_be_is_refused(config, request_) -> None:
 
 
 def test_nobody_tells_the_truth_where_there_is_no_simulation(ended) -> None:
-    with pytest.raises(BusError, match="nobody answers under bodyschema/arm/simulation"):
+    with pytest.raises(BusError, match="nothing answers under bodyschema/arm/simulation"):
         ended.ask_one(KEYS.simulation)
 
 

@@ -70,7 +70,7 @@ def test_a_missing_servo_is_named_with_its_joint(config, arm, port) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "state", "mend"),
+    ("change", "state", "fix"),
     [
         ({"model": "XL330-M288"}, "wrong model", 'set model = "XL330-M288"'),
         ({"model": "XL-320"}, "wrong model", "it is a XL-320, which no driver reads: put a XM540-W270 in its place"),
@@ -80,12 +80,12 @@ def test_a_missing_servo_is_named_with_its_joint(config, arm, port) -> None:
         ({"is_double": True}, "double", "give the other another ID"),
     ],
 )
-def test_a_servo_that_is_not_as_it_should_be_is_told_with_what_to_do(config, arm, port, change, state, mend) -> None:
+def test_a_servo_that_is_not_as_it_should_be_is_told_with_what_to_do(config, arm, port, change, state, fix) -> None:
     arm[1] = replace(arm[1], **change)
     told = report(config, arm, port)
     assert states(told) == ["ok", state, "ok", "ok"]
     assert told.joints is not None
-    assert mend in told.joints[1].mend
+    assert fix in told.joints[1].fix
     assert not told.is_well
 
 
@@ -131,6 +131,7 @@ def test_json_has_ports_joints_and_strangers(config, arm, port) -> None:
     assert told["strangers"] == []
 
 
+@pytest.mark.usefixtures("patient_host")
 def test_a_bench_is_found_by_the_command(tmp_path, capsys) -> None:
     with BenchRun(Config.load(EXAMPLE, {}), tmp_path / "bus") as run:
         arguments = ["scan", "--port", tmp_path / "bus", "--baud", 1000000, "--robot", run.robot_file, "--json"]

@@ -20,7 +20,7 @@ from small_arm import write_small_arm
 from bodyschema.cli.install.router import RouterConfig
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.transport.access import ROLES
-from bodyschema.daemon.transport.bus import Bus, Request, client
+from bodyschema.daemon.transport.bus import Request, ZenohSession, client
 from bodyschema.daemon.transport.identity import Identity, Route, TlsConfig
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.query_limiter import LIMITS
@@ -63,8 +63,8 @@ class Site:
 
     pki: Path
     endpoint: str
-    sampler: Bus
-    learner: Bus
+    sampler: ZenohSession
+    learner: ZenohSession
     heard: Queue[bytes]
     publish: Callable[[bytes], None]
 
@@ -82,7 +82,7 @@ def site(pki: Path, tmp_path_factory, free_endpoint) -> Iterator[Site]:
     heard: Queue[bytes] = Queue()
     with ExitStack() as stack:
         router = RouterConfig.load(router_file)
-        stack.enter_context(Bus(listen=endpoint, settings=router.settings()))
+        stack.enter_context(ZenohSession(listen=endpoint, settings=router.settings()))
         buses = {}
         for process, machine in (("sampler", "robot"), ("learner", "learner")):
             folder = tmp_path_factory.mktemp(machine)
@@ -92,7 +92,7 @@ def site(pki: Path, tmp_path_factory, free_endpoint) -> Iterator[Site]:
             settings = config.zenoh_settings(process)
             # Only through the router: on the two machines of a site the loopback leads nowhere else.
             settings["connect/endpoints"] = [endpoint]
-            buses[process] = stack.enter_context(Bus(listen=own[process], settings=settings))
+            buses[process] = stack.enter_context(ZenohSession(listen=own[process], settings=settings))
         sampler, learner = buses["sampler"], buses["learner"]
         for bus, keys in (
             (sampler, (KEYS.pairs, KEYS.status("sampler"), KEYS.command("sampler"))),
@@ -267,7 +267,7 @@ def two(pki: Path, tmp_path: Path, free_endpoint) -> Iterator[tuple[Config, Queu
             configs[process] = write_robot(tmp_path / machine, text, pki)
         sampler, learner = (
             stack.enter_context(
-                Bus(listen=config.tables.zenoh.endpoint(process), settings=config.zenoh_settings(process))
+                ZenohSession(listen=config.tables.zenoh.endpoint(process), settings=config.zenoh_settings(process))
             )
             for process, config in configs.items()
         )
@@ -315,7 +315,7 @@ def test_name_and_password_open_the_router_and_nothing_else_does(pki: Path, endp
         file.chmod(0o600)
         return Route((endpoint,), Identity(pki / "ca.pem", user=user, password_file=file))
 
-    with Bus(listen=endpoint, settings=RouterConfig.load(pki / "by_user.toml").settings()) as router:
+    with ZenohSession(listen=endpoint, settings=RouterConfig.load(pki / "by_user.toml").settings()) as router:
         router.answer(KEYS.predict, lambda _request: b"there")
         router.answer(KEYS.command("learner"), lambda _request: b"done")
         with client(route("anna", "a long password")) as viewer:
@@ -361,7 +361,7 @@ OWN = TLS + 'certificate = "anna.pem"\nkey = "anna.key"\n'
     [
         ('[zenoh]\nsampler = "tls/0.0.0.0:7447"\n', r"zenoh.sampler: tls/0.0.0.0:7447 needs certificates"),
         (f'[zenoh]\nsampler = "tls/0.0.0.0:7447"\n{TLS}', r"to listen on tls/0.0.0.0:7447 takes a certificate"),
-        (f'[zenoh]\nsampler = "tls/0.0.0.0:7447"\n{OWN}', r"nobody may do anything on tls/0.0.0.0:7447"),
+        (f'[zenoh]\nsampler = "tls/0.0.0.0:7447"\n{OWN}', r"no one may do anything on tls/0.0.0.0:7447"),
         ('[zenoh]\nrouter = "tcp/hub.lan:7450"\n', r"zenoh.router: tcp/hub.lan:7450 is open.*Write tls/hub.lan:7450"),
         ('[zenoh]\nrouter = "tls/hub.lan:7450"\n', r"zenoh.router: tls/hub.lan:7450 needs certificates"),
         ('[zenoh.login]\nuser = "anna"\npassword_file = "p"\n', r"zenoh.login: passwords go over TLS only"),
@@ -398,7 +398,7 @@ def test_a_key_that_everybody_can_read_is_refused(pki: Path, tmp_path: Path) -> 
     [
         ("tls/192.0.2.10", "tcp/192.0.2.10", r"line 2: listen: 'tcp/192.0.2.10:7450' is no endpoint with TLS"),
         ('[access."*"]', '[access."a/**"]', r"'a/\*\*' is no robot's name"),
-        ('viewer = ["anna"]', "", r"access.\*: nobody has a role. Known are: viewer, operator, sampler, learner"),
+        ('viewer = ["anna"]', "", r"access.\*: no one has a role. Known are: viewer, operator, sampler, learner"),
         ("operator", "admin", r"unknown key.*admin"),
     ],
 )
@@ -467,7 +467,7 @@ def test_a_flood_of_one_client_keeps_no_other_from_its_answer(endpoint: str) -> 
         if reply.err is not None:
             refused.put(reply.err.payload.to_string())
 
-    with Bus(listen=endpoint) as server, client(endpoint) as greedy, client(endpoint) as modest:
+    with ZenohSession(listen=endpoint) as server, client(endpoint) as greedy, client(endpoint) as modest:
         server.answer(KEYS.predict, serve)
         for _ in range(2 * LIMITS.waiting):
             greedy._open.get(
@@ -492,7 +492,7 @@ def test_a_flood_of_one_client_keeps_no_other_from_its_answer(endpoint: str) -> 
 
 
 def test_a_request_that_is_too_large_gets_the_largest_size_as_an_error(endpoint: str) -> None:
-    with Bus(listen=endpoint) as server, client(endpoint) as asking:
+    with ZenohSession(listen=endpoint) as server, client(endpoint) as asking:
         server.answer(KEYS.predict, lambda request: b"answered")
         assert asking.ask_one(KEYS.predict, bytes(LIMITS.request_bytes)) == b"answered"
         with pytest.raises(RequestError, match="the request has 4,194,305 bytes; send at most 4,194,304"):

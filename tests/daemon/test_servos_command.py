@@ -50,7 +50,7 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
+def bench(tmp_path: Path, patient_host: None) -> Iterator[Bench]:
     config = Config.load(EXAMPLE, {})
     port = tmp_path / "bus"
     motion = Motion(dict.fromkeys(config.robot.joints, lambda _: 0.2), "standing still")

@@ -19,7 +19,7 @@ from bodyschema.cli.terminal.status_view import Seen, Watcher, as_json, screen
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler.sampler import Sampler
 from bodyschema.daemon.sampler.session import session_of
-from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.recordings.store.store import PairStore
@@ -43,12 +43,12 @@ def shown(seen: Seen, config: Config) -> str:
 def sampler_running(config: Config) -> Iterator[None]:
     with (
         PairStore(config.store_file, session_of(config, SystemClock())) as store,
-        Bus(listen=config.tables.zenoh.sampler) as bus,
+        ZenohSession(listen=config.tables.zenoh.sampler) as bus,
     ):
         sampler = Sampler(config, Walk(config.robot, 20).sources(), bus, store)
         thread = threading.Thread(target=sampler.run)
         thread.start()
-        with Bus(connect=config.tables.zenoh.sampler, client=True) as waiting:
+        with ZenohSession(connect=config.tables.zenoh.sampler, client=True) as waiting:
             up = threading.Event()
             waiting.watch(Keys("arm").alive("sampler"), lambda _alive: up.set())
             assert up.wait(LIMIT_S)
@@ -82,7 +82,7 @@ def sampler_running(config: Config) -> Iterator[None]:
         "300 of moving shoulder over its range: 50%",
         "camera on base_link [mm] -11 ± 11 +20 ± 33 +10 ± 43",
         "zeros to add shoulder +3.7 ± 3.5°",
-        "left as drawn waist: no motion shows its zero",
+        "kept at nominal waist: no motion shows its zero",
     ],
 )
 def test_the_screen_shows_both_processes(config, said) -> None:
@@ -99,7 +99,7 @@ def test_a_told_tool_change_is_shown_as_told(config) -> None:
 
 def test_a_change_that_was_rolled_back_is_none_in_force(config) -> None:
     learner = msgspec.structs.replace(LEARNER, changes=2, last_change=None, pairs_since_change=600)
-    assert "change none in force of 2 told or found; 600 pairs count" in " ".join(
+    assert "change none in force of 2 reported or detected; 600 pairs count" in " ".join(
         shown(Seen(None, learner), config).split()
     )
 

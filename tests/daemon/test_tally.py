@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small_arm import write_small_arm
 
-from bodyschema.daemon.sampler.counters import FEWEST_FRAMES, NEWEST_FRAMES, Tally
+from bodyschema.daemon.sampler.counters import FEWEST_FRAMES, NEWEST_FRAMES, SamplerCounters
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.records import Reason
 from bodyschema.interfaces.rejections import REMEDIES, WORDS
@@ -16,11 +16,11 @@ Q = np.zeros(2)
 
 
 @pytest.fixture
-def tally(tmp_path: Path) -> Tally:
-    return Tally(RobotDescription.load(write_small_arm(tmp_path)), SystemClock())
+def tally(tmp_path: Path) -> SamplerCounters:
+    return SamplerCounters(RobotDescription.load(write_small_arm(tmp_path)), SystemClock())
 
 
-def refuse(tally: Tally, reason: Reason, count: int) -> None:
+def refuse(tally: SamplerCounters, reason: Reason, count: int) -> None:
     for _ in range(count):
         tally.reject(reason)
 

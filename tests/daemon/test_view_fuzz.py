@@ -16,7 +16,7 @@ from bodyschema.dashboard.app import application
 from bodyschema.dashboard.hub import Hub
 from bodyschema.interfaces.errors import BusError, RequestError
 
-LIMIT_S = 5.0
+LIMIT_S = 500.0
 HOST = b"127.0.0.1:8420"
 PATHS = ["/", "/api/state", "/api/events", "/api/command", "/api/diagnosis", "/report", "/static/style.css", "/static/"]
 MEANT = {200, 206, 304, 400, 403, 404, 405, 416, 503}

@@ -16,7 +16,7 @@ from small_arm import write_small_arm
 from told_statuses import LEARNER, SAMPLER
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.wire import (
     CommandReply,
@@ -69,7 +69,7 @@ def process(
     endpoint: str, name: str, status: object, answers: dict[str, Callable[..., bytes]], router: str = ""
 ) -> Iterator[None]:
     """Run one of the two processes as zenoh shows it; it publishes its state continuously."""
-    with Bus(listen=endpoint, connect=router or None, settings={"mode": "router"} if router else None) as bus:
+    with ZenohSession(listen=endpoint, connect=router or None, settings={"mode": "router"} if router else None) as bus:
         for key, answer in answers.items():
             bus.answer(key, answer)
         bus.token(KEYS.alive(name))
@@ -138,7 +138,7 @@ def test_a_learner_at_the_router_is_seen_wherever_it_runs(tmp_path, hub, free_en
     tables = f'[zenoh]\nsampler = "{free_endpoint()}"\nlearner = "{own}"\nrouter = "{meeting}"\n'
     config = Config.load(write_small_arm(tmp_path, tables), {})
     with (
-        Bus(listen=meeting, settings={"mode": "router"}),
+        ZenohSession(listen=meeting, settings={"mode": "router"}),
         process(own if here else free_endpoint(), "learner", LEARNER, {}, meeting),
         Watch(config, hub),
     ):

@@ -188,7 +188,7 @@ def test_images_that_calibrated_cameras_took_are_rectified_whatever_the_cameras_
     write_rig(rig, tmp_path / "c.toml")
     calibrated = IMAGES.format(speed=0.0).replace("[vision", '[vision.cameras]\ncalibration = "c.toml"\n[vision', 1)
     run("watch", "cameras", "--robot", str(write_robot(tmp_path, calibrated)), "--out", str(tmp_path / "seen"))
-    assert capsys.readouterr().out.startswith("4 frames, the marker in ")
+    assert "4 frames, the marker in " in capsys.readouterr().out
 
 
 def test_doctor_names_a_camera_that_is_not_there(tmp_path) -> None:

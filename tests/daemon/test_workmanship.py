@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 from guided_arm import Scene, nominal_model
 
-from bodyschema.learning import Solved
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.model_bank import RIGID
 from bodyschema.learning.regimes import Regimes
+from bodyschema.learning.solvers.solver import Solved
 from bodyschema.learning.solvers.tolerance_selection import Tolerances, best_tolerances
 from kbmaps import ChainTolerances, RigidLearner
 

@@ -28,7 +28,7 @@ from bodyschema.daemon.sampler.sampler import Sampler
 from bodyschema.daemon.sampler.session import session_of
 from bodyschema.daemon.sampler.sources import Sources
 from bodyschema.daemon.transport import status, wire
-from bodyschema.daemon.transport.bus import Bus, client
+from bodyschema.daemon.transport.bus import ZenohSession, client
 from bodyschema.daemon.transport.command_names import CommandName
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.wire import MSGPACK, IkReply, IkRequest, JointsRequest, PredictReply, decode, encode
@@ -115,7 +115,7 @@ def learner(tmp_path_factory, free_endpoint) -> Iterator[Config]:
     zenoh = f'[zenoh]\nsampler = "{free_endpoint()}"\nlearner = "{free_endpoint()}"\n'
     robot = write_small_arm(folder, zenoh + '[daemon]\nstate_dir = "state"\n')
     config, up = Config.load(robot, {}), threading.Event()
-    with (folder / "log").open("wb") as log, Bus(connect=config.tables.zenoh.learner) as bus:
+    with (folder / "log").open("wb") as log, ZenohSession(connect=config.tables.zenoh.learner) as bus:
         process = warm.Child("-m", "bodyschema", "learner", "--robot", robot, stderr=log)
         try:
             bus.watch(KEYS.alive("learner"), lambda _: up.set())
@@ -228,8 +228,8 @@ def sampler_running(config: Config, sources: Sources) -> Iterator[None]:
     endpoint, up = config.tables.zenoh.sampler, threading.Event()
     with (
         PairStore(config.store_file, session_of(config, SystemClock())) as store,
-        Bus(listen=endpoint) as bus,
-        Bus(connect=endpoint, client=True) as watching,
+        ZenohSession(listen=endpoint) as bus,
+        ZenohSession(connect=endpoint, client=True) as watching,
     ):
         sampler = Sampler(config, sources, bus, store)
         thread = threading.Thread(target=sampler.run)

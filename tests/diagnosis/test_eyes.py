@@ -65,17 +65,17 @@ def with_turned_eyes(vergence: float, seed: int) -> DiagnosisFile:
     return found(reported(right, CALIBRATION, np.array([0.0, vergence, 0.0])), seed)
 
 
-@pytest.mark.parametrize("vergence", [0.002, -0.005])
+@pytest.mark.parametrize("vergence", [0.002, pytest.param(-0.005, marks=pytest.mark.soak)])
 def test_eyes_that_are_turned_towards_each_other_are_unexplained_and_no_scale(vergence) -> None:
     file = with_turned_eyes(vergence, 1)
     assert (file.verdict, file.causes) == ("unexplained", ())
     assert file.unexplained.what == ("the eyes are turned towards each other",)
 
 
-def test_a_turn_that_the_data_hardly_tell_from_a_scale_is_no_scale_for_sure() -> None:
-    for seed in range(1, 4):
-        file = with_turned_eyes(0.0002, seed)
-        assert not any(cause.effect == "camera_scale" and cause.probability > 0.9 for cause in file.causes)
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.soak) for seed in (2, 3))])
+def test_a_turn_that_the_data_hardly_tell_from_a_scale_is_no_scale_for_sure(seed) -> None:
+    file = with_turned_eyes(0.0002, seed)
+    assert not any(cause.effect == "camera_scale" and cause.probability > 0.9 for cause in file.causes)
 
 
 def test_a_wrong_scale_is_named_and_not_taken_for_turned_eyes() -> None:

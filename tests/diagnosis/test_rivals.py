@@ -46,7 +46,7 @@ def test_a_cause_that_no_motion_tells_from_its_rival_is_as_sure_as_both_together
 
 def test_of_causes_that_no_motion_tells_apart_the_advice_is_to_mend_either(turned_camera) -> None:
     assert conclusion(turned_camera).advice == (
-        f"No motion tells camera_pose from link_geometry at {BASE}: mend whichever is easier.",
+        f"No motion tells camera_pose from link_geometry at {BASE}: fix whichever is easier.",
     )
 
 

@@ -78,7 +78,7 @@ def test_a_link_that_bends_is_unexplained_and_no_cause_is_named(robot) -> None:
     assert file.unexplained.what == (f"what carries {ELBOW} gives under the arm's weight",)
 
 
-@pytest.mark.parametrize("size", [1.0, 4.0])
+@pytest.mark.parametrize("size", [1.0, pytest.param(4.0, marks=pytest.mark.soak)])
 def test_a_mount_that_gives_alike_about_all_axes_is_unexplained_and_no_cause_is_named(robot, size) -> None:
     file = found(on_a_soft_mount(robot, size, 1), robot)
     assert (file.verdict, file.causes) == ("unexplained", ())
@@ -91,7 +91,7 @@ def test_a_small_one_is_no_sure_cause(robot, seed) -> None:
     assert all(cause.probability < 0.9 for cause in file.causes)
 
 
-@pytest.mark.parametrize("where", [SHOULDER, ELBOW])
+@pytest.mark.parametrize("where", [SHOULDER, pytest.param(ELBOW, marks=pytest.mark.soak)])
 def test_a_joint_that_gives_is_named(robot, where) -> None:
     truth = Effect.at(robot, "joint_compliance", where, values=[0.03])
     (cause,) = found(seen(robot, walk(robot, 1), (truth,), 1), robot).causes

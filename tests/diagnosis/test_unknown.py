@@ -120,6 +120,7 @@ def test_a_link_that_grows_as_it_warms_up_is_unexplained_and_no_cause_is_named(r
     assert {ELBOW, "time"} <= set(found.unexplained.depends_on)
 
 
+@pytest.mark.soak
 def test_depth_that_errs_with_the_place_in_the_image_is_unexplained_and_learnt() -> None:
     robot, motion = surveyed_arm(), walk(surveyed_arm(), 1)
     right = Simulation(robot).positions(motion)

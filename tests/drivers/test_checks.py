@@ -33,7 +33,7 @@ FEETECH_CONFIG = FeetechConfig(
     (ServoConfig("waist", 1, "STS3215"), ServoConfig("elbow", 2, "SCS0009")),
 )
 # Of each make: how to build its bench, how to open it, the model at the elbow, and how an
-# overloaded servo is mended.
+# overloaded servo is fixed.
 MAKES = {
     "Dynamixel": (
         DynamixelArm, CONFIG, DYNAMIXEL, open_dynamixel, "MX-28",
@@ -86,13 +86,13 @@ def test_a_port_that_is_there_and_free_is_ok(machine) -> None:
 def test_a_missing_port_is_told_with_the_one_that_is_there(machine) -> None:
     (check,) = machine.checks(machine.root / "dev" / "gone")
     assert check.state == "wrong"
-    assert f'set port = "{machine.by_id}"' in check.mend
+    assert f'set port = "{machine.by_id}"' in check.fix
 
 
 def test_who_has_the_port_is_told_with_the_command_that_ends_it(machine) -> None:
     machine.process(4711, "wizard --fast", "/dev/null", machine.port)
     (check,) = machine.checks()
-    assert (check.state, check.mend) == ("wrong", "kill 4711")
+    assert (check.state, check.fix) == ("wrong", "kill 4711")
     assert check.said.endswith("process 4711: wizard --fast")
 
 
@@ -118,7 +118,7 @@ def test_a_latency_timer_of_16_ms_is_told_with_the_cure(machine) -> None:
     check = machine.checks()[-1]
     assert (check.subject, check.state) == ("latency timer", "warning")
     assert "up to 16 ms" in check.said
-    assert check.mend.startswith("bodyschema install udev")
+    assert check.fix.startswith("bodyschema install udev")
 
 
 def test_a_latency_timer_of_1_ms_is_ok(machine) -> None:
@@ -128,7 +128,7 @@ def test_a_latency_timer_of_1_ms_is_ok(machine) -> None:
 
 def test_a_name_that_may_change_is_told_with_the_one_that_stays(machine) -> None:
     check = machine.checks(machine.port)[-1]
-    assert (check.state, check.mend) == ("warning", f'set port = "{machine.by_id}" in robot.toml')
+    assert (check.state, check.fix) == ("warning", f'set port = "{machine.by_id}" in robot.toml')
 
 
 def test_a_port_of_another_group_is_told_with_the_command(machine, monkeypatch) -> None:
@@ -136,7 +136,7 @@ def test_a_port_of_another_group_is_told_with_the_command(machine, monkeypatch) 
     monkeypatch.setattr(checks.os, "getgroups", list)
     check = machine.checks()[0]
     assert check.state == "wrong"
-    assert check.mend.startswith("sudo usermod -aG ")
+    assert check.fix.startswith("sudo usermod -aG ")
 
 
 # --- emulated servos
@@ -174,13 +174,13 @@ def test_a_missing_servo_is_wrong(make, tmp_path) -> None:
 def test_an_alert_is_wrong_and_says_what_to_do(make, tmp_path, joint) -> None:
     check = Told(make, tmp_path, f"overload@{joint}").of("servos")[1]
     assert (check.state, check.said) == ("wrong", f"joint {joint} (ID {JOINTS.index(joint) + 1}): it is overloaded")
-    assert check.mend == MAKES[make][5]
+    assert check.fix == MAKES[make][5]
 
 
 @EACH
 def test_slow_answers_are_told_with_the_register(make, tmp_path) -> None:
     check = Told(make, tmp_path, delay_s=500e-6).of("servos")[1]
-    assert (check.state, check.mend) == ("warning", "bodyschema servos set return_delay=0 --bus arm")
+    assert (check.state, check.fix) == ("warning", "bodyschema servos set return_delay=0 --bus arm")
 
 
 @EACH

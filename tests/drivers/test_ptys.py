@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from servo_arm import swing
 
-from bodyschema.daemon.sampler.reconnect import Reopening
+from bodyschema.daemon.sampler.reconnect import ReconnectingSource
 from bodyschema.drivers.bench.pty_shell import PtyShell
 from bodyschema.drivers.dynamixel.bench.chain import Chain as DynamixelChain
 from bodyschema.drivers.dynamixel.bench.servo import Servo as DynamixelServo
@@ -101,7 +101,7 @@ def test_nobody_else_of_us_opens_the_port(make: Make, tmp_path) -> None:
 def test_an_unplugged_port_is_told_once_and_back_after_the_replug(make: Make, tmp_path, caplog) -> None:
     with make(tmp_path) as (shell, driver):
         joints = driver()
-        with caplog.at_level(logging.WARNING), Reopening(joints, "the encoders", SystemClock()) as source:
+        with caplog.at_level(logging.WARNING), ReconnectingSource(joints, "the encoders", SystemClock()) as source:
             before = wait_for_reading(source)
             shell.unplug()
             for _ in range(20):

@@ -378,7 +378,7 @@ def test_what_is_wrong_with_all_messages_is_told() -> None:
         (rmw.publisher_token(0, "z", "n", "/joint_states", POINT_STAMPED), "no topic of sensor_msgs/JointState"),
         (rmw.publisher_token(5, "z", "n", "/joint_states", JOINT_STATE), "in the domain 5, not 0"),
         (rmw.publisher_token(0, "z", "n", "/arm/joint_states", JOINT_STATE), "joint states on /arm/joint_states"),
-        ("", "nobody publishes /joint_states at the router"),
+        ("", "nothing publishes /joint_states at the router"),
     ],
 )
 def test_what_the_router_knows_is_told_where_nothing_comes(token, says) -> None:

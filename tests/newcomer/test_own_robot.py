@@ -29,7 +29,7 @@ MORE_MISTAKES = [
     (
         'urdf = "desk_arm.urdf"',
         'urdf = "desk_arm.xacro"',
-        "desk_arm.xacro: cannot read the URDF: No such file or directory. Mend [robot] urdf, or --urdf",
+        "desk_arm.xacro: cannot read the URDF: No such file or directory. Fix [robot] urdf, or --urdf",
     ),
     (
         'marker_link = "gripper"',
@@ -105,7 +105,7 @@ def test_every_command_on_the_page_is_understood(command: str) -> None:
 
 def test_init_writes_what_the_page_says_and_guesses_what_the_example_has(desk) -> None:
     (desk / "robot.toml").unlink()
-    command = "bodyschema config init --urdf desk_arm.urdf"
+    command = "bodyschema init --urdf desk_arm.urdf"
     assert typed(command, desk).stdout == output_of(command)
     guessed, example = Config.load(desk / "robot.toml", {}).robot, Config.load(EXAMPLE / "robot.toml", {}).robot
     assert (guessed.joints, guessed.robot.marker_link) == (example.joints, example.robot.marker_link)
@@ -136,7 +136,7 @@ def test_a_mistake_in_robot_toml_gets_its_message(desk, right: str, wrong: str, 
     ("line", "message"),
     [
         *table("row or heading"),
-        ("0.1,nan,0.2,0.3,1,1,1", "line 2, column shoulder_pitch: nan is not a finite number. Mend or delete the row"),
+        ("0.1,nan,0.2,0.3,1,1,1", "line 2, column shoulder_pitch: nan is not a finite number. Fix or delete the row"),
     ],
 )
 def test_a_mistake_in_a_recording_gets_its_message(desk, line: str, message: str) -> None:

@@ -55,7 +55,7 @@ def test_the_commands_for_a_real_arm_go_through_on_a_bench(tmp_path: Path, capsy
         urdf, robot = str(ROOT / "examples" / "desk_arm" / "desk_arm.urdf"), str(tmp_path / "robot.toml")
         for words in (
             ["scan", *port],
-            ["robot", "new", "--urdf", urdf, "--from", "scan", *port, "--robot", robot, "--yes"],
+            ["init", "--urdf", urdf, "--from", "scan", *port, "--robot", robot, "--yes"],
             ["scan", *port, "--robot", robot],
             ["doctor", "--robot", str(run.robot_file)],
             ["joints", "--robot", robot, "--once"],
@@ -64,7 +64,7 @@ def test_the_commands_for_a_real_arm_go_through_on_a_bench(tmp_path: Path, capsy
     shown = capsys.readouterr().out
     assert "4 servos found." in shown
     assert "4 servos: those of robot.toml, all of them." in shown
-    assert "nobody else has it open" in shown
+    assert "no other program has it open" in shown
 
 
 PAGES = sorted((ROOT / "docs").rglob("*.md"))

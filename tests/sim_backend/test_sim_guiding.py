@@ -104,7 +104,10 @@ def test_a_single_tag_is_turned_to_the_eyes_in_nine_frames_of_ten(seed):
     "joints",
     [
         ("neck_yaw", "neck_pitch", "shoulder_flexion", "upperarm_rotation", "elbow_flexion"),
-        ("neck_yaw", "neck_pitch", "shoulder_flexion", "shoulder_abduction", "upperarm_rotation", "elbow_flexion"),
+        pytest.param(
+            ("neck_yaw", "neck_pitch", "shoulder_flexion", "shoulder_abduction", "upperarm_rotation", "elbow_flexion"),
+            marks=pytest.mark.soak,
+        ),
         (
             "neck_yaw", "neck_roll", "neck_pitch", "shoulder_flexion", "shoulder_abduction", "upperarm_rotation",
             "elbow_flexion", "forearm_rotation", "wrist_flexion", "wrist_abduction",

@@ -17,7 +17,7 @@ from typing import Any
 
 from bodyschema.cli.main import main
 from bodyschema.daemon.learner import checkpoint
-from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.recordings.store.store import PairStore
 
 NOWHERE = "at a random moment"  # from outside
@@ -61,9 +61,9 @@ def at_the_commit(kill: Countdown) -> None:
 
 def at_the_publication(kill: Countdown, *, before: bool) -> None:
     """Die before or after a stored pair is handed to zenoh."""
-    declare = Bus.publisher
+    declare = ZenohSession.publisher
 
-    def publisher(bus: Bus, key: str, *, cache: int = 0) -> Callable[[bytes], None]:
+    def publisher(bus: ZenohSession, key: str, *, cache: int = 0) -> Callable[[bytes], None]:
         publish = declare(bus, key, cache=cache)
 
         def doomed(payload: bytes) -> None:
@@ -75,7 +75,7 @@ def at_the_publication(kill: Countdown, *, before: bool) -> None:
 
         return doomed if key.endswith("/pair") else publish
 
-    Bus.publisher = publisher
+    ZenohSession.publisher = publisher
 
 
 def in_the_middle_of_a_checkpoint(kill: Countdown) -> None:

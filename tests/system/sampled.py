@@ -16,7 +16,7 @@ import numpy as np
 import warm
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.command_names import CommandName
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import SamplerStatus
@@ -72,7 +72,9 @@ def on_the_bench(config: Config, folder: Path, angle: Callable[[float], FloatArr
 class SamplerProcess:
     """A running `bodyschema sampler`."""
 
-    def __init__(self, config: Config, bus: Bus, process: subprocess.Popen[bytes] | warm.Child, log: Path) -> None:
+    def __init__(
+        self, config: Config, bus: ZenohSession, process: subprocess.Popen[bytes] | warm.Child, log: Path
+    ) -> None:
         self.process, self._bus, self._log = process, bus, log
         self._keys = Keys(config.robot.name)
 
@@ -110,7 +112,7 @@ def sampling(config: Config, environment: dict[str, str] | None = None) -> Itera
         else:
             process = warm.Child(*words, stderr=errors)
     try:
-        with Bus(connect=config.tables.zenoh.sampler) as bus:
+        with ZenohSession(connect=config.tables.zenoh.sampler) as bus:
             yield SamplerProcess(config, bus, process, log)
         if process.poll() is None:
             process.send_signal(signal.SIGTERM)

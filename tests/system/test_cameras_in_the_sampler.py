@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -33,6 +34,13 @@ def angles(t: float) -> FloatArray:
     """Return the joints at a time; they repeat with the camera's images."""
     swing = np.sin(2 * math.pi * t * FPS / FRAMES * TURNS + np.array([[0.0, 0.7], [0.7, 1.9], [1.5, 0.2], [2.0, 1.0]]))
     return MIDDLE + SWING * (swing @ [0.6, 0.4])
+
+
+@cache
+def film() -> list[np.ndarray]:
+    """Return side-by-side images of the arm, each as it was 70 ms before its time."""
+    config = Config.load(ARM / "servos.toml", {})
+    return [np.hstack(drawn(config, angles(k / FPS - LATENCY_S))) for k in range(FRAMES)]
 
 
 def write_arm(folder: Path, free_endpoint: Callable[[], str], cameras: str, tables: str = "") -> Config:
@@ -61,8 +69,7 @@ def moving(tmp_path: Path, free_endpoint: Callable[[], str]) -> Iterator[tuple[C
     """Yield a moving arm, and a stereo camera that sees it as it was 70 ms before each time stamp."""
     device = tmp_path / "dev" / "usb-Stereo_1234-video-index0"
     config = write_arm(tmp_path, free_endpoint, CAMERA.format(device=device, latency=LATENCY_S))
-    images = [np.hstack(drawn(config, angles(k / FPS - LATENCY_S))) for k in range(FRAMES)]
-    with ShimCamera(device, images, fps=FPS) as camera, on_the_bench(config, tmp_path, angles) as (benched, _):
+    with ShimCamera(device, film(), fps=FPS) as camera, on_the_bench(config, tmp_path, angles) as (benched, _):
         yield benched, camera
 
 
@@ -87,6 +94,7 @@ def test_a_camera_that_is_unplugged_is_told_of_and_taken_again_while_the_servos_
         assert not any("cameras are lost" in text for text in back.health)
 
 
+@pytest.mark.soak
 def test_a_hidden_latency_is_found_by_moving_the_arm(library, moving) -> None:
     config, _ = moving
     file = config.file

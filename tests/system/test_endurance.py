@@ -13,7 +13,7 @@ import pytest
 from two_processes import KEYS, expect_each_pair_learnt_once, learner_with, running, write_robot
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import Bus, client
+from bodyschema.daemon.transport.bus import ZenohSession, client
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.wire import JointsRequest, encode
 
@@ -71,7 +71,7 @@ class Look:
     latency: tuple[float, float]
 
 
-def look(pids: tuple[int, int], sampler: Bus, learner: Bus, idle: Bus) -> Look:
+def look(pids: tuple[int, int], sampler: ZenohSession, learner: ZenohSession, idle: ZenohSession) -> Look:
     question = encode(JointsRequest([0.1, 0.2]))
     asked = (
         latency_s(lambda: sampler.ask_one(KEYS.status("sampler"))),
@@ -85,7 +85,11 @@ def look(pids: tuple[int, int], sampler: Bus, learner: Bus, idle: Bus) -> Look:
 def watched(config: Config, endpoint: str) -> list[Look]:
     """Measure after the warm-up and after each further part; `endpoint` is free."""
     zenoh = config.tables.zenoh
-    with Bus(listen=endpoint) as idle, running(config, "sampler") as sampler, running(config, "learner") as learner:
+    with (
+        ZenohSession(listen=endpoint) as idle,
+        running(config, "sampler") as sampler,
+        running(config, "learner") as learner,
+    ):
         idle.answer(NOTHING, lambda _: b"")
         looks: list[Look] = []
         for part in range(PARTS + 1):

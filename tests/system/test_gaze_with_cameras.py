@@ -223,11 +223,12 @@ def with_the_head_still(episode: Episode, q: FloatArray) -> FloatArray:
     return q
 
 
+@pytest.mark.soak  # on a busy machine the head turns late; in virtual time it is in drivers/test_gaze.py
 def test_the_hand_stays_in_both_images_where_it_would_have_left_them(episode) -> None:
     q = episode.gazing.q
     lost, without = (1.0 - in_view(episode.robot, poses).mean() for poses in (q, with_the_head_still(episode, q)))
     assert without > 0.2
-    assert lost < 0.4 * without  # a busy machine turns the head late
+    assert lost < 0.4 * without
 
 
 def test_pairs_are_made_where_a_head_that_stands_still_sees_nothing(episode) -> None:

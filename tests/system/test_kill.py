@@ -13,7 +13,7 @@ from killed_at import LEARNER_POINTS, NOWHERE, SAMPLER_POINTS
 from two_processes import KEYS, LIFE_LIMIT_S, learner_with, pause, running, write_robot
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.status import LearnerStatus
 from bodyschema.daemon.transport.wire import PairMessage, decode, encode, pair_to_wire
 from bodyschema.recordings.store.store import PairReader
@@ -75,7 +75,7 @@ class Lives:
         self._last.wait()
 
     def _live(self) -> None:
-        with Bus(connect=getattr(self._config.tables.zenoh, self._process)) as witness:
+        with ZenohSession(connect=getattr(self._config.tables.zenoh, self._process)) as witness:
             witness.watch(KEYS.alive(self._process), lambda alive: self._born.set() if alive else None)
             for kill in self._kills:
                 self._born.clear()
@@ -133,7 +133,7 @@ def kill_again_and_again(config: Config, kills: int, seed: int) -> Aftermath:
     learner = plan(rng, list(LEARNER_POINTS), kills - kills // 2, LATEST_CHECKPOINT)
     published: list[PairMessage] = []
     with (
-        Bus(connect=config.tables.zenoh.sampler) as witness,
+        ZenohSession(connect=config.tables.zenoh.sampler) as witness,
         Lives(config, "sampler", sampler) as samplers,
         Lives(config, "learner", learner) as learners,
     ):

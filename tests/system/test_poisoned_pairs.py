@@ -14,7 +14,7 @@ from two_processes import KEYS, LIFE_LIMIT_S, answer, learner_with, running, sta
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler.history import answer_pairs
 from bodyschema.daemon.sampler.session import session_of
-from bodyschema.daemon.transport.bus import Bus
+from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.status import LearnerStatus
 from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode, pair_to_wire
 from bodyschema.interfaces.clock import SystemClock
@@ -55,9 +55,9 @@ def spoil(config: Config, column: str, numbers: str) -> None:
 
 
 @contextlib.contextmanager
-def history(config: Config) -> Iterator[Bus]:
+def history(config: Config) -> Iterator[ZenohSession]:
     """Yield the remains of a sampler: it serves the store and publishes what it is given."""
-    with Bus(listen=config.tables.zenoh.sampler) as bus, PairReader(config.store_file) as store:
+    with ZenohSession(listen=config.tables.zenoh.sampler) as bus, PairReader(config.store_file) as store:
         bus.answer(KEYS.pairs, lambda request: answer_pairs(store, request))
         bus.token(KEYS.alive("sampler"))
         yield bus

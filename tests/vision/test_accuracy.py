@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from ball_renderer import SMALL, VGA, Look, clutter, render_pair
 from scenes import RADIUS_M, Errors, compare, measure_errors, place
-from scipy.stats import binom
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import MarkerFix
@@ -72,6 +71,8 @@ def test_the_centres_have_no_bias(errors):
 
 
 def test_a_ball_in_full_view_is_found_nearly_always(errors):
+    from scipy.stats import binom  # it takes a second to import
+
     # 45 of 1200 others are missed; at a rate of 4 % there are more than this once in a thousand times.
     most = binom.isf(1e-3, len(errors.x) + len(errors.misses), 0.04)
     assert len(errors.misses) <= most, errors.misses

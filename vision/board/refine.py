@@ -126,17 +126,17 @@ def _crossings(
         p = (middle[:, None] + window) - at[:, None]
         pixels = middle[:, None] + window + reach
         g = padded[pixels[..., 1], pixels[..., 0]]
-        squares = np.einsum("nij,nkj->nki", into_squares, p)
+        squares = p @ into_squares.mT
         weights = _cross(np.abs(squares), half_widths[:, None])
         weighed = g * weights[..., None]
-        G = np.einsum("nki,nkj->nij", weighed, g)
+        G = weighed.mT @ g
         # Edges of a single direction determine no crossing.
         told = np.linalg.cond(G) < _MOST_CONDITION
         # The tangent of an edge that has deviated by b passes the corner at -b.
-        tangents = p + np.einsum("nij,nkj->nki", bends, squares**2)
-        h = np.einsum("nki,nk->ni", weighed, np.einsum("nki,nki->nk", g, tangents))
+        tangents = p + squares**2 @ bends.mT
+        h = weighed.mT @ np.einsum("nki,nki->nk", g, tangents)[..., None]
         step = np.full_like(at, np.nan)
-        step[told] = np.linalg.solve(G[told], h[told][..., None])[..., 0]
+        step[told] = np.linalg.solve(G[told], h[told])[..., 0]
         at = at + step
         if np.nanmax(np.abs(step), initial=0.0) < _CONVERGED_PX:
             break

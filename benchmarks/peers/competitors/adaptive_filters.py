@@ -6,15 +6,17 @@ import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from padasip.filters import FilterNLMS, FilterRLS
 
 from benchmarks.peers.competitors.maps import start_map
 from benchmarks.peers.problem import Competitor, Fitted, Problem, at_most
 from kbmaps import KBMap
 from kbmaps.arrays import FloatArray
+
+if TYPE_CHECKING:
+    from padasip.filters import FilterNLMS, FilterRLS
 
 _STEP = 0.5
 _PASSES = 4
@@ -51,10 +53,14 @@ def learn(make: Callable[[FloatArray], Any], passes: int, problem: Problem, earl
 
 
 def _nlms(weights: FloatArray) -> FilterNLMS:
+    from padasip.filters import FilterNLMS  # it imports all of scipy.stats
+
     return FilterNLMS(weights.size, mu=_STEP, eps=1e-12, w=weights)
 
 
 def _rls(weights: FloatArray) -> FilterRLS:
+    from padasip.filters import FilterRLS
+
     return FilterRLS(weights.size, mu=_RLS_MEMORY, eps=_RLS_FIRST, w=weights)
 
 

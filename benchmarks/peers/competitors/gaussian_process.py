@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 from benchmarks.peers.problem import Competitor, Fitted, Offset, Problem
 from kbmaps.arrays import FloatArray
+
+if TYPE_CHECKING:
+    from sklearn.gaussian_process import GaussianProcessRegressor
 
 # Marginal likelihoods cost n³ each, so the kernel is found on so many pairs and then used on all.
 _PAIRS_FOR_KERNEL = 200
@@ -33,6 +33,11 @@ class _Regression:
 
 
 def learn(problem: Problem, earlier: Fitted | None) -> Fitted:
+    # It takes a second to import.
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+
     offset = Offset.of(problem, earlier)
     rest = problem.x - offset.predict(problem.q)
     scale = max(float(rest.std()), 1e-9)

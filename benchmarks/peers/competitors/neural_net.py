@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.neural_network import MLPRegressor
 
 from benchmarks.peers.problem import Competitor, Fitted, Offset, Problem
 from kbmaps.arrays import FloatArray
+
+if TYPE_CHECKING:
+    from sklearn.neural_network import MLPRegressor
 
 _HIDDEN = (48, 48)
 _ITERATIONS = 400
@@ -32,6 +34,10 @@ def _features(q: FloatArray) -> FloatArray:
 
 
 def learn(problem: Problem, earlier: Fitted | None) -> Fitted:
+    # It takes a second to import.
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.neural_network import MLPRegressor
+
     offset = Offset.of(problem, earlier)
     rest = problem.x - offset.predict(problem.q)
     scale = max(float(rest.std()), 1e-9)

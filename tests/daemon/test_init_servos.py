@@ -1,4 +1,4 @@
-"""`bodyschema robot new`."""
+"""`bodyschema init --from`: a servo for each joint."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ JOINTS = ("base_yaw", "shoulder_pitch", "elbow_pitch", "wrist_roll")
 
 
 def new(*arguments: object) -> None:
-    words = ["robot", "new", "--urdf", EXAMPLE / "desk_arm.urdf", *arguments]
-    command_line("robot")(list(map(str, words)), exit_on_error=False, result_action="return_value")
+    source = () if "--from" in arguments else ("--from", "scan")
+    words = ["init", "--urdf", EXAMPLE / "desk_arm.urdf", *source, *arguments]
+    command_line("init")(list(map(str, words)), exit_on_error=False, result_action="return_value")
 
 
 def scan(file: Path, *servos: tuple[int, str], port: str = "/dev/ttyUSB0", **more: object) -> Path:
@@ -133,6 +134,7 @@ def test_the_zero_of_a_model_is_told(tmp_path) -> None:
     assert "# zero_ticks = 512 " in (tmp_path / "robot.toml").read_text()
 
 
+@pytest.mark.usefixtures("patient_host")
 @pytest.mark.parametrize(
     ("file", "models"),
     [

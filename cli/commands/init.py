@@ -1,0 +1,199 @@
+"""`bodyschema init`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from bodyschema.cli.commands.config import say
+from bodyschema.cli.commands.options import HERE, flag, several
+
+if TYPE_CHECKING:
+    from bodyschema.cli.hardware.robot_template import Guess
+    from bodyschema.cli.servos.fitting import Candidate, Fitting
+
+SCAN = "scan"
+
+
+def init(
+    *,
+    robot: Annotated[Path, Parameter(help="The file to write.")] = HERE,
+    urdf: Annotated[Path | None, Parameter(help="Your robot's URDF: joints and links are taken from it.")] = None,
+    marker_link: Annotated[
+        str | None, Parameter(help="The link with the marker; else the last one before the gripper.")
+    ] = None,
+    camera_link: Annotated[str | None, Parameter(help="The link with the cameras; else the first one.")] = None,
+    source: Annotated[
+        str | None,
+        Parameter(name="--from", help="`scan` to find the servos, or a file that `scan --json` wrote."),
+    ] = None,
+    lerobot: Annotated[
+        str | None, Parameter(help="An arm of LeRobot: so101, so100, moss, koch or koch_leader; with its URDF.")
+    ] = None,
+    calibration: Annotated[Path | None, Parameter(help="LeRobot's calibration of this arm, a JSON file.")] = None,
+    port: Annotated[tuple[str, ...], several("Scan only this port")] = (),
+    baud: Annotated[tuple[int, ...], several("Scan only at this rate")] = (),
+    yes: Annotated[bool, flag("Do not ask: the joints of the URDF get the servos in the order of their IDs.")] = False,
+    sim: Annotated[bool, flag("A whole example: the simulated upper body.")] = False,
+) -> None:
+    """Write a commented robot.toml. Never replaces a file.
+
+    With --urdf the longest chain of joints is filled in; fingers and joints that mimic others are left out. With
+    --from scan each joint gets a servo: you are asked which, and the result is checked against the URDF. With
+    --lerobot IDs, directions and zeros come from LeRobot's calibration: one robot.toml for a leader, another one for a
+    follower. Without --urdf the names are examples. Nothing is written to any servo.
+
+    Needs: your robot's URDF; with --from scan, powered servos; with --lerobot, LeRobot's calibration of the arm; with
+    --sim, nothing.
+
+    Next: correct what is marked CHECK, then `bodyschema config check`. With servos: `bodyschema joints`. With --sim
+    nothing is left to correct: `bodyschema run --sim`.
+    """
+    from bodyschema.interfaces.errors import ConfigError
+
+    _require_one_way(sim=sim, lerobot=lerobot, source=source, urdf=urdf)
+    if robot.exists():
+        raise ConfigError("is there already", file=robot, remedy="Give another --robot, or move it away")
+    try:
+        if sim:
+            _copy_model(robot)
+        elif lerobot is not None:
+            write_new(robot, _of_lerobot(lerobot, urdf, robot, calibration, port))
+        elif source is not None and urdf is not None:
+            _with_servos(_guess(urdf, robot, marker_link, camera_link), robot, _candidates(source, port, baud), yes=yes)
+        else:
+            from bodyschema.cli.hardware.robot_template import EXAMPLE, robot_toml
+
+            write_new(robot, robot_toml(EXAMPLE if urdf is None else _guess(urdf, robot, marker_link, camera_link)))
+    except OSError as error:
+        raise ConfigError(f"cannot be written: {error.strerror}", file=robot, remedy="Give another --robot") from error
+    following = "run --sim" if sim else "joints" if lerobot or source else "config check"
+    say(f"{robot} written. Next: `bodyschema {following} --robot {robot}`")
+
+
+def _require_one_way(*, sim: bool, lerobot: str | None, source: str | None, urdf: Path | None) -> None:
+    from bodyschema.interfaces.errors import ConfigError
+
+    ways = [name for name, given in (("--sim", sim), ("--lerobot", lerobot), ("--from", source)) if given]
+    if len(ways) > 1:
+        raise ConfigError(f"{' and '.join(ways)} exclude each other", remedy="Give one of them")
+    if source is not None and urdf is None:
+        raise ConfigError("--from needs the robot's URDF", remedy="Give it with --urdf")
+
+
+def _guess(urdf: Path, robot: Path, marker_link: str | None, camera_link: str | None) -> Guess:
+    from bodyschema.cli.hardware.robot_template import guess_from
+
+    return guess_from(urdf, robot, marker_link=marker_link, camera_link=camera_link)
+
+
+def _with_servos(guess: Guess, robot: Path, candidates: Sequence[Candidate], *, yes: bool) -> None:
+    """Write robot.toml with a servo for each joint, and take it back where it does not fit the URDF."""
+    from bodyschema.cli.hardware.robot_template import robot_toml
+    from bodyschema.cli.servos.fitting import first_of, fit, servo_tables
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.wiring.wiring import connected_cameras
+    from bodyschema.interfaces.errors import BodyschemaError
+
+    fitting = fit(guess.joints, candidates, first_of if yes else _asked)
+    text = robot_toml(guess._replace(joints=list(fitting.servos)), connected_cameras()) + servo_tables(fitting)
+    write_new(robot, text)
+    try:
+        Config.load(robot)
+    except BodyschemaError:
+        robot.unlink()
+        raise
+    for line in _summary(fitting):
+        say(line)
+
+
+def _of_lerobot(name: str, urdf: Path | None, robot: Path, calibration: Path | None, ports: Sequence[str]) -> str:
+    """Return a robot.toml for an arm of LeRobot."""
+    from bodyschema.cli.hardware.lerobot_robot import lerobot_arm, lerobot_port, lerobot_robot_toml
+    from bodyschema.daemon.wiring import servos as servo_wiring
+    from bodyschema.daemon.wiring.wiring import connected_cameras
+    from bodyschema.interfaces.errors import ConfigError
+    from bodyschema.robot.lerobot import where_calibrations_are
+
+    arm = lerobot_arm(name)
+    if urdf is None:
+        raise ConfigError(
+            "--lerobot needs the arm's URDF", remedy="Give it with --urdf; SO-ARM100 has one in Simulation/"
+        )
+    if calibration is None:
+        raise ConfigError(
+            "--lerobot needs the arm's calibration", remedy=f"Give --calibration. {where_calibrations_are()}"
+        )
+    if len(ports) != 1:
+        ports = servo_wiring.ports_to_scan(ports, None)
+        ports = [lerobot_port(arm, lambda bauds: servo_wiring.scan(ports, bauds, lambda _: None))]
+    return lerobot_robot_toml(arm, urdf, robot, calibration, ports[0], connected_cameras())
+
+
+def write_new(file: Path, text: str) -> None:
+    """Write a new file. Raise ConfigError if it exists."""
+    from bodyschema.interfaces.errors import ConfigError
+
+    try:
+        with file.open("x", encoding="utf-8") as stream:
+            stream.write(text)
+    except FileExistsError as error:
+        raise ConfigError("is there already", file=file, remedy="Give another --robot, or move it away") from error
+
+
+def _copy_model(robot: Path) -> None:
+    from bodyschema.daemon.wiring.wiring import demonstration_model
+
+    model = demonstration_model()
+    write_new(robot, model.read_text(encoding="utf-8"))
+    for urdf in model.parent.glob("*.urdf"):
+        write_new(robot.parent / urdf.name, urdf.read_text(encoding="utf-8"))
+
+
+def _candidates(source: str, ports: Sequence[str], bauds: Sequence[int]) -> list[Candidate]:
+    from rich.console import Console
+
+    from bodyschema.cli.hardware.scan_report import as_json, report_of
+    from bodyschema.cli.servos.fitting import candidates_in, read_scan
+    from bodyschema.cli.terminal.progress import shown_on
+    from bodyschema.daemon.wiring import servos as servo_wiring
+
+    if source != SCAN:
+        return read_scan(Path(source))
+    found = servo_wiring.ports_to_scan(ports, None)
+    with shown_on(Console(stderr=True, highlight=False), "scan") as tell:
+        report = report_of(servo_wiring.scan(found, bauds, tell), None)
+    return candidates_in(as_json(report).encode(), SCAN)
+
+
+def _asked(joint: str, left: Sequence[Candidate]) -> Candidate | None:
+    """Ask the user which servo moves `joint`; return it, or None."""
+    from rich.prompt import Prompt
+
+    if not left:
+        return None
+    names = {_name(servo, left): servo for servo in left}
+    listed = ", ".join(f"{name} ({servo.model})" for name, servo in names.items())
+    answer = Prompt.ask(
+        f"Which ID moves [bold]{joint}[/bold]? {listed}, or - for none",
+        choices=[*names, "-"],
+        default=next(iter(names)),
+        show_choices=False,
+    )
+    return names.get(answer)
+
+
+def _name(servo: Candidate, left: Sequence[Candidate]) -> str:
+    """Return its ID, with its port where the ID is not unique."""
+    alone = sum(other.id == servo.id for other in left) == 1
+    return str(servo.id) if alone else f"{servo.id}@{servo.port}"
+
+
+def _summary(fitting: Fitting) -> list[str]:
+    lines = [f"  {joint}: ID {servo.id}, {servo.model}" for joint, servo in fitting.servos.items()]
+    lines += [f"  {joint}: no servo, so it is not in joints and stands still at 0" for joint in fitting.bare]
+    lines += [f"  ID {servo.id}, {servo.model}: moves none of the joints" for servo in fitting.left]
+    return lines
