@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.whole_files import write_whole
 from bodyschema.robot.rpy import rotation_of
 
 LAUNCH = "hand_eye.launch.py"
@@ -86,7 +87,7 @@ def write_launch_file(pose: HandEye, folder: Path) -> Path:
     arguments = _arguments(np.array(pose.translation_m), np.array(pose.quaternion_xyzw), pose.parent, pose.child)
     text = _LAUNCH_FILE.format(package="tf2_ros", executable=_PUBLISHER, arguments=arguments)
     try:
-        file.write_text(text, encoding="utf-8")
+        write_whole({file: text.encode()})
     except OSError as error:
         raise ConfigError(f"cannot be written: {error.strerror}", file=file, remedy="Give another folder") from error
     return file

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
-import resource
 import sys
 from collections.abc import Sequence
-from typing import NoReturn
 
-import cyclopts
+try:
+    import resource
+    import shutil
+    from typing import NoReturn
 
-from bodyschema.daemon.service.remedies import as_typed, printable
-from bodyschema.daemon.service.signals import end_with_parent
-from bodyschema.interfaces.errors import BodyschemaError, ConfigError
-from bodyschema.interfaces.extras import missing_module
+    import cyclopts
+
+    from bodyschema.daemon.service.remedies import as_typed, printable
+    from bodyschema.daemon.service.signals import end_with_parent
+    from bodyschema.interfaces.errors import BodyschemaError, ConfigError
+    from bodyschema.interfaces.extras import missing_module
+except KeyboardInterrupt:  # loading takes a quarter of a second, in which no `main` can catch it
+    sys.exit(130)
 
 GROUPS = {
     "Start": {
@@ -48,7 +54,7 @@ GROUPS = {
     "Hardware": {
         "scan": "Find servos on all ports, rates and protocols.",
         "joints": "Show joint angles live: signs, ranges, health.",
-        "watch": "Show what the cameras and the tracker see.",
+        "watch": "Show what cameras and other marker sources see.",
         "servos": "Read and write servo EEPROM settings, with undo.",
         "bench": "Emulate the servos of robot.toml on a port.",
     },
@@ -135,6 +141,46 @@ def allow_enough_files() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
 
 
+# Help pages put text beside names: where no column is left for the text, wrapping fails or never ends.
+NARROWEST = 20
+
+
+def prepare_streams() -> None:
+    """Make standard streams of any kind usable: closed ones, encodings without our characters, terminals too narrow.
+
+    Files and pipes get UTF-8, as programs read it; a terminal of another encoding shows `?` for what it lacks.
+    """
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:  # else a store would get the number of a closed stream
+        pass
+    os.close(descriptor)
+    for name, number, mode in (("stdin", 0, "r"), ("stdout", 1, "w"), ("stderr", 2, "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, mode, encoding="utf-8", closefd=False))
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace") if stream.isatty() else stream.reconfigure(encoding="utf-8")
+    columns = shutil.get_terminal_size().columns
+    if columns < NARROWEST or os.environ.get("COLUMNS") == "0":
+        os.environ["COLUMNS"] = str(max(columns, NARROWEST))
+
+
+def _told(error: OSError) -> BodyschemaError:
+    """Return an error of the system that no command expects in one line."""
+    said = error.strerror or str(error)
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        return BodyschemaError(f"too many files and connections are open. {RAISE_LIMIT}")
+    if error.filename is not None:
+        return BodyschemaError(f"{os.fsdecode(error.filename)}: {said}")
+    if isinstance(error, FileNotFoundError):
+        return BodyschemaError("the current folder was deleted. Change into another")
+    return BodyschemaError(f"the output cannot be written: {said}")
+
+
+def _drop_output() -> None:
+    """Drop what is left of the output, which Python would otherwise try to write when it ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+
+
 def _fail(error: BodyschemaError) -> NoReturn:
     print(f"bodyschema: {as_typed(printable(str(error)))}", file=sys.stderr)  # noqa: T201
     sys.exit(1)
@@ -146,11 +192,15 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # OpenCV would allocate 3 GiB for a malicious PNG of a few kilobytes; the largest cameras have 100 megapixels.
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**27))
-    end_with_parent()
-    arguments = present_names(sys.argv[1:])
     try:
+        end_with_parent()
+        prepare_streams()
         allow_enough_files()
-        command_line(arguments[0] if arguments else None)(arguments)
+        arguments = present_names(sys.argv[1:])
+        try:
+            command_line(arguments[0] if arguments else None)(arguments)
+        finally:
+            sys.stdout.flush()
     except BodyschemaError as error:
         _fail(error)
     except ModuleNotFoundError as error:
@@ -161,13 +211,11 @@ def main() -> None:
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:  # the reader of our output has closed it, as `head` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         sys.exit(1)
     except OSError as error:
-        if error.errno not in (errno.EMFILE, errno.ENFILE):
-            raise
-        print(f"bodyschema: too many files and connections are open. {RAISE_LIMIT}", file=sys.stderr)  # noqa: T201
-        sys.exit(1)
+        _drop_output()
+        _fail(_told(error))
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from typing import Any
 
 import msgspec
 
-from bodyschema.drivers.config import DriversConfig
+from bodyschema.drivers.config import MARKER_SOURCE, AnySource, DriversConfig, source_tables
 from bodyschema.effects import Simulation, simulation_of
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.learning.config import LearnerConfig
@@ -88,6 +88,7 @@ class Tables(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     vision: VisionConfig = VisionConfig()
     learner: LearnerConfig = LearnerConfig()
     sim: SimConfig = SimConfig()
+    marker_source: tuple[AnySource, ...] = ()
     effects: tuple[dict[str, Any], ...] = ()
     background: tuple[dict[str, Any], ...] = ()
     unexplained: dict[str, Any] | None = None
@@ -121,9 +122,11 @@ class Config:
             if name not in known:
                 line = line_of(text, (name,))
                 raise ConfigError(f"unknown table [{name}]", file=file, line=line, remedy=did_you_mean(name, known))
-        overridden = _override(raw, [name for name in known if name not in EXTENSIONS], environment)
+        overridden = _override(raw, [name for name in known if name not in (*EXTENSIONS, MARKER_SOURCE)], environment)
         robot = RobotDescription.from_tables(overridden, text, file)
         simulation = simulation_of(robot, overridden, text)
+        if MARKER_SOURCE in raw:
+            overridden[MARKER_SOURCE] = source_tables(raw[MARKER_SOURCE], file, text)
         tables = convert(overridden, Tables, file=file, text=text)
         if tables.daemon.min_step_deg >= tables.daemon.max_step_deg:
             line = line_of(text, ("daemon", "min_step_deg"))
@@ -133,6 +136,8 @@ class Config:
         _check_router(tables, file, text)
         if tables.vision.cameras is not None:
             tables.vision.cameras.check(file, text)
+            _require_colour(tables, file, text)
+        _check_further_cameras(tables, file, text)
         if tables.vision.radius_m > LARGEST_BALL_M:
             raise ConfigError(
                 f"vision.radius_m = {tables.vision.radius_m:g}: this looks like millimetres",
@@ -216,14 +221,48 @@ def state_home() -> Path:
 
 
 def _check_router(tables: Tables, file: Path, text: str) -> None:
-    """ConfigError when the ROS 2 robot's router, whose port is 7447 too, is where one of ours listens."""
-    ours = (tables.zenoh.sampler, tables.zenoh.learner)
-    if tables.drivers.ros2 is not None and tables.drivers.ros2.router in ours:
+    """ConfigError when another router, whose port is usually 7447 too, is where one of our processes listens."""
+    ros2 = tables.drivers.ros2
+    routers = {} if ros2 is None else {("drivers", "ros2"): ros2.router}
+    routers |= {(MARKER_SOURCE, table.label): table.endpoint for table in tables.marker_source}
+    for keys, router in routers.items():
+        if router in (tables.zenoh.sampler, tables.zenoh.learner):
+            whose = "ROS 2" if keys[0] == "drivers" else "marker source's"
+            raise ConfigError(
+                f"the {whose} router and a process of ours have the same endpoint {router}",
+                file=file,
+                line=line_of(text, keys),
+                remedy='Write in [zenoh]: sampler = "tcp/127.0.0.1:7457" and learner = "tcp/127.0.0.1:7458"',
+            )
+
+
+def _check_further_cameras(tables: Tables, file: Path, text: str) -> None:
+    """Raise ConfigError if further cameras are incomplete, uncalibrated, or the only ones."""
+    names = ["cameras", *(source.label for source in tables.marker_source)]
+    for cameras in tables.vision.further_cameras:
+        cameras.check(file, text, ("vision", "further_cameras"))
+        what = remedy = ""
+        if tables.vision.cameras is None:
+            what, remedy = "there are no first ones", "Name one of them as [vision.cameras]"
+        elif cameras.calibration is None and cameras.realsense is None:
+            what, remedy = "nothing says how they see", "Name the file of `bodyschema calibrate cameras` as calibration"
+        elif cameras.name in names:
+            what, remedy = f"the name {cameras.name!r} is taken", "Give each its own name"
+        if what:
+            line = line_of(text, ("vision", "further_cameras"))
+            raise ConfigError(f"vision.further_cameras: {what}", file=file, line=line, remedy=remedy)
+        names.append(cameras.name)
+
+
+def _require_colour(tables: Tables, file: Path, text: str) -> None:
+    """Raise ConfigError if infra-red eyes would have to look for a colour."""
+    cameras = tables.vision.cameras
+    if cameras is not None and cameras.realsense is not None and tables.vision.marker == "ball":
         raise ConfigError(
-            f"the ROS 2 router and a process of ours have the same endpoint {tables.drivers.ros2.router}",
+            "the infra-red eyes of a RealSense see no colours, and the marker is a coloured ball",
             file=file,
-            line=line_of(text, ("drivers", "ros2")),
-            remedy='Write in [zenoh]: sampler = "tcp/127.0.0.1:7457" and learner = "tcp/127.0.0.1:7458"',
+            line=line_of(text, ("vision", "cameras", "realsense")),
+            remedy='Write marker = "tag", "cluster" or "bright_ball" in [vision]',
         )
 
 

@@ -14,8 +14,13 @@ from bodyschema.robot.toml_types import NonNegative, Positive
 
 from .dynamixel.config import DynamixelConfig
 from .feetech.config import FeetechConfig
+from .markers.config import TABLE as MARKER_SOURCE
+from .markers.config import AnySource, source_tables
 from .ros2.config import Ros2Config
 from .serial_lines.config import SerialLinesConfig
+
+__all__ = ["HARDWARE", "MARKER_SOURCE", "AnySource", "DriversConfig", "source_tables"]
+
 
 HARDWARE = {
     "dynamixel": "servos",

@@ -27,6 +27,7 @@ import msgspec
 import numpy as np
 
 from bodyschema.interfaces.errors import ConfigError, RobotError
+from bodyschema.interfaces.whole_files import write_whole
 from bodyschema.robot.calibrated_files import tables_elsewhere
 from bodyschema.robot.description import FARTHEST_CAMERA_M, LONGEST_TOOL_M, RobotDescription, Vector3
 from bodyschema.robot.limited import read_at_most
@@ -191,9 +192,8 @@ def write_extended(simulation: Simulation, folder: Path, heading: str, *, replac
         folder.mkdir(parents=True, exist_ok=True)
         if file.exists() and not replace:
             raise ConfigError("is there already", file=file, remedy="Give another folder")
-        if residual is not None:
-            (folder / MODEL_FILE).write_bytes(residual.model.to_bytes())
-        file.write_text(text, encoding="utf-8")
+        model = {} if residual is None else {folder / MODEL_FILE: residual.model.to_bytes()}
+        write_whole(model | {file: text.encode()})
     except OSError as error:
         raise ConfigError(f"cannot be written: {error.strerror}", file=folder, remedy="Give another folder") from error
     return file

@@ -14,6 +14,7 @@ MODULES = {
     "view": ("starlette", "uvicorn"),
     "fleet": ("distributed",),
     "bags": ("rosbags",),
+    "realsense": ("pyrealsense2",),
 }
 
 

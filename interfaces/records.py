@@ -36,6 +36,7 @@ class Reason(StrEnum):
     SIZE_MISMATCH = "size_mismatch"  # the two eyes' radii, or radius and depth, disagree
     AMBIGUOUS = "ambiguous"  # more than one candidate fits
     REPROJECTION = "reprojection"  # what is seen does not fit the marker's shape
+    DISAGREEING = "disagreeing"  # several sources contradict each other
     IMPLAUSIBLE_SPEED = "implausible_speed"  # farther from the last fix than a hand can move it
     NO_JOINTS = "no_joints"  # no encoder readings around the frame's time
     STALE = "stale"  # encoder readings around the frame's time too far apart

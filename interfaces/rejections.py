@@ -13,6 +13,7 @@ WORDS: Mapping[Reason, str] = {
     Reason.SATURATED: "over-exposed",
     Reason.REFLECTION: "a reflection",
     Reason.REPROJECTION: "not the marker's shape",
+    Reason.DISAGREEING: "sources disagree",
     Reason.IMPLAUSIBLE_SPEED: "too far from the last place",
     Reason.EPIPOLAR: "rows differ",
     Reason.SIZE_MISMATCH: "sizes differ",
@@ -35,6 +36,7 @@ REMEDIES: Mapping[Reason, str] = {
     Reason.SATURATED: "Shorten exposure_s, less light.",
     Reason.REFLECTION: "Turn the lamp or what mirrors it away, or mask it.",
     Reason.REPROJECTION: "Is the paper flat, the light not too bright, and is each tag where robot.toml has it?",
+    Reason.DISAGREEING: "The sampler's health says by how much, and what would make them agree: `bodyschema status`.",
     Reason.IMPLAUSIBLE_SPEED: "Is another thing of its colour in sight? If it really is so fast, raise [vision] "
     "max_speed_m_s and [daemon] max_marker_speed_m_s.",
     Reason.EPIPOLAR: "Are the cameras exchanged, one upside down, or moved? `bodyschema calibrate check` tells.",
@@ -49,7 +51,7 @@ REMEDIES: Mapping[Reason, str] = {
     "`bodyschema doctor` says of latency timer and return delay.",
     Reason.TOO_NEAR: "Move the arm.",
     Reason.PAUSED: "Resume with `bodyschema command resume`.",
-    Reason.NOT_FINITE: "That is a fault of the tracker in [vision.plugin].",
+    Reason.NOT_FINITE: "That is a fault of the tracker in [vision.plugin], or of the program in [marker_source].",
     Reason.NOT_STORED: "Make room on the disk of the store, and see that it can be written.",
     Reason.NOT_BORNE: "Switch it on: `bodyschema command zero_force_on`.",
 }

@@ -37,6 +37,7 @@ RESERVED = ("t", "segment", *POSITION, *SIGMA, *COVARIANCE, *CENTRES, *ORIENTATI
 EXTRA_PREFIXES = ("current_", "temperature_")
 
 QUATERNION_TOLERANCE = 1e-3
+LARGEST_POSITION = 1e9  # of an arm in any unit of length; which one it is, is checked where the robot is known
 LARGEST_SEGMENT = 2.0**53
 SMALLEST_SIGMA_M, LARGEST_SIGMA_M = 1e-100, 1e100  # their squares are still numbers
 _MEND_ROW = "Fix or delete the row"
@@ -143,9 +144,12 @@ def check_finite(table: Table) -> None:
 
 
 def check_values(table: Table) -> None:
-    """Raise Fault at the first invalid finite value: times, segments, sigmas, covariances, quaternions."""
+    """Raise Fault at the first invalid finite value: times, positions, segments, sigmas, covariances, quaternions."""
     if table.has(("t",)):
         _check_time(table)
+    if table.has(POSITION):
+        for name, x in zip(POSITION, table.columns(POSITION).T, strict=True):
+            _first(np.abs(x) > LARGEST_POSITION, lambda row, x=x: f"{float(x[row])!r} is no position in metres", name)
     if table.has(("segment",)):
         segment = table.columns(("segment",))[:, 0]
         bad = (segment != np.round(segment)) | (np.abs(segment) > LARGEST_SEGMENT)

@@ -15,8 +15,10 @@ import numpy as np
 
 from bodyschema.interfaces.errors import RecordingError
 from bodyschema.robot.lerobot import Calibrations, JointServo, Unit
-from bodyschema.robot.limited import read_at_most
+from bodyschema.robot.limited import MOST_MEMORY_BYTES, bounded_memory, opened, read_at_most
 
+from .columns import MOST_NUMBERS
+from .parquet_file import MOST_BYTES
 from .recording import Recording
 from .tracks import JointTrack, MarkerTrack, joined
 
@@ -91,7 +93,7 @@ def _info(source: Path) -> _Info:
     file = source / INFO
     try:
         info = msgspec.json.decode(read_at_most(file), type=_Info)
-    except (msgspec.DecodeError, UnicodeDecodeError, OSError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OSError) as error:
         raise RecordingError(f"is no description of a LeRobotDataset: {error}", file=file) from error
     if not info.codebase_version.startswith(("v2.1", "v3.")):
         raise RecordingError(
@@ -132,16 +134,28 @@ def _rows(source: Path, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, n
     if not files:
         raise RecordingError("the dataset has no data/**/*.parquet", file=source, remedy="Download it whole")
     states, times, episodes = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
+    left = most = MOST_NUMBERS // (len(names) + len(_COLUMNS) - 1)
     for file in files:
         try:
-            table = pyarrow.parquet.read_table(file, columns=list(_COLUMNS))
+            with bounded_memory(MOST_MEMORY_BYTES), opened(file, MOST_BYTES) as stream:
+                parquet = pyarrow.parquet.ParquetFile(stream)
+                left -= parquet.metadata.num_rows
+                if left < 0:
+                    raise ValueError(f"there are more than {most:,} rows with the files before it")
+                table = parquet.read(columns=list(_COLUMNS))
             flat = pyarrow.concat_arrays(table.column(STATE).chunks).flatten().to_numpy(zero_copy_only=False)
             states.append(flat.astype(np.float64).reshape(len(table), len(names)))
             times.append(table.column("timestamp").to_numpy().astype(np.float64))
-            episodes.append(table.column("episode_index").to_numpy().astype(np.int64))
-        except (pyarrow.ArrowException, KeyError, ValueError, OSError) as error:
-            said = str(error).strip().split("\n")[0].rstrip(".")
+            numbers = table.column("episode_index").to_numpy().astype(np.float64)
+            finite = np.isfinite(np.column_stack([states[-1], times[-1], numbers])).all(axis=1)
+            if not finite.all():
+                raise ValueError(f"row {int(np.argmin(finite)) + 1} has a number that is missing or not finite")
+            episodes.append(numbers.astype(np.int64))
+        except (pyarrow.ArrowException, AttributeError, KeyError, ValueError, TypeError, OSError) as error:
+            said = (getattr(error, "strerror", None) or str(error)).strip().split("\n")[0].rstrip(".")
             raise RecordingError(f"is no data of a LeRobotDataset: {said}", file=file) from error
+    if left == most:
+        raise RecordingError("the dataset has no rows", file=source, remedy="Record an episode")
     return np.concatenate(states), np.concatenate(times), np.concatenate(episodes)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from bodyschema.interfaces.errors import RecordingError
-from bodyschema.robot.limited import opened
+from bodyschema.robot.limited import MOST_MEMORY_BYTES, bounded_memory, opened
 
 from .columns import MOST_NUMBERS, Fault, Table, check_finite, check_header, check_width
 
@@ -73,7 +73,7 @@ def _check_rows(rows: int, most: int) -> None:
 def _opened(file: Path) -> Iterator[Any]:
     """Open the Parquet file. Raise Fault where the content read inside the with block is damaged."""
     arrow, parquet = _modules(file)
-    with opened(file, MOST_BYTES) as stream:
+    with bounded_memory(MOST_MEMORY_BYTES), opened(file, MOST_BYTES) as stream:
         try:
             yield parquet.ParquetFile(stream)
         except (arrow.ArrowException, OSError, ValueError) as error:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from bodyschema.interfaces.errors import RecordingError
+from bodyschema.robot.limited import MOST_MEMORY_BYTES, bounded_memory, check_regular, read_at_most
 from bodyschema.robot.suggest import did_you_mean
 
 from .recording import Recording
@@ -37,6 +38,9 @@ _MARKERS: Mapping[str, Callable[[Any], Taken]] = {
     "geometry_msgs/msg/TransformStamped": lambda m: (m.transform.translation, m.transform.rotation, None),
 }
 _NANO = 1_000_000_000
+# Of metadata.yaml, which is parsed at some 100 kB/s; a topic or a part of the bag takes 1 kB.
+MOST_METADATA_BYTES = 2**20
+MOST_SAID = 200  # characters of another library's message, which may quote the file
 # Messages that are looked at to learn which joints or frames a topic has.
 _FEW = 200
 
@@ -131,14 +135,31 @@ def _opened(source: Path) -> Iterator[_Bag]:
     if not source.exists():
         raise RecordingError("there is no such file", file=source, remedy="Name a bag that is there")
     try:
-        with AnyReader([source], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        _check_files(source)
+        store = get_typestore(Stores.ROS2_JAZZY)
+        with bounded_memory(MOST_MEMORY_BYTES), AnyReader([source], default_typestore=store) as reader:
             yield _Bag(source, reader)
     except RecordingError:
         raise
-    except Exception as error:  # of damaged bytes rosbags raises whatever comes, MemoryError among them
-        said = str(error).strip().split("\n")[0].rstrip(".")
+    except MemoryError as error:
+        what = f"reading it takes more than {MOST_MEMORY_BYTES // 2**30} GiB of memory"
+        remedy = "Record the topics of joints and marker alone, or cut the bag: `ros2 bag convert`"
+        raise RecordingError(what, file=source, remedy=remedy) from error
+    except Exception as error:  # of damaged bytes rosbags raises whatever comes
+        said = (str(error).strip() or type(error).__name__).split("\n")[0][:MOST_SAID].rstrip(".")
         remedy = "A bag whose recording was cut off: `ros2 bag reindex`; one of splits: name the folder"
         raise RecordingError(f"the bag cannot be read: {said}", file=source, remedy=remedy) from error
+
+
+def _check_files(source: Path) -> None:
+    """Raise OSError if a file of the bag is a device or a pipe, or its description is longer than plausible."""
+    if not source.is_dir():
+        check_regular(source)
+        return
+    read_at_most(source / METADATA, MOST_METADATA_BYTES)
+    for file in source.iterdir():
+        if not file.is_dir():
+            check_regular(file)
 
 
 def _joint_topic(bag: _Bag, joints: Sequence[str], topics: BagTopics) -> str:

@@ -15,6 +15,7 @@ import numpy as np
 
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.whole_files import write_whole
 
 from .calibrated import CalibratedGeometry
 from .description import RobotDescription
@@ -67,8 +68,7 @@ def write_calibrated(
             if own or (file.exists() and not replace):
                 remedy = "Give another folder" if own else "Give another folder, or --force"
                 raise ConfigError("is there already", file=file, remedy=remedy)
-        for file, text in texts.items():
-            file.write_bytes(text)
+        write_whole(texts)
     except OSError as error:
         raise ConfigError(f"cannot be written: {error.strerror}", file=folder, remedy="Give another folder") from error
     return toml

@@ -133,7 +133,7 @@ def read_calibration(file: Path, motors: Sequence[str] = ()) -> dict[str, MotorC
         found = msgspec.json.decode(read_at_most(file), type=dict[str, MotorCalibration])
     except OSError as error:
         raise ConfigError(f"cannot be read: {error.strerror}", file=file, remedy=where_calibrations_are()) from error
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         if _is_of_old_lerobot(file):
             raise ConfigError(
                 "is a calibration of LeRobot before version 0.3, which counts angles in another way",

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import errno
 import os
+import resource
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
 _PIECE = 2**20
 # For text written by a person or a command: over ten times the size of any URDF, log or table of ours.
 MOST_TEXT_BYTES = 2**24
+# What reading one file may take: 20 million joint states of some 200 bytes. A file of 256 kB can unpack to 8 GiB.
+MOST_MEMORY_BYTES = 2**32
 _KINDS = (
     (stat.S_ISCHR, "a device, not a file"),
     (stat.S_ISBLK, "a device, not a file"),
@@ -65,6 +68,28 @@ def read_at_most(file: Path, most: int = MOST_TEXT_BYTES) -> bytes:
             if len(data) > most:
                 raise _too_large(most)
     return bytes(data)
+
+
+@contextmanager
+def bounded_memory(most: int) -> Iterator[None]:
+    """Limit what a library takes for a file that it unpacks: `most` bytes more of memory, and as much in a file.
+
+    Beyond that allocations fail in the whole process: MemoryError, or what the library makes of it. A limit that is
+    lower already stays; where the system tells no sizes, memory is not limited.
+    """
+    limits = {resource.RLIMIT_FSIZE: most}
+    try:
+        with open("/proc/self/statm", "rb") as stream:
+            limits[resource.RLIMIT_AS] = int(stream.read().split()[0]) * resource.getpagesize() + most
+    except OSError:
+        pass
+    with ExitStack() as undo:
+        for kind, limit in limits.items():
+            soft, hard = resource.getrlimit(kind)
+            if limit < min((each for each in (soft, hard) if each != resource.RLIM_INFINITY), default=limit + 1):
+                resource.setrlimit(kind, (limit, hard))
+                undo.callback(resource.setrlimit, kind, (soft, hard))
+        yield
 
 
 def _require_regular(mode: int) -> None:

@@ -35,7 +35,7 @@ def _parts(path: tuple[str, ...], table: Mapping[str, Any]) -> tuple[list[str], 
                 plain, tables = _parts(below, entry)
                 inner += [[f"[[{_dotted(below)}]]", *plain], *tables]
         else:
-            own.append(f"{_key(name)} = {_value(value)}")
+            own.append(f"{_key(name)} = {toml_value(value)}")
     return own, inner
 
 
@@ -43,7 +43,8 @@ def _dotted(path: tuple[str, ...]) -> str:
     return ".".join(map(_key, path))
 
 
-def _value(value: object) -> str:
+def toml_value(value: object) -> str:
+    """Return a value as TOML, in one line."""
     match value:
         case bool():
             return "true" if value else "false"
@@ -53,13 +54,13 @@ def _value(value: object) -> str:
         case int() | float():
             return repr(value)
         case Mapping():
-            return "{" + ", ".join(f"{_key(name)} = {_value(inner)}" for name, inner in value.items()) + "}"
+            return "{" + ", ".join(f"{_key(name)} = {toml_value(inner)}" for name, inner in value.items()) + "}"
         case list() | tuple():
-            return "[" + ", ".join(map(_value, value)) + "]"
+            return "[" + ", ".join(map(toml_value, value)) + "]"
         case _:
             # Dates and times: TOML uses Python's ISO format.
             return str(value)
 
 
 def _key(name: str) -> str:
-    return name if _BARE_KEY.fullmatch(name) else _value(name)
+    return name if _BARE_KEY.fullmatch(name) else toml_value(name)

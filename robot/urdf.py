@@ -421,7 +421,7 @@ def _parse(file: Path) -> Any:
     try:
         root = etree.fromstring(data, parser)
     except etree.XMLSyntaxError as error:
-        what = error.msg.removesuffix(f", line {error.lineno}, column {error.offset}")
+        what = " ".join(error.msg.removesuffix(f", line {error.lineno}, column {error.offset}").split())
         raise RobotError(f"not XML: {what}", file=file, line=error.lineno) from error
     if root.getroottree().docinfo.doctype:
         raise RobotError("a URDF with a DOCTYPE is not accepted", file=file, line=1, remedy="Delete the DOCTYPE")

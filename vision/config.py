@@ -10,7 +10,7 @@ from msgspec import Meta
 from bodyschema.robot.plugins import PluginConfig
 from bodyschema.robot.toml_types import Fraction, Positive
 
-from .cameras.config import CamerasConfig
+from .cameras.config import CamerasConfig, FurtherCameras
 from .tag_config import ClusterConfig, TagConfig
 
 Ratio = Annotated[float, Meta(gt=1)]
@@ -67,6 +67,7 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         max_speed_m_s: faster than this the marker does not move; what is farther off is something else [m/s].
         max_candidates: at most this many patches per eye are looked at closely, the most disc-like first.
         cameras: where images come from; without it there are none.
+        further_cameras: others that see the same marker; their positions are fused.
         tag: the tag, or what the tags of a cluster have in common.
         cluster: where on the marker which tag is.
         plugin: the tracker of another package.
@@ -87,6 +88,7 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_speed_m_s: Positive = 3.0
     max_candidates: Annotated[int, Meta(ge=1, le=1000)] = 12
     cameras: CamerasConfig | None = None
+    further_cameras: tuple[FurtherCameras, ...] = ()
     tag: TagConfig = TagConfig()
     cluster: ClusterConfig = ClusterConfig()
     plugin: PluginConfig | None = None

@@ -12,6 +12,7 @@ import numpy as np
 
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.whole_files import write_whole
 from bodyschema.vision.board import Board
 from bodyschema.vision.board.board import Pattern
 from bodyschema.vision.board.page import page as board_page
@@ -226,7 +227,7 @@ def write_calibrated_cameras(result: Calibrated, found: Gathered, out: Path) -> 
     """Write cameras.toml with its report beside it, and return the report's path."""
     write_rig(result.rig, out)
     report = out.with_name(f"{out.stem}_{REPORT}")
-    report.write_text(report_page(result, found), encoding="utf-8")
+    write_whole({report: report_page(result, found).encode()})
     return report
 
 

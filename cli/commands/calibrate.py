@@ -46,7 +46,7 @@ def arm(
         float | None,
         Parameter(
             help="1-sigma of a measured coordinate where the source has none [mm]; else estimated.",
-            validator=Number(gt=0),
+            validator=Number(gt=0, lte=1000),
         ),
     ] = None,
     zeros_deg: Annotated[

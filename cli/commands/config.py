@@ -36,6 +36,7 @@ def check(*, robot: RobotFile = HERE) -> None:
     """
     from bodyschema.cli.recordings.synthesis import without_consequence
     from bodyschema.daemon.config import Config
+    from bodyschema.daemon.wiring.wiring import marker_source_lines
     from bodyschema.robot.urdf import REVOLUTE
 
     checked = Config.load(robot)
@@ -60,7 +61,9 @@ def check(*, robot: RobotFile = HERE) -> None:
     )
     for line in camera_lines:
         say(f"  {line}")
-    if cameras is None or cameras.calibration is None:
+    for line in marker_source_lines(checked):
+        say(f"  {line}")
+    if (cameras is None and not checked.tables.marker_source) or (cameras and cameras.calibration is None):
         seen = description.calibration
         stereo = "described" if seen else "not described: no images can be used, recordings can"
         say(f"  {'stereo' if seen is None or seen.is_stereo else 'one camera, its'} calibration {stereo}")

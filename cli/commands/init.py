@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -55,7 +56,7 @@ def init(
     from bodyschema.interfaces.errors import ConfigError
 
     _require_one_way(sim=sim, lerobot=lerobot, source=source, urdf=urdf)
-    if robot.exists():
+    if os.path.lexists(robot):
         raise ConfigError("is there already", file=robot, remedy="Give another --robot, or move it away")
     try:
         if sim:
@@ -136,12 +137,14 @@ def _of_lerobot(name: str, urdf: Path | None, robot: Path, calibration: Path | N
 def write_new(file: Path, text: str) -> None:
     """Write a new file. Raise ConfigError if it exists."""
     from bodyschema.interfaces.errors import ConfigError
+    from bodyschema.interfaces.whole_files import write_whole
 
+    if os.path.lexists(file):
+        raise ConfigError("is there already", file=file, remedy="Give another --robot, or move it away")
     try:
-        with file.open("x", encoding="utf-8") as stream:
-            stream.write(text)
-    except FileExistsError as error:
-        raise ConfigError("is there already", file=file, remedy="Give another --robot, or move it away") from error
+        write_whole({file: text.encode()})
+    except OSError as error:
+        raise ConfigError(f"cannot be written: {error.strerror}", file=file, remedy="Give another --robot") from error
 
 
 def _copy_model(robot: Path) -> None:

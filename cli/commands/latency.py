@@ -40,7 +40,7 @@ def latency(
 
     Needs: robot.toml with encoders and cameras, and no running sampler; or a recording; or --sim.
 
-    Next: put the two printed lines into [vision.cameras].
+    Next: put the two printed lines into [vision.cameras], or [marker_source].
     """
     from rich.console import Console
 
@@ -50,6 +50,8 @@ def latency(
     from bodyschema.daemon.transport.wire import encode
 
     config = Config.load(robot)
+    is_sent = not sim and config.tables.vision.cameras is None and bool(config.tables.marker_source)
+    table = "marker_source" if is_sent else "vision.cameras"
     console = Console(highlight=False, soft_wrap=True)
     wiggle = _wiggle(config, recording, seconds, sim=sim)
     if save is not None:
@@ -61,7 +63,7 @@ def latency(
     console.print(
         f"{found.fixes} fixes at {found.speed_m_s:.2f} m/s, {1e3 * found.residual_m:.1f} mm from where the angles "
         f"bring the marker: images are taken {1e3 * found.latency_s:.1f} ± {1e3 * found.sigma_s:.1f} ms before their "
-        "time stamps. In [vision.cameras] write",
+        f"time stamps. In [{table}] write",
         markup=False,
     )
     console.print(f"latency_s = {found.latency_s:.4f}", markup=False)
@@ -80,8 +82,8 @@ def _wiggle(config: Config, recording: Path | None, seconds: float, *, sim: bool
     if recording is not None:
         return read_wiggle(recording, config.robot.joints)
     console = Console(stderr=True, highlight=False)
-    cameras = None if sim else config.tables.vision.cameras
-    known_s = 0.0 if cameras is None else cameras.latency_s
+    seen = config.tables.vision.cameras or next(iter(config.tables.marker_source), None)
+    known_s = 0.0 if sim or seen is None else seen.latency_s
     with open_sources(config, sim=sim) as sources, console.status("move the arm to and fro, unevenly") as status:
         seen = collected(sources, seconds, lambda t: status.update(f"go on moving: {max(seconds - t, 0):.0f} s"))
     for text in (*seen.health, seen.said):

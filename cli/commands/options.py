@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
+from cyclopts.validators import Number
 
 if TYPE_CHECKING:
     from bodyschema.daemon.config import Config
@@ -55,7 +56,11 @@ class SourceOptions:
     ] = None
 
     marker_delay_ms: Annotated[
-        float, Parameter(help="Of a bag or a dataset: how late the marker's positions are stamped [ms].")
+        float,
+        Parameter(
+            help="Of a bag or a dataset: how late the marker's positions are stamped [ms].",
+            validator=Number(gte=-10_000, lte=10_000),
+        ),
     ] = 0.0
 
     def opened(self, config: Config, source: Path, lerobot: Path | None = None) -> Recording:

@@ -42,7 +42,7 @@ def replay(
     ] = None,
     sigma_mm: Annotated[
         float | None,
-        Parameter(help="1-sigma of the positions where the recording has none [mm].", validator=Number(gt=0)),
+        Parameter(help="1-sigma of the positions where the recording has none [mm].", validator=Number(gt=0, lte=1000)),
     ] = None,
     any_step: Annotated[bool, flag("Accept rows whatever their step and speed: single poses far apart.")] = False,
     held_out: Annotated[float, Parameter(help="Share of the rows to leave out and judge by.")] = 0.3,

@@ -14,16 +14,17 @@ from bodyschema.cli.commands.options import HERE, RobotFile
 
 watch = cyclopts.App(
     name="watch",
-    help="""What the cameras see, and what the tracker makes of it.
+    help="""What the cameras see and the tracker makes of it, and what other marker sources send.
 
-    Needs: robot.toml with cameras (docs/cameras.md).
+    Needs: robot.toml with cameras (docs/cameras.md) or [marker_source] (docs/marker_sources.md).
 
-    Next: `bodyschema watch cameras`.
+    Next: `bodyschema watch cameras` or `bodyschema watch marker`.
     """,
 )
 
 READ_S = 0.5
 TELL_EVERY_S = 2.0
+MARKER_EVERY_S = 1.0
 PORT = 8080
 
 
@@ -87,3 +88,49 @@ def cameras(
                     console.print(line, markup=False)
     for line in (watching.said, *watched.eyes.health):
         console.print(line, markup=False)
+
+
+@watch.command(sort_key=2)
+def marker(
+    *,
+    robot: RobotFile = HERE,
+    seconds: Annotated[
+        float | None, Parameter(help="End after this time [s]; else with Ctrl-C.", validator=Number(gt=0))
+    ] = None,
+) -> None:
+    """Show what the marker sources send: rate, position, uncertainty, delay, and what is wrong with their messages.
+
+    Needs: robot.toml with [marker_source] (docs/marker_sources.md), and no running sampler, because a UDP port can be
+    listened on only once.
+
+    Next: `bodyschema calibrate latency`; `bodyschema run`.
+    """
+    from contextlib import ExitStack
+
+    from rich.console import Console
+
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.marker_watch import MarkerWatch
+    from bodyschema.daemon.service.signals import on_termination
+    from bodyschema.daemon.wiring.wiring import open_streams
+    from bodyschema.interfaces.clock import SystemClock
+
+    console = Console(highlight=False, soft_wrap=True)
+    clock = SystemClock()
+    with ExitStack() as stack:
+        watches = [
+            MarkerWatch(stream.name, stream, stream, clock) for stream in open_streams(Config.load(robot), clock)
+        ]
+        for each in watches:
+            stack.enter_context(each)
+        stopping: list[bool] = []
+        stack.enter_context(on_termination(lambda: stopping.append(True)))
+        end = clock.now() + (float("inf") if seconds is None else seconds)
+        while not stopping and clock.now() < end:
+            tell_at = min(clock.now() + MARKER_EVERY_S, end)
+            while clock.now() < tell_at and not stopping:
+                for each in watches:
+                    each.read(READ_S / 10)
+            for each in watches:
+                for line in each.lines():
+                    console.print(line, markup=False)

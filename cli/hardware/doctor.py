@@ -61,10 +61,12 @@ def steps(config: Config) -> Iterator[Step]:
         yield "encoders", lambda: _on_the_ports(config, encoder_checks)
     if config.tables.vision.cameras is not None:
         yield "cameras", lambda: _cameras(config)
+    if config.tables.marker_source:
+        yield "marker source", lambda: _marker_sources(config)
     if config.tables.drivers.ros2 is not None:
         yield "router", lambda: joint_state_checks(config)
     yield "disk", lambda: disk_checks(config.state_dir)
-    if config.store_file.exists():
+    if os.path.exists(config.store_file):  # a folder of another user has none
         yield "store", lambda: store_checks(config.store_file)
     yield "clock", clock_checks
     yield "service", unit_checks
@@ -87,6 +89,8 @@ def _description(config: Config) -> Iterator[Check]:
     cameras = config.tables.vision.cameras
     if cameras is not None and cameras.calibration is not None:
         return
+    if cameras is None and config.tables.marker_source:
+        return
     if config.robot.calibration is None:
         said = "[camera] does not describe how the cameras see: images cannot be used, recordings can"
         keys = "focal_px, principal_point_px, image_size_px, and baseline_m or eyes = 1"
@@ -107,6 +111,24 @@ def _cameras(config: Config) -> Iterator[Check]:
     with ZenohSession(connect=config.route("sampler"), client=True) as bus:
         status = decode(bus.ask_one(Keys(config.robot.name).status("sampler")), SamplerStatus)
     yield Check("cameras", "ok", f"the running sampler takes {status.frames_per_s:.1f} stereo frames/s")
+
+
+def _marker_sources(config: Config) -> Iterator[Check]:
+    """Yield checks of what the marker sources send; a running sampler reads them, so its status is used instead."""
+    if not is_alive(config.route("sampler"), Keys(config.robot.name).alive("sampler"), open_timeout_s=OPEN_S):
+        from bodyschema.daemon.wiring.wiring import marker_source_checks
+
+        yield from marker_source_checks(config)
+        return
+    with ZenohSession(connect=config.route("sampler"), client=True) as bus:
+        status = decode(bus.ask_one(Keys(config.robot.name).status("sampler")), SamplerStatus)
+    yield Check("marker source", "ok", f"the running sampler takes {status.frames_per_s:.1f} positions/s")
+    names = [table.label for table in config.tables.marker_source]
+    for complaint in status.health:
+        name, _, rest = complaint.partition(": ")
+        if name in names:
+            what, _, remedy = rest.partition(": ")
+            yield Check(f"marker source {name}", "warning", what, remedy)
 
 
 def _on_the_ports(config: Config, look: Callable[[Config], Iterator[Check]]) -> Iterator[Check]:
@@ -140,7 +162,12 @@ def _of_the_sampler(config: Config) -> Iterator[Check]:
 
 def disk_checks(folder: Path) -> Iterator[Check]:
     """Yield checks of free space and write permission for the pairs in `folder`."""
-    there = next(path for path in (folder, *folder.parents) if path.exists())
+    try:
+        there = next(path for path in (folder, *folder.parents) if path.exists())
+    except PermissionError as error:
+        remedy = "bodyschema run --state-dir FOLDER    # one that you can write"
+        yield Check("disk", "wrong", f"{folder}, where pairs are to be kept, is not yours: {error.strerror}", remedy)
+        return
     if not os.access(there, os.W_OK):
         said = f"{there} cannot be written, and pairs are to be kept in {folder}"
         yield Check("disk", "wrong", said, f"sudo chown $USER {there}")

@@ -80,6 +80,12 @@ colour = "red"
 # Of the marker ball [m].
 radius_m = 0.020
 
+# Another program that measures the marker, in the place of cameras: udp, natnet, zenoh or ros2. docs/marker_sources.md
+# [marker_source]
+# kind = "udp"
+# port = 5005
+# sigma_m = 0.001
+
 # CHECK: the cameras; `bodyschema scan` names those that are plugged in, docs/cameras.md tells the rest.
 {cameras}"""
 

@@ -17,6 +17,7 @@ from bodyschema.daemon.sampler.sources import Sources
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import RecordingError, SourceEnded, SourceLost
 from bodyschema.interfaces.records import JointReading, MarkerFix, MarkerMiss
+from bodyschema.interfaces.whole_files import write_whole
 from bodyschema.robot.limited import read_at_most
 
 READ_S = 0.2
@@ -142,11 +143,12 @@ def write_wiggle(wiggle: Wiggle, joints: Sequence[str], file: Path) -> None:
         rows.append((t, [repr(t), *map(repr, q), *blank_position]))
     for t, x in zip(wiggle.t_marker.tolist(), wiggle.x.tolist(), strict=True):
         rows.append((t, [repr(t), *blank_joints, *map(repr, x)]))
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(["t", *joints, *POSITION])
+    writer.writerows(row for _, row in sorted(rows, key=lambda each: each[0]))
     try:
-        with file.open("w", newline="", encoding="utf-8") as stream:
-            writer = csv.writer(stream)
-            writer.writerow(["t", *joints, *POSITION])
-            writer.writerows(row for _, row in sorted(rows, key=lambda each: each[0]))
+        write_whole({file: text.getvalue().encode()})
     except OSError as error:
         raise RecordingError(f"cannot be written: {error.strerror}", file=file) from error
 

@@ -230,6 +230,7 @@ def devices_of(config: Config) -> list[str]:
     """Return the ports and cameras that robot.toml names, each once, and those of plug-in drivers and trackers."""
     cameras = config.tables.vision.cameras
     named = [*configured_ports(config).values(), *({} if cameras is None else cameras.devices).values()]
+    named += [device for further in config.tables.vision.further_cameras for device in further.devices.values()]
     named += [device for plugin in _plugins(config) for device in plugin.devices]
     return list(dict.fromkeys(name for name in named if name.startswith("/dev/")))
 
@@ -243,7 +244,8 @@ def endpoints_of(config: Config) -> list[str]:
     """Return the endpoints that the two processes listen on or connect to."""
     zenoh, ros2 = config.tables.zenoh, config.tables.drivers.ros2
     routers = [zenoh.router, "" if ros2 is None else ros2.router]
-    return [zenoh.sampler, zenoh.learner, *(router for router in routers if router)]
+    sources = [table.endpoint for table in config.tables.marker_source]
+    return [zenoh.sampler, zenoh.learner, *(router for router in routers if router), *sources]
 
 
 def folders_of(config: Config) -> list[Path]:

@@ -13,6 +13,7 @@ import msgspec
 from bodyschema.daemon.wiring.servos import KnownModel, known_models
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.limited import read_at_most
+from bodyschema.robot.toml_text import toml_value
 
 
 class Candidate(msgspec.Struct, frozen=True):
@@ -65,7 +66,7 @@ def candidates_in(json: bytes, file: object) -> list[Candidate]:
     """
     try:
         scan = msgspec.json.decode(json, type=_Scan)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(
             f"is no scan: {error}", file=file, remedy="Write one: bodyschema scan --json > FILE.json"
         ) from error
@@ -110,13 +111,13 @@ def servo_tables(fitting: Fitting) -> str:
     names = _bus_names(servos)
     lines = ["", "# The servos, as `bodyschema scan` found them. docs/hardware.md has all keys."]
     for (port, baud), name in names.items():
-        lines += [f"[{make.table}.buses.{name}]", f"port = {_quoted(port)}", f"baud = {baud:_}", ""]
+        lines += [f"[{make.table}.buses.{name}]", f"port = {toml_value(port)}", f"baud = {baud:_}", ""]
     lines.append("# CHECK each with `bodyschema joints`: move the joint, and look where its angle goes.")
     for joint, servo in fitting.servos.items():
-        lines += [f"[[{make.table}.servos]]", f"joint = {_quoted(joint)}", f"id = {servo.id}"]
-        lines.append(f"model = {_quoted(servo.model or '')}")
+        lines += [f"[[{make.table}.servos]]", f"joint = {toml_value(joint)}", f"id = {servo.id}"]
+        lines.append(f"model = {toml_value(servo.model or '')}")
         if len(names) > 1:
-            lines.append(f"bus = {_quoted(names[servo.port, servo.baud])}")
+            lines.append(f"bus = {toml_value(names[servo.port, servo.baud])}")
         zero_ticks = f"# zero_ticks = {known[servo.model or ''].zero_ticks}"
         lines += [
             "# direction = -1      # the joint counts against the servo",
@@ -160,11 +161,6 @@ def _other_rates(servos: Sequence[Candidate], port: str) -> str:
         if servo.baud != most
     ]
     return f"Give all the same: {'; '.join(commands)}; then scan again"
-
-
-def _quoted(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped}"'
 
 
 def read_scan(file: Path) -> list[Candidate]:

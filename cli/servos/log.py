@@ -82,7 +82,7 @@ class ServoLog:
         for number, line in enumerate(lines, 1):
             try:
                 entry = msgspec.json.decode(line, type=LoggedWrite) if line else None
-            except msgspec.DecodeError as error:
+            except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
                 if number == len(lines):
                     break
                 raise BodyschemaError(f"{self.file}, line {number}: {error}. Move the file away") from error

@@ -31,6 +31,7 @@ from bodyschema.diagnosis.words import modelled
 from bodyschema.effects import KINDS, write_corrected, write_extended
 from bodyschema.interfaces.errors import BodyschemaError, RecordingError, RequestError
 from bodyschema.interfaces.records import Pair
+from bodyschema.interfaces.whole_files import write_whole
 from bodyschema.learning.nominal import NominalModel
 from bodyschema.recordings import files as recordings
 from bodyschema.recordings.recording import Recording
@@ -252,7 +253,7 @@ def written(found: Found, folder: Path) -> None:
     write_corrected(bare, folder, heading)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / DIAGNOSIS).write_text(found.json + "\n", encoding="utf-8")
-        (folder / REPORT).write_text(page(found.diagnosis, found.file, found.remedies, about), encoding="utf-8")
+        report = page(found.diagnosis, found.file, found.remedies, about)
+        write_whole({folder / DIAGNOSIS: f"{found.json}\n".encode(), folder / REPORT: report.encode()})
     except OSError as error:
         raise RecordingError(f"cannot be written: {error.strerror or error}", file=folder) from error

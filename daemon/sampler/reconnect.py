@@ -74,6 +74,11 @@ class ReconnectingSource(Generic[R_co]):
     ) -> None:
         self._opened.close()
 
+    @property
+    def health(self) -> tuple[str, ...]:
+        """The problem with the source, if there is one."""
+        return () if self.trouble is None else (self.trouble,)
+
     def read(self, timeout_s: float) -> R_co | None:
         """Read like the source's `read`; also return None while the source is lost.
 

@@ -94,12 +94,14 @@ class Sampler:
         self._powered = {drive.name: drive for drive in sources.powered}
         held = config.robot.robot.hold == "zero_force"
         self._bears = self._powered.get(ZERO_FORCE) if held else None
-        self._cameras = sources.cameras
+        self._cameras, self._seen_by = sources.cameras, sources.seen_by
         self._gaze = gaze_of(config.robot, sources, bus, self._wall)
         self._simulation, self._source_clock = sources.simulation, sources.clock
         self._joints = ReconnectingSource(sources.joints, "the encoders", self._wall, forbidden=self._service.forbidden)
         self._encoders, self._devices = sources.joints, DeviceWatch(sources.joints, store, self._wall)
-        self._marker = ReconnectingSource(sources.marker, "the cameras", self._wall, forbidden=self._service.forbidden)
+        self._marker = ReconnectingSource(
+            sources.marker, sources.seen_by, self._wall, forbidden=self._service.forbidden
+        )
         rules, prismatic = config.tables.daemon, config.robot.chain.prismatic
         self._buffer = JointBuffer(prismatic, rules.max_reading_gap_s, live=sources.live, kept_s=AROUND_S)
         self._gate = Gate(rules, prismatic, store.last())
@@ -394,11 +396,11 @@ class Sampler:
     def _silences(self) -> list[str]:
         now = self._wall.now()
         silent = (
-            ("encoders", self._joints.trouble, self._last_reading),
-            ("cameras", self._marker.trouble, self._last_frame),
+            ("the encoders", self._joints.trouble, self._last_reading),
+            (self._seen_by, self._marker.trouble, self._last_frame),
         )
         return [
-            f"the {name} have said nothing for {now - since:.0f} s"
+            f"nothing has come from {name} for {now - since:.0f} s"
             for name, trouble, since in silent
             if trouble is None and now - since > SILENT_AFTER_S
         ]

@@ -92,13 +92,26 @@ class TellsHealth(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
+class JoinedHealth:
+    """The health of several devices."""
+
+    devices: Sequence[TellsHealth]
+
+    @property
+    def health(self) -> tuple[str, ...]:
+        """Problems of all devices, with remedies."""
+        return tuple(text for device in self.devices for text in device.health)
+
+
+@dataclass(frozen=True, slots=True)
 class Sources:
     """Encoders and marker, not opened yet, on one clock; and the simulated world if there is one.
 
     Attributes:
         powered: drives that may move the arm or the head once a person asks for it.
         head: the one of them that moves the cameras.
-        cameras: reports the cameras' health, if there are cameras.
+        cameras: reports the health of the cameras or of other marker sources, if there are any.
+        seen_by: name of the marker source in messages.
         calibration: the cameras' calibration, if it differs from [camera].
         live: neither encoders nor cameras wait for the other; otherwise unread data is kept.
     """
@@ -110,6 +123,7 @@ class Sources:
     powered: tuple[Powered, ...] = ()
     head: Head | None = None
     cameras: TellsHealth | None = None
+    seen_by: str = "the cameras"
     calibration: StereoCalibration | None = None
     live: bool = False
 

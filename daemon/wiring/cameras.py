@@ -13,14 +13,16 @@ from bodyschema.daemon.config import Config
 from bodyschema.drivers.checks import Check, holders
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import BodyschemaError, ConfigError
+from bodyschema.interfaces.extras import require_extra
 from bodyschema.interfaces.protocols import Clock, StereoCamera
 from bodyschema.robot.toml_file import line_of, read_toml
-from bodyschema.vision.cameras.config import CamerasConfig, ImagesConfig, UvcSettings, VideosConfig
+from bodyschema.vision.cameras.config import CamerasConfig, ImagesConfig, RealsenseConfig, UvcSettings, VideosConfig
 from bodyschema.vision.cameras.controls import left_to_the_camera
 from bodyschema.vision.cameras.film import Film
 from bodyschema.vision.cameras.ideal import IdealCamera
 from bodyschema.vision.cameras.live import CameraFigures, LiveEyes
 from bodyschema.vision.cameras.opened import eyes_of
+from bodyschema.vision.cameras.realsense import RealsenseCamera
 from bodyschema.vision.cameras.serials import connected
 from bodyschema.vision.cameras.watched import PlainEyes, WatchedCamera
 from bodyschema.vision.rectified import RectifiedCamera
@@ -30,6 +32,8 @@ from bodyschema.vision.rig_file import read_rig
 LOOK_S = 2.0  # `doctor` looks at the images
 READ_S = 0.5
 PAGE = "docs/cameras.md"
+
+Eyes = LiveEyes | RealsenseCamera | Film
 
 
 def cameras_of(config: Config) -> CamerasConfig | None:
@@ -47,7 +51,7 @@ def require_cameras(config: Config) -> CamerasConfig:
     return cameras
 
 
-def open_eyes(config: Config, clock: Clock) -> LiveEyes | Film:
+def open_eyes(config: Config, clock: Clock) -> Eyes:
     """Return the cameras of robot.toml with unprocessed images, not opened yet.
 
     Raises:
@@ -67,7 +71,7 @@ def names_calibration(config: Config) -> bool:
     return require_cameras(config).calibration is not None
 
 
-def camera_of(config: Config, eyes: LiveEyes | Film) -> StereoCamera:
+def camera_of(config: Config, eyes: Eyes) -> StereoCamera:
     """Return `eyes` with rectified images, not opened yet: by the calibration file, else by [camera].
 
     Raises:
@@ -77,6 +81,8 @@ def camera_of(config: Config, eyes: LiveEyes | Film) -> StereoCamera:
     if cameras.calibration is not None:
         rig = read_rig(calibration_file(config))
         return RectifiedCamera(eyes, _of_files(rig, cameras) if isinstance(eyes, Film) else rig)
+    if isinstance(eyes, RealsenseCamera):
+        return eyes
     if config.robot.calibration is None:
         raise ConfigError(
             "nothing says how the cameras see",
@@ -99,6 +105,9 @@ def _of_files(rig: Rig, cameras: CamerasConfig) -> Rig:
 
 def require_usable(config: Config) -> None:
     """ConfigError when pairs cannot be made of the cameras' images and the encoders' readings."""
+    cameras = require_cameras(config)
+    if cameras.realsense is not None:
+        require_extra("realsense", "a RealSense camera")
     camera_of(config, open_eyes(config, SystemClock()))
     layout = require_cameras(config).layout
     if isinstance(layout, ImagesConfig | VideosConfig) and not layout.speed:
@@ -120,14 +129,15 @@ class Watched:
     """
 
     camera: WatchedCamera | PlainEyes
-    eyes: LiveEyes | Film
+    eyes: Eyes
     is_calibrated: bool
 
 
 def open_watched(config: Config) -> Watched:
     """Return the cameras of robot.toml, not opened yet; once calibrated, detections are drawn into their images."""
     eyes = open_eyes(config, SystemClock())
-    is_calibrated = require_cameras(config).calibration is not None or config.robot.calibration is not None
+    is_described = config.robot.calibration is not None or isinstance(eyes, RealsenseCamera)
+    is_calibrated = require_cameras(config).calibration is not None or is_described
     if not is_calibrated:
         return Watched(PlainEyes(eyes), eyes, is_calibrated)
     return Watched(WatchedCamera(camera_of(config, eyes), config.tables.vision), eyes, is_calibrated)
@@ -138,7 +148,13 @@ def open_watched(config: Config) -> Watched:
 
 def camera_checks(config: Config) -> Iterator[Check]:
     """Yield checks that the cameras of robot.toml are present and send images when both are open at once."""
-    cameras = require_cameras(config)
+    yield from _checks_of(require_cameras(config), config.file.parent)
+    for further in config.tables.vision.further_cameras:
+        for check in _checks_of(further, config.file.parent):
+            yield replace(check, subject=f"{further.name}: {check.subject}")
+
+
+def _checks_of(cameras: CamerasConfig, folder: Path) -> Iterator[Check]:
     missing = False
     for name, device in cameras.devices.items():
         for check in _device_checks(name, device):
@@ -146,7 +162,7 @@ def camera_checks(config: Config) -> Iterator[Check]:
             yield check
     if missing:
         return
-    eyes = open_eyes(config, SystemClock())
+    eyes = eyes_of(cameras, folder, SystemClock())
     try:
         yield from _open_checks(eyes, cameras)
     except BodyschemaError as error:
@@ -170,7 +186,7 @@ def _where(device: str) -> str:
     return f"plug it in; {known}"
 
 
-def _open_checks(eyes: LiveEyes | Film, cameras: CamerasConfig) -> Iterator[Check]:
+def _open_checks(eyes: Eyes, cameras: CamerasConfig) -> Iterator[Check]:
     """Open the cameras together for a while and yield checks of what they send."""
     with ExitStack() as stack:
         stack.enter_context(eyes)
@@ -215,13 +231,22 @@ def _told(figures: CameraFigures) -> str:
 
 def camera_lines(config: Config) -> Iterator[str]:
     """Describe in words where images come from. Raise ConfigError if the calibration cannot be read."""
-    cameras = require_cameras(config)
+    yield from _lines_of(require_cameras(config), config.file.parent)
+    for further in config.tables.vision.further_cameras:
+        for line in _lines_of(further, config.file.parent):
+            yield f"{further.name}: {line}"
+
+
+def _lines_of(cameras: CamerasConfig, folder: Path) -> Iterator[str]:
     match cameras.layout:
         case UvcSettings() as layout:
             for name, device in cameras.devices.items():
                 yield f"{name} {device}"
             width, height = layout.image_size_px
             yield f"images of {width}x{height} pixels for each eye, {layout.fps:g} a second, as {layout.fourcc}"
+        case RealsenseConfig(image_size_px=(width, height), serial=serial) as layout:
+            which = "the only RealSense" if serial is None else f"RealSense {serial}"
+            yield f"{which}: infra-red images of {width}x{height} pixels, {layout.fps:g} a second"
         case ImagesConfig(left=left, right=right) as images:
             yield f"images {left if right is None else f'{left} and {right}'}, {_speed(images.speed)}"
         case VideosConfig() as films:
@@ -230,7 +255,7 @@ def camera_lines(config: Config) -> Iterator[str]:
     known = "" if cameras.latency_sigma_s is not None or not cameras.devices else ", not measured"
     yield f"taken {1e3 * cameras.latency_s:.1f} ms before their time stamp ± {1e3 * cameras.sigma_s:.1f} ms{known}"
     if cameras.calibration is not None:
-        yield _calibrated_by(cameras.calibration, calibration_file(config))
+        yield _calibrated_by(cameras.calibration, folder / cameras.calibration)
 
 
 def _calibrated_by(name: str, file: Path) -> str:

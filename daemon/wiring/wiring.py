@@ -8,17 +8,35 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
+import numpy as np
+
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.sampler.sources import Head, MarkerTopic, Powered, Sources, StampedJoints
+from bodyschema.daemon.sampler.reconnect import ReconnectingSource
+from bodyschema.daemon.sampler.sources import (
+    Head,
+    JoinedHealth,
+    MarkerTopic,
+    Powered,
+    Sources,
+    StampedJoints,
+    TellsHealth,
+)
+from bodyschema.drivers.checks import Check
 from bodyschema.drivers.dynamixel.config import DynamixelConfig
 from bodyschema.drivers.feetech.config import FeetechConfig
+from bodyschema.drivers.markers.checks import stream_checks
+from bodyschema.drivers.markers.fusing import FusedMarkers, Member
+from bodyschema.drivers.markers.opened import stream_of
+from bodyschema.drivers.markers.stream import MarkerStream
 from bodyschema.drivers.ros2.config import Ros2Config
 from bodyschema.drivers.serial_lines.config import SerialLinesConfig
 from bodyschema.drivers.serial_lines.joints import SerialLineJoints
+from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, StoreError
 from bodyschema.interfaces.extras import require_extra
-from bodyschema.interfaces.protocols import Clock, JointSource
+from bodyschema.interfaces.protocols import Clock, JointSource, MarkerSource
 from bodyschema.interfaces.servos import EncoderJoints, ServoJoints
 from bodyschema.recordings.store.store import PairReader
 from bodyschema.robot.plugins import PluginConfig, load
@@ -30,6 +48,7 @@ from .simulation import simulation_settings
 
 if TYPE_CHECKING:
     from bodyschema.drivers.ros2.joints import Ros2Joints
+    from bodyschema.vision.cameras.config import CamerasConfig
 
 log = logging.getLogger(__name__)
 
@@ -151,10 +170,13 @@ def _require_source(config: Config, *, sim: bool) -> None:
             "an arm of your own: docs/hardware.md",
         )
     if config.tables.vision.cameras is None:
+        if config.tables.marker_source:
+            return
         raise ConfigError(
             "the joints have a driver, but nothing tells where the marker is: no cameras are configured",
             file=config.file,
-            remedy="Add the table [vision.cameras] (docs/cameras.md); or give --sim for the simulated robot",
+            remedy="Add the table [vision.cameras] (docs/cameras.md) or [marker_source] (docs/marker_sources.md); or "
+            "give --sim for the simulated robot",
         )
     from .cameras import require_usable
 
@@ -186,26 +208,113 @@ def demonstration_model() -> Path:
 
 
 def _real(config: Config) -> Sources:
+    clock = SystemClock()
+    joints = open_joints(config, clock)
+    marker, health, calibration = _open_marker(config, clock)
+    drives = joints.drives if isinstance(joints, ServoJoints) else ()
+    return Sources(
+        joints,
+        marker,
+        clock,
+        powered=tuple(drive for drive in drives if isinstance(drive, Powered)),
+        head=next((drive for drive in drives if isinstance(drive, Head)), None),
+        cameras=health,
+        seen_by=_seen_by(config),
+        calibration=calibration,
+        live=True,
+    )
+
+
+def _open_marker(config: Config, clock: Clock) -> tuple[MarkerSource, TellsHealth, StereoCalibration | None]:
+    """Return what sees the marker, not opened yet, what reports its health, and the cameras' calibration."""
+    tables = config.tables.marker_source
+    streams = [stream_of(table, clock) for table in tables]
+    if config.tables.vision.cameras is None and len(streams) == 1:
+        return streams[0], streams[0], None
+    members = [Member(table.label, stream, table.pose) for table, stream in zip(tables, streams, strict=True)]
+    calibration = None
+    healths: list[TellsHealth] = [*streams]
+    if config.tables.vision.cameras is not None:
+        cameras, eyes, calibration = _tracked_cameras(config, clock)
+        further = config.tables.vision.further_cameras
+        if not tables and not further:
+            return cameras, eyes, calibration
+        members.insert(0, Member("cameras", cameras, np.eye(4)))
+        healths.insert(0, eyes)
+        for place, table in enumerate(further, 1):
+            others, health, _ = _tracked_cameras(_seen_through(config, table), clock)
+            members.insert(place, Member(table.name, others, table.pose))
+            healths.insert(place, health)
+    for place, member in enumerate(members):
+        member.source = reopening = ReconnectingSource(member.source, f"the positions by {member.name}", clock)
+        healths[place] = JoinedHealth([reopening, healths[place]])
+    fused = FusedMarkers(members, clock)
+    return fused, JoinedHealth([fused, *healths]), calibration
+
+
+def _seen_through(config: Config, cameras: CamerasConfig) -> Config:
+    """Return the configuration with `cameras` as the only ones."""
+    vision = msgspec.structs.replace(config.tables.vision, cameras=cameras, further_cameras=())
+    return config.with_tables(msgspec.structs.replace(config.tables, vision=vision))
+
+
+def _seen_by(config: Config) -> str:
+    """Return the name in messages of what sees the marker."""
+    tables = config.tables
+    names = [*(table.name for table in tables.vision.further_cameras), *(table.label for table in tables.marker_source)]
+    if tables.vision.cameras is not None:
+        if not names:
+            return Sources.seen_by
+        names.insert(0, "cameras")
+    return f"the positions by {' and '.join(names)}"
+
+
+def _tracked_cameras(config: Config, clock: Clock) -> tuple[MarkerSource, TellsHealth, StereoCalibration]:
+    """Return the cameras of robot.toml with their tracker, not opened yet, their health and their calibration."""
+    from bodyschema.vision.cameras.realsense import RealsenseCamera
+    from bodyschema.vision.depth_check import DepthChecked
     from bodyschema.vision.tracked_camera import TrackedCamera
     from bodyschema.vision.trackers import tracker_of
 
     from .cameras import camera_of, open_eyes
 
-    clock = SystemClock()
-    joints = open_joints(config, clock)
     eyes = open_eyes(config, clock)
-    camera = camera_of(config, eyes)
-    drives = joints.drives if isinstance(joints, ServoJoints) else ()
-    return Sources(
-        joints,
-        TrackedCamera(camera, tracker_of(camera.calibration, config.tables.vision)),
-        clock,
-        powered=tuple(drive for drive in drives if isinstance(drive, Powered)),
-        head=next((drive for drive in drives if isinstance(drive, Head)), None),
-        cameras=eyes,
-        calibration=camera.calibration,
-        live=True,
-    )
+    camera, vision = camera_of(config, eyes), config.tables.vision
+    tracked = TrackedCamera(camera, tracker_of(camera.calibration, vision))
+    if eyes is not camera or not isinstance(eyes, RealsenseCamera):
+        return tracked, eyes, camera.calibration
+    checked = DepthChecked(tracked, eyes, vision.radius_m if vision.marker == "bright_ball" else 0.0)
+    return checked, JoinedHealth([eyes, checked]), camera.calibration
+
+
+def open_streams(config: Config, clock: Clock) -> list[MarkerStream]:
+    """Return the marker sources of robot.toml, not opened yet. Raise ConfigError if it has none."""
+    if not config.tables.marker_source:
+        raise ConfigError(
+            "no marker source is configured",
+            file=config.file,
+            remedy="Add the table [marker_source]: docs/marker_sources.md",
+        )
+    return [stream_of(table, clock) for table in config.tables.marker_source]
+
+
+def marker_source_checks(config: Config) -> Iterator[Check]:
+    """Yield checks of what each marker source of robot.toml sends. Open it for that."""
+    clock = SystemClock()
+    for stream in open_streams(config, clock):
+        yield from stream_checks(stream, clock)
+
+
+def marker_source_lines(config: Config) -> Iterator[str]:
+    """Describe in words where the marker's positions come from."""
+    for table in config.tables.marker_source:
+        body = "" if table.body is None else f", body {table.body}"
+        yield f"marker positions by {table.label} ({table.kind}) at {table.endpoint}{body}, in {table.unit}"
+        known = "" if table.latency_sigma_s is not None else ", not measured"
+        yield (
+            f"measured {1e3 * table.latency_s:.1f} ms before their time stamp ± {1e3 * table.sigma_s:.1f} ms{known}; "
+            f"1-sigma {1e3 * table.sigma_m:.2g} mm where none is sent"
+        )
 
 
 @contextmanager

@@ -76,6 +76,10 @@ class CdrReader:
         count = self.count(8)
         return self._numbers("d", 8, count) if count else ()
 
+    def float64_array(self, count: int) -> tuple[float, ...]:
+        """Read an array of 8-byte floats of fixed length."""
+        return self._numbers("d", 8, count)
+
     def end(self) -> None:
         """Raise Malformed if any bytes are left."""
         if self._at != len(self._data):

@@ -74,7 +74,7 @@ def decode_joint_state(data: bytes) -> JointState:
         Malformed: not such a message. No length field makes it read beyond `data`.
     """
     reader = CdrReader(data)
-    message = JointState(_header(reader), reader.strings(), reader.float64s(), reader.float64s(), reader.float64s())
+    message = JointState(read_header(reader), reader.strings(), reader.float64s(), reader.float64s(), reader.float64s())
     reader.end()
     for values in (message.positions, message.velocities, message.efforts):
         if len(values) not in (0, len(message.names)):
@@ -85,7 +85,7 @@ def decode_joint_state(data: bytes) -> JointState:
 def encode_joint_state(message: JointState, *, big_endian: bool = False) -> bytes:
     """Encode the message."""
     writer = CdrWriter(big_endian=big_endian)
-    _write_header(writer, message.header)
+    write_header(writer, message.header)
     writer.strings(message.names)
     for values in (message.positions, message.velocities, message.efforts):
         writer.float64s(values)
@@ -95,7 +95,7 @@ def encode_joint_state(message: JointState, *, big_endian: bool = False) -> byte
 def encode_point(header: Header, x: tuple[float, ...]) -> bytes:
     """Encode geometry_msgs/PointStamped at `x` [m], 3 numbers."""
     writer = CdrWriter()
-    _write_header(writer, header)
+    write_header(writer, header)
     writer.float64_array(x)
     return writer.to_bytes()
 
@@ -112,20 +112,22 @@ def encode_pose(
         covariance: of position [m²] and rotations about the fixed axes [rad²], 6 × 6 by rows.
     """
     writer = CdrWriter()
-    _write_header(writer, header)
+    write_header(writer, header)
     for values in (x, quaternion, covariance):
         writer.float64_array(values)
     return writer.to_bytes()
 
 
-def _header(reader: CdrReader) -> Header:
+def read_header(reader: CdrReader) -> Header:
+    """Read std_msgs/Header. Raise Malformed for an invalid stamp."""
     seconds, nanoseconds = reader.int32(), reader.uint32()
     if nanoseconds >= NANO:
         raise Malformed(f"{nanoseconds} nanoseconds in a stamp")
     return Header(seconds * NANO + nanoseconds, reader.string())
 
 
-def _write_header(writer: CdrWriter, header: Header) -> None:
+def write_header(writer: CdrWriter, header: Header) -> None:
+    """Write std_msgs/Header."""
     seconds, nanoseconds = divmod(header.stamp_ns, NANO)
     writer.int32(seconds)
     writer.uint32(nanoseconds)

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from bodyschema.interfaces.errors import StoreError, StoreUnwritable
 
+FileIdentities = tuple[tuple[int, int] | None, tuple[int, int] | None]
 NOTHING_CHANGED = "Nothing was changed"
 # SQLite's errors when the disk temporarily accepts no data.
 _PASSING = ("SQLITE_FULL", "SQLITE_IOERR", "SQLITE_READONLY", "SQLITE_CANTOPEN", "SQLITE_BUSY")
@@ -62,6 +63,25 @@ def damaged(file: Path, what: str) -> str:
         f"{file} is damaged ({what}). Put a backup back (`bodyschema restore --force` keeps this one), or keep it and "
         f"give another --state-dir; `sqlite3 {file.name} .recover` shows what can be read. {NOTHING_CHANGED}"
     )
+
+
+def gone(file: Path) -> str:
+    return (
+        f"{file} was deleted, moved or replaced while the sampler had it open. "
+        "Put it back, or start the sampler again, which takes what is there"
+    )
+
+
+def file_identities(file: Path) -> FileIdentities:
+    """Return device and inode of a store and of its write-ahead log; None for what is not there."""
+    found: list[tuple[int, int] | None] = []
+    for part in (file, file.with_name(f"{file.name}-wal")):
+        try:
+            state = os.stat(part)
+            found.append((state.st_dev, state.st_ino))
+        except OSError:
+            found.append(None)
+    return found[0], found[1]
 
 
 def free_bytes(file: Path) -> int:

@@ -22,7 +22,17 @@ from bodyschema.interfaces.records import FloatArray, MarkerFix, Pair, frozen_ar
 
 from . import schema as store_schema
 from .damage import Damage, count_pairs, oldest, rebuild, records, scan, scan_back
-from .file import NOTHING_CHANGED, damaged, explained, is_damage, lock, unwritable
+from .file import (
+    NOTHING_CHANGED,
+    FileIdentities,
+    damaged,
+    explained,
+    file_identities,
+    gone,
+    is_damage,
+    lock,
+    unwritable,
+)
 from .log import commits
 from .retention import Keep, delete_until
 from .rows import Checked, as_json, checked, decoded, pair_of, require_sound, row_of, sealed
@@ -224,7 +234,7 @@ class PairReader:
                 Devices(session, seq, utc.decode(), tuple(msgspec.json.decode(record, type=list[dict[str, Any]])))
                 for session, seq, utc, record in rows
             ]
-        except (msgspec.DecodeError, UnicodeDecodeError, AttributeError, TypeError) as error:
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, AttributeError, TypeError) as error:
             raise StoreError(damaged(self.file, f"what the joints were read with is not a record: {error}")) from error
 
     def _pair(self, row: tuple[Any, ...]) -> Pair:
@@ -275,6 +285,7 @@ class PairStore:
         self._session_id = self._newest_session = 0
         self._audit: Audit | None = None
         self._rebuilt: str | None = None
+        self._identities: FileIdentities = (None, None)
 
     @property
     def identity(self) -> str:
@@ -312,9 +323,10 @@ class PairStore:
         """Assign the next number to a pair and commit it.
 
         Raises:
-            StoreError: the disk is full or broken; the pair is not in the store.
+            StoreError: the disk is full or broken, or the file is gone; the pair is not in the store.
         """
         connection = self._require_open()
+        self._require_in_place()
         measured = (fix.x, fix.cov, fix.centres_px, fix.R, fix.cov_R)
         pair = Pair(self.identity, self._seq + 1, segment, fix.t, utc, q, *measured)
         with explained(self.file), store_schema.transaction(connection):
@@ -396,8 +408,16 @@ class PairStore:
             self._audit = self.reader.audit(self._working)
             self._seq, self._newest_session = self._audit.newest, self._audit.session
             self._begin_session(self._connection)
+        self._identities = file_identities(self.file)
         for said in self.complaints:
             log.error("%s", said)
+
+    def _require_in_place(self) -> None:
+        """Raise StoreUnwritable if the file was deleted, moved or replaced: SQLite would go on writing where it was."""
+        now = file_identities(self.file)
+        if any(before not in (None, here) for before, here in zip(self._identities, now, strict=True)):
+            raise StoreUnwritable(gone(self.file))
+        self._identities = now
 
     def _give_up(self, connection: sqlite3.Connection, written: Sequence[bool]) -> None:
         """Never reuse the numbers of pairs that were committed after a damaged place in the log.

@@ -38,6 +38,11 @@ from bodyschema.drivers.feetech.config import BusConfig as FeetechBus
 from bodyschema.drivers.feetech.config import FeetechConfig
 from bodyschema.drivers.feetech.joints import FeetechJoints
 from bodyschema.drivers.feetech.models import BY_NAME as FEETECH_MODELS
+from bodyschema.drivers.markers.config import UdpTable
+from bodyschema.drivers.markers.datagram import SCHEMA, decode_datagram
+from bodyschema.drivers.markers.fusing import FusedMarkers, Member
+from bodyschema.drivers.markers.report import Packet
+from bodyschema.drivers.markers.stream import MarkerStream
 from bodyschema.drivers.replay import Replay
 from bodyschema.drivers.ros2.bench.faults import Send, intact
 from bodyschema.drivers.ros2.bench.node import Node
@@ -375,6 +380,42 @@ def encoders_that_fall_silent() -> AbstractContextManager[Rig]:
     return encoders_on_the_bench(lambda reply: reply if next(said) < 300 else replace(reply, data=b""))
 
 
+class SentPositions:
+    """A `Receiver` of a datagram every 10 ms, in virtual time."""
+
+    def __init__(self, clock: VirtualClock) -> None:
+        self._clock = clock
+
+    def open(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    def receive(self, until: float) -> Packet:
+        self._clock.wait_until(self._clock.now() + 0.01)
+        told = {"schema": SCHEMA, "position": (0.1, 0.2, 0.3), "stamp": self._clock.now()}
+        return Packet(msgspec.json.encode(told), "sender", self._clock.now())
+
+    def silence(self) -> str:
+        return ""
+
+
+def stream_in(clock: VirtualClock) -> MarkerStream:
+    return MarkerStream(UdpTable(), SentPositions(clock), decode_datagram, clock)
+
+
+@contextmanager
+def sent_positions() -> Iterator[Rig]:
+    yield Rig(stream_in(VirtualClock()))
+
+
+@contextmanager
+def fused_positions() -> Iterator[Rig]:
+    clock = VirtualClock()
+    yield Rig(FusedMarkers([Member(name, stream_in(clock), np.eye(4)) for name in "ab"], clock))
+
+
 def swinging(id: int) -> Callable[[float], float]:
     return lambda t: float(np.sin(t + id))
 
@@ -388,6 +429,7 @@ SILENT = [*SILENT_SERVOS, encoders_that_fall_silent, ros_2_robot_that_falls_sile
 CAMERAS = [pytest.param(camera, marks=SIMULATED) for camera in (simulated_camera, rectified_camera)]
 ENDING_EYES = [image_folder, video_files, side_by_side_video, ideal_camera]
 WAITING_EYES = [two_cameras, side_by_side_camera, image_folder_in_its_own_time]
+SENT = [sent_positions, fused_positions]
 MARKERS = [replayed_marker, scripted_marker, pytest.param(tracked_camera, marks=SIMULATED)]
 # They live as a tracked camera does.
 TAGS = pytest.param(tracked_tags, marks=SIMULATED)
@@ -403,7 +445,7 @@ def shared() -> Iterator[Shared]:
         yield cache(lambda make: stack.enter_context(make()))
 
 
-@pytest.fixture(params=[*JOINTS, *MARKERS, *CAMERAS, *ENDING_EYES, *WAITING_EYES])
+@pytest.fixture(params=[*JOINTS, *MARKERS, *SENT, *CAMERAS, *ENDING_EYES, *WAITING_EYES])
 def rig(request: pytest.FixtureRequest, shared: Shared) -> Rig:
     return shared(request.param)
 

@@ -184,8 +184,8 @@ def test_a_closed_session_says_so(endpoint) -> None:
 
 def test_a_process_ends_although_its_handlers_are_still_declared(endpoint) -> None:
     code = (
-        "import sys; from bodyschema.daemon.transport.bus import Bus\n"
-        "with Bus(listen=sys.argv[1]) as bus:\n"
+        "import sys; from bodyschema.daemon.transport.bus import ZenohSession\n"
+        "with ZenohSession(listen=sys.argv[1]) as bus:\n"
         "    bus.answer('a/b', lambda r: b''); bus.subscribe('a/c', print); bus.watch('a/d', print)\n"
         "    raise SystemExit(7)"
     )

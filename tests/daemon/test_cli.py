@@ -209,3 +209,9 @@ def test_a_sigma_is_shown_with_two_digits_however_small(value: float, shown: str
 def test_a_demo_of_no_pairs_is_refused() -> None:
     with pytest.raises(CycloptsError, match="--pairs"):
         app(["demo", "--pairs", "-1"], exit_on_error=False, print_error=False)
+
+
+@pytest.mark.parametrize("option", [("--sigma-mm", "1e308"), ("--marker-delay-ms", "nan")])
+def test_numbers_that_cannot_be_are_refused_before_anything_is_read(option) -> None:
+    with pytest.raises(CycloptsError, match=option[0]):
+        called("calibrate", "a.csv", *option)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import socket
@@ -260,3 +261,12 @@ def test_damaged_pages_are_told_with_what_mends_them(stored) -> None:
     (check,) = doctor.store_checks(stored)
     assert check.state == "wrong"
     assert "The sampler puts what can be read into a new file" in check.said
+
+
+def test_a_state_folder_of_another_user_is_named(tmp_path, monkeypatch) -> None:
+    def denied(_path: Path, **_options: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "stat", denied)
+    (check,) = doctor.disk_checks(tmp_path)
+    assert (check.state, "is not yours: Permission denied" in check.said) == ("wrong", True)

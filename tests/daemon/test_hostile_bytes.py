@@ -7,6 +7,7 @@ of their drivers, messages of ROS 2 by tests/drivers/test_ros2_bytes.py.
 from __future__ import annotations
 
 import math
+import tomllib
 import tracemalloc
 from collections.abc import Callable
 from copy import deepcopy
@@ -22,6 +23,8 @@ from hypothesis import strategies as st
 from small_arm import JOINTS, URDF, write_small_arm
 
 from bodyschema.cli.install.router import RouterConfig
+from bodyschema.cli.servos.fitting import first_of, fit, read_scan, servo_tables
+from bodyschema.cli.servos.log import LoggedWrite, ServoLog
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner import checkpoint
 from bodyschema.daemon.learner.answers import Answers
@@ -40,6 +43,7 @@ from bodyschema.learning.solvers.solver import DirectSolver
 from bodyschema.learning.state import StateError
 from bodyschema.recordings.recording import Recording, joints_in
 from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.lerobot import MotorCalibration, calibration_json, read_calibration
 from bodyschema.robot.urdf import UrdfTree
 from bodyschema.vision.rig_file import read_rig
 from kbmaps import KBMapsError
@@ -208,6 +212,23 @@ parameters = { offset_rad = 0.1 }
 """
 ROUTER = b'listen = "tls/127.0.0.1:7450"\n[tls]\nca = "ca.pem"\n[access."*"]\nviewer = ["anna"]\n'
 CAMERAS = b'format = "bodyschema stereo rig 1"\nimage_size_px = [640, 480]\nmodel = "pinhole"\n[left]\nserial = ""\n'
+SERVO = {"port": "/dev/ttyUSB0", "baud": 1_000_000, "id": 1, "model": "XL330-M288"}
+SCAN = msgspec.json.encode({"ports": [{"servos": [SERVO, SERVO | {"id": 2}]}]})
+WRITE = LoggedWrite(
+    utc="", batch=1, table="feetech", port="/dev/ttyUSB0", baud=1_000_000, id=1, model="STS3215", joint="waist",
+    name="homing_offset", address=31, old=0, new=5,
+)  # fmt: skip
+WRITES = msgspec.json.encode(WRITE) + b"\n" + msgspec.json.encode(WRITE) + b"\n"
+MOTORS = calibration_json({name: MotorCalibration(1, 0, 0, 1000, 3000) for name in JOINTS}).encode()
+
+
+def read_servos(file: Path) -> dict[str, Any]:
+    """Return what `robot new` makes of a scan, which has to be TOML."""
+    return tomllib.loads(servo_tables(fit(JOINTS, read_scan(file), first_of)))
+
+
+def read_writes(file: Path) -> object:
+    return ServoLog(file.parent).to_undo()
 
 
 def parquet(folder: Path) -> bytes:
@@ -239,6 +260,9 @@ def check_all_files(tmp_path: Path, data: st.DataObject) -> None:
         ("router.toml", ROUTER, RouterConfig.load),
         ("cameras.toml", CAMERAS, read_rig),
         ("a.csv", RECORDING, lambda file: (joints_in(file), Recording.read(file, JOINTS))),
+        ("scan.json", SCAN, read_servos),
+        ("servo_writes.jsonl", WRITES, read_writes),
+        ("calibration.json", MOTORS, read_calibration),
         ("a.parquet", parquet(tmp_path), lambda file: (joints_in(file), Recording.read(file, JOINTS))),
     ):
         read_bytes(tmp_path, name, data.draw(mangled(good)), read)
@@ -256,6 +280,25 @@ def test_a_mangled_file_is_read_or_refused(tmp_path: Path, data: st.DataObject) 
 @given(st.data())
 def test_thousands_of_mangled_files_are_read_or_refused(tmp_path: Path, data: st.DataObject) -> None:
     check_all_files(tmp_path, data)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "read"),
+    [
+        ("scan.json", b'{"a":' + b"[" * 100_000, read_servos),
+        ("calibration.json", b'{"a": {"a": ' + b"[" * 100_000, read_calibration),
+        ("servo_writes.jsonl", b'{"a":' + b"[" * 100_000 + b"\n\n", read_writes),
+        ("servo_writes.jsonl", WRITES.replace(b"feet", b"f\xff\xff\xff"), read_writes),
+    ],
+)
+def test_json_that_is_none_is_refused(tmp_path: Path, name: str, data: bytes, read: Callable[[Path], object]) -> None:
+    assert read_bytes(tmp_path, name, data, read) is None
+
+
+def test_a_control_character_in_a_scan_is_escaped_in_robot_toml(tmp_path: Path) -> None:
+    tables = read_bytes(tmp_path, "scan.json", SCAN.replace(b"ttyUSB0", b"tty\x7f\\n"), read_servos)
+    assert isinstance(tables, dict)
+    assert tables["drivers"]["dynamixel"]["buses"]["arm"]["port"] == "/dev/tty\x7f\n"
 
 
 @pytest.mark.parametrize(
@@ -299,6 +342,7 @@ ENTITIES = '<!DOCTYPE r [<!ENTITY a "aaaaaaaaaa">' + "".join(
             urdf_of('<link name="a"/><link name="b"/><link name="c"/>' + RING),
             "the links b, c hang on each other in a ring",
         ),
+        (b"<robot>\0</robot>", "^[^\n]*not XML: [^\n]*$"),
         (urdf_of("<link>" * 50_000 + "</link>" * 50_000), "not XML"),
         ((ENTITIES + ']><robot name="&i;"/>').encode(), "DOCTYPE|not XML"),
         (b'<!DOCTYPE r [<!ENTITY a SYSTEM "file:///etc/passwd">]><robot name="&a;"/>', "DOCTYPE|not XML"),

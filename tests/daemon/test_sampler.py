@@ -422,8 +422,8 @@ def test_silent_sources_are_reported(config, monkeypatch) -> None:
     with running(config, sources) as bus:
         status = status_when(bus, lambda status: bool(status.health))
     assert [sentence.split(" for ")[0] for sentence in status.health] == [
-        "the encoders have said nothing",
-        "the cameras have said nothing",
+        "nothing has come from the encoders",
+        "nothing has come from the cameras",
     ]
 
 

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bodyschema.interfaces.errors import StoreError
+from bodyschema.interfaces.errors import StoreError, StoreUnwritable
 from bodyschema.interfaces.records import MarkerFix, Pair, frozen_array
 from bodyschema.recordings.store import schema as store_schema
 from bodyschema.recordings.store.rows import pair_of, row_of
@@ -210,6 +210,20 @@ def test_a_second_sampler_on_the_store_is_refused(file, store) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code, file], capture_output=True, text=True, check=False)
     assert f"another sampler is writing {file}" in done.stderr
+
+
+@pytest.mark.parametrize("part", ["", "-wal"])
+def test_no_pair_is_accepted_into_a_file_that_is_gone(file, store, part) -> None:
+    fill(store, 2)
+    there, aside = file.with_name(file.name + part), file.with_name("aside")
+    there.rename(aside)
+    with pytest.raises(StoreUnwritable, match="deleted, moved or replaced while"):
+        fill(store, 1)
+    there.write_bytes(b"")
+    with pytest.raises(StoreUnwritable, match="deleted, moved or replaced"):
+        fill(store, 1)
+    aside.replace(there)
+    assert [pair.seq for pair in fill(store, 2)] == [3, 4]
 
 
 def refused(file: Path) -> str:

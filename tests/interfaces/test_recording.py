@@ -188,3 +188,9 @@ def test_chosen_rows_keep_all_their_columns(write) -> None:
     assert chosen.extra["current_waist"].tolist() == [10, 30, 40]
     assert chosen.cov is not None
     assert len(chosen.cov) == 3
+
+
+def test_a_position_that_no_arm_reaches_is_refused(tmp_path) -> None:
+    (tmp_path / "a.csv").write_text("lift,x,y,z\n0,1,2,3\n0,1,-1e200,3\n")
+    with pytest.raises(RecordingError, match=r"line 3, column y: -1e\+200 is no position in metres"):
+        Recording.read(tmp_path / "a.csv", ("lift",))

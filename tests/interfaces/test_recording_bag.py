@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from bodyschema.interfaces.errors import RecordingError
+from bodyschema.recordings import ros_bag as recording_bag
 from bodyschema.recordings.ros_bag import BagTopics, read_bag
 from bodyschema.recordings.tracks import JointTrack, MarkerTrack, joined
 
@@ -133,6 +136,43 @@ def test_a_torn_bag_is_told(tmp_path) -> None:
     file = next(bag.glob("*.mcap"))
     file.write_bytes(file.read_bytes()[:2000])
     assert "the bag cannot be read" in refused(bag)
+
+
+@pytest.mark.parametrize("mcap", [True, False])
+def test_a_pipe_among_the_files_of_a_bag_is_refused(tmp_path, mcap) -> None:
+    bag = write_bag(tmp_path / "bag", {"/js": states(), "/p": marker()}, mcap=mcap)
+    (data,) = (file for file in bag.iterdir() if file.suffix != ".yaml")
+    data.unlink()
+    os.mkfifo(data)
+    assert "a pipe, not a file" in refused(bag)
+    assert "a pipe, not a file" in refused(data)
+
+
+def test_a_long_description_of_a_bag_is_refused(tmp_path) -> None:
+    bag = write_bag(tmp_path / "bag", {"/js": states(), "/p": marker()}, mcap=True)
+    with (bag / "metadata.yaml").open("a") as stream:
+        stream.write("x: [" + "1," * 600_000 + "]\n")
+    assert "larger than 1 MiB" in refused(bag)
+
+
+def test_a_chunk_that_unpacks_to_more_than_memory_is_refused(tmp_path, monkeypatch) -> None:
+    zstd = pytest.importorskip("backports.zstd")
+    monkeypatch.setattr(recording_bag, "MOST_MEMORY_BYTES", 2**26)
+    unpacked = 2**28
+
+    def text(value: bytes) -> bytes:
+        return struct.pack("<I", len(value)) + value
+
+    def record(kind: int, content: bytes) -> bytes:
+        return struct.pack("<BQ", kind, len(content)) + content
+
+    packed = zstd.compress(bytes(unpacked))
+    chunk = struct.pack("<QQQI", 0, 1, unpacked, 0) + text(b"zstd") + struct.pack("<Q", len(packed)) + packed
+    magic = b"\x89MCAP0\r\n"
+    records = (record(1, text(b"ros2") + text(b"")), record(6, chunk), record(15, bytes(4)), record(2, bytes(20)))
+    (tmp_path / "a.mcap").write_bytes(magic + b"".join(records) + magic)
+    assert "reading it takes more than" in refused(tmp_path / "a.mcap")
+    assert len(bytes(unpacked)) == unpacked  # the limit has been taken back
 
 
 def test_joints_too_fast_to_interpolate_are_left_out() -> None:

@@ -78,3 +78,35 @@ def test_motors_of_another_arm_are_named(tmp_path) -> None:
     source = dataset(tmp_path / "set", "v2.1", "degrees", names=["a.pos", "b.pos"])
     with pytest.raises(RecordingError, match=r"has no motor shoulder_pan, .*; it has a, b"):
         read_lerobot_dataset(source, LeRobotUnits(CALIBRATION, SERVOS, "degrees"), marker())
+
+
+@pytest.mark.parametrize(
+    ("columns", "told"),
+    [
+        ({"timestamp": [0.0, float("nan")]}, "row 2 has a number that is missing or not finite"),
+        ({"episode_index": [None, 0]}, "row 1 has a number that is missing or not finite"),
+        ({"observation.state": [{"a": 1.0}] * 2}, "is no data of a LeRobotDataset"),
+        ({"episode_index": [None, None]}, "is no data of a LeRobotDataset"),
+        ({"timestamp": [], "episode_index": [], "observation.state": None}, "the dataset has no rows"),
+    ],
+)
+def test_data_that_are_none_are_refused(columns, told, tmp_path) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    source = dataset(tmp_path / "set", "v3.0", "degrees")
+    (file,) = source.rglob("*.parquet")
+    state = pa.array([[1.0] * len(MOTORS)] * 2, type=pa.list_(pa.float32()))
+    told_columns = {"observation.state": state, "timestamp": [0.0, 0.1], "episode_index": [0, 0]} | columns
+    if columns.get("observation.state", ...) is None:
+        told_columns["observation.state"] = state[:0]
+    pq.write_table(pa.table(told_columns), file)
+    with pytest.raises(RecordingError, match=told):
+        read_lerobot_dataset(source, LeRobotUnits(CALIBRATION, SERVOS, "degrees"), marker())
+
+
+def test_more_rows_than_are_read_are_refused_unread(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("bodyschema.recordings.lerobot_dataset.MOST_NUMBERS", 100)
+    source = dataset(tmp_path / "set", "v3.0", "degrees")
+    with pytest.raises(RecordingError, match="there are more than 12 rows with the files before it"):
+        read_lerobot_dataset(source, LeRobotUnits(CALIBRATION, SERVOS, "degrees"), marker())

@@ -45,7 +45,7 @@ def recordings(draw: st.DrawFn) -> Recording:
             "temperature_waist": np.array(draw(column(n))),
         }
     q = np.array(draw(column(2 * n))).reshape(n, 2)
-    x = np.array(draw(column(3 * n))).reshape(n, 3)
+    x = np.array(draw(column(3 * n, st.floats(-1e9, 1e9)))).reshape(n, 3)
     return Recording(JOINTS, q, x, **fields)  # pyright: ignore[reportArgumentType]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -93,3 +94,9 @@ def test_another_package_keeps_its_name(tmp_path: Path) -> None:
 
 def test_nothing_answers_to_an_old_name_without_a_plug_in() -> None:
     assert not any(isinstance(finder, old_names.OldNames) for finder in sys.meta_path)
+
+
+def test_the_type_checker_is_given_each_part() -> None:
+    """It does not follow links by itself."""
+    given = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["pyright"]["include"]
+    assert {f"bodyschema/{part}" for part in PARTS} <= set(given)

@@ -16,8 +16,8 @@ from bodyschema.cli.main import main
 
 # The work of each loop in one round.
 WORK = {
-    "encoders": ("bodyschema.daemon.sampler.reconnect", "Reopening", "read", "the encoders"),
-    "frames": ("bodyschema.daemon.sampler.reconnect", "Reopening", "read", "the cameras"),
+    "encoders": ("bodyschema.daemon.sampler.reconnect", "ReconnectingSource", "read", "the encoders"),
+    "frames": ("bodyschema.daemon.sampler.reconnect", "ReconnectingSource", "read", "the cameras"),
     "learning": ("bodyschema.daemon.learner.feed", "PairFeed", "step", None),
     "background": ("bodyschema.daemon.learner.findings", "Findings", "renew", None),
     "status": ("bodyschema.daemon.learner.learner", "Learner", "status", None),

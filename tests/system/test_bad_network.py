@@ -133,8 +133,8 @@ def test_minutes_without_a_link_or_with_a_slow_one_cost_no_pair(tmp_path, how, p
 
 SUBSCRIBER = """
 import sys, time, zenoh
-from bodyschema.daemon.transport.bus import Bus
-with Bus(connect=sys.argv[1]) as bus:
+from bodyschema.daemon.transport.bus import ZenohSession
+with ZenohSession(connect=sys.argv[1]) as bus:
     bus.subscribe(sys.argv[2], lambda payload: (print("heard", flush=True), time.sleep(3600)))
     time.sleep(3600)
 """

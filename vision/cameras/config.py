@@ -7,16 +7,19 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import msgspec
+import numpy as np
 from msgspec import Meta
 
 from bodyschema.interfaces.camera import LARGEST_SIDE_PX
 from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.robot.rpy import rotation_of
 from bodyschema.robot.toml_file import line_of
 from bodyschema.robot.toml_types import NonNegative, Positive
 
 Side = Annotated[int, Meta(ge=16, le=LARGEST_SIDE_PX)]
 
-LAYOUTS = ("one", "two", "side_by_side", "images", "videos")
+LAYOUTS = ("one", "two", "side_by_side", "realsense", "images", "videos")
 # Latency uncertainty of an uncalibrated camera [s]: exposure, readout and transfer of a webcam.
 UNKNOWN_LATENCY_SIGMA_S = 0.015
 ENUMERATED = re.compile(r"\d+|/dev/video\d+")
@@ -80,6 +83,28 @@ class SideBySideConfig(UvcSettings, frozen=True, forbid_unknown_fields=True, kw_
     device: str
 
 
+class RealsenseConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The table [vision.cameras.realsense]: the infra-red eyes of a RealSense camera, by the extra `realsense`.
+
+    Attributes:
+        serial: its serial number; needed where several are connected.
+        image_size_px: width and height of each eye's image.
+        fps: frames per second.
+        exposure_s: exposure time; without it the camera chooses.
+        gain: in the camera's units; without it unchanged.
+        emitter: keep the projector on. Its dots disturb the tracker.
+        depth_check: compare the marker's depth with the depth image.
+    """
+
+    serial: str | None = None
+    image_size_px: tuple[Side, Side] = (848, 480)
+    fps: Positive = 30.0
+    exposure_s: Positive | None = None
+    gain: NonNegative | None = None
+    emitter: bool = False
+    depth_check: bool = True
+
+
 class ImagesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The table [vision.cameras.images]: image files instead of cameras, sorted by name.
 
@@ -119,7 +144,7 @@ class VideosConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [vision.cameras]: source of the images. Exactly one of the five layouts is given.
+    """The table [vision.cameras]: source of the images. Exactly one of the six layouts is given.
 
     Attributes:
         calibration: the file that `bodyschema calibrate cameras` wrote, relative to robot.toml. Without it the
@@ -134,13 +159,14 @@ class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     one: OneConfig | None = None
     two: TwoConfig | None = None
     side_by_side: SideBySideConfig | None = None
+    realsense: RealsenseConfig | None = None
     images: ImagesConfig | None = None
     videos: VideosConfig | None = None
 
     @property
-    def layout(self) -> OneConfig | TwoConfig | SideBySideConfig | ImagesConfig | VideosConfig:
+    def layout(self) -> OneConfig | TwoConfig | SideBySideConfig | RealsenseConfig | ImagesConfig | VideosConfig:
         """The layout that is given; call `check` first."""
-        found = self.one or self.two or self.side_by_side or self.images or self.videos
+        found = self.one or self.two or self.side_by_side or self.realsense or self.images or self.videos
         if found is None:
             raise ConfigError("[vision.cameras] names no cameras")
         return found
@@ -172,19 +198,20 @@ class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         """1-sigma of the latency [s]."""
         if self.latency_sigma_s is not None:
             return self.latency_sigma_s
-        return UNKNOWN_LATENCY_SIGMA_S if self.devices else 0.0
+        return UNKNOWN_LATENCY_SIGMA_S if self.devices or self.realsense is not None else 0.0
 
-    def check(self, file: Path, text: str) -> None:
-        """Raise ConfigError if there is not exactly one layout, or if it is incomplete."""
+    def check(self, file: Path, text: str, table: tuple[str, ...] = ("vision", "cameras")) -> None:
+        """Raise ConfigError if there is not exactly one layout, or if it is incomplete; `table` is where it stands."""
         given = [name for name in LAYOUTS if getattr(self, name) is not None]
 
         def refuse(what: str, remedy: str, *keys: str) -> None:
-            place = ("vision", "cameras", *keys)
+            place = (*table, *keys)
             raise ConfigError(f"{'.'.join(place)}: {what}", file=file, line=line_of(text, place), remedy=remedy)
 
         if not given:
             refuse(
-                "no cameras are named", "Add one of its tables one, two, side_by_side, images, videos: docs/cameras.md"
+                "no cameras are named",
+                "Add one of its tables one, two, side_by_side, realsense, images, videos: docs/cameras.md",
             )
         if len(given) > 1:
             refuse(f"images cannot come from both {given[0]} and {given[1]}", "Take one out", given[1])
@@ -207,6 +234,27 @@ class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
                 refuse("which films?", "Give left and right, side_by_side, or left alone for one camera", "videos")
             if _count(self.videos, "times", "fps") > 1:
                 refuse("the times have to come from one thing", "Give times or fps", "videos")
+
+
+class FurtherCameras(CamerasConfig, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A table [[vision.further_cameras]]: cameras that see the same marker from elsewhere.
+
+    Attributes:
+        name: in messages.
+        xyz, rpy: pose of their left optical frame in the measurement frame, that of [vision.cameras] [m], [rad].
+    """
+
+    name: str
+    xyz: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def pose(self) -> FloatArray:
+        """The pose, shape (4, 4)."""
+        T = np.eye(4)
+        T[:3, :3] = rotation_of(np.array(self.rpy))
+        T[:3, 3] = self.xyz
+        return T
 
 
 def _count(table: msgspec.Struct, *keys: str) -> int:

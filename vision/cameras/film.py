@@ -17,6 +17,8 @@ from bodyschema.robot.limited import read_at_most
 
 from .look import of_image
 
+MOST_SAID = 200  # characters of a message that quotes a line of a file
+
 
 class Roll(Protocol):
     """Recorded images of one eye or two, in order."""
@@ -171,7 +173,7 @@ def read_times(file: Path, count: int) -> FloatArray:
         times = np.array([float(words[0]) for words in lines if words])
     except (OSError, ValueError) as error:
         remedy = "Write one time in seconds a line"
-        raise ConfigError(f"the times cannot be read: {error}", file=file, remedy=remedy) from error
+        raise ConfigError(f"the times cannot be read: {str(error)[:MOST_SAID]}", file=file, remedy=remedy) from error
     if len(times) != count:
         raise ConfigError(f"has {len(times)} times for {count} pairs of images", file=file, remedy="Give one for each")
     return checked_times(times, file)

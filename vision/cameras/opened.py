@@ -7,17 +7,26 @@ from pathlib import Path
 
 from bodyschema.interfaces.protocols import Clock
 
-from .config import CamerasConfig, ImagesConfig, OneConfig, SideBySideConfig, TwoConfig, VideosConfig
+from .config import (
+    CamerasConfig,
+    ImagesConfig,
+    OneConfig,
+    RealsenseConfig,
+    SideBySideConfig,
+    TwoConfig,
+    VideosConfig,
+)
 from .device import OpenCapture, open_v4l2
 from .film import Film, Roll
 from .images import ImageRoll
 from .live import LiveEyes
+from .realsense import RealsenseCamera
 from .videos import VideoRoll
 
 
 def eyes_of(
     config: CamerasConfig, folder: Path, clock: Clock, open_capture: OpenCapture = open_v4l2
-) -> LiveEyes | Film:
+) -> LiveEyes | RealsenseCamera | Film:
     """Create the configured cameras or files as `StereoEyes`, not opened yet.
 
     Args:
@@ -27,6 +36,8 @@ def eyes_of(
     match config.layout:
         case OneConfig() | TwoConfig() | SideBySideConfig() as layout:
             return LiveEyes(config, layout, clock, open_capture)
+        case RealsenseConfig() as realsense:
+            return RealsenseCamera(config, realsense, clock)
         case ImagesConfig() as images:
             return _film(config, lambda: ImageRoll(images, folder), clock, images.speed)
         case VideosConfig() as videos:

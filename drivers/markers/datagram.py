@@ -1,0 +1,87 @@
+"""The JSON that programs send by UDP or on a zenoh key: docs/marker_sources.md."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import msgspec
+
+from .report import Fault, Report, Unusable
+
+SCHEMA = "bodyschema.marker/1"
+NANO = 1_000_000_000
+LARGEST_BYTES = 8192
+SIZES = (9, 36)
+
+Row = tuple[float, ...]
+
+
+class Datagram(msgspec.Struct, frozen=True):
+    """One position. Keys that are not named here are ignored.
+
+    Attributes:
+        schema: name and version of this layout.
+        position: of the marker, in m unless robot.toml says mm; null where it is not tracked.
+        stamp: time of the measurement on any steady clock of the sender [s].
+        seq: grows by one with each datagram, whatever its body.
+        quaternion: (x, y, z, w) of the marker in the frame of the positions.
+        covariance: of the position (3 × 3), or of position and rotation (6 × 6), as rows or flat.
+        body: name of the body.
+        tracked: false where the position is not a measurement.
+    """
+
+    schema: str
+    position: tuple[float, float, float] | None = None
+    stamp: float | None = None
+    seq: int | None = None
+    quaternion: tuple[float, float, float, float] | None = None
+    covariance: list[float | Row] | None = None
+    body: str | None = None
+    tracked: bool = True
+
+
+_decode = msgspec.json.Decoder(Datagram).decode
+
+
+def decode_datagram(payload: bytes, _: bytes = b"") -> Iterator[Report]:
+    """Yield the position in a datagram.
+
+    Raises:
+        Unusable: it is no such JSON, or has numbers that are not finite.
+    """
+    if len(payload) > LARGEST_BYTES:
+        raise Unusable(Fault.MALFORMED, f"{len(payload)} bytes are more than a position has")
+    try:
+        found = _decode(payload)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        if b"NaN" in payload or b"Infinity" in payload:
+            raise Unusable(Fault.NOT_FINITE, "NaN or Infinity in the JSON") from error
+        raise Unusable(Fault.MALFORMED, str(error)) from error
+    if found.schema != SCHEMA:
+        raise Unusable(Fault.MALFORMED, f"the schema is {found.schema[:40]!r}, not {SCHEMA!r}")
+    if found.position is None and found.tracked:
+        raise Unusable(Fault.MALFORMED, "there is no position")
+    yield Report(
+        x=found.position if found.tracked else None,
+        stamp_ns=None if found.stamp is None else _nanoseconds(found.stamp),
+        seq=found.seq,
+        turn=found.quaternion,
+        cov=_flat(found.covariance),
+        body=found.body,
+    )
+
+
+def _nanoseconds(stamp: float) -> int:
+    if not -9e9 < stamp < 9e9:
+        raise Unusable(Fault.DELAYED, f"the stamp {stamp:g} is no number of seconds")
+    return round(stamp * NANO)
+
+
+def _flat(rows: list[float | Row] | None) -> tuple[float, ...] | None:
+    """Return a matrix by rows, which may be nested."""
+    if rows is None:
+        return None
+    flat = [value for row in rows for value in (row if isinstance(row, tuple) else (row,))]
+    if len(flat) not in SIZES:
+        raise Unusable(Fault.COVARIANCE, f"{len(flat)} numbers, neither 3 × 3 nor 6 × 6")
+    return tuple(flat)

@@ -1,0 +1,307 @@
+"""Fuse the positions of several sources that see the same marker, and name those that disagree."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections import deque
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from bodyschema.interfaces.errors import SourceEnded
+from bodyschema.interfaces.protocols import Clock, MarkerSource
+from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, frozen_array
+from bodyschema.robot.rpy import rpy_of
+
+log = logging.getLogger(__name__)
+
+SLICE_S = 0.004  # of waiting for one source before the next is asked
+LONGEST_WAIT_S = 0.1  # for the other sources' positions of the same time
+LONGEST_GAP_S = 0.12  # between two positions that are interpolated: three frames at 30 Hz, of which one is missing
+LEADS_FOR_S = 0.5  # without a position from it, another source leads
+KEPT = 64
+HAND_M_S2 = 2.0  # acceleration of a guided hand: bounds the error of linear interpolation
+CHI2_999, CHI2_MEDIAN = 16.27, 2.37  # of 3 degrees of freedom
+JUDGED, FEWEST_JUDGED = 300, 30  # common positions for the verdict on a source
+MANY = 0.05  # share of disagreeing positions that is reported; by chance it is 0.001
+WELL_FITTED = 3.0  # a rigid transform explains a disagreement that it brings below this multiple of the usual chi²
+SPREAD_M = 0.02  # the positions have to span so much in two directions for the transform to be known
+
+
+@dataclass(frozen=True, slots=True)
+class Common:
+    """Positions of two sources at one time.
+
+    Attributes:
+        lead, other: positions [m], (3,).
+        cov: covariance of their difference [m²], (3, 3).
+    """
+
+    lead: FloatArray
+    other: FloatArray
+    cov: FloatArray
+
+    @property
+    def chi2(self) -> float:
+        """Squared Mahalanobis distance of the two."""
+        apart = self.other - self.lead
+        return float(apart @ np.linalg.solve(self.cov, apart))
+
+
+class Member:
+    """A source among several.
+
+    Attributes:
+        name: in messages.
+        source: gives the positions.
+        pose: of the source's frame in the measurement frame, (4, 4).
+        newest_t: time of its newest position or miss [s].
+        common: its positions beside the leading source's.
+    """
+
+    def __init__(self, name: str, source: MarkerSource, pose: FloatArray) -> None:
+        """Store the settings."""
+        self.name, self.source, self.pose = name, source, pose
+        self.common: deque[Common] = deque(maxlen=JUDGED)
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget all positions."""
+        self.fixes: deque[MarkerFix] = deque(maxlen=KEPT)
+        self.waiting: deque[tuple[MarkerFix, float]] = deque(maxlen=KEPT)
+        self.newest_t = self.fixed_at = -math.inf
+
+    def take(self, seen: MarkerFix | MarkerMiss, now: float) -> None:
+        """Take a position or a miss that came at `now` [s]."""
+        self.newest_t = seen.t
+        if isinstance(seen, MarkerFix):
+            fix = _moved(seen, self.pose)
+            self.fixes.append(fix)
+            self.waiting.append((fix, now))
+            self.fixed_at = now
+
+    def at(self, t: float, sigma_s: float) -> tuple[FloatArray, FloatArray] | None:
+        """Return position [m] and covariance [m²] at time `t` [s], which is known to `sigma_s`; None if unknown."""
+        after = next((k for k, fix in enumerate(self.fixes) if fix.t >= t), 0)
+        if after == 0:
+            return None
+        first, second = self.fixes[after - 1], self.fixes[after]
+        gap_s = second.t - first.t
+        if gap_s > LONGEST_GAP_S:
+            return None
+        share = (t - first.t) / gap_s
+        velocity = (second.x - first.x) / gap_s
+        late_m = velocity * math.hypot(sigma_s, first.t_sigma, second.t_sigma)
+        bend_m = 0.5 * HAND_M_S2 * share * (1 - share) * gap_s**2
+        cov = (1 - share) ** 2 * first.cov + share**2 * second.cov + np.outer(late_m, late_m) + bend_m**2 * np.eye(3)
+        return first.x + share * (second.x - first.x), cov
+
+    def verdict(self, leader: str) -> str | None:
+        """Return what its positions disagree in with the leader's, with the remedy; None if they agree."""
+        common = list(self.common)  # another thread may add to it
+        if len(common) < FEWEST_JUDGED:
+            return None
+        chi2 = np.array([pair.chi2 for pair in common])
+        share = float((chi2 > CHI2_999).mean())
+        if share < MANY:
+            return None
+        apart = float(np.median([np.linalg.norm(pair.other - pair.lead) for pair in common]))
+        return (
+            f"{leader} and {self.name} disagree in {100 * share:.0f} % of {len(chi2)} common positions, by "
+            f"{1e3 * apart:.1f} mm in the median, which is {math.sqrt(float(np.median(chi2)) / CHI2_MEDIAN):.1f} times "
+            f"what their uncertainties allow: {self._remedy(common)}"
+        )
+
+    def _remedy(self, common: Sequence[Common]) -> str:
+        lead, other = (np.array([getattr(pair, side) for pair in common]) for side in ("lead", "other"))
+        T, spread = _rigid(other, lead)
+        if spread < SPREAD_M:
+            return "move the marker through the whole workspace; then this message says what would make them agree"
+        fitted = [replace(pair, other=T[:3, :3] @ pair.other + T[:3, 3]).chi2 for pair in common]
+        if float(np.median(fitted)) > WELL_FITTED * CHI2_MEDIAN:
+            return (
+                "one of them follows another marker, or its latency_s or sigma_m is wrong; look at each alone, with "
+                "`bodyschema watch marker` and `bodyschema calibrate latency`"
+            )
+        pose = T @ self.pose
+        xyz = ", ".join(f"{value:.4f}" for value in pose[:3, 3])
+        rpy = ", ".join(f"{value:.4f}" for value in rpy_of(pose[:3, :3]))
+        return (
+            f"their frames differ; write xyz = [{xyz}] and rpy = [{rpy}] in the [[marker_source]] {self.name}, and "
+            "start again"
+        )
+
+
+class FusedMarkers:
+    """A `MarkerSource` of several, each in its own frame and at its own times.
+
+    The first source that sees the marker leads. The others' positions are interpolated to its times, and all are
+    averaged with their full covariances as weights. Where they contradict each other, there is no position.
+
+    Attributes:
+        members: the sources, in the order of preference.
+    """
+
+    def __init__(self, members: Sequence[Member], clock: Clock) -> None:
+        """Prepare without opening anything."""
+        self.members, self._clock = list(members), clock
+        self._opened = ExitStack()
+        self._last_t = -math.inf
+
+    @property
+    def health(self) -> tuple[str, ...]:
+        """What sources disagree, with the remedy."""
+        verdicts = (member.verdict(self.members[0].name) for member in self.members[1:])
+        return tuple(verdict for verdict in verdicts if verdict is not None)
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            for member in self.members:
+                stack.enter_context(member.source)
+                member.forget()
+            self._opened = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._opened.close()
+
+    def read(self, timeout_s: float) -> MarkerFix | MarkerMiss | None:
+        """Return the next fused position, or the reason for a missing one; see `MarkerSource.read`."""
+        deadline = self._clock.now() + timeout_s
+        while True:
+            missed = self._read_all()
+            found = self._next() or missed
+            if found is not None and found.t > self._last_t:
+                self._last_t = found.t
+                return found
+            if self._clock.now() >= deadline:
+                return None
+
+    def _read_all(self) -> MarkerMiss | None:
+        """Read each source once; return a miss if none has seen the marker for a while."""
+        missed: MarkerMiss | None = None
+        ended = 0
+        for member in self.members:
+            try:
+                seen = member.source.read(SLICE_S)
+            except SourceEnded:
+                ended += 1
+                continue
+            if seen is not None:
+                member.take(seen, self._clock.now())
+            if isinstance(seen, MarkerMiss):
+                missed = seen
+        if ended == len(self.members):
+            raise SourceEnded
+        is_seen = any(self._clock.now() - member.fixed_at < LEADS_FOR_S for member in self.members)
+        return None if is_seen else missed
+
+    def _next(self) -> MarkerFix | MarkerMiss | None:
+        now = self._clock.now()
+        seeing = [member for member in self.members if now - member.fixed_at < LEADS_FOR_S]
+        if not seeing:
+            return None
+        leader, *others = seeing
+        for other in others:
+            other.waiting.clear()
+        while leader.waiting and leader.waiting[0][0].t <= self._last_t:
+            leader.waiting.popleft()
+        if not leader.waiting:
+            return None
+        fix, came = leader.waiting[0]
+        if now - came < LONGEST_WAIT_S and any(other.newest_t < fix.t for other in others):
+            return None
+        leader.waiting.popleft()
+        return self._fused(leader, fix, others)
+
+    def _fused(self, leader: Member, fix: MarkerFix, others: Sequence[Member]) -> MarkerFix | MarkerMiss:
+        found = [(fix.x, fix.cov)]
+        for other in others:
+            at = other.at(fix.t, fix.t_sigma)
+            if at is None:
+                continue
+            if leader is self.members[0]:
+                other.common.append(Common(fix.x, at[0], fix.cov + at[1]))
+            found.append(at)
+        agreeing = _agreeing(found)
+        if not agreeing:
+            return MarkerMiss(fix.t, Reason.DISAGREEING)
+        if len(found) == 1:
+            return fix
+        x, cov = _mean(agreeing)
+        return replace(fix, x=frozen_array(x), cov=frozen_array(cov), centres_px=None)
+
+
+Found = list[tuple[FloatArray, FloatArray]]
+
+
+def _agreeing(found: Found) -> Found:
+    """Return those that agree with the mean of the others, without the worst until all do; empty if no two agree."""
+    left = list(found)
+    while len(left) > 1:
+        chi2 = []
+        for place, (x, cov) in enumerate(left):
+            mean, of_mean = _mean(left[:place] + left[place + 1 :])
+            chi2.append(Common(mean, x, cov + of_mean).chi2)
+        worst = int(np.argmax(chi2))
+        if chi2[worst] < CHI2_999:
+            return left
+        del left[worst]
+    return left if len(found) == 1 else []
+
+
+def _mean(found: Found) -> tuple[FloatArray, FloatArray]:
+    """Return the mean of positions weighted by their inverse covariances, and its covariance."""
+    informations = [np.linalg.inv(cov) for _, cov in found]
+    cov = np.linalg.inv(sum(informations, np.zeros((3, 3))))
+    total = sum((weight @ x for weight, (x, _) in zip(informations, found, strict=True)), np.zeros(3))
+    return cov @ total, 0.5 * (cov + cov.T)
+
+
+def _rigid(points: FloatArray, targets: FloatArray) -> tuple[FloatArray, float]:
+    """Return the rigid transform (4, 4) of points (n, 3) onto targets, and their second largest RMS spread [m]."""
+    mean, mean_target = points.mean(axis=0), targets.mean(axis=0)
+    u, s, vt = np.linalg.svd((targets - mean_target).T @ (points - mean))
+    T = np.eye(4)
+    T[:3, :3] = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    T[:3, 3] = mean_target - T[:3, :3] @ mean
+    return T, math.sqrt(s[1] / len(points))
+
+
+def _moved(fix: MarkerFix, pose: FloatArray) -> MarkerFix:
+    """Return the fix in the frame in which `pose` (4, 4) is that of its own."""
+    if np.array_equal(pose, np.eye(4)):
+        return fix
+    R = pose[:3, :3]
+    x, cov = frozen_array(R @ fix.x + pose[:3, 3]), frozen_array(R @ fix.cov @ R.T)
+    turn = None if fix.R is None else frozen_array(_turned(R, fix.R))
+    cov_turn = None if fix.cov_R is None else frozen_array(R @ fix.cov_R @ R.T)
+    return replace(fix, x=x, cov=cov, R=turn, cov_R=cov_turn, centres_px=None)
+
+
+def _turned(R: FloatArray, q: FloatArray) -> FloatArray:
+    """Return the quaternion (x, y, z, w) of R (3, 3) after that of `q`."""
+    a = _quaternion(R)
+    vector = a[3] * q[:3] + q[3] * a[:3] + np.cross(a[:3], q[:3])
+    return np.append(vector, a[3] * q[3] - a[:3] @ q[:3])
+
+
+def _quaternion(R: FloatArray) -> FloatArray:
+    """Return the unit quaternion (x, y, z, w) of a rotation: the eigenvector of its symmetric form."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R
+    K = np.array(
+        [
+            [xx - yy - zz, yx + xy, zx + xz, zy - yz],
+            [yx + xy, yy - xx - zz, zy + yz, xz - zx],
+            [zx + xz, zy + yz, zz - xx - yy, yx - xy],
+            [zy - yz, xz - zx, yx - xy, xx + yy + zz],
+        ]
+    )
+    return np.linalg.eigh(K)[1][:, -1]

@@ -1,0 +1,213 @@
+"""Talk to a NatNet server: ask for its version, join its stream, and notice when it is gone."""
+
+from __future__ import annotations
+
+import errno
+import math
+import socket
+from collections.abc import Callable, Iterator
+
+from bodyschema.drivers.markers.config import NatnetTable
+from bodyschema.drivers.markers.report import Packet, Report, Unusable
+from bodyschema.drivers.markers.udp import await_any, listening, received
+from bodyschema.interfaces.errors import SourceError, SourceLost
+from bodyschema.interfaces.protocols import Clock
+
+from . import packets
+from .packets import Message, ServerInfo
+
+NANO = 1_000_000_000
+ANSWER_S, ASK_EVERY_S = 2.0, 0.4
+RETRY_S = 10.0  # opening takes ANSWER_S where no server is
+ALIVE_EVERY_S = 1.0  # a server forgets clients that are silent for seconds
+GONE_AFTER_S = 4.0
+
+
+class NatnetReceiver:
+    """The stream of a NatNet server, by multicast or to this client alone, as the server is set up.
+
+    Attributes:
+        server: the server's answer; None before it.
+        names: names of the rigid bodies by streaming ID.
+    """
+
+    def __init__(self, table: NatnetTable, clock: Clock) -> None:
+        self._table, self._clock = table, clock
+        self._commands: socket.socket | None = None
+        self._data: socket.socket | None = None
+        self.server: ServerInfo | None = None
+        self.names: dict[int, str] = {}
+        self._frames = 0
+        self._heard = self._asked = self._asked_names = -math.inf
+
+    def open(self) -> None:
+        """Ask the server for its version and join its stream.
+
+        Raises:
+            SourceLost: it does not answer.
+            SourceError: it speaks another version of NatNet.
+        """
+        self.server, self.names, self._frames = None, {}, 0
+        try:
+            self._commands = listening("0.0.0.0", 0)
+            self._await_server()
+            self._join()
+            self._await_names()
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Leave the stream."""
+        for found in (self._commands, self._data):
+            if found is not None:
+                found.close()
+        self._commands = self._data = None
+
+    def receive(self, until: float) -> Packet | None:
+        """Return the next frame; None when none arrives by `until` [s].
+
+        Raises:
+            SourceLost: the server has been silent for seconds.
+        """
+        while True:
+            self._keep_alive()
+            sockets = [found for found in (self._data, self._commands) if found is not None]
+            got = next(filter(None, (received(found, self._clock) for found in sockets)), None)
+            packet = None if got is None else self._sorted(*got)
+            if packet is not None:
+                return packet
+            now = self._clock.now()
+            if now >= until:
+                return None
+            if got is None:
+                await_any(sockets, min(until, now + ALIVE_EVERY_S), self._clock)
+
+    def silence(self) -> str:
+        """Return why nothing may be coming, and what to do."""
+        if self.server is None:
+            return "start Motive"
+        if self.server.group:
+            return (
+                f"Motive answers, but no frame of the multicast group {self.server.group} arrives: set local to this "
+                "machine's address in that network, or Transmission Type: Unicast in Motive"
+            )
+        return "Motive answers, but sends no frames: start its live mode, and check Rigid Bodies in Data Streaming"
+
+    def decode(self, payload: bytes, _: bytes = b"") -> Iterator[Report]:
+        """Yield the rigid bodies of a frame. Raise Unusable if it is damaged."""
+        if self.server is None:
+            return
+        found = packets.frame(payload, self.server.version)
+        rate = self.server.ticks_per_s
+        is_dated = rate > 0 and found.exposed > 0 and found.sent >= found.exposed
+        stamp_ns = found.sent * NANO // rate if is_dated else round(found.time_s * NANO)
+        age_s = (found.sent - found.exposed) / rate if is_dated else 0.0
+        if any(body.id not in self.names for body in found.bodies):
+            self._ask_names()
+        for body in found.bodies:
+            yield Report(
+                x=body.x if body.is_tracked else None,
+                stamp_ns=stamp_ns,
+                age_s=age_s,
+                seq=found.number,
+                turn=body.turn,
+                spread=body.error,
+                body=self.names.get(body.id, str(body.id)),
+                where=(str(body.id),),
+            )
+
+    def _await_server(self) -> None:
+        begin = self._clock.now()
+        while self.server is None and self._commands is not None:
+            now = self._clock.now()
+            if now - begin > ANSWER_S:
+                raise SourceLost(
+                    f"no NatNet server answers on {self._table.server}:{self._table.command_port}. Start Motive, "
+                    "switch on its Data Streaming on that network interface, and let its firewall pass UDP",
+                    retry_s=RETRY_S,
+                )
+            self._ask(packets.connect(), lambda: self.server is not None)
+        if self.server is not None and not packets.OLDEST <= self.server.version[0] <= packets.NEWEST:
+            major, minor = self.server.version
+            raise SourceError(
+                f"{self.server.application} streams NatNet {major}.{minor}; this program reads 3.0 to 4.x. Update "
+                "Motive to 2.0 or later"
+            )
+
+    def _await_names(self) -> None:
+        """Ask for the rigid bodies' names; without an answer they go by their IDs."""
+        until = self._clock.now() + ANSWER_S
+        while not self.names and self._clock.now() < until:
+            self._ask(packets.packet(Message.REQUEST_MODEL), lambda: bool(self.names))
+
+    def _ask(self, question: bytes, is_answered: Callable[[], bool]) -> None:
+        """Send a question and take what comes until it is answered, for `ASK_EVERY_S` at most."""
+        self._send(question)
+        until = self._clock.now() + ASK_EVERY_S
+        # Frames may come all the time, so the time is looked at, too.
+        while not is_answered() and self._commands is not None and self._clock.now() < until:
+            if await_any([self._commands], until, self._clock):
+                got = received(self._commands, self._clock)
+                if got is not None:
+                    self._sorted(*got)
+
+    def _ask_names(self) -> None:
+        now = self._clock.now()
+        if now - self._asked_names > ALIVE_EVERY_S:
+            self._asked_names = now
+            self._send(packets.packet(Message.REQUEST_MODEL))
+
+    def _join(self) -> None:
+        """Join the multicast group, if the server sends to one."""
+        if self.server is None or not self.server.group:
+            return
+        group, local = socket.inet_aton(self.server.group), socket.inet_aton(self._table.local)
+        try:
+            self._data = listening(self.server.group, self.server.data_port, shared=True)
+            self._data.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group + local)
+        except OSError as error:
+            raise SourceLost(
+                f"the multicast group {self.server.group}:{self.server.data_port} cannot be joined: {error.strerror}. "
+                "Set local in [marker_source] to this machine's address in Motive's network, or Transmission Type: "
+                "Unicast in Motive",
+                retry_s=RETRY_S,
+            ) from error
+
+    def _send(self, data: bytes) -> None:
+        """Send a command; a server that is not there shows by its silence."""
+        self._asked = self._clock.now()
+        if self._commands is None:
+            return
+        try:
+            self._commands.sendto(data, (self._table.server, self._table.command_port))
+        except OSError as error:
+            if error.errno not in (errno.ECONNREFUSED, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN):
+                raise
+
+    def _keep_alive(self) -> None:
+        now = self._clock.now()
+        if now - self._heard > GONE_AFTER_S:
+            raise SourceLost(f"the NatNet server {self._table.server} has fallen silent", retry_s=RETRY_S)
+        if now - self._asked > ALIVE_EVERY_S:
+            # CONNECT is answered, so that a server without frames still shows that it lives.
+            self._send(packets.packet(Message.KEEP_ALIVE))
+            self._send(packets.connect())
+
+    def _sorted(self, data: bytes, sender: tuple[str, int], arrived: float) -> Packet | None:
+        """Return a packet's frame; take notice of what else it may be."""
+        if sender[0] != self._table.server:
+            return None
+        self._heard = arrived
+        try:
+            message, contents = packets.opened(data)
+            if message == Message.SERVER_INFO:
+                self.server = packets.server_info(contents)
+            elif message == Message.MODEL and self.server is not None:
+                self.names = packets.body_names(contents, self.server.version)
+            elif message == Message.FRAME:
+                return Packet(contents, self._table.server, arrived)
+        except Unusable:
+            # Let the stream count it: as a frame, it is refused with its reason.
+            return Packet(data[packets.HEADER.size :][:8], self._table.server, arrived)
+        return None

@@ -1,0 +1,314 @@
+"""Positions that another program sends, as a `MarkerSource`."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections import deque
+from collections.abc import Callable, Hashable, Iterable
+from types import TracebackType
+from typing import Protocol, Self
+
+import numpy as np
+
+from bodyschema.drivers.ros2.cdr import Malformed
+from bodyschema.drivers.ros2.senders import Refusal, Sender
+from bodyschema.interfaces.errors import SourceError
+from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, frozen_array
+
+from .config import SourceTable
+from .ledger import USED, Ledger
+from .report import Fault, Packet, Report, Unusable
+
+log = logging.getLogger(__name__)
+
+SILENT_AFTER_S = 2.0
+RIVAL_AFTER_S = 1.0  # after this silence of a sender another one is accepted
+ARRIVAL_SIGMA_S = 0.005  # of a position without a stamp: the sender's computation and the network
+FARTHEST_M = 50.0  # no arm is measured over a larger distance: such a number is in millimetres
+NEAREST_M = 0.005  # with unit = "mm": metres, divided by 1000, are all nearer to the origin
+WIDEST_SIGMA_M = 0.2  # a wider covariance is in mm², or useless
+ASYMMETRY = 1e-6
+UNIT_LENGTH = 0.01  # quaternions of single precision, and those written with three digits
+RESTART = 3  # consecutive lower numbers: the sender was started again
+STAMPS = {
+    Refusal.NO_STAMP: Fault.NO_STAMP,
+    Refusal.DUPLICATE: Fault.DUPLICATE,
+    Refusal.OUT_OF_ORDER: Fault.OUT_OF_ORDER,
+    Refusal.DELAYED: Fault.DELAYED,
+}
+
+SENDERS = 64
+
+Decode = Callable[[bytes, bytes], Iterable[Report]]
+
+
+class Receiver(Protocol):
+    """The wire that messages come over."""
+
+    def open(self) -> None:
+        """Open it. Raise SourceError if that is not possible."""
+        ...
+
+    def close(self) -> None:
+        """Close it; again does no harm."""
+        ...
+
+    def receive(self, until: float) -> Packet | None:
+        """Return the next message; None when none arrives by `until` [s].
+
+        Raises:
+            SourceLost: the other end is gone.
+        """
+        ...
+
+    def silence(self) -> str:
+        """Return why nothing may be coming, and what to do."""
+        ...
+
+
+class MarkerStream:
+    """A `MarkerSource` of messages: decoded, checked, and dated on this machine's clock.
+
+    The sender's clock is mapped to ours by the fastest messages. Unusable messages are dropped and counted; `health`
+    names them with the remedy.
+
+    Attributes:
+        ledger: what came of the messages.
+    """
+
+    def __init__(self, table: SourceTable, receiver: Receiver, decode: Decode, clock: Clock) -> None:
+        """Prepare without opening anything."""
+        self._table, self._receiver, self._decode, self._clock = table, receiver, decode, clock
+        self._is_open = False
+        self._last_t = -math.inf
+        self.ledger = Ledger()
+        self._forget()
+
+    @property
+    def name(self) -> str:
+        """Name in messages."""
+        return self._table.label
+
+    @property
+    def health(self) -> tuple[str, ...]:
+        """Current problems, each with its remedy."""
+        now = self._clock.now()
+        said, silence = list(self.ledger.complaints(now, self.name)), self._silence
+        if self._is_open and silence is not None:
+            said.append(f"{self.name}: no message for {now - self._heard:.0f} s: {silence}")
+        return tuple(said)
+
+    def __enter__(self) -> Self:
+        self._receiver.open()
+        self._forget()
+        self._is_open = True
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._is_open = False
+        self._receiver.close()
+
+    def read(self, timeout_s: float) -> MarkerFix | MarkerMiss | None:
+        """Return the next position; see `MarkerSource.read`."""
+        if not self._is_open:
+            raise SourceError(f"the marker source {self.name} is not open; use it in a with statement")
+        deadline = self._clock.now() + timeout_s
+        while not self._waiting:
+            packet = self._receiver.receive(deadline)
+            if packet is None:
+                self._note_silence()
+                return None
+            self._take(packet)
+            if not self._waiting and self._clock.now() >= deadline:
+                return None
+        return self._waiting.popleft()
+
+    def _forget(self) -> None:
+        """Reset everything that was learnt from earlier messages."""
+        self._waiting: deque[MarkerFix | MarkerMiss] = deque()
+        self._heard = self._clock.now()
+        self._silence: str | None = None
+        self._sender: Hashable = None
+        self._sender_heard = -math.inf
+        self._clock_of: Sender = Sender(self._table.max_delay_s)
+        self._numbers: dict[Hashable, _Numbers] = {}
+        self._bodies: dict[str, float] = {}
+        self._frame: str | None = None
+        self._first_turn: tuple[float, ...] | None = None
+        self._turns = False
+
+    def _note_silence(self) -> None:
+        """Ask once why nothing comes: the answer may take a second."""
+        if self._silence is None and self._clock.now() - self._heard > SILENT_AFTER_S:
+            self._silence = self._receiver.silence()
+
+    def _take(self, packet: Packet) -> None:
+        self._heard, self._silence = packet.arrived, None
+        try:
+            for report in self._decode(packet.payload, packet.attached):
+                self._take_report(report, packet)
+        except Unusable as error:
+            self._refuse(packet.arrived, error.fault, error.detail)
+        except Malformed as error:
+            self._refuse(packet.arrived, Fault.MALFORMED, str(error))
+
+    def _take_report(self, report: Report, packet: Packet) -> None:
+        try:
+            seen = self._fix(report, packet)
+        except Unusable as error:
+            self._refuse(packet.arrived, error.fault, error.detail)
+            return
+        if isinstance(seen, MarkerFix):
+            self.ledger.note(packet.arrived, USED)
+        self._last_t = seen.t
+        self._waiting.append(seen)
+
+    def _refuse(self, t: float, fault: Fault, detail: str) -> None:
+        if self.ledger.note(t, fault, detail) and fault != Fault.OTHER_BODY:
+            log.warning("%s: a message was not used; such messages %s", self.name, self.ledger.explained(fault))
+
+    def _fix(self, report: Report, packet: Packet) -> MarkerFix | MarkerMiss:
+        arrived = packet.arrived
+        order = self._count_lost(report.seq, packet)
+        self._require_body(report, arrived)
+        self._require_frame(report)
+        self._require_one_sender(packet)
+        if order is not None and report.stamp_ns is None:
+            raise Unusable(order)
+        t, sigma_s = self._time(report, arrived)
+        if t <= self._last_t:
+            raise Unusable(Fault.OUT_OF_ORDER)
+        if report.x is None:
+            self.ledger.note(arrived, Fault.NOT_TRACKED)
+            return MarkerMiss(t, Reason.NO_MARKER)
+        if not all(map(math.isfinite, report.x)):
+            self._refuse(arrived, Fault.NOT_FINITE, "position")
+            return MarkerMiss(t, Reason.NOT_FINITE)
+        x = self._position(report.x)
+        cov, cov_turn = self._covariances(report)
+        R = self._turned(report.turn)
+        return MarkerFix(t, x, cov, t_sigma=sigma_s, R=R, cov_R=None if R is None else cov_turn)
+
+    def _require_one_sender(self, packet: Packet) -> None:
+        if packet.sender != self._sender:
+            if packet.arrived - self._sender_heard < RIVAL_AFTER_S:
+                raise Unusable(Fault.RIVAL, f"{packet.sender} beside {self._sender}")
+            if self._sender is not None:
+                self._clock_of = Sender(self._table.max_delay_s)
+            self._sender = packet.sender
+        self._sender_heard = packet.arrived
+
+    def _require_body(self, report: Report, arrived: float) -> None:
+        if report.body is None:
+            if self._table.body is not None and not report.where:
+                raise Unusable(Fault.OTHER_BODY, f"without a name, not {self._table.body!r}")
+            return
+        if self._table.body is not None:
+            if str(self._table.body) not in (report.body, *report.where):
+                self._bodies[report.body] = arrived
+                raise Unusable(Fault.OTHER_BODY, f"{report.body!r}, not {str(self._table.body)!r}")
+            return
+        self._bodies[report.body] = arrived
+        there = sorted(name for name, t in self._bodies.items() if arrived - t < SILENT_AFTER_S)
+        if len(there) > 1:
+            raise Unusable(Fault.SEVERAL_BODIES, ", ".join(there))
+
+    def _require_frame(self, report: Report) -> None:
+        if report.frame is None:
+            return
+        if self._frame is None:
+            self._frame = report.frame
+        if report.frame != self._frame:
+            raise Unusable(Fault.OTHER_FRAME, f"{report.frame!r}, not {self._frame!r}")
+
+    def _time(self, report: Report, arrived: float) -> tuple[float, float]:
+        """Return the time of the measurement and its 1-sigma [s]."""
+        if report.stamp_ns is None:
+            return arrived - self._table.latency_s, math.hypot(ARRIVAL_SIGMA_S, self._table.sigma_s)
+        times_set = self._clock_of.times_set
+        t = self._clock_of.time_of(report.stamp_ns, (0,), arrived)
+        if self._clock_of.times_set != times_set:
+            log.warning("%s: the clock of its stamps was set; its time is learnt anew", self.name)
+        if isinstance(t, Refusal):
+            raise Unusable(STAMPS[t])
+        return t - report.age_s - self._table.latency_s, math.hypot(self._clock_of.sigma_s, self._table.sigma_s)
+
+    def _count_lost(self, seq: int | None, packet: Packet) -> Fault | None:
+        """Count the numbers that the sender's messages leave out; return what the order of its numbers says."""
+        if seq is None:
+            return None
+        numbers = self._numbers.get(packet.sender)
+        if numbers is None:
+            if len(self._numbers) >= SENDERS:
+                self._numbers.clear()
+            numbers = self._numbers[packet.sender] = _Numbers()
+        lost, order = numbers.count(seq)
+        if lost and packet.sender == self._sender and self.ledger.note(packet.arrived, Fault.LOST, count=lost):
+            log.warning("%s: %d messages %s", self.name, lost, self.ledger.explained(Fault.LOST))
+        return order
+
+    def _position(self, sent: tuple[float, ...]) -> FloatArray:
+        x = self._table.metres * np.array(sent)
+        if float(np.linalg.norm(x)) > FARTHEST_M:
+            raise Unusable(Fault.UNIT, f"{float(np.linalg.norm(x)):.4g} m")
+        if self._table.unit == "mm" and float(np.linalg.norm(x)) < NEAREST_M:
+            raise Unusable(Fault.SMALL_UNIT, f"{1e3 * float(np.linalg.norm(x)):.2g} mm")
+        return frozen_array(x)
+
+    def _covariances(self, report: Report) -> tuple[FloatArray, FloatArray | None]:
+        """Return the covariances of position [m²] and rotation [rad²], (3, 3) each; of the rotation if it was sent."""
+        if report.cov is None or not any(report.cov):  # ROS: all zeros where unknown
+            sigma_m = max(self._table.sigma_m, self._table.metres * report.spread)
+            return frozen_array(sigma_m**2 * np.eye(3)), None
+        size = math.isqrt(len(report.cov))
+        whole = np.array(report.cov).reshape(size, size)
+        cov = self._table.metres**2 * self._proper(whole[:3, :3])
+        if float(np.linalg.eigvalsh(cov)[-1]) > WIDEST_SIGMA_M**2:
+            raise Unusable(Fault.COVARIANCE, f"1-sigma {math.sqrt(float(np.linalg.eigvalsh(cov)[-1])):.3g} m")
+        turn = whole[3:, 3:] if size == 6 and whole[3:, 3:].any() else None
+        return frozen_array(cov), None if turn is None else frozen_array(self._proper(turn))
+
+    @staticmethod
+    def _proper(cov: FloatArray) -> FloatArray:
+        """Return a covariance that is symmetric and positive definite."""
+        if not np.isfinite(cov).all() or np.abs(cov - cov.T).max() > ASYMMETRY * np.abs(cov).max():
+            raise Unusable(Fault.COVARIANCE, "not symmetric, or not finite")
+        if float(np.linalg.eigvalsh(cov)[0]) <= 0.0:
+            raise Unusable(Fault.COVARIANCE, "not positive definite")
+        return 0.5 * (cov + cov.T)
+
+    def _turned(self, turn: tuple[float, ...] | None) -> FloatArray | None:
+        """Return the unit quaternion; None until it changes: trackers of points fill in one rotation for all."""
+        if turn is None or not any(turn):
+            return None
+        length = math.sqrt(sum(part * part for part in turn))
+        if not abs(length - 1.0) < UNIT_LENGTH:
+            raise Unusable(Fault.TURN, f"length {length:.3g}")
+        if self._first_turn is None:
+            self._first_turn = turn
+        self._turns = self._turns or turn != self._first_turn
+        return frozen_array(np.array(turn) / length) if self._turns else None
+
+
+class _Numbers:
+    """The numbers of a sender's messages."""
+
+    def __init__(self) -> None:
+        self._newest: int | None = None
+        self._lower = 0
+
+    def count(self, seq: int) -> tuple[int, Fault | None]:
+        """Return how many were left out before `seq`, and the fault if it is not a newer one."""
+        before = self._newest
+        if before is None or seq > before:
+            self._newest, self._lower = seq, 0
+            return 0 if before is None else seq - before - 1, None
+        self._lower += seq < before
+        if self._lower >= RESTART:
+            self._newest, self._lower = seq, 0
+            return 0, None
+        return 0, Fault.DUPLICATE if seq == before else Fault.OUT_OF_ORDER
