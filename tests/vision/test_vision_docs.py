@@ -26,7 +26,7 @@ def test_the_pages_example_runs(capsys):
 
 def test_the_page_shows_every_setting_with_its_default():
     shown = msgspec.toml.decode(blocks("toml")[0])["vision"]
-    elsewhere = {"plugin", "cameras", "tag", "cluster"}  # docs/cameras.md, docs/tags.md
+    elsewhere = {"plugin", "cameras", "further_cameras", "tag", "cluster"}  # cameras.md, marker_sources.md, tags.md
     assert shown == {key: value for key, value in msgspec.to_builtins(VisionConfig()).items() if key not in elsewhere}
 
 
