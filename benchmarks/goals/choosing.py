@@ -46,7 +46,7 @@ def rows() -> list[Row]:
     return [
         Row(
             "choosing",
-            "pairs at chosen poses over pairs at random ones, to the same error (d = 7, rough drawing, σ = 10 mm)",
+            "samples at chosen over random poses, for the same error (d = 7, rough nominal model, σ = 10 mm)",
             tuple(
                 Figure(f"{_WHERE[name]}, {pairs} pairs, {text}", studies[name], _share(way, pairs), at_most(0.6))
                 for name in _MOST

@@ -56,5 +56,5 @@ def _figures(model: str) -> list[Figure]:
 def rows() -> list[Row]:
     figures = tuple(figure for model in _JUDGED for figure in _figures(model))
     return [
-        Row("intervals", "claimed intervals: share of true coordinates within them, 100 pairs where not rigid", figures)
+        Row("intervals", "predicted intervals: share of true coordinates inside, 100 pairs where not rigid", figures)
     ]

@@ -213,7 +213,7 @@ def _rigid_row() -> Row:
         "rigid chain, d = 7, exact",
         (
             Figure(
-                "15 pairs, from the drawing: share of seeds exact",
+                "15 pairs, from the nominal model: share of seeds exact",
                 (Study("rigid, 15 pairs from the drawing", partial(_rigid_from_drawing, 15)),),
                 mean("exact"),
                 at_least(95.0, "%"),

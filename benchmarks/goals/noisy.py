@@ -74,7 +74,7 @@ def _few_rows() -> list[Row]:
             "d = 6, σ = 10 mm, ±80°: mean error below σ",
             (
                 Figure(
-                    "rigid chain, rough drawing: pairs until then",
+                    "rigid chain, rough nominal model: pairs until then",
                     few,
                     first_below(rough, sigma_mm),
                     at_most(30, "pairs"),
@@ -101,7 +101,7 @@ def _few_rows() -> list[Row]:
         ),
         Row(
             "many",
-            "the same arm, rough drawing, rigid chain, more pairs",
+            "the same arm, rough nominal model, rigid chain, more pairs",
             tuple(
                 Figure(f"{pairs:,} pairs, ±{reach}°", study, mean(name), at_most(goal, "mm"), mean(f"{name}_bound"))
                 for pairs, study in several
@@ -144,7 +144,7 @@ def _stream_rows() -> list[Row]:
     return [
         Row(
             "stream",
-            "figure 6's stream, σ = 20 mm, calibrated drawing, poses anywhere (normal, 22°)",
+            "figure 6's stream, σ = 20 mm, calibrated nominal model, poses anywhere (normal, 22°)",
             (
                 Figure("tool layer, 30 pairs", stream, mean("after 30"), at_most(6.5, "mm")),
                 Figure("tool layer, 1,700 pairs", stream, mean("after 1700"), at_most(1.0, "mm")),
@@ -163,7 +163,7 @@ def _stream_rows() -> list[Row]:
         ),
         Row(
             "guided",
-            "guided walk, σ = 20 mm, rough drawing (2°, 10 mm), tool moved",
+            "guided walk, σ = 20 mm, rough nominal model (2°, 10 mm), tool moved",
             tuple(
                 Figure(
                     f"{stage:,} pairs, {where}",
@@ -196,7 +196,11 @@ def _other_rows() -> list[Row]:
         Row(
             "local",
             "local ±20°, 300 pairs, σ = 10, error at ±80°",
-            (Figure("rigid chain, rough drawing, d = 6", local, mean("error"), at_most(15.0, "mm"), mean("bound")),),
+            (
+                Figure(
+                    "rigid chain, rough nominal model, d = 6", local, mean("error"), at_most(15.0, "mm"), mean("bound")
+                ),
+            ),
         ),
         Row(
             "outliers",

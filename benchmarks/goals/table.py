@@ -10,12 +10,31 @@ from benchmarks.goals.study import Values
 # Values between these are shown with all three digits. Standard errors below this share of the value are not shown.
 _LEAST_PLAIN, _LARGEST_PLAIN = 1e-3, 1e3
 _NEGLIGIBLE = 1e-3
+OVERVIEW_HEADER = "| goal | figures met | |\n| --- | ---: | --- |"
 HEADER = "| what | goal | measured | bound | seeds | |\n| --- | --- | --- | --- | --- | --- |"
+
+
+def overview(rows: Iterable[Row], results: Mapping[str, Sequence[Values]]) -> str:
+    """Format the totals, and one line for each row: how many of its figures are met, and the verdict."""
+    judgements = [(row, [judged(figure, results) for figure in row.figures]) for row in rows]
+    met, goals = sum(_met(cells) for _, cells in judgements), len(judgements)
+    reached = sum(_standing(cells) == Verdict.MET.value for _, cells in judgements)
+    figures = sum(len(cells) for _, cells in judgements)
+    lines = [
+        f"| **{row.name}**: {row.what} | {_met(cells)} of {len(cells)} | {_standing(cells)} |"
+        for row, cells in judgements
+    ]
+    totals = f"{met} of {figures} figures and {reached} of {goals} goals are met."
+    return "\n".join([totals, "", OVERVIEW_HEADER, *lines])
 
 
 def table(rows: Iterable[Row], results: Mapping[str, Sequence[Values]]) -> str:
     """Format all rows: each with its name and subject, and a line for each figure."""
     return "\n".join([HEADER, *(line for row in rows for line in _lines(row, results))])
+
+
+def _met(cells: Sequence[Cell]) -> int:
+    return sum(cell.verdict is Verdict.MET for cell in cells)
 
 
 def _lines(row: Row, results: Mapping[str, Sequence[Values]]) -> Iterator[str]:

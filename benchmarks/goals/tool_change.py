@@ -157,29 +157,34 @@ def rows() -> list[Row]:
     return [
         Row(
             "tool",
-            "tool moved by 200 mm while running, σ = 5 mm, rough drawing",
+            "tool moved by 200 mm while running, σ = 5 mm, rough nominal model",
             (
                 Figure(
-                    "the daemon's learner, not told, guided path, d = 7: share of seeds noticed within 3 pairs",
+                    "the daemon's learner, change unknown, guided path, d = 7: share of seeds detected within 3 pairs",
                     walking,
                     mean("in time"),
                     at_least(95.0, "%"),
                 ),
                 Figure(
-                    "the same, poses drawn within ±80°, d = 6: share of seeds noticed within 3 pairs",
+                    "the same, random poses within ±80°, d = 6: share of seeds detected within 3 pairs",
                     found,
                     mean("in time"),
                     at_least(95.0, "%"),
                 ),
-                Figure("the same: pairs until noticed", found, mean("noticed"), at_most(3.0, "pairs")),
-                Figure("the same: changes noticed that were none, a seed", found, mean("false alarms"), at_most(0.0)),
+                Figure("the same: pairs until detected", found, mean("noticed"), at_most(3.0, "pairs")),
+                Figure("the same: false alarms per seed", found, mean("false alarms"), at_most(0.0)),
                 Figure("the same: error after 10 pairs", found, mean("after 10"), at_most(3.0, "mm"), mean("bound")),
-                Figure("recursive rigid chain, told: error after 10 pairs", told, mean("after 10"), at_most(3.0, "mm")),
+                Figure(
+                    "recursive rigid chain, change known: error after 10 pairs",
+                    told,
+                    mean("after 10"),
+                    at_most(3.0, "mm"),
+                ),
             ),
         ),
         Row(
             "demo",
-            "the demo's course (d = 7, drawing off by 2°, 10 mm, 30 mm, σ = 3 mm, tool moved by 250 mm)",
+            "the demo (d = 7, nominal model off by 2°, 10 mm, 30 mm, σ = 3 mm, tool moved by 250 mm)",
             (Figure("60 pairs after the change, near the path", demo, mean("after 60"), at_most(5.0, "mm")),),
         ),
     ]

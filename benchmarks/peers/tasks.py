@@ -195,7 +195,7 @@ def simulated_tasks() -> list[Task]:
     tasks += [
         Task(
             f"rough{d}",
-            f"From a rough drawing, {d} joints",
+            f"From a rough nominal model, {d} joints",
             Setting(joints=d),
             goals={30: 0.01, 300: 0.003} if d == 6 else {},
             note="axes 3°, points 15 mm, tip 30 mm a component; ±80°, σ 10 mm",
@@ -205,7 +205,7 @@ def simulated_tasks() -> list[Task]:
     tasks += [
         Task(
             "tool",
-            "Tool change of 250 mm, told",
+            "Tool change of 250 mm, known",
             Setting(sigma=0.005, tool_move=0.25),
             counts=(3, 10, 30, 100, 300),
             goals={10: 0.003},

@@ -13,8 +13,8 @@ from bodyschema.interfaces.errors import ConfigError
 
 FILE = Path("etc/udev/rules.d/60-bodyschema.rules")
 ROOT = Path("/")
-# Vendor and product of USB adapters for servos, and of boards that read encoders. docs/hardware.md cites the source of
-# each.
+# Vendor and product of USB adapters for servos, and of boards that read encoders: from published udev rules (ROBOTIS,
+# SO-101, Reachy Mini) and outputs of lsusb and udevadm; not tried on hardware.
 ADAPTERS = (
     ("0403", "6014", "FTDI FT232H: U2D2"),
     ("0403", "6001", "FTDI FT232R: USB2Dynamixel and many others"),

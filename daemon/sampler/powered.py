@@ -17,7 +17,7 @@ def find_powered(drives: Iterable[object], name: str, file: Path) -> Powered:
     for drive in drives:
         if isinstance(drive, Powered) and drive.name == name:
             return drive
-    remedy = f"Add the table [drivers.dynamixel.{name}]: docs/hardware.md"
+    remedy = f"Add the table [drivers.dynamixel.{name}]: docs/zero_force.md"
     raise ConfigError(f"{name} is not configured", file=file, remedy=remedy)
 
 

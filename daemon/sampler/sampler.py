@@ -343,7 +343,7 @@ class Sampler:
         if self._simulation is not None:
             raise RequestError(f"{name} is of a real arm: in the simulation the head follows the hand by itself")
         if name not in self._powered:
-            raise RequestError(f"{name} is not configured: docs/hardware.md shows its table [drivers.dynamixel.{name}]")
+            raise RequestError(f"{name} is not configured: docs/zero_force.md has its table [drivers.dynamixel.{name}]")
         said = asked(self._powered[name], on=on)
         log.info("%s", said)
         return said

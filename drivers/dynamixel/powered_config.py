@@ -97,7 +97,7 @@ class ZeroForceConfig(PoweredConfig, frozen=True, forbid_unknown_fields=True, kw
                 yield (
                     keys,
                     f"joint {joint!r}: a {model.name} has no current control, so it cannot bear the arm",
-                    "Take the joint out (its torque stays off), or fit a servo with current control (docs/hardware.md)",
+                    "Leave the joint out (its torque stays off), or fit one with current control (docs/zero_force.md)",
                 )
             elif table.torque_constant is None and torque_constant(model.name) is None:
                 yield (

@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 # Memory and time grow with the square and the cube of the control points: 3^7 take 77 MB and 0.2 s.
 LARGEST_NET = 2187
 # Number of the newest pairs that the exact map is fitted to, which bounds time and memory; the chain keeps the
-# information of older ones. Measured where a chain misses 10 mm (docs/learner.md).
+# information of older ones. Measured where a chain misses 10 mm (docs/results/learning.md).
 WINDOW = 20_000
 # Growth of the number of pairs before the next search for the prior's precision.
 RETUNE = 1.25

@@ -28,7 +28,8 @@ from benchmarks.goals.study import (
 )
 from benchmarks.goals.table import table
 
-PAGE = (Path(__file__).parents[2] / "docs" / "goals.md").read_text(encoding="utf-8")
+RESULTS = Path(__file__).parents[2] / "docs" / "results"
+PAGE = (RESULTS / "goals_table.md").read_text(encoding="utf-8")
 
 
 def nothing(seed: int) -> Values:
@@ -53,6 +54,23 @@ def test_the_page_has_every_row_and_figure_in_the_table_s_order():
     rows = registry.rows(None)
     assert re.findall(r"^\| \*\*(\S+)\*\*: (.*?) \|", PAGE, re.MULTILINE) == [(row.name, row.what) for row in rows]
     assert re.findall(r"^\| – (.*?) \|", PAGE, re.MULTILINE) == [one.what for row in rows for one in row.figures]
+
+
+def test_the_summary_has_every_row():
+    summary = (RESULTS / "goals.md").read_text(encoding="utf-8")
+    shown = re.findall(r"^\| \*\*(\S+)\*\*: .* \| \d+ of (\d+) \|", summary, re.MULTILINE)
+    assert shown == [(row.name, str(len(row.figures))) for row in registry.rows(None)]
+
+
+def test_docs_are_written_in_place(tmp_path):
+    page = (RESULTS / "goals.md").read_text(encoding="utf-8")
+    (tmp_path / "goals.md").write_text(page, encoding="utf-8")
+    rows = [Row("some", "something", (a_figure(),))]
+    command.write_docs(tmp_path, rows, Results(tmp_path / "goals.json"))
+    totals = "0 of 1 figures and 0 of 1 goals are met."
+    line = "| **some**: something | 0 of 1 | not measured |"
+    assert all(text in (tmp_path / "goals.md").read_text(encoding="utf-8") for text in (totals, line))
+    assert table(rows, {}) in (tmp_path / "goals_table.md").read_text(encoding="utf-8")
 
 
 def test_what_is_kept_under_one_key_is_measured_in_one_way():

@@ -39,14 +39,14 @@ def test_the_page_s_numbers_are_the_code_s() -> None:
     words = {2: "two", 3: "three", 5: "five", 6: "six", 100: "hundred"}
     text = " ".join(PAGE.split())
     assert f"more than {words[round(DOUBT)]} times as far" in text
-    assert f"{words[FEWEST_FOR_CHANGE]} doubted pairs in a row" in text
-    assert f"and {words[CHANGE]} are none in any case" in text
-    assert f"after {words[PAIRS_TO_REFIT]} pairs (a change that was found: at once) the tool's three numbers" in text
+    assert f"{words[FEWEST_FOR_CHANGE]} outliers in a row" in text
+    assert f"or any {words[CHANGE]} outliers in a row" in text
+    assert f"After {words[PAIRS_TO_REFIT]} samples (at once if the change was detected)" in text
     assert f"at {LARGEST_NET:,} control points" in text
     assert f"up to {LARGEST_MAP:,} control points" in text
-    assert f"the newest {WINDOW:,} pairs" in text
+    assert f"the newest {WINDOW:,} samples" in text
     assert f"within {words[round(57.29578 * REGION_RAD)]} degrees a joint" in text
     assert ("less than a quarter of the prior's variance" in text) == (IN_SUPPORT == 0.25)
-    assert f"the last {words[SHORTEST]} pairs" in text
+    assert f"the last {words[SHORTEST]} samples" in text
     assert f"by {words[round(CLEARLY)]} standard errors" in text
-    assert f"the newest {KEPT:,} pairs" in text
+    assert f"the newest {KEPT:,} samples" in text

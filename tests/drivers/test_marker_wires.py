@@ -119,7 +119,7 @@ def test_doctor_tells_rate_place_and_silence(monkeypatch) -> None:
     assert "last at (100.0, 200.0, 300.0) mm ± 1 mm" in check.said
     [silent] = stream_checks(opened(port=port), SystemClock(), 0.3)
     assert silent.state == "wrong"
-    assert f"port {port}" in silent.mend
+    assert f"port {port}" in silent.fix
 
 
 # --- NatNet

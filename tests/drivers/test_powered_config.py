@@ -109,7 +109,7 @@ def test_the_watchdog_is_no_shorter_than_the_heartbeat(heartbeat_ms, watchdog) -
 
 def test_one_model_with_current_control_has_no_torque_constant() -> None:
     able = {model.name for model in MODELS if model.protocol == 2 and model.current_unit is not None}
-    assert able - set(TORQUE_AT_CURRENT) == {"XW540-H260"}  # as in docs/hardware.md
+    assert able - set(TORQUE_AT_CURRENT) == {"XW540-H260"}  # as in docs/zero_force.md
 
 
 def test_each_torque_constant_is_of_a_servo_with_current_control() -> None:

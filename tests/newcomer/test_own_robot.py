@@ -25,6 +25,44 @@ ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "own_robot.md").read_text(encoding="utf-8")
 EXAMPLE = ROOT / "examples" / "desk_arm"
 STEP_RAD = np.radians(2.0)
+MORE_MISTAKES = [
+    (
+        'urdf = "desk_arm.urdf"',
+        'urdf = "desk_arm.xacro"',
+        "desk_arm.xacro: cannot read the URDF: No such file or directory. Fix [robot] urdf, or --urdf",
+    ),
+    (
+        'marker_link = "gripper"',
+        'marker_link = "hand"',
+        "robot.toml, line 6: there is no link 'hand' in desk_arm.urdf. "
+        "Known are: base_link, turret, upper_arm, forearm, wrist, gripper",
+    ),
+    ("[0.0, 0.0, 0.03]", "[0.0, 0.03]", "robot.toml, line 7: robot.marker_xyz: expected array of length 3, got 2"),
+    (
+        "baseline_m = 0.20",
+        "# baseline_m = 0.09",
+        "robot.toml, line 11: the stereo camera is described in part: baseline_m missing. "
+        "Give all or none; a camera without a second one is eyes = 1",
+    ),
+    ("pose_known = false", 'pose_known = "no"', "robot.toml, line 15: camera.pose_known: expected bool, got str"),
+    (
+        "[0.0, 0.0, 0.03]",
+        "[0, 0, 30]",
+        "robot.toml, line 7: robot.marker_xyz = [0.0, 0.0, 30.0]: this looks like millimetres. Give metres",
+    ),
+    (
+        "radius_m = 0.020",
+        "radius_m = 20",
+        "robot.toml, line 23: vision.radius_m = 20: this looks like millimetres. Give metres",
+    ),
+    (
+        '"desk_arm"',
+        '"my arm"',
+        "robot.toml, line 3: robot.name: 'my arm' is no name for zenoh keys. "
+        "Take letters, digits, _ . and -, without spaces, and begin with a letter, a digit or _",
+    ),
+    ("[vision]", "[visoin]", "robot.toml, line 21: unknown table [visoin]. Did you mean 'vision'?"),
+]  # right, wrong, message
 COMMANDS = re.findall(r"^\$ (bodyschema .*)$", PAGE, re.MULTILINE)
 
 
@@ -83,8 +121,8 @@ def test_check_names_a_joint_that_was_forgotten(desk) -> None:
     assert "base_yaw: on the way, but not in joints: stands still at 0" in typed("bodyschema config check", desk).stdout
 
 
-@pytest.mark.parametrize(("right", "wrong", "message"), table("instead of"))
-def test_a_mistake_in_robot_toml_gets_the_page_s_message(desk, right: str, wrong: str, message: str) -> None:
+@pytest.mark.parametrize(("right", "wrong", "message"), [*table("instead of"), *MORE_MISTAKES])
+def test_a_mistake_in_robot_toml_gets_its_message(desk, right: str, wrong: str, message: str) -> None:
     file = desk / "robot.toml"
     text = file.read_text(encoding="utf-8")
     assert code(right) in text
@@ -94,8 +132,14 @@ def test_a_mistake_in_robot_toml_gets_the_page_s_message(desk, right: str, wrong
     assert str(refused.value).replace(f"{desk}/", "").replace("`", "") == code(message)
 
 
-@pytest.mark.parametrize(("line", "message"), table("row or heading"))
-def test_a_mistake_in_a_recording_gets_the_page_s_message(desk, line: str, message: str) -> None:
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        *table("row or heading"),
+        ("0.1,nan,0.2,0.3,1,1,1", "line 2, column shoulder_pitch: nan is not a finite number. Fix or delete the row"),
+    ],
+)
+def test_a_mistake_in_a_recording_gets_its_message(desk, line: str, message: str) -> None:
     robot = RobotDescription.load(desk / "robot.toml")
     heading = ",".join([*robot.joints, "x", "y", "z"])
     rows = [code(line), ""] if code(line)[0].isalpha() else [heading, code(line), ""]

@@ -84,6 +84,8 @@ def test_what_a_page_links_to_is_there(page: Path, target: str) -> None:
 
 
 def anchors(page: Path) -> list[str]:
-    """Return the anchors of a page's headings."""
-    headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
-    return [re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings]
+    """Return the anchors of a page: its headings, and former ones kept as `<a id="...">`."""
+    text = page.read_text(encoding="utf-8")
+    headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    kept = re.findall(r'^<a id="([\w-]+)"></a>$', text, re.MULTILINE)
+    return [re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings] + kept

@@ -38,7 +38,7 @@ def joined(kinds: Iterable[Errors]) -> Errors:
 
 
 def report(name: str, found: Errors) -> None:
-    """Print one row of the table in docs/vision.md; shown by `pytest -s`."""
+    """Print one row of the table in docs/results/vision.md; shown by `pytest -s`."""
     ones, twos = (" ".join(f"{100 * share:.0f}" for share in found.covered(sigmas)) for sigmas in (1.0, 2.0))
     median_px = np.median(np.abs(found.centres_px))
     missed = 100 * len(found.misses) / (len(found.x) + len(found.misses))

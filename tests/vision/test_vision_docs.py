@@ -10,7 +10,7 @@ from bodyschema.interfaces.records import MarkerMiss, Reason
 from bodyschema.vision.config import NAMED_COLOURS, HueBand, VisionConfig
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = (ROOT / "docs" / "vision.md").read_text(encoding="utf-8")
+PAGE, METHOD = ((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("vision.md", "vision_method.md"))
 
 
 def blocks(language: str) -> list[str]:
@@ -26,7 +26,7 @@ def test_the_pages_example_runs(capsys):
 
 def test_the_page_shows_every_setting_with_its_default():
     shown = msgspec.toml.decode(blocks("toml")[0])["vision"]
-    elsewhere = {"plugin", "cameras", "tag", "cluster"}  # docs/cameras.md, docs/tags.md
+    elsewhere = {"plugin", "cameras", "further_cameras", "tag", "cluster"}  # cameras.md, marker_sources.md, tags.md
     assert shown == {key: value for key, value in msgspec.to_builtins(VisionConfig()).items() if key not in elsewhere}
 
 
@@ -46,6 +46,6 @@ def test_the_page_lists_every_reason_that_the_tracker_gives():
     assert given == set(re.findall(r"^\| `(\w+)` \|", PAGE, re.MULTILINE)) & set(Reason)
 
 
-@pytest.mark.parametrize("file", re.findall(r"`(\w+\.py)`", PAGE))
-def test_every_module_that_the_page_names_exists(file):
+@pytest.mark.parametrize("file", re.findall(r"`(\w+\.py)`", PAGE + METHOD))
+def test_every_module_that_the_pages_name_exists(file):
     assert (ROOT / "vision" / file).is_file()
