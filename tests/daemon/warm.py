@@ -163,6 +163,8 @@ def _settle(request: tuple[list[str], str, dict[str, str]], files: list[int]) ->
     os.dup2(files[1], 1)
     os.dup2(files[2], 2)
     os.closerange(3, max(map(int, os.listdir("/proc/self/fd"))) + 1)
+    # Those of the server know whether its own files can seek, not whether these can.
+    sys.stdout, sys.stderr = (os.fdopen(number, "w", closefd=False) for number in (1, 2))
     os.chdir(folder)
     os.environ.clear()
     os.environ.update(environment)
