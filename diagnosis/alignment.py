@@ -21,9 +21,8 @@ def aligned(observations: Observations, simulation: Simulation) -> Fit:
     nuisances = free_effects(robot)
     if not robot.camera.pose_known:
         predicted = simulation.positions(observations.motion)
-        nuisances = [
-            e.with_values(placed(predicted, observations.x)) if e.name == "camera_pose" else e for e in nuisances
-        ]
+        # The camera's pose comes first.
+        nuisances = [nuisances[0].with_values(placed(predicted, observations.x)), *nuisances[1:]]
     own = list(simulation.effects)
     return fitted(observations, simulation.with_effects([*nuisances, *own]), len(nuisances) + len(own))
 

@@ -258,7 +258,7 @@ def diagnose(
         told(loose.what)
         # Begin again: causes may have been named for it, and the noise is smaller without it.
         # What rattles has no place of its own, and does not slip.
-        fixed = [effect for effect in hypotheses.effects if effect.name not in ("tool_slip", "tool_offset")]
+        fixed = [effect for effect in hypotheses.effects if effect.kind.stage != "tool"]
         search = Search(fixed, told)
         observations = observations.with_rattle(loose.ratio, loose.ways)
         start = aligned(observations, simulation)

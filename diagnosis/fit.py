@@ -23,14 +23,8 @@ _ROUNDS, _ENOUGH = 12, 0.02
 _SLACK, _LITTLE = 2.0, 5.0
 # A step that promises a smaller rise is not tried [nats].
 _NOT_TRIED = 1e-3
-# Step limits: phase of a ripple over its range [rad], remaining share of a settling, relative change of a time
-# constant.
-_OF_A_PEAK, _OF_A_MEMORY, _OF_A_TIME = 0.5, 0.1, 0.3
-_LONGEST_MEMORY, _FEWEST_CYCLES = 0.95, 1.5
-# Uncertainty, in such steps, of a period or a time constant that is not identifiable.
+# Uncertainty, in steps that are still valid, of a period or a time constant that is not identifiable.
 _UNTOLD = 10.0
-# A drift that ends within a smaller share of the recording is an offset from the beginning.
-SHORTEST_DRIFT = 0.03
 _FEWEST_OUTLIERS = 1e-4
 # Blocks of time whose disagreement widens the intervals.
 _BLOCKS = 60
@@ -283,7 +277,7 @@ class Fit:
     @property
     def _shape_precision(self) -> FloatArray:
         """Prior precision of periods and time constants (s,), from the limit of one step."""
-        reaches = [_reach(self.run, effect, k) for effect in self.causes for k in effect.shapes]
+        reaches = [effect.kind.shape_step(self.run, effect, k) for effect in self.causes for k in effect.shapes]
         return 1.0 / np.square(np.array(reaches))
 
     def step(self) -> tuple[FloatArray, float]:
@@ -339,7 +333,7 @@ class Fit:
             first += len(effect.amounts)
             if index >= self.nuisances:
                 for k in effect.shapes:
-                    values[k] = _bounded(effect, k, values[k] + step[shape], self.observations.motion.clock)
+                    values[k] = effect.kind.bounded(effect, k, values[k] + step[shape], self.observations.motion)
                     shape += 1
             effects.append(effect.with_values(values))
         return self.simulation.with_effects(effects), self.tolerated + step[first : first + len(self.tolerated)]
@@ -481,25 +475,6 @@ def solved(normal: FloatArray, gradient: FloatArray) -> FloatArray:
     """Return the shortest solution (p,) of normal equations, with columns scaled to equal length."""
     scales = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     return np.linalg.lstsq(normal / np.outer(scales, scales), gradient / scales, rcond=1e-12)[0] / scales
-
-
-def _reach(run: Simulated, effect: Effect, k: int) -> float:
-    """Return the largest step of a period or a time constant for which its derivative is still valid."""
-    if effect.name == "joint_ripple":
-        return _OF_A_PEAK / max(float(np.ptp(run.readings.q[:, run.simulation.place(effect).joint])), 1e-6)
-    return _OF_A_MEMORY if effect.name == "settling" else _OF_A_TIME * float(effect.values[k])
-
-
-def _bounded(effect: Effect, k: int, value: float, clock: FloatArray) -> float:
-    """Limit a period or a time constant to its valid range."""
-    if effect.name == "settling":
-        return float(np.clip(value, 0.0, _LONGEST_MEMORY))
-    if effect.parameters[k].name == "cycles_per_turn":
-        # At once per turn it would be an eccentricity.
-        value = max(value, _FEWEST_CYCLES)
-    if effect.name == "thermal_drift":
-        value = max(value, SHORTEST_DRIFT * float(clock[-1] - clock[0]))
-    return float(np.clip(value, 0.5 * effect.values[k], 2.0 * effect.values[k]))
 
 
 def prior_precision(simulation: Simulation, nuisances: int) -> FloatArray:

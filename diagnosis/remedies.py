@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bodyschema.effects import KINDS, corrected_file
+from bodyschema.effects import EFFECT_TYPES, corrected_file
 from bodyschema.effects.poses import transforms
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
@@ -221,8 +221,7 @@ class _Workshop:
         )
 
     def of_a_plugin(self, cause: Cause, _: Mapping[str, float]) -> str:
-        encoder = KINDS[cause.effect].encoder
-        return "" if encoder is None else encoder.remedy(f"joint {cause.where}")
+        return EFFECT_TYPES[cause.effect].remedy(f"joint {cause.where}")
 
     def outliers(self, _: Cause, numbers: Mapping[str, float]) -> str:
         return (

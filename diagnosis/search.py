@@ -29,8 +29,6 @@ _ASKED_EACH = 3
 _MOST_SETS = 60
 Key = tuple[str, str | None, str | None]
 Named = frozenset[tuple[Key, int]]
-# Maximum of effects at one place that begin at a moment, and of ripples, which differ in their periods.
-_MOST_MOMENTS, _MOST_RIPPLES = 2, 4
 # A rival must explain this share of a cause's gain; differences within this count as equal [nats].
 _COMES_NEAR, _EQUAL = 0.8, 0.3
 # Largest part of the evidence between two memory effects of a joint that may lie in a few rows [nats].
@@ -195,7 +193,7 @@ class Search:
 
     def _doubt_of_pair(self, one: Candidate, other: Candidate) -> float:
         """Return the multiplicity penalty of two causes named together [nats]."""
-        alike = one.effect.name == other.effect.name
+        alike = one.effect.kind is other.effect.kind
         further = min(self.doubt(other), ANOTHER + float(np.log(other.trials))) if alike else self.doubt(other)
         return self.doubt(one) + further
 
@@ -246,7 +244,7 @@ class Search:
             count = present[effect.key]
             if count == 0:
                 others.append(effect)
-            elif count < most_of_a_kind(effect):
+            elif count < effect.kind.most_at_one_place:
                 more = (effect.one_more(ordinal) for ordinal in range(count + 1))
                 others.append(next(one for one in more if one.identity not in taken))
         return others
@@ -283,7 +281,7 @@ class Search:
 
     def _counted(self, fit: Fit, effect: Effect) -> float:
         """Return the share of a gain that counts: correlated noise looks like a change with time."""
-        return fit.independence if effect.kind.begins or effect.name == "thermal_drift" else 1.0
+        return fit.independence if effect.kind.changes_with_time else 1.0
 
     def shortlist(self, scan: Scan, hypotheses: Sequence[Effect]) -> list[Candidate]:
         """Return the candidates that may be best after a refit, the most probable first."""
@@ -382,16 +380,9 @@ def named(causes: Sequence[Effect]) -> Named:
     return frozenset(Counter(effect.key for effect in causes).items())
 
 
-def most_of_a_kind(effect: Effect) -> int:
-    """Return the maximum of effects of a kind at one place."""
-    if effect.kind.begins:
-        return _MOST_MOMENTS
-    return _MOST_RIPPLES if effect.name == "joint_ripple" else 1
-
-
 def simplicity(effect: Effect) -> int:
     """Return a complexity score; of equally probable causes the one with the lowest is named."""
-    return len(effect.amounts) + len(effect.shapes) + (_OF_A_LINK if effect.name == "link_geometry" else 0)
+    return len(effect.amounts) + len(effect.shapes) + (_OF_A_LINK if effect.kind.in_parts else 0)
 
 
 def describe(effect: Effect) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve, get_lapack_funcs
 
-from bodyschema.effects import Effect, Identity
+from bodyschema.effects import Effect, EffectType, Identity
 from bodyschema.interfaces.records import FloatArray
 
 from .background import SPREAD, Scales
@@ -46,8 +46,6 @@ _SHOWN = 3.0
 _MOST_MOVES, _MOST_TOGETHER = 60, 8
 # Maximum of refitted sets, and the margin to the best within which a set is refitted [nats].
 _MOST_REFITTED, _COMES_NEAR = 8, 15.0
-# To first order it looks like backlash; the search tries it in place of one.
-_LEFT_TO_THE_SEARCH = ("hysteresis",)
 
 dpotrf, dpotri, dpotrs = get_lapack_funcs(("potrf", "potri", "potrs"), dtype=np.float64)
 
@@ -156,10 +154,10 @@ class Sets:
         yield own
         yield ()
         steady = [effect for k, effect in enumerate(self.effects) if k not in self._begins]
-        kinds = dict.fromkeys(effect.name for effect in steady if effect.kind.at_joint and not effect.source)
-        zeros = tuple(k for k, effect in enumerate(self.effects) if effect.name == "joint_offset")
+        kinds = dict.fromkeys(effect.kind for effect in steady if effect.kind.at_joint and not effect.source)
+        zeros = tuple(k for k, effect in enumerate(self.effects) if effect.kind.is_zero)
         for kind in kinds:
-            yield tuple(k for k, effect in enumerate(self.effects) if effect.name == kind)
+            yield tuple(k for k, effect in enumerate(self.effects) if effect.kind is kind)
         yield tuple(dict.fromkeys((*own, *zeros)))
         whole = dict.fromkeys(effect.key for effect in self.effects if effect.kind.in_parts and links)
         for key in whole:
@@ -218,15 +216,15 @@ class Sets:
 
     def _cost(self, chosen: Sequence[int]) -> float:
         """Return the cost of naming the causes of a set [nats]."""
-        total, kinds = 0.0, set[str]()
+        total, kinds = 0.0, set[EffectType]()
         numbers: Counter[Key] = Counter()
         for k in chosen:
             effect = self.effects[k]
             if effect.kind.in_parts:
                 numbers[effect.key] += len(effect.amounts)
                 continue
-            total += self._trials[k] + (min(self._first, ANOTHER) if effect.name in kinds else self._first)
-            kinds.add(effect.name)
+            total += self._trials[k] + (min(self._first, ANOTHER) if effect.kind in kinds else self._first)
+            kinds.add(effect.kind)
         return total + sum(
             self._first + float(np.log(ways_to_choose(n, self._numbers[key]))) for key, n in numbers.items()
         )
@@ -433,7 +431,7 @@ class _Place:
     def __init__(self, fit: Fit, hypotheses: Sequence[Effect]) -> None:
         self.fit = fit
         present = {cause.key for cause in fit.causes}
-        others = [one for one in hypotheses if one.key not in present and one.name not in _LEFT_TO_THE_SEARCH]
+        others = [one for one in hypotheses if one.key not in present and not one.kind.refines]
         scanned = Scan(fit).candidates(others)
         candidates = [Candidate(cause, 0.0, 1) for cause in fit.causes] + [_at_rest(one) for one in scanned]
         candidates = [part for candidate in candidates for part in _in_parts(candidate)]
@@ -468,7 +466,7 @@ def _in_parts(candidate: Candidate) -> list[Candidate]:
 def _at_rest(candidate: Candidate) -> Candidate:
     """Return the candidate at zero amounts, where it is linear in them."""
     effect = candidate.effect
-    if effect.name in ("backlash",):
+    if not effect.kind.is_linear:
         return candidate
     values = effect.values.copy()
     values[effect.amounts] = 0.0

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bodyschema.effects import KINDS
+from bodyschema.effects import EFFECT_TYPES
 from bodyschema.effects.unexplained import PLACE
 
 from .numbers import told_values
@@ -122,8 +122,7 @@ def finding(
         case "outliers":
             return f"{100 * numbers['share']:.2g} % of the fixes are not the marker"
         case _:
-            encoder = KINDS[name].encoder
-            return name if encoder is None else encoder.finding(at, numbers)
+            return EFFECT_TYPES[name].finding(at, numbers)
 
 
 def _axes(how: str, axes: Sequence[str]) -> str:

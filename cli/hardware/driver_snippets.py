@@ -10,8 +10,9 @@ import numpy as np
 
 from bodyschema.daemon.config import Config
 from bodyschema.effects import Simulation
+from bodyschema.effects.exports.arm_errors import ArmErrors
 from bodyschema.effects.exports.geometry import geometry_of
-from bodyschema.effects.exports.joint_errors import ArmErrors, JointErrors
+from bodyschema.effects.joint_errors import JointErrors
 from bodyschema.robot.rpy import rpy_of
 
 # ur_description, from the base outwards: the joint's name without prefix, and its link's name in kinematics.yaml.

@@ -28,7 +28,7 @@ from bodyschema.diagnosis.remedies import remedies
 from bodyschema.diagnosis.report import About, page
 from bodyschema.diagnosis.result import DiagnosisFile
 from bodyschema.diagnosis.words import modelled
-from bodyschema.effects import KINDS, write_corrected, write_extended
+from bodyschema.effects import EFFECT_TYPES, write_corrected, write_extended
 from bodyschema.interfaces.errors import BodyschemaError, RecordingError, RequestError
 from bodyschema.interfaces.records import Pair
 from bodyschema.interfaces.whole_files import write_whole
@@ -68,7 +68,7 @@ class Asked:
     def of(cls, only: str | None, without: str | None, seed: int) -> Asked:
         """Parse comma-separated names. Raise RequestError if an effect is unknown, or none remains."""
         asked = cls(_names(only, "--effects"), _names(without, "--exclude"), seed)
-        if set(asked.only or KINDS) <= set(asked.without):
+        if set(asked.only or EFFECT_TYPES) <= set(asked.without):
             raise RequestError("--effects and --exclude leave nothing to look for. Exclude fewer")
         return asked
 
@@ -78,12 +78,12 @@ def _names(text: str | None, option: str) -> tuple[str, ...]:
         return ()
     names = tuple(name.strip() for name in text.split(",") if name.strip())
     if not names:
-        raise RequestError(f"{option} names no effect. Known are: {', '.join(KINDS)}")
+        raise RequestError(f"{option} names no effect. Known are: {', '.join(EFFECT_TYPES)}")
     for name in names:
         if name in ALWAYS:
             raise RequestError(f"{option} {name}: {name} are always looked for, and left out. Take it out")
-        if name not in KINDS:
-            raise RequestError(f"{option}: there is no effect {name!r}. {did_you_mean(name, KINDS)}")
+        if name not in EFFECT_TYPES:
+            raise RequestError(f"{option}: there is no effect {name!r}. {did_you_mean(name, EFFECT_TYPES)}")
     return names
 
 

@@ -91,7 +91,7 @@ def _of_encoder(residuals: Residuals, effect: Effect) -> Panel:
 
 def _cycles(effect: Effect) -> float | None:
     """Return the cycles of a ripple per radian or metre; None for other effects."""
-    if effect.name != "joint_ripple":
+    if not effect.kind.is_periodic:
         return None
     return float(effect.values[2]) / (1.0 if effect.prismatic else 2.0 * np.pi)
 

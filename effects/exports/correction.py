@@ -13,34 +13,28 @@ import numpy as np
 
 from bodyschema.effects.effect import Effect
 from bodyschema.effects.gravity import GRAVITY_M_S2, carried
-from bodyschema.effects.simulation import RIGID, Simulation
+from bodyschema.effects.simulation import Simulation
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.urdf import inverse
 
+from .arm_errors import BORNE_BY_HAND, LeftOut, moment_notes, residual_note, sentences
 from .geometry import geometry_without_zeros
-from .joint_errors import LeftOut, moment_notes, residual_note, sentences, why_not
 
 FORMAT, VERSION = "bodyschema correction", 1
-# Values as in extended.toml; a ripple's cycles become radians per unit of the reading.
-_OF_READINGS = (
-    "joint_offset",
-    "joint_scale",
-    "joint_eccentricity",
-    "joint_ripple",
-    "joint_coupling",
-    "backlash",
-    "settling",
-)
-_HELD = {*_OF_READINGS, *RIGID, "joint_compliance"}
 
 
 def held_by_correction(simulation: Simulation) -> Simulation:
     """Return the simulation with only the effects that correction.json holds."""
     stayed = simulation.after_moments
     own, background = (
-        tuple(effect for effect in effects if effect.name in _HELD) for effects in (stayed.effects, stayed.background)
+        tuple(effect for effect in effects if _is_held(effect)) for effects in (stayed.effects, stayed.background)
     )
     return Simulation(simulation.robot, own, None, background)
+
+
+def _is_held(effect: Effect) -> bool:
+    kind = effect.kind
+    return kind.rigid or kind.is_spring or kind.correction_values(effect) is not None
 
 
 def write_correction(simulation: Simulation, file: Path, heading: str) -> list[str]:
@@ -57,32 +51,28 @@ def write_correction(simulation: Simulation, file: Path, heading: str) -> list[s
     """
     kept, left_out = held_by_correction(simulation), []
     for effect in simulation.after_moments.all_effects:
-        if effect.name == "joint_compliance" and not simulation.bears_weight:
-            left_out.append(LeftOut(effect, 'with hold = "torque_free" the guiding hand bore the weight'))
-        elif effect.name not in _HELD:
-            left_out.append(LeftOut(effect, why_not(effect)))
+        if effect.kind.is_spring and not simulation.bears_weight:
+            left_out.append(LeftOut(effect, BORNE_BY_HAND))
+        elif not _is_held(effect):
+            left_out.append(LeftOut(effect, effect.kind.no_counterpart))
     told = [*sentences(left_out), *residual_note(simulation), *moment_notes(simulation)]
-    springs = np.zeros(len(simulation.robot.joints))
-    for effect in kept.all_effects:
-        if effect.name == "joint_compliance" and simulation.bears_weight:
-            springs[kept.place(effect).joint] += effect.values[0]
+    springs = kept.springs if simulation.bears_weight else np.zeros(len(simulation.robot.joints))
+    entries = [(effect, effect.kind.correction_values(effect)) for effect in kept.all_effects]
     contents = {
         "format": FORMAT,
         "version": VERSION,
         "robot": simulation.robot.name,
         "from": heading,
         "notes": told,
-        "effects": [_entry(kept, effect) for effect in kept.all_effects if effect.name in _OF_READINGS],
+        "effects": [_entry(kept, effect, values) for effect, values in entries if values is not None],
         "gravity_m_s2": GRAVITY_M_S2,
     } | _chain(kept, springs)
     file.write_text(json.dumps(contents, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     return told
 
 
-def _entry(simulation: Simulation, effect: Effect) -> dict[str, Any]:
-    place, values = simulation.place(effect), effect.values.tolist()
-    if effect.name == "joint_ripple" and effect.prismatic:
-        values[2] *= 2.0 * np.pi
+def _entry(simulation: Simulation, effect: Effect, values: list[float]) -> dict[str, Any]:
+    place = simulation.place(effect)
     # Settling and backlash have a state; it is unknown before the first reading.
     entry = {"effect": effect.name, "joint": place.joint, "values": values, "state": []}
     return entry if place.source is None else entry | {"source": place.source}

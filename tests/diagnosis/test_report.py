@@ -22,7 +22,7 @@ from bodyschema.diagnosis.report.plot import round_up
 from bodyschema.diagnosis.report.plot import ticks as axis_ticks
 from bodyschema.diagnosis.report.residuals import Residuals, binned, structure
 from bodyschema.diagnosis.result import DiagnosisFile, Interval
-from bodyschema.effects import KINDS, Effect, Simulation
+from bodyschema.effects import EFFECT_TYPES, Effect, Simulation
 from bodyschema.robot.description import RobotDescription
 
 ABOUT = About("<pairs> & more.csv", "desk", "1.2.3")
@@ -161,7 +161,7 @@ def test_a_recording_in_which_nothing_is_found_has_a_report_without_causes(robot
 
 PLACES = [
     (kind.name, 1 if kind.at_joint else None, 2 if kind.takes_source else None)
-    for kind in KINDS.values()
+    for kind in EFFECT_TYPES.values()
 ]  # fmt: skip
 
 

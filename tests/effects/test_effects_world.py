@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from effect_arms import arm, everywhere, sized, walk
 
-from bodyschema.effects import KINDS, Motion, Simulation
+from bodyschema.effects import EFFECT_TYPES, Motion, Simulation
 from bodyschema.sim_backend import ErrorConfig, SimConfig
 from bodyschema.sim_backend.posed import PERIOD_S, PosedWorld
 from bodyschema.sim_backend.truth import GEOMETRY
@@ -44,7 +44,7 @@ def rows(postures) -> Motion:
     return Motion(postures, PERIOD_S * np.arange(1.0, len(postures) + 1), np.zeros(len(postures), dtype=np.int64))
 
 
-@pytest.mark.parametrize("name", [name for name in KINDS if name != "camera_latency"])
+@pytest.mark.parametrize("name", [name for name in EFFECT_TYPES if name != "camera_latency"])
 def test_an_effect_at_any_joint_shows_in_the_world(robot, name, monkeypatch) -> None:
     postures = walk(2).q[:20]
     for place in everywhere(robot):

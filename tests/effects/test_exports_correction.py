@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from effect_arms import arm, everywhere, sized, walk
 
-from bodyschema.effects import KINDS, Effect, LiveEncoders, Motion, Simulation
+from bodyschema.effects import EFFECT_TYPES, Effect, LiveEncoders, Motion, Simulation
 from bodyschema.effects.exports import write_correction
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
@@ -21,7 +21,7 @@ READERS = Path(__file__).resolve().parents[2] / "examples" / "correction"
 NOT_OF_THE_ARM = {"camera_scale", "camera_focal", "lens_distortion", "camera_latency", "thermal_drift"}
 # Their state depends on loads as well as on readings; the readers do not have them.
 NOT_IN_THE_READERS = {"hysteresis", "gravity_backlash", "payload"}
-NAMES = tuple(name for name in KINDS if name not in NOT_OF_THE_ARM | NOT_IN_THE_READERS)
+NAMES = tuple(name for name in EFFECT_TYPES if name not in NOT_OF_THE_ARM | NOT_IN_THE_READERS)
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_sim_truth import NO_ERRORS
 
-from bodyschema.effects import KINDS, Effect, Motion, Simulation
+from bodyschema.effects import EFFECT_TYPES, Effect, Motion, Simulation
 from bodyschema.interfaces.records import MarkerFix
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.toml_file import read_toml
@@ -117,7 +117,7 @@ def frames(motion: Motion) -> Motion:
 
 
 def test_every_effect_of_the_table_is_tried() -> None:
-    assert {case[0] for case in EFFECTS} == set(KINDS)
+    assert {case[0] for case in EFFECTS} == set(EFFECT_TYPES)
 
 
 @pytest.mark.parametrize("cases", groups(), ids=lambda cases: "-".join(map(named, cases)))
