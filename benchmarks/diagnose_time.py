@@ -21,7 +21,7 @@ from bodyschema.cli.recordings.synthesis import simulated, with_noise
 from bodyschema.diagnosis.conclusion import conclusion
 from bodyschema.diagnosis.diagnosis import diagnose
 from bodyschema.diagnosis.remedies import remedies
-from bodyschema.diagnosis.report import About, page
+from bodyschema.diagnosis.report.page import About, page
 from bodyschema.effects import Effect, Motion, Simulation
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.recordings.recording import Recording

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
-from bodyschema.effects import EFFECT_TYPES
 from bodyschema.effects.unexplained import PLACE
 
 from .numbers import told_values
+from .presenters.presenter import Found
+from .presenters.registry import presenter_of
 from .result import Alike, Cause, Errors, Gain, Interval, Tolerances, Unexplained, Verdict
 from .rivals import Standing
 
-_DEG = 180.0 / np.pi
-# A scale error below this reverses the joint's direction.
-_BACKWARDS = -1.0
 # Tolerances that leave at most this share of the error are mentioned.
 _BY_TOLERANCES = 0.95
 # An interval with a larger ratio of its ends is given by its upper end.
@@ -41,93 +37,7 @@ def finding(
         numbers: only the shifts and turns given count.
         seen_by: the kind of measuring device, as in `DiagnosisFile`.
     """
-    at = f"joint {where}"
-
-    def size(*names: str) -> float:
-        return float(np.linalg.norm([numbers[n] for n in names if n in numbers]))
-
-    def turned(base: str) -> str:
-        if f"{base}_rad" in numbers:
-            return f"{numbers[f'{base}_rad'] * _DEG:+.3g}°"
-        return f"{numbers[f'{base}_m'] * 1e3:+.3g} mm"
-
-    shift = f"{1e3 * size('x_m', 'y_m', 'z_m'):.3g} mm"
-    turn = f"{size('rx_rad', 'ry_rad', 'rz_rad') * _DEG:.2g}°"
-    shifts, turns = ([axis for axis in "xyz" if form.format(axis) in numbers] for form in ("{}_m", "r{}_rad"))
-    moved = " and ".join(said for said, axes in ((shift, shifts), (turn, turns)) if axes)
-    when = f" at {'t =' if timed else 'row'} {numbers['t0']:.1f}" if "t0" in numbers else ""
-    match name:
-        case "joint_offset":
-            return f"the zero of {at} is off by {turned('offset')}"
-        case "joint_scale":
-            if numbers["scale_error"] < _BACKWARDS:
-                return f"{at} counts the other way than its encoder says"
-            more = "more" if numbers["scale_error"] > 0.0 else "less"
-            return f"{at} turns {100 * abs(numbers['scale_error']):.3g} % {more} than its encoder says"
-        case "joint_eccentricity":
-            return f"the encoder of {at} sits off its axis: ±{numbers['amplitude_rad'] * _DEG:.2g}° once a turn"
-        case "joint_ripple":
-            amplitude = (
-                f"{numbers['amplitude_rad'] * _DEG:.2g}°"
-                if "amplitude_rad" in numbers
-                else (f"{1e3 * numbers['amplitude_m']:.2g} mm")
-            )
-            often = (
-                f"{numbers['cycles_per_turn']:.3g} times a turn"
-                if "cycles_per_turn" in numbers
-                else f"{numbers['cycles_per_m']:.3g} times a metre"
-            )
-            return f"{at} has a ripple of ±{amplitude}, {often}"
-        case "joint_coupling":
-            return f"{at} moves by {100 * numbers['ratio']:+.3g} % of joint {source}'s angle"
-        case "encoder_jump":
-            return f"the zero of {at} jumped by {turned('jump')}{when}"
-        case "backlash":
-            return f"{at} has {turned('width').lstrip('+')} of play"
-        case "settling":
-            return f"{at} was read before it came to rest: {100 * numbers['fraction']:.2g} % of each move was missing"
-        case "hysteresis":
-            lag, length = turned("lag").lstrip("+"), turned("length").lstrip("+")
-            return f"{at} lags by {lag} behind its reading, against the way it went, and turns round over {length}"
-        case "gravity_backlash":
-            return f"{at} has {turned('width').lstrip('+')} of play and hangs on the flank to which the weight pulls it"
-        case "payload":
-            return f"the hand carries {numbers['mass_kg']:.2g} kg that the URDF does not have"
-        case "joint_compliance":
-            if "compliance_rad_per_Nm" in numbers:
-                return f"{at} gives by {numbers['compliance_rad_per_Nm'] * _DEG:.2g}°/N·m under the arm's weight"
-            return f"{at} gives by {1e3 * numbers['compliance_m_per_N']:.2g} mm/N under the arm's weight"
-        case "link_geometry":
-            parts = ((shift, "in", shifts), (turn, "about", turns))
-            said = [f"{amount}{_axes(how, axes)}" for amount, how, axes in parts if axes]
-            return f"the link before {at} is off by {' and '.join(said)}"
-        case "tool_offset":
-            return f"the marker sits {shift} beside its place on the hand"
-        case "tool_slip":
-            return f"the marker slipped by {shift}{when}"
-        case "camera_pose":
-            return f"the {seen_by} stands {moved} off"
-        case "camera_moved":
-            return f"the {seen_by} {'was bumped' if seen_by == 'camera' else 'moved'} by {moved}{when}"
-        case "camera_scale":
-            return f"all that is measured is {100 * numbers['scale_error']:+.3g} % too large: the baseline is wrong"
-        case "camera_focal":
-            return f"the focal length is {100 * numbers['focal_error']:+.3g} % off: depth is scaled"
-        case "lens_distortion":
-            return f"the lenses still distort: k1 = {numbers['k1']:+.3g}"
-        case "camera_latency":
-            return f"images are stamped {1e3 * numbers['latency_s']:.3g} ms late"
-        case "thermal_drift":
-            return f"what is measured drifts by {shift} with a time constant of {numbers['time_constant_s']:.0f} s"
-        case "outliers":
-            return f"{100 * numbers['share']:.2g} % of the fixes are not the marker"
-        case _:
-            return EFFECT_TYPES[name].finding(at, numbers)
-
-
-def _axes(how: str, axes: Sequence[str]) -> str:
-    """Return along or about which axes of its frame a link is off; empty for all three."""
-    return "" if len(axes) == len("xyz") else f" {how} {' and '.join(axes)}"
+    return presenter_of(name).finding(Found(where, source, numbers, seen_by, timed))
 
 
 def sentence(

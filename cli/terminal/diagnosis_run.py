@@ -25,7 +25,7 @@ from bodyschema.diagnosis.diagnosis import diagnose as diagnosed
 from bodyschema.diagnosis.hypotheses import STILL
 from bodyschema.diagnosis.observations import ticks
 from bodyschema.diagnosis.remedies import remedies
-from bodyschema.diagnosis.report import About, page
+from bodyschema.diagnosis.report.page import About, page
 from bodyschema.diagnosis.result import DiagnosisFile
 from bodyschema.diagnosis.words import modelled
 from bodyschema.effects import EFFECT_TYPES, write_corrected, write_extended

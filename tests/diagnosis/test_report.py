@@ -15,9 +15,9 @@ from walked import DESK_ARM, walked
 from bodyschema.diagnosis.conclusion import conclusion
 from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
 from bodyschema.diagnosis.observations import ticks
+from bodyschema.diagnosis.presenters.registry import presenter_of
 from bodyschema.diagnosis.remedies import remedies
-from bodyschema.diagnosis.report import About, page
-from bodyschema.diagnosis.report.evidence import evidence_panels
+from bodyschema.diagnosis.report.page import About, page
 from bodyschema.diagnosis.report.plot import round_up
 from bodyschema.diagnosis.report.plot import ticks as axis_ticks
 from bodyschema.diagnosis.report.residuals import Residuals, binned, structure
@@ -175,9 +175,9 @@ def test_every_effect_has_a_plot_and_a_remedy_of_its_own(robot, planted, file, n
         values[-1] = 50.0
     effect = effect.with_values(values)
     fit = planted.extended.with_causes([effect])
-    panels = evidence_panels(Residuals(dataclasses.replace(planted, extended=fit)), fit.causes[0])
-    assert "<path" in panels[0].svg
-    assert "nan" not in panels[0].svg
+    panel = presenter_of(name).panel(Residuals(dataclasses.replace(planted, extended=fit)), fit.causes[0])
+    assert "<path" in panel.svg
+    assert "nan" not in panel.svg
     parameters = {p.name: Interval(v, (v, v)) for p, v in zip(effect.parameters, effect.values.tolist(), strict=True)}
     extra = {"amplitude_rad": Interval(0.1, (0.1, 0.1)), "phase_rad": Interval(0.2, (0.2, 0.2))}
     known = next(cause for cause in file.causes if cause.effect == "joint_scale")
