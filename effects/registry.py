@@ -13,7 +13,7 @@ from . import catalogue
 from .effect_type import STAGES, EffectType
 
 
-def _built_in() -> list[EffectType]:
+def built_in() -> list[EffectType]:
     """Return one of each class with a name in `catalogue`, by stage, rank and name."""
     modules = [import_module(f"{catalogue.__name__}.{found.name}") for found in iter_modules(catalogue.__path__)]
     effects = [member() for module in modules for member in vars(module).values() if _is_defined_in(module, member)]
@@ -39,7 +39,7 @@ def _of_plugins(names: set[str]) -> Iterator[EffectType]:
 
 
 def _all() -> dict[str, EffectType]:
-    own = _built_in()
+    own = built_in()
     encoder = [effect for effect in own if effect.encoder is not None]
     others = [effect for effect in own if effect.encoder is None]
     return {e.name: e for e in (*encoder, *_of_plugins({effect.name for effect in own}), *others)}

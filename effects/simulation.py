@@ -184,11 +184,13 @@ class Simulation:
         Args:
             optics: in the place of its own.
         """
-        calibration = self.robot.calibration
-        x = (self.optics if optics is None else optics).reported(x, calibration)
+        return self.altered((self.optics if optics is None else optics).reported(x, self.robot.calibration), motion)
+
+    def altered(self, x: FloatArray, motion: Motion) -> FloatArray:
+        """Return the positions (n, 3) [m] that are reported in the place of x (n, 3), by effects beyond the optics."""
         for effect, kind in self._of(CameraEffect):
             if kind.alters_report:
-                x = kind.reported(x, motion, effect.values, calibration)
+                x = kind.reported(x, motion, effect.values, self.robot.calibration)
         return x
 
     @cached_property

@@ -16,11 +16,12 @@ def presenter_of(effect: str) -> Presenter:
     return PRESENTERS.get(effect) or PlainPresenter(EFFECT_TYPES[effect])
 
 
-def _all() -> dict[str, Presenter]:
+def built_in() -> dict[str, Presenter]:
+    """Return one of each class of this folder, by the name of its effect."""
     modules = [import_module(f"{presenters.__name__}.{found.name}") for found in iter_modules(presenters.__path__)]
     members = [member for module in modules for member in vars(module).values()]
     classes = [m for m in members if isinstance(m, type) and issubclass(m, Presenter) and hasattr(m, "effect")]
     return {member.effect: member() for member in classes}
 
 
-PRESENTERS: dict[str, Presenter] = _all()
+PRESENTERS: dict[str, Presenter] = built_in()
