@@ -20,7 +20,7 @@ from bodyschema.robot.description import RobotDescription
 from .joint_errors import JointErrors
 from .motion import Motion
 from .optics import Optics
-from .parameter import T0, Parameter
+from .parameter import Parameter
 
 if TYPE_CHECKING:
     from .effect import Effect
@@ -119,7 +119,7 @@ class EffectType(ABC):
     @cached_property
     def begins(self) -> bool:
         """True if it begins at a moment, its last parameter `t0`."""
-        return T0.name in [parameter.name for parameter in self.turning]
+        return "t0" in [parameter.name for parameter in self.turning]
 
     @property
     def encoder(self) -> EncoderEffect | None:

@@ -18,7 +18,7 @@ from bodyschema.robot.urdf import inverse
 from kbmaps import RigidChain
 
 from .effect import Effect, Identity
-from .effect_type import CameraEffect, EffectType, StructureEffect, TimeEffect, ToolEffect
+from .effect_type import STAGES, CameraEffect, EffectType, Stage, StructureEffect, TimeEffect, ToolEffect
 from .encoder import Place
 from .gravity import GravityLoad
 from .moments import after, since
@@ -211,7 +211,15 @@ class Simulation:
 
     def _of(self, stage: type[Staged]) -> list[tuple[Effect, Staged]]:
         """Return the effects of a stage, each with its type."""
-        return [(effect, effect.kind) for effect in self.all_effects if isinstance(effect.kind, stage)]
+        return [(effect, effect.kind) for effect in self._staged[stage.stage] if isinstance(effect.kind, stage)]
+
+    @cached_property
+    def _staged(self) -> dict[Stage, list[Effect]]:
+        """All effects by their stage."""
+        staged: dict[Stage, list[Effect]] = {stage: [] for stage in STAGES}
+        for effect in self.all_effects:
+            staged[effect.kind.stage].append(effect)
+        return staged
 
     @property
     def bears_weight(self) -> bool:
