@@ -7,7 +7,6 @@ import numpy as np
 from bodyschema.effects import Effect
 from bodyschema.interfaces.records import FloatArray
 
-from .advice import advice
 from .aliases import alias_sentences
 from .background import ANGLE_RAD, DRIVE_RAD, LENGTH_M
 from .contact import doubtful
@@ -29,7 +28,7 @@ from .result import (
 )
 from .rivals import Rival, Standing
 from .scan import Candidate
-from .words import evidence, is_unsure, sentence
+from .text import advice, evidence, is_unsure, sentence
 from .worth import NAMED, nats
 
 _HALF_WIDTH_95 = 1.959964

@@ -24,10 +24,9 @@ from bodyschema.diagnosis.diagnosis import Diagnosis
 from bodyschema.diagnosis.diagnosis import diagnose as diagnosed
 from bodyschema.diagnosis.hypotheses import STILL
 from bodyschema.diagnosis.observations import ticks
-from bodyschema.diagnosis.remedies import remedies
 from bodyschema.diagnosis.report.page import About, page
 from bodyschema.diagnosis.result import DiagnosisFile
-from bodyschema.diagnosis.words import modelled
+from bodyschema.diagnosis.text import modelled, remedies
 from bodyschema.effects import EFFECT_TYPES, write_corrected, write_extended
 from bodyschema.interfaces.errors import BodyschemaError, RecordingError, RequestError
 from bodyschema.interfaces.records import Pair

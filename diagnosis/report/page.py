@@ -15,7 +15,7 @@ from bodyschema.diagnosis.numbers import chance, mm, share, told_values
 from bodyschema.diagnosis.presenters.outliers import outlier_panel
 from bodyschema.diagnosis.presenters.registry import presenter_of
 from bodyschema.diagnosis.result import Cause, DiagnosisFile, Verdict
-from bodyschema.diagnosis.words import beside_geometry, finding, made_to, modelled
+from bodyschema.diagnosis.text import beside_geometry, finding, made_to, modelled
 from bodyschema.effects import Effect
 
 from . import tables

@@ -13,8 +13,8 @@ from bodyschema.diagnosis import presenters
 from bodyschema.diagnosis.conclusion import conclusion
 from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
 from bodyschema.diagnosis.presenters import registry as presenting
-from bodyschema.diagnosis.remedies import remedies
 from bodyschema.diagnosis.report.page import About, page
+from bodyschema.diagnosis.text import remedies
 from bodyschema.effects import EFFECT_TYPES, Effect, Simulation, catalogue, load_simulation, registry, write_extended
 from bodyschema.robot.description import RobotDescription
 

@@ -11,7 +11,7 @@ from planted_cases import ELBOW, SHOULDER, SIGMA_M, desk_arm, measured, motion_o
 from bodyschema.diagnosis.conclusion import conclusion
 from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
 from bodyschema.diagnosis.result import DiagnosisFile
-from bodyschema.diagnosis.words import modelled
+from bodyschema.diagnosis.text import modelled
 from bodyschema.effects import Effect, Motion, Simulation, load_simulation, write_extended
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.recordings.recording import Recording

@@ -1,16 +1,24 @@
-"""Describe causes in words that a mechanic understands."""
+"""Say in words that a mechanic understands what was found, what to do about it, and what to measure next."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from bodyschema.effects.unexplained import PLACE
+import numpy as np
 
-from .numbers import told_values
-from .presenters.presenter import Found
+from bodyschema.effects import Effect
+from bodyschema.effects.unexplained import PLACE
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.robot.description import RobotDescription
+
+from .diagnosis import Diagnosis
+from .nameless import Nameless
+from .numbers import named, rival_named, told_values
+from .presenters.presenter import Found, Workshop
 from .presenters.registry import presenter_of
-from .result import Alike, Cause, Errors, Gain, Interval, Tolerances, Unexplained, Verdict
-from .rivals import Standing
+from .result import Alike, Cause, DiagnosisFile, Errors, Gain, Interval, Tolerances, Unexplained, Verdict
+from .rivals import Rival, Standing, apart_on, whole_range, widened
+from .search import describe
 
 # Tolerances that leave at most this share of the error are mentioned.
 _BY_TOLERANCES = 0.95
@@ -18,8 +26,16 @@ _BY_TOLERANCES = 0.95
 _UNTOLD = 10.0
 # A headline names this many causes and counts the others, to fit two lines.
 _TOLD = 2
-# A less probable cause leaves the verdict open.
+# A less probable cause leaves the verdict open, and is to be confirmed first.
 SURE = 0.9
+# Smallest Δχ² between two causes at which a motion is worth advising.
+_TELLS = 25.0
+# Measurements that reveal an unnamed cause.
+_WATCH = {
+    "joint": "compare its reading with an angle that is measured otherwise",
+    "body": "press on it, or record with a second marker on what carries it",
+    "place": "calibrate the cameras again, where they stand to each other too",
+}
 
 
 def finding(
@@ -38,6 +54,32 @@ def finding(
         seen_by: the kind of measuring device, as in `DiagnosisFile`.
     """
     return presenter_of(name).finding(Found(where, source, numbers, seen_by, timed))
+
+
+def remedies(
+    diagnosis: DiagnosisFile, robot: RobotDescription, steps: FloatArray, torques: FloatArray | None
+) -> list[str]:
+    """Return advice on each cause, the one that explains most first.
+
+    Args:
+        steps: encoder step of each joint (d,) [rad, m]; 0 where it is unknown.
+        torques: the largest torque of gravity on each joint (d,) [N·m, N]; None where masses are unknown.
+    """
+    workshop = Workshop(robot, steps, torques, {cause.effect: cause for cause in diagnosis.causes})
+    causes = sorted(diagnosis.causes, key=lambda cause: -cause.share_of_gain_percent)
+    told = [presenter_of(cause.effect).remedy(workshop, Found.of(cause)) for cause in causes]
+    return [_if_sure(cause, remedy) for cause, remedy in zip(causes, told, strict=True)]
+
+
+def _if_sure(cause: Cause, remedy: str) -> str:
+    """Return the remedy, preceded by what to confirm before any change."""
+    open_ones = [rival for rival in cause.rivals if rival.by == "this_motion"]
+    if cause.probability >= SURE or not open_ones:
+        return remedy
+    rivals = " or ".join(rival_named(rival) for rival in open_ones[:2])
+    return (
+        f"If it is {named(cause.effect, cause.where, cause.source)} and not {rivals}: {remedy[0].lower()}{remedy[1:]}"
+    )
 
 
 def sentence(
@@ -160,3 +202,51 @@ def evidence(standing: Standing) -> str:
         return f"{text}; nothing else comes near."
     rival = standing.rivals[0]
     return f"{text}; the nearest rival: {rival.described} ({100 * rival.probability:.0f} %)."
+
+
+def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
+    """Return sentences of advice: motions that would separate confounded causes, and steps against unnamed causes."""
+    told = []
+    for cause, standing in zip(diagnosis.causes, diagnosis.standings, strict=True):
+        for rival in standing.rivals:
+            if not rival.is_same_anywhere:
+                told.append(_motion(diagnosis, cause, rival))
+            elif not rival.is_one:
+                told.append(
+                    f"{rival.described} can do all that {describe(cause)} does, and more: "
+                    "a longer recording of the same kind would show whether it does."
+                )
+            elif rival.effect is not None:
+                told.append(f"No motion tells {describe(cause)} from {rival.described}: fix whichever is easier.")
+            if isinstance(rival.instead, Nameless):
+                told.append(f"Watch whether {rival.described}: {_WATCH[rival.instead.kind]}.")
+    if diagnosis.left.rattle is not None:
+        told.append(f"Fasten the marker: {diagnosis.left.rattle.what}.")
+    if what := diagnosis.left.nameless:
+        joints = [diagnosis.extended.simulation.robot.joints[k] for k in diagnosis.left.joints]
+        where = f" Look at {', '.join(joints)} first." if joints else ""
+        told.append(f"None of the known effects fits {'; '.join(what)}.{where}{_of_the_model(diagnosis)}")
+    return tuple(dict.fromkeys(told))
+
+
+def _of_the_model(diagnosis: Diagnosis) -> str:
+    stored = diagnosis.left.model is not None and diagnosis.left.model.stored is not None
+    return " The extended simulation is right about it only where the recording has been." if stored else ""
+
+
+def _motion(diagnosis: Diagnosis, cause: Effect, rival: Rival) -> str:
+    """Return advice on the joint that, moved through its whole range, best separates two causes."""
+    robot, fit = diagnosis.extended.simulation.robot, diagnosis.extended
+    pair = f"{describe(cause)} from {rival.described}"
+    apart = [apart_on(fit, rival.instead, widened(fit, [k])) for k in range(len(robot.joints))]
+    best = int(np.argmax(apart))
+    if apart[best] >= _TELLS:
+        low, high = whole_range(fit, best)
+        unit, scale = ("mm", 1e3) if robot.chain.prismatic[best] else ("°", 180.0 / np.pi)
+        span = f"{low * scale:.0f}{unit} to {high * scale:.0f}{unit}"
+        return f"To tell {pair}, move joint {robot.joints[best]} through its whole range ({span}) in another recording."
+    poses = f"To tell {pair}, record poses over the whole range of all joints, with stops and at different speeds"
+    if rival.anywhere >= _TELLS:
+        return f"{poses}."
+    pairs = len(fit.observations) * _TELLS / rival.anywhere
+    return f"{poses}: about {float(f'{pairs:.1g}'):,.0f} of them, since the effect is small beside the noise."
