@@ -14,35 +14,32 @@ from .effect_type import STAGES, EffectType
 
 
 def built_in() -> list[EffectType]:
-    """Return one of each class with a name in `catalogue`, by stage, rank and name."""
+    """Return one of each class in `catalogue` that has a name."""
     modules = [import_module(f"{catalogue.__name__}.{found.name}") for found in iter_modules(catalogue.__path__)]
-    effects = [member() for module in modules for member in vars(module).values() if _is_defined_in(module, member)]
-    return sorted(effects, key=lambda effect: (STAGES.index(effect.stage), effect.rank, effect.name))
+    members = [(module.__name__, member) for module in modules for member in vars(module).values()]
+    classes = [m for place, m in members if isinstance(m, type) and issubclass(m, EffectType) and m.__module__ == place]
+    return [one() for one in classes if hasattr(one, "name")]
 
 
-def _is_defined_in(module: object, member: object) -> bool:
-    own = isinstance(member, type) and issubclass(member, EffectType) and hasattr(member, "name")
-    return own and getattr(member, "__module__", None) == getattr(module, "__name__", "")
-
-
-def _of_plugins(names: set[str]) -> Iterator[EffectType]:
-    """Yield the effects of other packages that load; built-in names take precedence."""
+def _of_plugins() -> Iterator[EffectType]:
+    """Yield the effects of other packages that load."""
     for entry in installed("bodyschema.effects"):
         try:
             effect = entry.load()()
+            if not isinstance(effect, EffectType):
+                raise TypeError("it is not an EffectType")
         except Exception as error:
             warnings.warn(f"the effect {entry.value} of another package is left out: {error}", stacklevel=2)
             continue
-        if effect.name not in names:
-            names.add(effect.name)
-            yield effect
+        yield effect
 
 
 def _all() -> dict[str, EffectType]:
-    own = built_in()
-    encoder = [effect for effect in own if effect.encoder is not None]
-    others = [effect for effect in own if effect.encoder is None]
-    return {e.name: e for e in (*encoder, *_of_plugins({effect.name for effect in own}), *others)}
+    """Return all effects by stage, rank and name; of two with one name, the first."""
+    found: dict[str, EffectType] = {}
+    for effect in (*built_in(), *_of_plugins()):
+        found.setdefault(effect.name, effect)
+    return {e.name: e for e in sorted(found.values(), key=lambda e: (STAGES.index(e.stage), e.rank, e.name))}
 
 
 EFFECT_TYPES: dict[str, EffectType] = _all()
