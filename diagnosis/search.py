@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -142,7 +143,7 @@ class Search:
         self.path = [start]
         if start.causes:
             fit = self._reviewed(start)
-            self.path.append(fit)
+            self._went_to(fit)
         while len(self.path) <= _MOST_STEPS and len(fit.causes) <= _MOST_CAUSES and len(self._seen) < _MOST_SETS:
             added, worth = self._added(fit)
             if added is not None and len(fit.causes) >= asked + _ASKED_EACH:
@@ -159,10 +160,15 @@ class Search:
                 self._tell(f"found {describe(added.causes[-1])}")
             self._seen.add(causes)
             fit = self._reviewed(better)
-            self.path.append(fit)
+            self._went_to(fit)
         is_long = len(self.path) > _MOST_STEPS or len(self._seen) >= _MOST_SETS
         self.ended_early = is_long or len(fit.causes) > _MOST_CAUSES
         return fit
+
+    def _went_to(self, fit: Fit) -> None:
+        """Append a fit to the path; the one before drops its cached results, which are large for many rows."""
+        self.path[-1] = replace(self.path[-1])
+        self.path.append(fit)
 
     def _added(self, fit: Fit) -> tuple[Fit | None, float]:
         """Add one more cause and return its worth [nats]; None if no candidate is probable enough."""
