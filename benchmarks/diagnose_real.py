@@ -129,13 +129,12 @@ def main(argv: Sequence[str] | None = None) -> None:
         return
     for name in args.sets if args.corners else ():
         arm = Arm.load(args.data / name, args.every if name == ONE_DAY else 1)
-        errors = [corner_mm(arm, number, args.seed) for number in CORNERS[: args.corners]]
-        each = ", ".join(f"{one.mean():.3f}" for one in errors)
-        asked = ASKED_OF_CORNERS.get(name, "–")
-        print(
-            f"{name}: mean on left-out corners {np.concatenate(errors).mean():.3f} mm ({each}); asked {asked}.",
-            flush=True,
-        )
+        errors = []
+        for number in CORNERS[: args.corners]:
+            errors.append(corner_mm(arm, number, args.seed))
+            print(f"{name}: corner {number}, mean {errors[-1].mean():.3f} mm", flush=True)
+        mean, asked = np.concatenate(errors).mean(), ASKED_OF_CORNERS.get(name, "–")
+        print(f"{name}: mean on left-out corners {mean:.3f} mm, asked {asked}", flush=True)
     if args.only_corners:
         return
     print("Errors on rows that were not fitted, RMS/mean [mm]; seconds are the processor's.\n")

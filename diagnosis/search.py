@@ -336,8 +336,11 @@ class Search:
         return fit
 
     def _leads_clearly(self, fit: Fit, cause: Effect) -> bool:
-        """Return True if a cause led by more, when it was last reviewed, than the fit has changed since."""
-        if cause.identity not in self._leads:
+        """Return True if a cause led by more, when it was last reviewed, than the fit has changed since.
+
+        A moment, and the choice of a link's numbers, may be better elsewhere however clear the cause is.
+        """
+        if cause.kind.begins or cause.kind.in_parts or cause.identity not in self._leads:
             return False
         lead, then, observations = self._leads[cause.identity]
         changed = abs(fit.log_likelihood - then)
@@ -388,7 +391,8 @@ class Search:
             if better and tried.causes[-1].is_possible:
                 self._tell(f"exchanged {describe(cause)} for {describe(candidate.effect)}")
                 return tried
-        self._leads[cause.identity] = beside.lead, fit.log_likelihood, fit.observations
+        lead = min(beside.lead, 0.5 * beside.itself.gain - rise_for(least, beside.itself.dof))
+        self._leads[cause.identity] = lead, fit.log_likelihood, fit.observations
         return None
 
 

@@ -132,6 +132,26 @@ def test_a_search_that_would_exchange_two_causes_for_ever_ends_with_each_set_tri
     assert search.asked <= 4
 
 
+class Reviewing(Search):
+    """Search that lists which cause it reviews."""
+
+    reviewed: list[str]
+
+    def _second_thoughts(self, fit: Fit, cause: Effect) -> Fit | None:
+        self.reviewed.append(cause.name)
+        return super()._second_thoughts(fit, cause)
+
+
+def test_a_cause_far_ahead_is_not_reviewed_after_a_small_change(robot) -> None:
+    large = Effect.at(robot, "joint_offset", ELBOW, values=[0.05])
+    small = Effect.at(robot, "joint_eccentricity", SHOULDER, values=[0.004, 0.0])
+    search = Reviewing([at_rest(large), at_rest(small)], lambda _: None)
+    search.reviewed = []
+    found = search.run(start_of(robot, walk(robot, 2), (large, small), 2))
+    assert {cause.name for cause in found.causes} == {large.name, small.name}
+    assert search.reviewed.count(large.name) == 1
+
+
 def test_a_moment_is_sought_again_beside_causes_that_came_later(robot) -> None:
     slip = Effect.at(robot, "tool_slip", values=[2e-3, 0.0, 0.0, 30.0])
     turned = Effect.at(robot, "joint_eccentricity", SHOULDER, values=[0.03, 0.0])
