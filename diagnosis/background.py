@@ -27,6 +27,8 @@ _LIKE_OTHERS = 3.0
 _COUNTS_IN_FULL = 1e-9
 # Prior standard deviation of the logarithms of the scales.
 SPREAD = 2.0
+# Largest scale.
+MOST = 10.0
 
 
 class Scales(NamedTuple):
