@@ -100,7 +100,7 @@ class CamerasFile(msgspec.Struct):
 
 
 class CheckFile(msgspec.Struct):
-    """Output of `bodyschema calibrate check --json`. Half widths are those of 95 % intervals."""
+    """Output of `bodyschema calibrate cameras --check --json`. Half widths are those of 95 % intervals."""
 
     holds: bool
     wrong: list[str]

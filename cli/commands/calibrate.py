@@ -9,7 +9,7 @@ import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from bodyschema.cli.commands.calibrate_cameras import cameras, check
+from bodyschema.cli.commands.calibrate_cameras import cameras
 from bodyschema.cli.commands.latency import latency
 from bodyschema.cli.commands.options import (
     AS_THEY_ARE,
@@ -26,8 +26,7 @@ CAMERA_FRAME = "calibrated_camera"
 # Without a help of its own its page shows what `arm` says, beside the commands.
 calibrate = cyclopts.App(name="calibrate")
 calibrate.command(cameras, sort_key=1)
-calibrate.command(check, sort_key=2)
-calibrate.command(latency, sort_key=3)
+calibrate.command(latency, sort_key=2)
 
 
 @calibrate.default

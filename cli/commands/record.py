@@ -26,7 +26,7 @@ def record(
 
     For the store of a sampler that is not running, use `bodyschema export`.
 
-    Needs: a running sampler (`bodyschema run` or `bodyschema sampler`).
+    Needs: a running sampler (`bodyschema run` or `bodyschema run sampler`).
 
     Next: `bodyschema replay` on a CSV or Parquet file.
     """

@@ -44,7 +44,7 @@ CONNECT_S = 0.3
 OPEN_S = 0.7
 
 # One that began before an update is called by the old name.
-SAMPLER = re.compile(r"(bodyschema|-m daemon) sampler\b")
+SAMPLER = re.compile(r"(bodyschema|-m daemon) (run )?sampler\b")
 OLD_UNIT = re.compile(r"^ExecStart=.* -m daemon\b", re.MULTILINE)
 
 Step = tuple[str, Callable[[], Iterator[Check]]]

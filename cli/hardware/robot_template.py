@@ -26,7 +26,7 @@ _FINGER = re.compile(r"gripper|finger|jaw|knuckle", re.IGNORECASE)
 EXAMPLE = Guess("my_robot", "my_robot.urdf", ["joint_1", "joint_2"], "hand", "base_link")
 
 _TEMPLATE = """\
-# A robot for bodyschema. Fix what is marked CHECK, then type `bodyschema config check`.
+# A robot for bodyschema. Fix what is marked CHECK, then type `bodyschema config`.
 
 [robot]
 # Part of the zenoh keys: letters, digits, _ . -

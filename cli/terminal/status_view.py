@@ -112,7 +112,7 @@ def screen(seen: Seen, config: Config) -> RenderableType:
 
 
 def _absent(process: str, route: Route) -> list[RenderableType]:
-    said = f"does not answer on {route}. Start it with `bodyschema {process}`, or both with `bodyschema run`."
+    said = f"does not answer on {route}. Start it with `bodyschema run {process}`, or both with `bodyschema run`."
     return [Text.assemble((process, "bold"), " ", (as_typed(said), "yellow"))]
 
 

@@ -202,7 +202,7 @@ class Learner:
         if not self._sampler_alive:
             yield (
                 f"no sampler on {self._config.tables.zenoh.sampler}, so no new pairs; start it with "
-                "`bodyschema sampler`. Predictions go on"
+                "`bodyschema run sampler`. Predictions go on"
             )
         for problem in (self._feed.problem, self._checkpoint_problem, self._set_aside):
             if problem is not None:

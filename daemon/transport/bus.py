@@ -206,7 +206,7 @@ class ZenohSession:
                     "that may ask this (docs/security.md)"
                 )
             raise BusError(
-                f"nothing answers under {key}. Is the {process} running? Start it with `bodyschema {process}`"
+                f"nothing answers under {key}. Is the {process} running? Start it with `bodyschema run {process}`"
             )
         if replies[0].error is not None:
             raise RequestError(replies[0].error)

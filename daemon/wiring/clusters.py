@@ -50,7 +50,7 @@ class TagFigures(msgspec.Struct):
 
 
 class ClusterFile(msgspec.Struct):
-    """Output of `bodyschema marker cluster --json`."""
+    """Output of `bodyschema marker learn --json`."""
 
     views: int
     misfit: float

@@ -234,7 +234,7 @@ class PoweredJoints(ABC):
         return (
             f"joint {servo.joint!r} (ID {servo.id}) is in operating mode {found}, not {self.mode_name} ({self.mode}). "
             f"It is kept in the servo's EEPROM; type: "
-            f"`bodyschema servos set operating_mode={self.mode} --joint {servo.joint}`"
+            f"`bodyschema servos operating_mode={self.mode} --joint {servo.joint}`"
         )
 
     # --- torque off

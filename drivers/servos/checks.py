@@ -99,7 +99,7 @@ def _delays(servos: Sequence[FittedServo]) -> Iterator[Check]:
             worst_us = 1e6 * max(servo.return_delay_s for servo in slow)
             names = ", ".join(servo.joint for servo in slow)
             said = f"{names}: each answer comes {worst_us:.0f} µs late by Return Delay Time"
-            yield Check(TYPE, "warning", said, f"bodyschema servos set return_delay=0 --bus {name}")
+            yield Check(TYPE, "warning", said, f"bodyschema servos return_delay=0 --bus {name}")
 
 
 def _pace(
@@ -152,7 +152,7 @@ def _rate(times: Sequence[float], read_s: float, config: ServosConfig[Any]) -> C
         slow = next((name for name, bus in config.buses.items() if bus.baud < FAST_BAUD), None)
         faster = "bodyschema install udev    # an adapter's latency timer; then plug it in again"
         return Check(
-            "rate", "warning", said, faster if slow is None else f"bodyschema servos set baud={FAST_BAUD} --bus {slow}"
+            "rate", "warning", said, faster if slow is None else f"bodyschema servos baud={FAST_BAUD} --bus {slow}"
         )
     return Check("rate", "ok", said)
 

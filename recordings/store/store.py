@@ -497,7 +497,7 @@ class PairStore:
 def require_store(file: Path) -> None:
     """Raise StoreError if the file does not exist."""
     if not file.is_file():
-        raise StoreError(f"there is no store {file}. The sampler makes it: start it with `bodyschema sampler`")
+        raise StoreError(f"there is no store {file}. The sampler makes it: start it with `bodyschema run sampler`")
 
 
 def leave_out_damage(file: Path, joints: Sequence[str]) -> Audit:

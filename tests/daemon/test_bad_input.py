@@ -29,7 +29,7 @@ from bodyschema.interfaces.errors import BusError, RequestError
 
 LIMIT_S = 500.0
 DAEMON = ("-m", "bodyschema")
-PROCESSES = ("sampler", "learner", "run")
+PROCESSES = ("run",)
 KEYS = Keys("arm")
 RECORDING = "waist,shoulder,x,y,z\n" + "".join(f"{0.03 * k},0.1,0.3,0.0{k},0.5\n" for k in range(1, 9))
 # Root may write wherever it likes; without this capability it is as everybody.
@@ -116,7 +116,7 @@ def test_nothing_starts_with_a_wrong_description(robot, command, right, wrong, l
     assert said in message
 
 
-@pytest.mark.parametrize("command", ["config check", "learner", "run", "replay walk.csv"])
+@pytest.mark.parametrize("command", ["config", "run learner", "run", "replay walk.csv"])
 def test_more_joints_than_can_be_learnt_are_refused_with_the_limit_and_what_learns_them(tmp_path, command) -> None:
     write_long_arm(tmp_path, joints=13)
     message = refused(*command.split(), cwd=tmp_path)
@@ -127,12 +127,15 @@ def test_more_joints_than_can_be_learnt_are_refused_with_the_limit_and_what_lear
 
 def test_twelve_joints_are_in_order(tmp_path) -> None:
     write_long_arm(tmp_path, joints=12)
-    done = run_here("config", "check", cwd=tmp_path)
+    done = run_here("config", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_a_folder_for_robot_toml_is_refused(robot) -> None:
-    assert refused("sampler", "--robot", ".", cwd=robot.parent) == ".: a folder, not a file. Name the robot.toml in it"
+    assert (
+        refused("run", "sampler", "--robot", ".", cwd=robot.parent)
+        == ".: a folder, not a file. Name the robot.toml in it"
+    )
 
 
 @pytest.mark.parametrize(
@@ -212,7 +215,7 @@ def test_a_port_in_use_is_named_and_leaves_no_trace(robot, process) -> None:
 def test_a_folder_that_cannot_be_written_ends_the_sampler(robot, state_dir, said) -> None:
     folder = robot.parent / state_dir
     (robot.parent / "locked").mkdir(mode=0o555)
-    done = run("sampler", "--state-dir", folder, cwd=robot.parent, by=("-c", WITHOUT_ROOTS_RIGHTS))
+    done = run("run", "sampler", "--state-dir", folder, cwd=robot.parent, by=("-c", WITHOUT_ROOTS_RIGHTS))
     assert done.returncode == 1
     assert said.format(folder if "new" in state_dir else folder / "pairs.sqlite") in done.stderr
     assert list((robot.parent / "locked").iterdir()) == []
@@ -271,7 +274,7 @@ def test_a_prediction_before_any_pair_is_refused_where_the_camera_stands_anywher
     said = refused("predict", "--", "0.1", "-0.2", cwd=lonely_learner.file.parent)
     assert said == (
         "there is no model yet: robot.toml says [camera] pose_known = false, so positions have no frame until about "
-        "10 pairs have come (0 so far). Start the sampler with `bodyschema sampler` and guide the arm"
+        "10 pairs have come (0 so far). Start the sampler with `bodyschema run sampler` and guide the arm"
     )
 
 
@@ -307,8 +310,8 @@ def test_a_learner_without_a_sampler_says_where_it_looks_and_how_to_start_one(lo
     status = learner_status(lonely_learner)
     assert (status.state, status.sampler_alive) == ("waiting", False)
     assert status.health[0] == (
-        f"no sampler on {lonely_learner.tables.zenoh.sampler}, so no new pairs; start it with `bodyschema sampler`. "
-        "Predictions go on"
+        f"no sampler on {lonely_learner.tables.zenoh.sampler}, so no new pairs; start it with `bodyschema run "
+        "sampler`. Predictions go on"
     )
 
 

@@ -151,7 +151,7 @@ def test_a_model_that_is_not_good_is_not_taken(truth, sigma, support) -> None:
 def test_another_mode_is_refused_with_the_command_that_changes_it() -> None:
     robot = GazingRobot()
     robot.chain.servo(2)["operating_mode"] = CURRENT_MODE
-    with robot.joints, pytest.raises(RequestError, match="bodyschema servos set operating_mode=3 --joint neck_pitch"):
+    with robot.joints, pytest.raises(RequestError, match="bodyschema servos operating_mode=3 --joint neck_pitch"):
         robot.switch_on()
     assert torque(robot) == [0] * 7
 
