@@ -112,9 +112,9 @@ def arm(
     from bodyschema.calibration.plausibility.limits import require_units
     from bodyschema.calibration.report import CalibrationReport
     from bodyschema.calibration.rigid_chain import Calibration, CalibrationError
-    from bodyschema.cli.recordings.present_tool import first_pair
     from bodyschema.cli.terminal.calibration_view import two_tools, view
     from bodyschema.daemon.config import Config
+    from bodyschema.daemon.learner.checkpoint import first_pair
     from bodyschema.daemon.transport.wire import encode
     from bodyschema.interfaces.errors import RequestError
     from bodyschema.recordings import files as recordings

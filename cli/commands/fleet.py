@@ -98,8 +98,7 @@ def _list(looked_at: list[Place], *, watch: bool, json: bool) -> None:
     from rich.live import Live
 
     from bodyschema.cli.terminal.status_view import EVERY_S
-    from bodyschema.fleet.roster import Fleet
-    from bodyschema.fleet.roster_view import as_json, screen
+    from bodyschema.fleet.roster import Fleet, as_json, screen
 
     console = Console(highlight=False)
     with Fleet(looked_at) as robots:
@@ -126,8 +125,7 @@ def _compare(looked_at: list[Place], *, as_json: bool) -> None:
     from rich.console import Console
 
     from bodyschema.daemon.transport.wire import encode
-    from bodyschema.fleet.asking import compare_types
-    from bodyschema.fleet.comparison_view import view
+    from bodyschema.fleet.comparison import compare_types, view
     from bodyschema.fleet.roster import Fleet
     from bodyschema.interfaces.errors import RequestError
 

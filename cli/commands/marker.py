@@ -15,7 +15,7 @@ from bodyschema.cli.commands.options import HERE, RobotFile, flag
 
 if TYPE_CHECKING:
     from bodyschema.cli.cameras.calibration import Images
-    from bodyschema.daemon.wiring.clusters import Wanted
+    from bodyschema.daemon.wiring.markers import Wanted
 
 marker = cyclopts.App(
     name="marker",
@@ -145,7 +145,7 @@ def learn(
         if auto or at is not None or len(images) != 1:
             raise RequestError("--side-mm measures a cluster: give one folder of images, and neither --at nor --auto")
         from bodyschema.cli.cameras.tag_pages import numbers_of
-        from bodyschema.daemon.wiring.clusters import Wanted, sides_of
+        from bodyschema.daemon.wiring.markers import Wanted, sides_of
 
         numbers = None if ids is None else tuple(numbers_of(ids))
         wanted = Wanted(family, 1e-3 * side_mm, numbers, sides_of(other_sides_mm) if other_sides_mm else {})
@@ -163,7 +163,7 @@ def _measure_cluster(images: Images, calibration: Path, wanted: Wanted, *, as_js
     from rich.console import Console
 
     from bodyschema.daemon.transport.wire import encode
-    from bodyschema.daemon.wiring.clusters import figures, measured, said, tables
+    from bodyschema.daemon.wiring.markers import figures, measured, said, tables
 
     progress = Console(stderr=True, highlight=False, soft_wrap=True)
     found = measured(images, calibration, wanted, lambda text: progress.print(text, markup=False))

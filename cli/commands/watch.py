@@ -86,8 +86,7 @@ def _joints(robot: Path, *, once: bool, json: bool, zero_force: bool) -> None:
     from rich.console import Console
     from rich.live import Live
 
-    from bodyschema.cli.hardware.joints_view import as_json, screen
-    from bodyschema.cli.hardware.joints_watch import JointsWatch
+    from bodyschema.cli.hardware.joints_watch import JointsWatch, as_json, screen
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.sampler.powered import find_powered
     from bodyschema.daemon.service.signals import on_termination

@@ -15,12 +15,10 @@ from importlib.metadata import version
 
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner.answers import Answers
-from bodyschema.daemon.learner.changes import Changes
-from bodyschema.daemon.learner.checkpoint import CheckpointError, write_checkpoint
+from bodyschema.daemon.learner.checkpoint import CheckpointError, go_on, write_checkpoint
 from bodyschema.daemon.learner.expected import ExpectedMarker
 from bodyschema.daemon.learner.feed import BEHIND, PairFeed
-from bodyschema.daemon.learner.findings import Findings, FindingTurns
-from bodyschema.daemon.learner.resume import go_on
+from bodyschema.daemon.learner.findings import Changes, Findings, FindingTurns
 from bodyschema.daemon.sampler.history import Page, read_page
 from bodyschema.daemon.service.reload import reload
 from bodyschema.daemon.service.service import Service, with_health

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from bodyschema.cli.servos.servos_view import servos_table
+from bodyschema.cli.terminal.status_view import servos_table
 from bodyschema.daemon.sampler.devices import DeviceWatch, differences
 from bodyschema.daemon.transport.status import ServoStatus
 from bodyschema.interfaces.clock import SystemClock

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from bodyschema.cli.hardware import doctor
 from bodyschema.cli.hardware.bench_run import BenchRun
-from bodyschema.cli.hardware.doctor_view import show
+from bodyschema.cli.hardware.doctor import show
 from bodyschema.cli.install.units import FOLDER
 from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config

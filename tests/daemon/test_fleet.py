@@ -20,8 +20,7 @@ from bodyschema.daemon.transport.bus import Request, ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import JointRange, LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode
-from bodyschema.fleet.comparison import Model, common_poses, compared
-from bodyschema.fleet.comparison_view import sentences
+from bodyschema.fleet.comparison import Model, common_poses, compared, sentences
 from bodyschema.fleet.roster import Fleet, places
 from bodyschema.interfaces.errors import BusError, RequestError
 from bodyschema.interfaces.records import FloatArray

@@ -11,8 +11,7 @@ import pytest
 from rich.console import Console
 
 from bodyschema.cli.hardware.bench_run import BenchRun
-from bodyschema.cli.hardware.joints_view import screen
-from bodyschema.cli.hardware.joints_watch import JointState, JointsWatch, Seen, SignCheck, Speeds, signs_in
+from bodyschema.cli.hardware.joints_watch import JointState, JointsWatch, Seen, SignCheck, Speeds, screen, signs_in
 from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.wiring import open_joints

@@ -8,7 +8,7 @@ import sys
 import pytest
 from rich.console import Console
 
-from bodyschema.cli.hardware.doctor_view import show
+from bodyschema.cli.hardware.doctor import show
 from bodyschema.daemon.service.logs import PlainFormatter
 from bodyschema.daemon.service.remedies import WITH_ROBOT, as_typed, given_robot, printable
 from bodyschema.daemon.wiring.servos import Check

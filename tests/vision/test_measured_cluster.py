@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from tag_renderer import Sheet, photograph
 
 from bodyschema.cli.main import app
-from bodyschema.daemon.wiring.clusters import ClusterFile, Wanted, _require_tags, figures, said, sides_of
+from bodyschema.daemon.wiring.markers import ClusterFile, Wanted, _require_tags, figures, said, sides_of
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
