@@ -247,7 +247,7 @@ def by_type(members: Sequence[Member]) -> tuple[dict[tuple[str, ...], list[Membe
         if member.learner is None:
             left_out.append(f"{member.name}: no learner of it answers")
         elif member.joints is None:
-            left_out.append(f"{member.name}: neither a sampler nor a solution tells its joints yet")
+            left_out.append(f"{member.name}: no sampler or solution has reported its joints yet")
         else:
             types.setdefault(member.joints, []).append(member)
     return types, left_out

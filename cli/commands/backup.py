@@ -70,7 +70,7 @@ def _write(file: Path, robot: Path, state_dir: Path | None, *, force: bool) -> N
     if made.unreadable:
         console.print(
             f"{made.unreadable} pairs cannot be read and are not in it: the disk changed what was written. Check the "
-            "disk; `bodyschema doctor` tells their numbers",
+            "disk; `bodyschema doctor` lists their numbers",
             markup=False,
         )
 

@@ -70,7 +70,7 @@ class EyeFiles:
     left: Annotated[str | None, Parameter(help="Pattern of the left eye's files in it, as in cam0_*.png.")] = None
     right: Annotated[str | None, Parameter(help="Pattern of the right eye's.")] = None
     side_by_side: Annotated[bool, flag("Each image shows both eyes, the left one in its left half.")] = False
-    one: Annotated[bool, flag("All images are of one camera alone; --left may tell which of the folder's.")] = False
+    one: Annotated[bool, flag("All images are of one camera alone; --left may select them in the folder.")] = False
 
     def of(self, folder: Path) -> Images:
         """Return the images in `folder` that these options select."""

@@ -37,9 +37,10 @@ def cameras(
         Literal["auto", "pinhole", "fisheye"], Parameter(help="`auto`: what foretells views better.")
     ] = "auto",
     left_serial: Annotated[
-        str, Parameter(help="What tells the left camera from all others; live, it is known.", show_default=False)
+        str,
+        Parameter(help="Serial number of the left camera, kept in the file; live, it is known.", show_default=False),
     ] = "",
-    right_serial: Annotated[str, Parameter(help="The same of the right camera.", show_default=False)] = "",
+    right_serial: Annotated[str, Parameter(help="Serial number of the right camera.", show_default=False)] = "",
     save: Annotated[
         Path | None, Parameter(help="Live: keep the images of all views in this folder, as IMAGES has them.")
     ] = None,

@@ -92,7 +92,7 @@ def _udev(root: Path, *, uninstall: bool, yes: bool, dry_run: bool) -> None:
         console.print("Nothing was changed.")
         return
     of_machine.install()
-    console.print("Written. Plug the adapter in again; `bodyschema doctor` tells whether all is well.")
+    console.print("Written. Plug the adapter in again; `bodyschema doctor` checks it.")
 
 
 def _service(

@@ -58,6 +58,6 @@ def record(
         console.print(
             f"{history.missing.count} pair{'' if one else 's'} between them {'is' if one else 'are'} missing "
             f"(number{'' if one else 's'} {history.missing}): the sampler's disk changed them, or they were deleted "
-            "([daemon] keep_days, keep_mb); `bodyschema status` tells which",
+            "([daemon] keep_days, keep_mb); `bodyschema status` shows which",
             markup=False,
         )

@@ -208,7 +208,7 @@ def _first(watch: JointsWatch) -> Seen:
             seen = watch.look_all_over()
             if seen is not None:
                 return seen
-    raise SourceError("the joints cannot be read. `bodyschema doctor` tells why")
+    raise SourceError("the joints cannot be read. `bodyschema doctor` shows why")
 
 
 def _begin(watch: JointsWatch, force: Powered) -> None:

@@ -207,7 +207,7 @@ def clock_checks(is_synchronised: Callable[[], bool | None] | None = None) -> It
     """Check that the wall clock, which dates the pairs, is synchronised. (Time stamps use the monotonic clock.)"""
     known = (_is_synchronised if is_synchronised is None else is_synchronised)()
     if known is None:
-        yield Check("clock", "ok", "the system does not tell whether the clock is kept right")
+        yield Check("clock", "ok", "the system does not report whether the clock is synchronised")
     elif known:
         yield Check("clock", "ok", "kept right by the network")
     else:
@@ -261,7 +261,7 @@ def zenoh_check(process: str, route: Route, token: str) -> Check:
     if is_alive(route, token, open_timeout_s=OPEN_S):
         return Check("zenoh", "ok", f"the {process} answers on {endpoint}")
     port = endpoint.rpartition(":")[2]
-    said = f"somebody else listens on {endpoint}, where the {process} should"
+    said = f"another program listens on {endpoint}, where the {process} should"
     return Check("zenoh", "wrong", said, f"ss -ltnp 'sport = :{port}'    # who it is; or another port in [zenoh]")
 
 

@@ -86,7 +86,7 @@ radius_m = 0.020
 # port = 5005
 # sigma_m = 0.001
 
-# CHECK: the cameras; `bodyschema scan` names those that are plugged in, docs/cameras.md tells the rest.
+# CHECK: the cameras; `bodyschema scan` names those that are plugged in, docs/cameras.md has the rest.
 {cameras}"""
 
 _CAMERAS = """\

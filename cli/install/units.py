@@ -116,7 +116,7 @@ StateDirectory=bodyschema/%i
 StateDirectoryMode=0750
 Environment=XDG_STATE_HOME=%S
 
-# Nobody from outside is reached or heard, unless robot.toml has endpoints on other machines.
+# No other machine is reached, unless robot.toml has endpoints there.
 IPAddressDeny=any
 IPAddressAllow=localhost
 {devices}

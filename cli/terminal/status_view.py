@@ -177,7 +177,7 @@ def _change(status: LearnerStatus) -> Iterator[str]:
     if change.kind == UNDECIDED:
         yield ", ".join(f"{kind} {share:.0%}" for kind, share in change.probabilities.items())
     elif change.alike is not None:
-        yield f"or {change.alike}: no motion tells them apart"
+        yield f"or {change.alike}: no motion separates them"
     if change.can_roll_back:
         yield as_typed("`bodyschema command rollback` goes back to the model before it")
 

@@ -276,7 +276,7 @@ class Learner:
         self._feed.wake()
         self.checkpoint()
         if foreign is not None:
-            return f"the learner begins anew with the pairs of the store {foreign}"
+            return f"the learner starts again with the pairs of the store {foreign}"
         return "the learner is back at the nominal model; only pairs from now on count"
 
     def _tool_changed(self) -> str:

@@ -13,7 +13,7 @@ log = logging.getLogger(__name__)
 
 Device = Mapping[str, Any]
 
-ANEW = "or keep it, and begin anew with another --state-dir"
+ANEW = "or keep it, and start again with another --state-dir"
 IN_SERVO = {"homing_offset_ticks": "homing_offset", "drive_mode": "drive_mode"}
 IN_ROBOT_TOML = ("zero_ticks", "direction")
 

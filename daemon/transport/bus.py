@@ -389,7 +389,7 @@ def unreached(route: Route) -> str:
             "or its certificate is not for that name or not of your authority. docs/security.md shows how to look"
         )
     return (
-        f"somebody listens on {last} but does not answer: it is stopped, very busy, or no bodyschema. "
+        f"a program listens on {last} but does not answer: it is stopped, very busy, or not bodyschema. "
         "`ps` shows what it is"
     )
 

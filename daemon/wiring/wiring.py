@@ -181,7 +181,7 @@ def _require_source(config: Config, *, sim: bool) -> None:
         if config.tables.marker_source:
             return
         raise ConfigError(
-            "the joints have a driver, but nothing tells where the marker is: no cameras are configured",
+            "the joints have a driver, but nothing measures the marker's position: no cameras are configured",
             file=config.file,
             remedy="Add the table [vision.cameras] (docs/cameras.md) or [marker_source] (docs/marker_sources.md); or "
             "give --sim for the simulated robot",

@@ -293,7 +293,7 @@ class PoweredJoints(ABC):
         if exchange.trouble is not None:
             self._missed[servo.joint] = self._missed.get(servo.joint, 0) + 1
             if self._missed[servo.joint] >= MISSED_LOOKS:
-                raise Drop(f"joint {servo.joint!r}: its servo does not tell its state: {exchange.trouble}")
+                raise Drop(f"joint {servo.joint!r}: its servo does not report its state: {exchange.trouble}")
             return
         self._missed[servo.joint] = 0
         data = exchange.answers[0].status.data

@@ -293,7 +293,7 @@ class MarkerStream:
         times_set = self._clock_of.times_set
         t = self._clock_of.time_of(report.stamp_ns, (0,), arrived)
         if self._clock_of.times_set != times_set:
-            log.warning("%s: the clock of its stamps was set; its time is learnt anew", self.name)
+            log.warning("%s: the clock of its stamps was set; its time is learnt again", self.name)
         if isinstance(t, Refusal):
             raise Unusable(STAMPS[t])
         return t - report.age_s - self._table.latency_s, math.hypot(self._clock_of.sigma_s, self._table.sigma_s)

@@ -59,7 +59,7 @@ def silence(
     if names and missing:
         there = ", ".join(sorted(names)[:SHOWN])
         return (
-            f"{config.topic} says nothing about {', '.join(missing)}; it tells of {there}. "
+            f"{config.topic} does not name {', '.join(missing)}; it names {there}. "
             "Say in [drivers.ros2] names what ROS calls each joint"
         )
     if names:
@@ -257,7 +257,7 @@ class Ros2Joints:
         times_set = sender.times_set
         t = sender.time_of(message.header.stamp_ns, places, arrived)
         if sender.times_set != times_set:
-            log.warning("the clock of the stamps in %s was set; its time is learnt anew", self._config.topic)
+            log.warning("the clock of the stamps in %s was set; its time is learnt again", self._config.topic)
         return t
 
     def _sender(self, who: Who) -> Sender:

@@ -77,7 +77,7 @@ def _health(make: Make, bus: Bus, servo: FittedServo) -> Iterator[Check]:
     layout = servo.model.layout
     exchange = ask_again(bus, bus.read_request(servo.model, servo.id, layout.state))
     if exchange.trouble is not None:
-        said = f"joint {servo.joint} (ID {servo.id}) does not tell how it is: {exchange.trouble}"
+        said = f"joint {servo.joint} (ID {servo.id}) does not report its state: {exchange.trouble}"
         yield Check(TYPE, "wrong", said, "look at cable and connectors, then bodyschema doctor once more")
         return
     status = exchange.answers[0].status

@@ -210,7 +210,7 @@ def test_two_cameras_that_are_plugged_in_are_the_eyes_of_a_new_robot() -> None:
 
 
 def test_without_cameras_the_tables_are_an_example_that_does_nothing() -> None:
-    lines = robot_toml(EXAMPLE).split("docs/cameras.md tells the rest.\n")[1].splitlines()
+    lines = robot_toml(EXAMPLE).split("docs/cameras.md has the rest.\n")[1].splitlines()
     assert all(line.startswith("#") for line in lines)
     assert json.dumps("/dev/v4l/by-id/usb-LEFT-video-index0") in "\n".join(lines)
 
