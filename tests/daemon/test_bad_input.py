@@ -97,13 +97,25 @@ def fix(file: Path, right: str, wrong: str) -> None:
 @pytest.mark.parametrize(
     ("command", "right", "wrong", "line", "said"),
     [
-        ("sampler", '"arm.urdf"', '"leg.urdf"', None, "cannot read the URDF: No such file or directory. Fix [robot]"),
-        ("learner", '"arm.urdf"', '"leg.urdf"', None, "cannot read the URDF: No such file or directory. Fix [robot]"),
-        ("sampler", '"waist", ', '"wrist", ', 4, "there is no joint 'wrist' in arm.urdf. Did you mean 'waist'?"),
+        (
+            "run sampler",
+            '"arm.urdf"',
+            '"leg.urdf"',
+            None,
+            "cannot read the URDF: No such file or directory. Fix [robot]",
+        ),
+        (
+            "run learner",
+            '"arm.urdf"',
+            '"leg.urdf"',
+            None,
+            "cannot read the URDF: No such file or directory. Fix [robot]",
+        ),
+        ("run sampler", '"waist", ', '"wrist", ', 4, "there is no joint 'wrist' in arm.urdf. Did you mean 'waist'?"),
         ("run", '"waist", ', '"wrist", ', 4, "there is no joint 'wrist' in arm.urdf. Did you mean 'waist'?"),
-        ("learner", '"hand"', '"hnd"', 5, "there is no link 'hnd' in arm.urdf. Did you mean 'hand'?"),
-        ("sampler", "state_dir", "statedir", 12, "unknown key 'statedir' in [daemon]. Did you mean 'state_dir'?"),
-        ("learner", "state_dir", "statedir", 12, "unknown key 'statedir' in [daemon]. Did you mean 'state_dir'?"),
+        ("run learner", '"hand"', '"hnd"', 5, "there is no link 'hnd' in arm.urdf. Did you mean 'hand'?"),
+        ("run sampler", "state_dir", "statedir", 12, "unknown key 'statedir' in [daemon]. Did you mean 'state_dir'?"),
+        ("run learner", "state_dir", "statedir", 12, "unknown key 'statedir' in [daemon]. Did you mean 'state_dir'?"),
         ("replay", '"arm.urdf"', '"leg.urdf"', None, "cannot read the URDF: No such file or directory. Fix [robot]"),
         ("predict", '"waist", ', '"wrist", ', 4, "there is no joint 'wrist' in arm.urdf. Did you mean 'waist'?"),
         ("status", "state_dir", "statedir", 12, "unknown key 'statedir' in [daemon]. Did you mean 'state_dir'?"),
@@ -111,7 +123,7 @@ def fix(file: Path, right: str, wrong: str) -> None:
 )
 def test_nothing_starts_with_a_wrong_description(robot, command, right, wrong, line, said) -> None:
     fix(robot, right, wrong)
-    message = refused(command, *(["walk.csv"] if command == "replay" else []), cwd=robot.parent)
+    message = refused(*command.split(), *(["walk.csv"] if command == "replay" else []), cwd=robot.parent)
     assert message.startswith("leg.urdf: " if line is None else f"robot.toml, line {line}: ")
     assert said in message
 
@@ -166,7 +178,7 @@ def test_a_recording_that_is_not_there_is_refused(robot) -> None:
 
 def test_a_sampler_of_an_unreadable_recording_leaves_no_store(robot) -> None:
     fix(robot.parent / "walk.csv", "0.03,", "0.03x,")
-    assert "walk.csv, line 2, column waist: '0.03x' is not a number" in refused("sampler", cwd=robot.parent)
+    assert "walk.csv, line 2, column waist: '0.03x' is not a number" in refused("run", "sampler", cwd=robot.parent)
 
 
 # --- joint angles at the command line
@@ -198,7 +210,7 @@ def test_a_letter_among_the_joint_angles_is_named(robot) -> None:
 def test_a_port_in_use_is_named_and_leaves_no_trace(robot, process) -> None:
     endpoint = getattr(Config.load(robot, {}).tables.zenoh, process)
     with ZenohSession(listen=endpoint):
-        said = refused(process, cwd=robot.parent)
+        said = refused("run", process, cwd=robot.parent)
     assert said == (
         f"the port of {endpoint} is in use. Stop the other bodyschema, "
         "or give another endpoint in the table [zenoh] of robot.toml"
@@ -229,7 +241,7 @@ def process_running(config: Config, process: str, by: tuple[str, ...] = DAEMON) 
     """Run a process and stop it when the context ends."""
     up = threading.Event()
     with tempfile.TemporaryFile() as log, ZenohSession(connect=getattr(config.tables.zenoh, process)) as bus:
-        words = (*by, process, "--robot", config.file)
+        words = (*by, "run", process, "--robot", config.file)
         child = (
             warm.Child(*words, stderr=log) if by == DAEMON else subprocess.Popen([sys.executable, *words], stderr=log)
         )
@@ -319,7 +331,7 @@ def test_the_status_of_a_learner_alone_names_the_command_that_starts_a_sampler(l
     done = run_here("status", cwd=lonely_learner.file.parent)
     text = " ".join(done.stdout.split())
     assert done.returncode == 0
-    assert f"sampler does not answer on {lonely_learner.tables.zenoh.sampler}. Start it with `bodyschema s" in text
+    assert f"sampler does not answer on {lonely_learner.tables.zenoh.sampler}. Start it with `bodyschema run s" in text
 
 
 def test_a_command_of_the_sampler_is_refused_by_the_learner(lonely_learner) -> None:
