@@ -39,9 +39,10 @@ REMEDIES: Mapping[Reason, str] = {
     Reason.DISAGREEING: "The sampler's health says by how much, and what would make them agree: `bodyschema status`.",
     Reason.IMPLAUSIBLE_SPEED: "Is another thing of its colour in sight? If it really is so fast, raise [vision] "
     "max_speed_m_s and [daemon] max_marker_speed_m_s.",
-    Reason.EPIPOLAR: "Are the cameras exchanged, one upside down, or moved? `bodyschema calibrate check` tells.",
+    Reason.EPIPOLAR: "Are the cameras exchanged, one upside down, or moved? `bodyschema calibrate cameras --check` "
+    "shows it.",
     Reason.SIZE_MISMATCH: "Is its size in [vision] right? Else it is the calibration of other cameras, or they were "
-    "moved: `bodyschema calibrate check`.",
+    "moved: `bodyschema calibrate cameras --check`.",
     Reason.AMBIGUOUS: "Take other things of its colour, or the second tag of its number, out of sight.",
     Reason.NO_JOINTS: "Do the encoders answer, and is [vision.cameras] latency_s right? `bodyschema calibrate latency` "
     "measures it.",

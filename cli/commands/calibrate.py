@@ -9,7 +9,7 @@ import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from bodyschema.cli.commands.calibrate_cameras import cameras, check
+from bodyschema.cli.commands.calibrate_cameras import cameras
 from bodyschema.cli.commands.latency import latency
 from bodyschema.cli.commands.options import (
     AS_THEY_ARE,
@@ -26,8 +26,7 @@ CAMERA_FRAME = "calibrated_camera"
 # Without a help of its own its page shows what `arm` says, beside the commands.
 calibrate = cyclopts.App(name="calibrate")
 calibrate.command(cameras, sort_key=1)
-calibrate.command(check, sort_key=2)
-calibrate.command(latency, sort_key=3)
+calibrate.command(latency, sort_key=2)
 
 
 @calibrate.default
@@ -113,9 +112,9 @@ def arm(
     from bodyschema.calibration.plausibility.limits import require_units
     from bodyschema.calibration.report import CalibrationReport
     from bodyschema.calibration.rigid_chain import Calibration, CalibrationError
-    from bodyschema.cli.recordings.present_tool import first_pair
     from bodyschema.cli.terminal.calibration_view import two_tools, view
     from bodyschema.daemon.config import Config
+    from bodyschema.daemon.learner.checkpoint import first_pair
     from bodyschema.daemon.transport.wire import encode
     from bodyschema.interfaces.errors import RequestError
     from bodyschema.recordings import files as recordings

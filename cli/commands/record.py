@@ -26,7 +26,7 @@ def record(
 
     For the store of a sampler that is not running, use `bodyschema export`.
 
-    Needs: a running sampler (`bodyschema run` or `bodyschema sampler`).
+    Needs: a running sampler (`bodyschema run` or `bodyschema run sampler`).
 
     Next: `bodyschema replay` on a CSV or Parquet file.
     """
@@ -58,6 +58,6 @@ def record(
         console.print(
             f"{history.missing.count} pair{'' if one else 's'} between them {'is' if one else 'are'} missing "
             f"(number{'' if one else 's'} {history.missing}): the sampler's disk changed them, or they were deleted "
-            "([daemon] keep_days, keep_mb); `bodyschema status` tells which",
+            "([daemon] keep_days, keep_mb); `bodyschema status` shows which",
             markup=False,
         )

@@ -80,7 +80,7 @@ def _servos(simulation: Simulation, joints: dict[str, JointErrors]) -> Iterator[
         table = getattr(drivers, make)
         if table is None:
             continue
-        lines = [f"{make}: one of the two, in ticks; then torque off, and `bodyschema servos show`"]
+        lines = [f"{make}: one of the two, in ticks; then torque off, and `bodyschema servos`"]
         for servo in table.servos:
             if servo.joint not in joints or not joints[servo.joint].offset:
                 continue

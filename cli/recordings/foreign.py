@@ -52,7 +52,7 @@ def opened(config: Config, source: Path, taken: Taken) -> Recording:
     if is_lerobot_dataset(source):
         if marker is None:
             raise RecordingError(
-                "a LeRobotDataset tells joints alone",
+                "a LeRobotDataset has no marker positions",
                 file=source,
                 remedy="Give the marker's positions with --markers FILE.csv: t, x, y, z, and the episode as segment",
             )

@@ -20,7 +20,7 @@ from bodyschema.daemon.wiring.wiring import open_joints
 from bodyschema.drivers.bench.pty_shell import PtyShell
 from bodyschema.drivers.dynamixel.bench.servo import Servo as DynamixelServo
 from bodyschema.drivers.dynamixel.models import BY_NAME as DYNAMIXEL
-from bodyschema.drivers.feetech.bench.chain import Chain
+from bodyschema.drivers.feetech.bench.arm import Chain
 from bodyschema.drivers.feetech.bench.servo import Servo
 from bodyschema.drivers.feetech.models import BY_NAME
 from bodyschema.interfaces.clock import SystemClock

@@ -31,7 +31,7 @@ from bodyschema.reproduce.stream import RULE, Stream, bernstein_map, in_stages, 
 from bodyschema.reproduce.walk import walk
 from kbmaps import ChainTolerances, NonFiniteError, RigidChain
 
-PAGE = Path(__file__).parents[2] / "docs" / "reproduced.md"
+PAGE = Path(__file__).parents[2] / "docs" / "results" / "paper.md"
 # Small variants, so that every curve and table is made in seconds.
 SMALL = {
     "fig4": lambda run: fig4(run, samples=1_000, tests=200),

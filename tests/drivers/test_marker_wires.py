@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from sent_markers import table
 
+from bodyschema.daemon.wiring.wiring import stream_of
 from bodyschema.drivers.markers.bench.natnet_server import NatnetServer
 from bodyschema.drivers.markers.checks import stream_checks
 from bodyschema.drivers.markers.datagram import SCHEMA
 from bodyschema.drivers.markers.natnet import packets
-from bodyschema.drivers.markers.opened import stream_of
 from bodyschema.drivers.markers.report import Unusable
 from bodyschema.drivers.markers.stream import MarkerStream
 from bodyschema.drivers.ros2 import rmw

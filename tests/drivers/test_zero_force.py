@@ -182,7 +182,7 @@ def test_nothing_is_written_to_an_eeprom() -> None:
 
 def test_another_mode_is_refused_with_the_command_that_changes_it() -> None:
     with (arm := FloatingArm(mode=POSITION_MODE)).joints:
-        with pytest.raises(RequestError, match="bodyschema servos set operating_mode=0 --joint joint1"):
+        with pytest.raises(RequestError, match="bodyschema servos operating_mode=0 --joint joint1"):
             arm.switch_on()
         assert arm.torque == [0, 0]
 

@@ -58,7 +58,7 @@ def test_the_commands_for_a_real_arm_go_through_on_a_bench(tmp_path: Path, capsy
             ["init", "--urdf", urdf, "--from", "scan", *port, "--robot", robot, "--yes"],
             ["scan", *port, "--robot", robot],
             ["doctor", "--robot", str(run.robot_file)],
-            ["joints", "--robot", robot, "--once"],
+            ["watch", "joints", "--robot", robot, "--once"],
         ):
             command_line(words[0])(words, exit_on_error=False, result_action="return_value")
     shown = capsys.readouterr().out

@@ -5,9 +5,9 @@ import pytest
 from guided_run import guide, learning, shipped, shipped_run, step_degrees
 
 from bodyschema.sim_backend import SimConfig, true_chain
-from bodyschema.sim_backend.arm import TorqueFreeArm
 from bodyschema.sim_backend.bullet import Body
 from bodyschema.sim_backend.config import CameraConfig, SimTag
+from bodyschema.sim_backend.physics import TorqueFreeArm
 from bodyschema.sim_backend.physics_urdf import physics_urdf
 from bodyschema.sim_backend.roles import JointRoles
 from bodyschema.sim_backend.truth import TrueRobot

@@ -70,7 +70,7 @@ def on_the_bench(config: Config, folder: Path, angle: Callable[[float], FloatArr
 
 
 class SamplerProcess:
-    """A running `bodyschema sampler`."""
+    """A running `bodyschema run sampler`."""
 
     def __init__(
         self, config: Config, bus: ZenohSession, process: subprocess.Popen[bytes] | warm.Child, log: Path
@@ -104,7 +104,7 @@ class SamplerProcess:
 @contextlib.contextmanager
 def sampling(config: Config, environment: dict[str, str] | None = None) -> Iterator[SamplerProcess]:
     """Run a sampler process."""
-    words = ["-m", "bodyschema", "sampler", "--robot", config.file]
+    words = ["-m", "bodyschema", "run", "sampler", "--robot", config.file]
     log = config.file.with_suffix(".log")
     with log.open("w") as errors:
         if environment:  # the environment applies to new processes

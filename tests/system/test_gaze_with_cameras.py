@@ -1,4 +1,4 @@
-"""`bodyschema sampler` with gaze: an emulated head of two servos, which carries cameras below OpenCV."""
+"""`bodyschema run sampler` with gaze: an emulated head of two servos, which carries cameras below OpenCV."""
 
 from __future__ import annotations
 
