@@ -14,6 +14,7 @@ import numpy as np
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler.reconnect import ReconnectingSource
 from bodyschema.daemon.sampler.sources import (
+    THE_CAMERAS,
     Head,
     JoinedHealth,
     MarkerTopic,
@@ -264,7 +265,7 @@ def _seen_by(config: Config) -> str:
     names = [*(table.name for table in tables.vision.further_cameras), *(table.label for table in tables.marker_source)]
     if tables.vision.cameras is not None:
         if not names:
-            return Sources.seen_by
+            return THE_CAMERAS
         names.insert(0, "cameras")
     return f"the positions by {' and '.join(names)}"
 

@@ -51,7 +51,7 @@ def test_help_names_every_command(tmp_path) -> None:
     assert [name for name in COMMANDS if f" {name} " not in text] == []
 
 
-@pytest.mark.parametrize("command", [*COMMANDS, "init", "config check", "config show", "install udev", "robot new"])
+@pytest.mark.parametrize("command", [*COMMANDS, "init", "config check", "config show", "install udev"])
 def test_each_command_says_what_it_needs_and_what_is_next(command, capsys) -> None:
     # As in a process of its own: a summary given to the same page before would be shown in its place.
     sys.modules.pop(f"bodyschema.cli.commands.{command.split()[0]}", None)
