@@ -237,7 +237,7 @@ def test_a_learner_restored_amid_a_tool_change_fits_the_tool_all_the_same() -> N
     assert Scene(changed, q, []).error_m(restored) < 0.025
 
 
-@pytest.mark.parametrize("end", ["restart", "lost solver"])
+@pytest.mark.parametrize("end", ["restart", pytest.param("lost solver", marks=pytest.mark.soak)])
 def test_what_was_learnt_from_pairs_that_are_no_longer_kept_is_not_forgotten(end: str) -> None:
     scene = Scene.draw(0, 240)
     settings = LearnerConfig(replay_capacity=60)
@@ -348,7 +348,7 @@ def test_the_same_pairs_and_seed_give_the_same_model() -> None:
     assert one.snapshot.digest == two.snapshot.digest
 
 
-@settings(max_examples=6)
+@settings(max_examples=3)
 @given(
     seed=st.integers(0, 2**32 - 1),
     wild=st.dictionaries(st.integers(0, 23), st.floats(-900.0, 900.0), max_size=12),

@@ -18,7 +18,7 @@ from bodyschema.recordings.recording import Recording
 from bodyschema.robot.description import RobotDescription
 
 PER_RAD = 0.03
-ROWS = 150
+ROWS = 300
 
 
 @pytest.fixture(scope="module")

@@ -376,8 +376,15 @@ def test_six_servos_are_read_two_hundred_times_a_second() -> None:
         assert 500 / (arm.clock.now() - begin) >= 200
 
 
-@pytest.mark.parametrize("models", [("XM430-W350",) * 6, MIXED])
-@pytest.mark.parametrize("fast", ["auto", "never"])
+@pytest.mark.parametrize(
+    ("models", "fast"),
+    [
+        (("XM430-W350",) * 6, "auto"),
+        (MIXED, "never"),
+        pytest.param(("XM430-W350",) * 6, "never", marks=pytest.mark.soak),
+        pytest.param(MIXED, "auto", marks=pytest.mark.soak),
+    ],
+)
 def test_in_a_storm_of_faults_no_wrong_reading_is_believed(models, fast) -> None:
     arm = Arm(models, fast=fast, seed=5)
     with arm.joints:
