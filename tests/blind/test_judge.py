@@ -32,7 +32,7 @@ from .kinds import KINDS
 from .meaning import meant
 from .sealed import encoded, read
 
-PAIRS = 250
+PAIRS = 150
 ELBOW = "joint_offset@elbow"
 Hide = Callable[..., Truth]
 

@@ -18,7 +18,6 @@ from bodyschema.recordings.recording import Recording
 from bodyschema.robot.description import RobotDescription
 
 PER_RAD = 0.03
-ROWS = 300
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +33,7 @@ def squared_positions(robot: RobotDescription, motion: Motion) -> FloatArray:
 
 
 def squared_recording(robot: RobotDescription) -> Recording:
-    motion = walk(robot, 1, rows=ROWS)
+    motion = walk(robot, 1)
     x = squared_positions(robot, motion)
     return measured(robot, motion, x + SIGMA_M * np.random.default_rng([1, 1]).normal(size=x.shape))
 
@@ -77,9 +76,9 @@ def stored(diagnosis: Diagnosis, folder: Path) -> Simulation:
 
 
 def test_the_stored_model_makes_the_simulation_right_on_another_way(robot, diagnosis, tmp_path) -> None:
-    motion = walk(robot, 2, rows=ROWS)
+    motion = walk(robot, 2)
     left = stored(diagnosis, tmp_path).positions(motion) - squared_positions(robot, motion)
-    learnt = walk(robot, 1, rows=ROWS).q
+    learnt = walk(robot, 1).q
     inside = np.abs(motion.q - np.median(learnt, axis=0)) < 0.4 * np.ptp(learnt, axis=0)
     assert np.sqrt(np.square(left[inside.all(axis=1)]).sum(axis=1).mean()) < 0.5 * SIGMA_M * np.sqrt(3.0)
 
@@ -91,7 +90,7 @@ def test_a_further_diagnosis_with_the_stored_model_finds_nothing(robot, diagnosi
 
 
 def test_the_held_out_error_is_that_of_the_stored_model(robot, diagnosis, file, tmp_path) -> None:
-    motion = walk(robot, 1, rows=ROWS)
+    motion = walk(robot, 1)
     off = stored(diagnosis, tmp_path).positions(motion) - squared_positions(robot, motion)
     truth_mm = 1e3 * np.sqrt(np.square(off).sum(axis=1).mean() + 3.0 * SIGMA_M**2)
     assert abs(file.rms_mm.extended / truth_mm - 1.0) < 0.05
