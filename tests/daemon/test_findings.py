@@ -171,7 +171,7 @@ def test_the_arm_is_found_to_be_better_made_than_the_learner_s_tolerances() -> N
 
 
 def test_what_is_known_of_the_zeros_outlives_a_tool_change() -> None:
-    arm = Planted.of(3, 100)
+    arm = Planted.of(3, 60)
     before, _ = figures(arm.robot, arm.known())
     arm.change[arm.parameters.tool] += OTHER_TOOL
     arm.learning.tool_changed()
@@ -182,7 +182,7 @@ def test_what_is_known_of_the_zeros_outlives_a_tool_change() -> None:
 
 
 def test_the_noise_is_the_scatter_of_the_pairs() -> None:
-    assert Scatter.of(Planted.of(4, 120).known()).noise_m == pytest.approx(SIGMA_M, rel=0.15)
+    assert Scatter.of(shared(2, 60).known()).noise_m == pytest.approx(SIGMA_M, rel=0.15)
 
 
 # --- outlook
