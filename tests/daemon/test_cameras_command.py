@@ -85,8 +85,18 @@ def test_the_check_of_a_bumped_camera_ends_with_exit_code_1(folder, tmp_path, ca
     [
         (lambda pair: pair.right, lambda pair: pair.left, "left and right are exchanged"),
         (lambda pair: pair.left, lambda pair: pair.right[::-1, ::-1], "the right image is upside down"),
-        (lambda pair: pair.left[::-1, ::-1], lambda pair: pair.right, "the left image is upside down"),
-        (lambda pair: pair.left[::-1, ::-1], lambda pair: pair.right[::-1, ::-1], "both images are upside down"),
+        pytest.param(
+            lambda pair: pair.left[::-1, ::-1],
+            lambda pair: pair.right,
+            "the left image is upside down",
+            marks=pytest.mark.soak,
+        ),
+        pytest.param(
+            lambda pair: pair.left[::-1, ::-1],
+            lambda pair: pair.right[::-1, ::-1],
+            "both images are upside down",
+            marks=pytest.mark.soak,
+        ),
     ],
 )
 def test_the_check_names_images_that_are_exchanged_or_upside_down(folder, tmp_path, capsys, left, right, said) -> None:

@@ -23,7 +23,7 @@ from bodyschema.drivers.markers.datagram import SCHEMA
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.records import JointReading, frozen_array
 
-LIMIT_S = 120.0
+LIMIT_S = 400.0
 PAIRS = 12
 AHEAD_S = 999.0
 SIGMA_M = 2e-4

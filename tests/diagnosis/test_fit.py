@@ -85,7 +85,9 @@ SHAPED = {
 }
 
 
-@pytest.mark.parametrize("name", SHAPED)
+@pytest.mark.parametrize(
+    "name", ["settling", *(pytest.param(name, marks=pytest.mark.soak) for name in SHAPED if name != "settling")]
+)
 def test_a_period_or_time_constant_lies_in_its_stated_interval_as_often_as_stated(robot, name) -> None:
     where, values, off = SHAPED[name]
     truth = Effect.at(robot, name, where, values=values)

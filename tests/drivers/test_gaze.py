@@ -74,8 +74,8 @@ def test_the_head_turns_no_faster_than_allowed() -> None:
 def test_the_head_stays_within_its_limits() -> None:
     with (robot := GazingRobot(limits_deg={"neck_pitch": (15.0, 22.0), "neck_yaw": (-5.0, 5.0)})).joints:
         robot.switch_on()
-        robot.run(2.0)
-        for _ in range(60):
+        robot.run(1.0)
+        for _ in range(30):
             robot.run(0.1)
             yaw, pitch = np.degrees(robot.q()[:2])
             assert -5.2 <= yaw <= 5.2

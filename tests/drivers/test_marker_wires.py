@@ -29,7 +29,7 @@ from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.records import MarkerFix
 
-LIMIT_S = 60.0
+LIMIT_S = 400.0
 AT = (0.1, 0.2, 0.3)
 LEVEL = (0.0, 0.0, 0.0, 1.0)
 EVERY_S = 0.004

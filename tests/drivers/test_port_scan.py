@@ -92,8 +92,15 @@ def test_a_servo_is_found_at_every_rate(model, baud) -> None:
     assert [(s.id, s.baud, s.model) for s in told] == [(7, baud, model), (8, baud, model)]
 
 
-@pytest.mark.parametrize("model", FEETECH)
-@pytest.mark.parametrize("baud", FEETECH_BAUDS)
+@pytest.mark.parametrize(
+    ("model", "baud"),
+    [
+        # Each model and each rate once; every model at every rate in soak.
+        pytest.param(model, baud, marks=() if k == j % len(FEETECH) else pytest.mark.soak)
+        for k, model in enumerate(FEETECH)
+        for j, baud in enumerate(FEETECH_BAUDS)
+    ],
+)
 def test_a_feetech_servo_is_found_at_every_rate(model, baud) -> None:
     told = found(feetech(model, 9, baud), feetech(model, 10, baud))  # 9 is a byte of an STS3215's number, too
     assert [(s.id, s.baud, s.model, s.protocol) for s in told] == [(id, baud, model, "Feetech") for id in (9, 10)]

@@ -71,7 +71,7 @@ def test_a_hand_moves_it_and_it_stays_there() -> None:
         assert abs(arm.q[0] - moved) < DRIFT_RAD
 
 
-@pytest.mark.parametrize("directions", [(1, -1), (-1, 1)])
+@pytest.mark.parametrize("directions", [(1, -1), pytest.param((-1, 1), marks=pytest.mark.soak)])
 def test_a_joint_that_counts_against_its_servo_floats_too(directions) -> None:
     with (arm := FloatingArm(directions=directions)).joints:
         arm.float()

@@ -184,6 +184,7 @@ def guided_recording(robot: RobotDescription, rows: int) -> str:
     return "\n".join([",".join([*robot.joints, "x", "y", "z"]), *lines, ""])
 
 
+@pytest.mark.soak
 def test_a_recording_of_one_s_own_is_replayed_as_on_the_page(desk) -> None:
     recording = guided_recording(RobotDescription.load(desk / "robot.toml"), 60)
     (desk / "guided.csv").write_text(recording, encoding="utf-8")

@@ -94,7 +94,7 @@ def extended(*cases) -> Simulation:
     return Simulation(robot, tuple(Effect.at(robot, *case) for case in cases))
 
 
-def guided(simulation: Simulation, config: SimConfig = CONFIG, seconds: float = 1.5) -> tuple[Motion, np.ndarray]:
+def guided(simulation: Simulation, config: SimConfig = CONFIG, seconds: float = 1.0) -> tuple[Motion, np.ndarray]:
     """Return readings at every step from the start, and an ideal tracker's positions; NaN between frames."""
     robot = simulation.robot
     assert robot.calibration is not None
