@@ -61,9 +61,8 @@ def test_the_simulated_robot_has_no_latency(tmp_path, monkeypatch, capsys) -> No
     monkeypatch.chdir(tmp_path)
     app(["init", "--sim"], exit_on_error=False, result_action="return_value")
     with Path("robot.toml").open("a", encoding="utf-8") as file:
-        file.write(
-            "[sim.camera]\nclutter = 0\nscene_step = 4\nsupersampling = 1\nrate_hz = 20\n"
-        )  # cheaper images, and fewer
+        # Cheaper images, and fewer.
+        file.write("[sim.camera]\nclutter = 0\nscene_step = 4\nsupersampling = 1\nrate_hz = 20\n")
     capsys.readouterr()
     words = ["calibrate", "latency", "--sim", "--json", "--seconds", "3.5"]
     app(words, exit_on_error=False, result_action="return_value")
