@@ -123,6 +123,40 @@ def test_what_blur_brings_from_the_modules_beyond_pulls_no_edge(blur_px) -> None
     assert np.abs(tag.corners_px - true).max() < 0.06
 
 
+PHOTOGRAPHED = {
+    "a lamp at one side": replace(WALL, light_slope=(0.5, -0.3), ambient=0.25),
+    "halos": replace(WALL, sharpen=1.5),
+    "phone": replace(WALL, sharpen=1.0, bayer=True, denoise=4.0, jpeg=75),
+    "tone curve": replace(WALL, tone=1 / 2.2),
+}
+
+
+def corners_in_the_left_eye(rotation: FloatArray) -> FloatArray:
+    corners = MIDDLE + SIDE_M * TAG_CORNERS @ rotation.T
+    return SMALL.focal_px * corners[:, :2] / corners[:, 2:] + SMALL.principal_point_px
+
+
+def measured(thing: Sheet, look: Look = WALL) -> TagImage | Reason:
+    grey = np.asarray(cv2.cvtColor(seen(thing, look=look).left, cv2.COLOR_BGR2GRAY), np.uint8)
+    return measure_tag(grey, 0, corners_in_the_left_eye(thing.rotation) + 0.4, CONFIG)
+
+
+@pytest.mark.parametrize("look", PHOTOGRAPHED.values(), ids=PHOTOGRAPHED)
+def test_no_camera_moves_a_corner_far(look) -> None:
+    rotation = tilted([1.0, 1.0, 0.3], 12.0)
+    tag = measured(sheet(rotation=rotation), look)
+    assert isinstance(tag, TagImage)
+    # A tone curve makes all that is black narrower, by a third of the lens blur.
+    assert np.abs(tag.corners_px - corners_in_the_left_eye(rotation)).max() < (0.1 if look.tone == 1.0 else 0.35)
+
+
+def test_a_curled_sheet_is_measured_with_less_certainty() -> None:
+    flat, curled = measured(sheet()), measured(replace(sheet(), curl=6.0, rotation=tilted([1.0, 0.0, 0.0], 40.0)))
+    assert isinstance(flat, TagImage)
+    assert isinstance(curled, TagImage)
+    assert np.trace(curled.cov_px) > 2.0 * np.trace(flat.cov_px)
+
+
 def test_a_followed_tag_is_found_after_a_step_and_after_a_jump() -> None:
     found = tracker()
     for number, x in enumerate(MIDDLE + np.array([[0.0, 0.0, 0.0], [0.004, 0.0, 0.0], [-0.04, 0.03, 0.05]])):
