@@ -21,6 +21,7 @@ from bodyschema.vision.calibration.guidance import Coverage
 from bodyschema.vision.calibration.images import ImagePair
 from bodyschema.vision.calibration.influence import covariance
 from bodyschema.vision.calibration.view import View
+from bodyschema.vision.lens import Lens
 from bodyschema.vision.rig import CalibrationError
 
 ASKED = Asked(SIZE, ("A1", "B2"), "2026-01-01T00:00:00Z", scale_sigma=0.0)
@@ -104,6 +105,15 @@ def test_the_lens_model_is_chosen_that_foretells_views_better(fisheye) -> None:
     rig = webcams(rng, fisheye=fisheye)
     found = calibrate(corner_views(rig, rng), BOARD, ASKED)
     assert found.rig.model == ("fisheye" if fisheye else "pinhole")
+
+
+def test_a_model_that_folds_the_image_over_is_not_taken(planted, monkeypatch) -> None:
+    _, views = planted
+    monkeypatch.setattr(Lens, "is_one_to_one", lambda lens, _: lens.model != "pinhole")
+    told: list[str] = []
+    found = calibrate(views, BOARD, ASKED, told.append)
+    assert "pinhole" not in found.rivals_px
+    assert any("pinhole lenses do not fit: the pinhole model folds over within the image" in each for each in told)
 
 
 def test_the_held_out_error_is_that_of_new_views(planted) -> None:

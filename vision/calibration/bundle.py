@@ -16,7 +16,7 @@ from bodyschema.vision.rig import CalibrationError, lens_of_one, split
 from .view import EYES, Eye, View
 
 _ITERATIONS = 60
-_CONVERGED = 1e-9  # smallest relative decrease of the sum of squares for another step
+_CONVERGED = 1e-7  # smallest relative decrease of the sum of squares for another step: thousandths of a sigma
 _FIRST_DAMPING = 1e-4
 _MOST_DAMPING = 1e12
 _POSE = 6
