@@ -38,6 +38,9 @@ _FEWEST_POINTS, _MOST_POINTS = 6, 80
 SHARPEST_PX = 0.45
 # Variance that interpolation between pixels adds to a blur [px²].
 _INTERPOLATION = 1.0 / 6.0
+# Fourth cumulant along an axis of a square pixel and of the interpolation between them [px⁴]: no such blur reaches as
+# far as a Gaussian.
+PIXEL_CUMULANT = -1.0 / 40.0
 # Relative error of the correction for the modules beyond: no lens blurs exactly like a Gaussian.
 _BEYOND_SHARE = 0.2
 # Systematic error of an edge's position on long lines [px]; larger on short ones.
@@ -134,7 +137,8 @@ def find_edge(grey: ImageArray, corners_px: FloatArray, side: int, blur_px: floa
         return Reason.AT_BORDER
     beyond = _sampled(grey, _within(grey, _beyond(to_px, points[:, None] + ends[..., None] * normal)))
     ideal = _ideal(places, origin, normal, blur_px)
-    found = _points(_sampled(grey, places), ideal, steps, beyond, ends, blur_px, config.min_contrast)
+    cumulant = PIXEL_CUMULANT * float((normal**4).sum()) / blur_px**4
+    found = _points(_sampled(grey, places), ideal, steps, beyond, ends, blur_px, cumulant, config.min_contrast)
     if isinstance(found, Reason):
         return found
     line = _line(s, found, config)
@@ -216,6 +220,7 @@ def _points(
     beyond: FloatArray,
     ends: FloatArray,
     blur_px: float,
+    cumulant: float,
     min_contrast: float,
 ) -> _Points | Reason:
     """Return the edge's points on the lines across it, or the reason why there are none.
@@ -226,6 +231,7 @@ def _points(
         profiles: grey levels (n, m) at `steps` (m,) [px].
         ideal: levels of an ideal edge at 0 there, 0 black and 1 white.
         beyond: grey levels (n, 2) beyond `ends` (n, 2) [px], inside and outside.
+        cumulant: the fourth one of the blur across the edge, in units of `blur_px`.
     """
     step = float(steps[1] - steps[0])
     reach = 0.5 * step * len(steps)
@@ -241,8 +247,8 @@ def _points(
     black, white = levels(profiles)
     if white - black < min_contrast:
         return Reason.OCCLUDED
-    shown = (beyond[:, :1] - black) * ndtr((ends[:, :1] - steps) / blur_px)
-    shown += (beyond[:, 1:] - white) * ndtr((steps - ends[:, 1:]) / blur_px)
+    shown = (beyond[:, :1] - black) * blurred_step((ends[:, :1] - steps) / blur_px, cumulant)
+    shown += (beyond[:, 1:] - white) * blurred_step((steps - ends[:, 1:]) / blur_px, cumulant)
     cleared = profiles - shown
     with_beyond = (white - profiles).sum(axis=1) * step / (white - black)
     black, white = levels(cleared)
@@ -265,6 +271,15 @@ def _points(
         return Reason.NO_MARKER
     spread = _spread(share.mean(axis=0), steps, float(places.mean()) / gain, blur_px)
     return _Points(places / own, together / own, (share.sum(axis=1) * step - with_beyond) / own, own / gain, *spread)
+
+
+def blurred_step(places: FloatArray, cumulant: float) -> FloatArray:
+    """Return the levels of a step from 0 to 1 at 0, at places in units of its blur.
+
+    Edgeworth's series of a Gaussian blur and its fourth cumulant.
+    """
+    density = np.exp(-0.5 * places**2) / math.sqrt(2.0 * math.pi)
+    return np.asarray(ndtr(places) - cumulant / 24.0 * (places**3 - 3.0 * places) * density, dtype=np.float64)
 
 
 def _spread(share: FloatArray, steps: FloatArray, place: float, blur_px: float) -> tuple[float, float]:
