@@ -30,6 +30,10 @@ _OUTLIER_SPREADS = 8.0
 _OUTLIER_RATIO = 3.0
 _MOST_LEFT_OUT = 0.35
 _REWEIGHTED = 3
+# Power of the distance from the axis in the last term of the distortion, and the 1-sigma of that term at the image's
+# corner where it would fold the image over: a lens of a webcam has 0.01.
+_STEEPEST_POWER: dict[Model, int] = {"pinhole": 6, "fisheye": 8, "rational": 6}
+_STEEPEST_TERM = 0.02
 _NUMBERS = re.compile(r"-?\d+(\.\d+)?")
 
 
@@ -171,13 +175,12 @@ def fit(
         raise CalibrationError(
             f"the views do not determine {model} lenses. Take more views, tilted and all over the image"
         ) from error
-    for lens in lenses_of(model, fitted.bundle.vector):
-        if not lens.is_one_to_one(image_size_px):
-            raise CalibrationError(
-                f"the {model} model folds over within the image: it would show two directions at one point. Show the "
-                "board in the image's corners, or take another lens model"
-            )
-    return fitted
+    if _is_one_to_one(fitted.bundle, image_size_px):
+        return fitted
+    raise CalibrationError(
+        f"the {model} model folds over within the image: it would show two directions at one point. Show the board in "
+        "the image's corners, or take another lens model"
+    )
 
 
 def _fit(
@@ -205,14 +208,37 @@ def _fit(
             )
         vector, poses = bundle.vector, np.delete(bundle.poses, worst, axis=0)
     _require_places(model, bundle.vector)
+    if not _is_one_to_one(bundle, image_size_px):
+        bundle = _stiffened(kept, corners_m, bundle, image_size_px)
     return Fitted(tuple(kept), tuple(left_out), bundle, held_out(kept, corners_m, bundle))
+
+
+def _is_one_to_one(bundle: Bundle, image_size_px: tuple[int, int]) -> bool:
+    return all(lens.is_one_to_one(image_size_px) for lens in lenses_of(bundle.model, bundle.vector))
+
+
+def _stiffened(views: Sequence[View], corners_m: FloatArray, bundle: Bundle, image_size_px: tuple[int, int]) -> Bundle:
+    """Refit a lens that folds over, with a prior that keeps the steepest term of its polynomial small.
+
+    A narrow lens hardly shows that term, and it may fold the image over where the board never was.
+    """
+    count = 4 + len(DISTORTION_NAMES[bundle.model])
+    prior, vector = np.zeros(len(bundle.vector)), bundle.vector.copy()
+    for number, lens in enumerate(lenses_of(bundle.model, bundle.vector)):
+        # The last coefficient is of the largest power.
+        corner = 0.5 * np.linalg.norm(np.array(image_size_px) / np.array(lens.focal_px))
+        last = (number + 1) * count - 1
+        prior[last] = (bundle.sigma_px * corner ** _STEEPEST_POWER[bundle.model] / _STEEPEST_TERM) ** 2
+        vector[last] = 0.0
+    stiff = solve(views, corners_m, bundle.model, vector, bundle.poses, bundle.weights, prior)
+    return _weighed(views, corners_m, stiff)
 
 
 def _weighed(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> Bundle:
     """Refit with weights that follow the accuracy of each image's corners."""
     for _ in range(_REWEIGHTED):
         weights = corner_weights(views, corners_m, bundle)
-        bundle = solve(views, corners_m, bundle.model, bundle.vector, bundle.poses, weights)
+        bundle = solve(views, corners_m, bundle.model, bundle.vector, bundle.poses, weights, bundle.prior)
     return bundle
 
 
