@@ -35,6 +35,9 @@ _FEWEST_POINTS, _MOST_POINTS = 6, 80
 SHARPEST_PX = 0.45
 # Variance that interpolation between pixels adds to a blur [px²].
 _INTERPOLATION = 1.0 / 6.0
+# Fourth cumulant along an axis of a square pixel and of the interpolation between them [px⁴]: no such blur reaches as
+# far as a Gaussian.
+PIXEL_CUMULANT = -1.0 / 40.0
 # Relative error of the correction for the modules beyond: no lens blurs exactly like a Gaussian.
 _BEYOND_SHARE = 0.2
 # Systematic error of an edge's position on long lines [px]; larger on short ones.
@@ -173,7 +176,8 @@ def find_edge(
     ways = np.column_stack([0.5 * length * along, normal])
     gradients, unlit = light.gradients @ ways, np.einsum("iw,kij,jw->kw", ways, light.cov, ways)
     profiles = _sampled(grey, places)
-    found = _points(profiles, ideal, s, steps, beyond, ends, blur_px, gradients, unlit, config.min_contrast)
+    cumulant = PIXEL_CUMULANT * float((normal**4).sum()) / blur_px**4
+    found = _points(profiles, ideal, s, steps, beyond, ends, blur_px, cumulant, gradients, unlit, config.min_contrast)
     if isinstance(found, Reason):
         return found
     line = _line(s, found, config)
@@ -270,6 +274,7 @@ def _points(
     beyond: FloatArray,
     ends: FloatArray,
     blur_px: float,
+    cumulant: float,
     gradients: FloatArray,
     unlit: FloatArray,
     min_contrast: float,
@@ -280,6 +285,7 @@ def _points(
         profiles: grey levels (n, m) at s (n,) along the edge and `steps` (m,) [px] across it.
         ideal: levels of an ideal edge at 0 there, 0 black and 1 white.
         beyond: grey levels (n, 2) beyond `ends` (n, 2) [px], inside and outside.
+        cumulant: the fourth one of the blur across the edge, in units of `blur_px`.
         gradients: change of black and white (2, 2) per unit of s [grey levels] and of `steps` [grey levels/px].
         unlit: their variances (2, 2).
     """
@@ -298,8 +304,8 @@ def _points(
     black, white = levels(profiles).T
     if (white - black).mean() < min_contrast:
         return Reason.LOW_CONTRAST
-    shown = (beyond[:, :1] - black[:, None]) * ndtr((ends[:, :1] - steps) / blur_px)
-    shown += (beyond[:, 1:] - white[:, None]) * ndtr((steps - ends[:, 1:]) / blur_px)
+    shown = (beyond[:, :1] - black[:, None]) * blurred_step((ends[:, :1] - steps) / blur_px, cumulant)
+    shown += (beyond[:, 1:] - white[:, None]) * blurred_step((steps - ends[:, 1:]) / blur_px, cumulant)
     cleared = profiles - shown
     black, white = levels(cleared).T
     contrast = white - black
@@ -323,6 +329,15 @@ def _points(
     widening = float((wider * np.square(contrast)) @ clear) * information
     light = (np.column_stack([black, white]) + np.outer(s, gradients[:, 0]))[[0, -1]]
     return _Points(shift, held, clear, correction, doubt, widening, told, light)
+
+
+def blurred_step(places: FloatArray, cumulant: float) -> FloatArray:
+    """Return the levels of a step from 0 to 1 at 0, at places in units of its blur.
+
+    Edgeworth's series of a Gaussian blur and its fourth cumulant.
+    """
+    density = np.exp(-0.5 * places**2) / math.sqrt(2.0 * math.pi)
+    return np.asarray(ndtr(places) - cumulant / 24.0 * (places**3 - 3.0 * places) * density, dtype=np.float64)
 
 
 def _shift_filter(steps: FloatArray, blur_px: float, level: float) -> FloatArray:

@@ -34,7 +34,7 @@ def cameras(
         float, Parameter(help="How well the size of a square is known, 1-sigma [%].", validator=Number(gte=0, lt=10))
     ] = 0.1,
     lens: Annotated[
-        Literal["auto", "pinhole", "fisheye"], Parameter(help="`auto`: what foretells views better.")
+        Literal["auto", "pinhole", "fisheye", "rational"], Parameter(help="`auto`: what foretells views better.")
     ] = "auto",
     left_serial: Annotated[
         str,

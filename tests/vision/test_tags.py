@@ -18,6 +18,7 @@ from bodyschema.vision.config import VisionConfig
 from bodyschema.vision.pose import PoseEstimator, Sighting, mirrored
 from bodyschema.vision.tag_body import TAG_CORNERS, TagBody
 from bodyschema.vision.tag_config import ClusterConfig, PlacedTag, TagConfig
+from bodyschema.vision.tag_edge import PIXEL_CUMULANT, blurred_step
 from bodyschema.vision.tag_image import TagImage, measure_tag
 from bodyschema.vision.tag_tracker import TagTracker
 from bodyschema.vision.tracker import StereoTracker
@@ -293,3 +294,18 @@ def test_exact_pixels_give_the_exact_pose_from_a_rough_one() -> None:
 def test_the_mirrored_pose_of_a_mirrored_pose_is_the_first() -> None:
     rotation = Rotation.random(rng=np.random.default_rng(4)).as_matrix()
     assert mirrored(mirrored(rotation, MIDDLE), MIDDLE) == pytest.approx(rotation, abs=1e-12)
+
+
+def test_light_beyond_an_edge_is_that_of_square_pixels() -> None:
+    shift = (np.arange(400) + 0.5) / 400.0
+    places = np.linspace(-2.0, 2.0, 81)
+    whole = np.floor(places[:, None] - shift)
+    part = places[:, None] - shift - whole
+    # Pixels whose centres are at whole numbers plus the shift see this share of a step at 0.
+    left, right = (np.clip(0.5 + shift + whole + more, 0.0, 1.0) for more in (0.0, 1.0))
+    seen = (left * (1.0 - part) + right * part).mean(axis=1)
+    blur_px = 0.5  # of a pixel and the interpolation
+    assert np.abs(blurred_step(places / blur_px, PIXEL_CUMULANT / blur_px**4) - seen).max() < 0.003
+    tail = places <= -0.85
+    gauss, ours = (float(np.sum(blurred_step(places[tail] / blur_px, c) - seen[tail])) for c in (0.0, -0.4))
+    assert abs(ours) < 0.2 * abs(gauss)
