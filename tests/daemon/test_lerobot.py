@@ -43,6 +43,9 @@ READ_BY_LEROBOT = [
     ("feetech", "range_m100_100", 0, 3300, 100.0),
 ]
 
+# The emulated arms are on real ports.
+pytestmark = pytest.mark.usefixtures("patient_host")
+
 
 def config(*arguments: object) -> None:
     words = ["init", "--lerobot", "so101", *arguments]
@@ -99,7 +102,6 @@ def test_ticks_come_back_from_readings(unit, drive_mode) -> None:
     assert motor.ticks(motor.readings(ticks, unit, "feetech"), unit, "feetech") == pytest.approx(ticks, abs=1e-9)
 
 
-@pytest.mark.usefixtures("patient_host")
 def test_leader_and_follower_read_true_angles(tmp_path) -> None:
     with both_arms(tmp_path) as ports:
         for arm, port in ports.items():
@@ -107,7 +109,6 @@ def test_leader_and_follower_read_true_angles(tmp_path) -> None:
             assert np.degrees(q) == pytest.approx([math.degrees(POSE_RAD[name]) for name in JOINTS], abs=0.05)
 
 
-@pytest.mark.usefixtures("patient_host")
 def test_two_arms_on_two_ports_are_asked_about(tmp_path) -> None:
     told = r"such arms are on .*leader and .*follower"
     with both_arms(tmp_path) as ports, pytest.raises(ConfigError, match=told):
