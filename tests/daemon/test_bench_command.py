@@ -66,7 +66,7 @@ def test_a_bench_leaves_nothing_behind(file, folder) -> None:
     ("file", "what", "command"),
     [
         ("servos.toml", "4 servos", "scan"),
-        ("feetech.toml", "4 servos", "joints"),
+        ("feetech.toml", "4 servos", "watch joints"),
         ("encoders.toml", "4 encoders", "doctor"),
     ],
 )
