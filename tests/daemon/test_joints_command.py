@@ -112,6 +112,7 @@ def look_until(watch: JointsWatch, done) -> Seen:
     raise AssertionError("it was never seen")
 
 
+@pytest.mark.usefixtures("patient_host")
 @pytest.mark.parametrize(
     ("file", "ids"), [("servos.toml", [1, 2, 3, 4]), ("feetech.toml", [1, 2, 3, 4]), ("encoders.toml", [None] * 4)]
 )
@@ -181,6 +182,7 @@ def test_an_angle_beyond_the_limits_is_told() -> None:
     assert "elbow was from +0° to +80°, its limits are -57° to +57°" in shown(high=1.4, within_limits=False)
 
 
+@pytest.mark.usefixtures("patient_host")
 def test_one_table_tells_what_is_wrong_with_any_servo(tmp_path, capsys) -> None:
     with BenchRun(Config.load(EXAMPLE), tmp_path / "bus", faults=["overload@wrist_roll"]) as run:
         app(["watch", "joints", "--robot", str(run.robot_file), "--once", "--json"], result_action="return_value")

@@ -43,6 +43,9 @@ READ_BY_LEROBOT = [
     ("feetech", "range_m100_100", 0, 3300, 100.0),
 ]
 
+# The emulated arms are on real ports.
+pytestmark = pytest.mark.usefixtures("patient_host")
+
 
 def config(*arguments: object) -> None:
     words = ["init", "--lerobot", "so101", *arguments]

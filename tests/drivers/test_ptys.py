@@ -79,6 +79,7 @@ def wait_for_reading(source: Any) -> JointReading:
     raise AssertionError("no reading came")
 
 
+@pytest.mark.usefixtures("patient_host")
 @EACH
 def test_readings_are_right_with_wire_time(make: Make, tmp_path, monkeypatch) -> None:
     # Emulator and driver share this process: on a busy machine the emulator itself may be silent for a while.
