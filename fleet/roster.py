@@ -194,6 +194,7 @@ def as_json(members: Sequence[Member]) -> str:
     return msgspec.json.encode(
         [
             {
+                "schema": 1,
                 "robot": member.name,
                 "alive": sorted(member.alive),
                 "health": member.health,

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from bodyschema.cli.commands.options import HERE, VARIABLE, flag
+from bodyschema.cli.commands.options import HERE, VARIABLE, flag, print_json
 
 
 def backup(
@@ -27,6 +27,7 @@ def backup(
         Path | None, Parameter(help="Where state lives, or goes; else as robot.toml says, in its folder.")
     ] = None,
     force: Annotated[bool, flag("Replace FILE if it is there; with --restore, move what is in the way aside.")] = False,
+    as_json: Annotated[bool, flag("Print the result as JSON.", name="--json")] = False,
 ) -> None:
     """Copy pairs, checkpoint, robot.toml and the files that it names into one file, or restore such a file.
 
@@ -42,12 +43,12 @@ def backup(
     for the robot's services.
     """
     if restore:
-        _restore(file, robot or HERE, state_dir, force=force)
+        _restore(file, robot or HERE, state_dir, force=force, as_json=as_json)
     else:
-        _write(file, robot or Path(os.environ.get(VARIABLE, HERE)), state_dir, force=force)
+        _write(file, robot or Path(os.environ.get(VARIABLE, HERE)), state_dir, force=force, as_json=as_json)
 
 
-def _write(file: Path, robot: Path, state_dir: Path | None, *, force: bool) -> None:
+def _write(file: Path, robot: Path, state_dir: Path | None, *, force: bool, as_json: bool) -> None:
     from importlib.metadata import version
 
     from rich.console import Console
@@ -60,6 +61,12 @@ def _write(file: Path, robot: Path, state_dir: Path | None, *, force: bool) -> N
     if state_dir is not None:
         config = config.with_state_dir(state_dir)
     made = write_backup(config, file, utc=SystemClock().utc(), version=version("bodyschema"), replace=force)
+    if as_json:
+        unreadable = {"unreadable": made.unreadable}
+        print_json(
+            {"file": str(file), "robot": made.robot, "pairs": made.pairs, "last_seq": made.last_seq, **unreadable}
+        )
+        return
     learnt = "" if any(name.endswith(".ckpt") for name in made.files) else ", no checkpoint yet"
     console = Console(highlight=False, soft_wrap=True)
     console.print(
@@ -75,7 +82,7 @@ def _write(file: Path, robot: Path, state_dir: Path | None, *, force: bool) -> N
         )
 
 
-def _restore(file: Path, robot: Path, state_dir: Path | None, *, force: bool) -> None:
+def _restore(file: Path, robot: Path, state_dir: Path | None, *, force: bool, as_json: bool) -> None:
     from rich.console import Console
 
     from bodyschema.cli.install.backup import Backup
@@ -85,6 +92,10 @@ def _restore(file: Path, robot: Path, state_dir: Path | None, *, force: bool) ->
     with Backup(file) as opened:
         made = opened.manifest
         done = restore(opened, robot, state_dir, force=force)
+    if as_json:
+        aside = {"aside": list(map(str, done.aside)), "elsewhere": {str(a): str(b) for a, b in done.elsewhere.items()}}
+        print_json({"robot": made.robot, "pairs": made.pairs, "written": list(map(str, done.written)), **aside})
+        return
     text = f"{made.robot} as it was at {made.written_utc}: {made.pairs} pairs to number {made.last_seq}"
     console.print(text, markup=False)
     if done.unreadable:

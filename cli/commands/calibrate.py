@@ -18,6 +18,7 @@ from bodyschema.cli.commands.options import (
     SourceRobotFile,
     flag,
     lerobot_lines,
+    print_json,
     robot_file,
 )
 
@@ -103,7 +104,6 @@ def arm(
     the servos instead, by LeRobot's own calibration file.
     """
     import math
-    import sys
 
     from rich.console import Console
 
@@ -115,7 +115,6 @@ def arm(
     from bodyschema.cli.terminal.calibration_view import two_tools, view
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.learner.checkpoint import first_pair
-    from bodyschema.daemon.transport.wire import encode
     from bodyschema.interfaces.errors import RequestError
     from bodyschema.recordings import files as recordings
     from bodyschema.robot.calibrated_files import write_calibrated
@@ -163,7 +162,7 @@ def arm(
         offsets = {zero.joint: math.radians(zero.zero) for zero in report.zeros if zero.half_width is not None}
         lines = lerobot_lines(config, lerobot, offsets, write=write)
     if as_json:
-        sys.stdout.write(encode(report).decode() + "\n")
+        print_json(report)
         return
     console = Console(highlight=False)
     console.print(view(report))

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from bodyschema.cli.commands.board_options import AS_PRINTED, BY_NAME, EyeFiles, EyeImages, PrintedBoard
-from bodyschema.cli.commands.options import HERE, RobotFile, flag
+from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
 
 if TYPE_CHECKING:
     from bodyschema.cli.cameras.calibration import Board, Calibrated, CheckFile, Gathered, Wanted
@@ -89,7 +89,6 @@ def cameras(
     from bodyschema.cli.cameras.calibration import Wanted, figures, write_calibrated_cameras
     from bodyschema.cli.cameras.calibration_view import cameras_view
     from bodyschema.daemon.config import Config
-    from bodyschema.daemon.transport.wire import encode
     from bodyschema.daemon.wiring.cameras import calibration_file, names_calibration
 
     if print_board:
@@ -111,7 +110,7 @@ def cameras(
     report = write_calibrated_cameras(result, found, out)
     told = figures(result, found, size_was_measured=printed.ruler_mm is not None or baseline_mm is not None)
     if as_json:
-        sys.stdout.write(encode(told).decode() + "\n")
+        print_json(told)
         return
     console = Console(highlight=False)
     console.print(cameras_view(told))
@@ -135,7 +134,6 @@ def _check(
     from bodyschema.cli.cameras.calibration import checked
     from bodyschema.cli.cameras.calibration_view import check_view
     from bodyschema.daemon.config import Config
-    from bodyschema.daemon.transport.wire import encode
     from bodyschema.daemon.wiring.cameras import calibration_file
 
     board = printed.board()
@@ -145,7 +143,7 @@ def _check(
         config = Config.load(robot)
         found, name = _checked_live(config, calibration or calibration_file(config), board, seconds)
     if as_json:
-        sys.stdout.write(encode(found).decode() + "\n")
+        print_json(found)
     else:
         Console(highlight=False).print(check_view(found, name))
     if not found.holds:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from bodyschema.cli.commands.options import HERE, VARIABLE, flag, several
+from bodyschema.cli.commands.options import HERE, VARIABLE, flag, print_json, several
 
 if TYPE_CHECKING:
     from bodyschema.cli.terminal.diagnosis_run import Asked
@@ -124,7 +124,6 @@ def _list(looked_at: list[Place], *, watch: bool, json: bool) -> None:
 def _compare(looked_at: list[Place], *, as_json: bool) -> None:
     from rich.console import Console
 
-    from bodyschema.daemon.transport.wire import encode
     from bodyschema.fleet.comparison import compare_types, view
     from bodyschema.fleet.roster import Fleet
     from bodyschema.interfaces.errors import RequestError
@@ -137,7 +136,7 @@ def _compare(looked_at: list[Place], *, as_json: bool) -> None:
     if not found:
         raise RequestError(f"nothing to compare. {'; '.join(left_out)}")
     if as_json:
-        sys.stdout.write(encode({"types": found, "not_compared": left_out}).decode() + "\n")
+        print_json({"types": found, "not_compared": left_out})
         return
     Console(highlight=False).print(view(found, left_out))
 
@@ -153,7 +152,6 @@ def _diagnose(
 ) -> None:
     from rich.console import Console
 
-    from bodyschema.daemon.transport.wire import encode
     from bodyschema.fleet.diagnosing import diagnose_all
     from bodyschema.fleet.diagnosing import workers as cluster
     from bodyschema.fleet.summary import summary
@@ -166,7 +164,7 @@ def _diagnose(
         results = diagnose_all(wanted, asked, out, client, told, done)
     found = summary(results)
     if as_json:
-        sys.stdout.write(encode(found).decode() + "\n")
+        print_json(found)
     else:
         console = Console(highlight=False)
         console.print(view(found))

@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from bodyschema.cli.commands.board_options import BY_NAME, EyeFiles
-from bodyschema.cli.commands.options import HERE, RobotFile, flag
+from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
 
 if TYPE_CHECKING:
     from bodyschema.cli.cameras.calibration import Images
@@ -162,13 +162,12 @@ def learn(
 def _measure_cluster(images: Images, calibration: Path, wanted: Wanted, *, as_json: bool) -> None:
     from rich.console import Console
 
-    from bodyschema.daemon.transport.wire import encode
     from bodyschema.daemon.wiring.markers import figures, measured, said, tables
 
     progress = Console(stderr=True, highlight=False, soft_wrap=True)
     found = measured(images, calibration, wanted, lambda text: progress.print(text, markup=False))
     if as_json:
-        sys.stdout.write(encode(figures(found)).decode() + "\n")
+        print_json(figures(found))
         return
     progress.print(said(found), markup=False)
     sys.stdout.write(tables(found, wanted))

@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from bodyschema.cli.commands.options import HERE, RobotFile, flag
+from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
 
 
 def record(
@@ -21,6 +21,7 @@ def record(
     ] = 1,
     follow: Annotated[bool, flag("Go on with the pairs to come, until Ctrl-C.")] = False,
     force: Annotated[bool, flag("Replace OUT when it is there.")] = False,
+    as_json: Annotated[bool, flag("Print the result as JSON.", name="--json")] = False,
 ) -> None:
     """Copy the running sampler's pairs into a file.
 
@@ -47,10 +48,16 @@ def record(
         if follow:
             wishes = SignalFlags()
             with on_termination(wishes.end):
-                console.print(f"writing pairs to {out} as they come; Ctrl-C ends it", markup=False)
+                if not as_json:
+                    console.print(f"writing pairs to {out} as they come; Ctrl-C ends it", markup=False)
                 count = follow_history(history, joints, out, lambda: wishes.ending)
         else:
             count = copy_history(history, joints, out)
+    if as_json:
+        print_json(
+            {"file": str(out), "pairs": count, "last_seq": history.next_seq - 1, "missing": history.missing.count}
+        )
+        return
     last = f", the last has the number {history.next_seq - 1}" if count else "; no file was left"
     console.print(f"{count} pairs written to {out}{last}", markup=False)
     if history.missing.count:

@@ -79,7 +79,7 @@ def steps(config: Config) -> Iterator[Step]:
 
 def as_json(checks: list[Check]) -> str:
     """Return the checks as JSON; `well` is true if none is wrong."""
-    contents = {"well": all(check.state != "wrong" for check in checks), "checks": checks}
+    contents = {"schema": 1, "well": all(check.state != "wrong" for check in checks), "checks": checks}
     return msgspec.json.format(msgspec.json.encode(contents)).decode()
 
 

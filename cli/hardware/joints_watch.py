@@ -284,7 +284,7 @@ def screen(seen: Seen) -> RenderableType:
 
 def as_json(seen: Seen) -> str:
     """Return one line of JSON."""
-    return msgspec.json.encode(seen).decode()
+    return msgspec.json.encode({"schema": 1, **msgspec.to_builtins(seen)}).decode()
 
 
 def _row(joint: JointState) -> tuple[str | Text, ...]:

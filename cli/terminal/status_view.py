@@ -91,7 +91,7 @@ class Watcher:
 
 def as_json(seen: Seen) -> str:
     """Return both states as one line of JSON."""
-    return msgspec.json.encode({"sampler": seen.sampler, "learner": seen.learner}).decode()
+    return msgspec.json.encode({"schema": 1, "sampler": seen.sampler, "learner": seen.learner}).decode()
 
 
 def screen(seen: Seen, config: Config) -> RenderableType:

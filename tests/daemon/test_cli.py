@@ -12,6 +12,7 @@ import warm
 from cyclopts import CycloptsError
 from small_arm import URDF, write_small_arm
 
+from bodyschema.cli.commands.options import print_json
 from bodyschema.cli.main import COMMANDS, RENAMED, app, command_line, present_names
 from bodyschema.cli.terminal.screen import two_digits
 from bodyschema.daemon.config import Config
@@ -157,6 +158,13 @@ def test_what_an_earlier_name_became_is_a_command(present, capsys) -> None:
     page = capsys.readouterr().out
     assert f"Usage: bodyschema {present[0]}" in page
     assert all(word in page for word in present)
+
+
+def test_every_output_for_programs_has_a_schema(capsys) -> None:
+    print_json({"pairs": 3})
+    assert json.loads(capsys.readouterr().out) == {"schema": 1, "pairs": 3}
+    print_json({"schema": 2, "pairs": 3})
+    assert json.loads(capsys.readouterr().out)["schema"] == 2
 
 
 def test_options_that_belong_to_another_process_are_refused(robot) -> None:
