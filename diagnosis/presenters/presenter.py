@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -150,8 +151,8 @@ class Workshop:
         return np.eye(4) if cause is None else pose(Found.of(cause).numbers)
 
 
-class Presenter:
-    """Sentences and a plot for one effect. Where it has none of its own, those of the effect's type are used.
+class Presenter(ABC):
+    """Sentences and a plot for one effect.
 
     Attributes:
         effect: name of the effect.
@@ -159,13 +160,13 @@ class Presenter:
 
     effect: ClassVar[str]
 
+    @abstractmethod
     def finding(self, found: Found) -> str:
         """Return a cause as a clause: what is wrong, where, by how much."""
-        raise NotImplementedError
 
+    @abstractmethod
     def remedy(self, workshop: Workshop, found: Found) -> str:
         """Return what to do about a cause."""
-        raise NotImplementedError
 
     def panel(self, residuals: Residuals, effect: Effect) -> Panel:
         """Plot the evidence for a cause."""
