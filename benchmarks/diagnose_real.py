@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyschema.diagnosis.alignment import aligned
-from bodyschema.diagnosis.conclusion import conclusion
 from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
-from bodyschema.diagnosis.fit import Fit
-from bodyschema.diagnosis.held_out import Blocks, held_out_errors
-from bodyschema.diagnosis.observations import Observations
+from bodyschema.diagnosis.fit.alignment import aligned
+from bodyschema.diagnosis.fit.fit import Fit
+from bodyschema.diagnosis.fit.observations import Observations
+from bodyschema.diagnosis.report.conclusion import conclusion
+from bodyschema.diagnosis.search.held_out import Blocks, held_out_errors
 from bodyschema.effects import Simulation, load_simulation
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.recordings.recording import Recording

@@ -18,10 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyschema.cli.recordings.synthesis import simulated, with_noise
-from bodyschema.diagnosis.conclusion import conclusion
 from bodyschema.diagnosis.diagnosis import diagnose
+from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.diagnosis.report.page import About, page
-from bodyschema.diagnosis.text import remedies
+from bodyschema.diagnosis.report.text import remedies
 from bodyschema.effects import Effect, Motion, Simulation
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.recordings.recording import Recording

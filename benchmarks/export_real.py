@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyschema.diagnosis.alignment import aligned
-from bodyschema.diagnosis.conclusion import conclusion
 from bodyschema.diagnosis.diagnosis import diagnose
-from bodyschema.diagnosis.observations import Observations
+from bodyschema.diagnosis.fit.alignment import aligned
+from bodyschema.diagnosis.fit.observations import Observations
+from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.effects import Motion, load_simulation
 from bodyschema.effects.exports import replayed, write_correction, write_mjcf
 from bodyschema.interfaces.records import FloatArray

@@ -18,7 +18,7 @@ import msgspec
 from bodyschema.cli.recordings.recorder import History
 from bodyschema.cli.terminal.diagnosis_run import DIAGNOSIS, REPORT
 from bodyschema.daemon.service.signals import with_parent
-from bodyschema.diagnosis.result import DiagnosisFile
+from bodyschema.diagnosis.report.result import DiagnosisFile
 from bodyschema.interfaces.errors import BodyschemaError, RecordingError, RequestError
 from bodyschema.interfaces.interpreter import module_command
 from bodyschema.interfaces.records import Pair

@@ -8,29 +8,35 @@ from functools import cached_property, partial
 
 import numpy as np
 
+from bodyschema.diagnosis.assess.explanation import (
+    changed_by_the_way,
+    explain,
+    needs_no_more_names,
+    useful,
+    without_one,
+)
+from bodyschema.diagnosis.assess.leftover import Leftover, leftover
+from bodyschema.diagnosis.assess.rivals import Standing, standings
+from bodyschema.diagnosis.fit.alignment import aligned
+from bodyschema.diagnosis.fit.background import Scales
+from bodyschema.diagnosis.fit.contact import doubtful
+from bodyschema.diagnosis.fit.fit import Fit, fitted
+from bodyschema.diagnosis.fit.instrument import instrument_factor
+from bodyschema.diagnosis.fit.observations import Observations
+from bodyschema.diagnosis.search.alike import Alike, alike
+from bodyschema.diagnosis.search.drives import with_small_ripples
+from bodyschema.diagnosis.search.held_out import Added, Blocks, added, gain_percent, held_out_errors, is_marker
+from bodyschema.diagnosis.search.hypotheses import Hypotheses
+from bodyschema.diagnosis.search.scan import Candidate, Scan
+from bodyschema.diagnosis.search.search import Search
+from bodyschema.diagnosis.search.together import Tolerated, together, tolerated
+from bodyschema.diagnosis.unnamed.rattle import rattle
+from bodyschema.diagnosis.unnamed.unknown import Unknowns
 from bodyschema.effects import Effect, Identity, Simulation
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.recordings.recording import Recording
 
-from .alignment import aligned
-from .alike import Alike, alike
-from .background import Scales
-from .contact import doubtful
-from .drives import with_small_ripples
-from .explanation import changed_by_the_way, explain, needs_no_more_names, useful, without_one
-from .fit import Fit, fitted
-from .held_out import Added, Blocks, added, gain_percent, held_out_errors, is_marker
-from .hypotheses import Hypotheses
-from .instrument import instrument_factor
-from .leftover import Leftover, leftover
-from .observations import Observations
-from .rattle import rattle
-from .rivals import Standing, standings
-from .scan import Candidate, Scan
-from .search import Search
 from .stages import NAMELESS, RIVALS, SEARCH, SETS, Stages
-from .together import Tolerated, together, tolerated
-from .unknown import Unknowns
 
 Told = Callable[[str], None]
 # Fewer outliers than this are not a finding.

@@ -184,12 +184,12 @@ class EffectType(ABC):
         return self.no_counterpart
 
     def finding(self, at: str, numbers: Mapping[str, float]) -> str:
-        """Describe it in a clause, where `diagnosis.presenters` has no sentence. `at` names the joint, if any."""
+        """Describe it in a clause, where no presenter has a sentence. `at` names the joint, if any."""
         amounts = ", ".join(f"{name} = {value:.3g}" for name, value in numbers.items())
         return f"{at or 'the arm'} has {self.name.replace('_', ' ')} ({amounts})"
 
     def remedy(self, at: str) -> str:
-        """Return a remedy, where `diagnosis.presenters` has none."""
+        """Return a remedy, where no presenter has one."""
         return f"See what could cause it{f' at {at}' if at else ''}; extended.toml takes it into account"
 
 

@@ -19,7 +19,7 @@ import msgspec
 
 from bodyschema.cli.terminal.diagnosis_run import Asked, Found, Source, measured, require_writable, run, written
 from bodyschema.daemon.config import Config
-from bodyschema.diagnosis.result import DiagnosisFile
+from bodyschema.diagnosis.report.result import DiagnosisFile
 from bodyschema.interfaces.errors import BodyschemaError, ConfigError
 from bodyschema.interfaces.interpreter import safe_children
 

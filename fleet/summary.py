@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import msgspec
 
-from bodyschema.diagnosis.numbers import numbers_of, place, telling
-from bodyschema.diagnosis.result import Cause, DiagnosisFile
+from bodyschema.diagnosis.report.numbers import numbers_of, place, telling
+from bodyschema.diagnosis.report.result import Cause, DiagnosisFile
 
 from .diagnosing import Diagnosed
 

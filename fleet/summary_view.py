@@ -11,7 +11,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from bodyschema.diagnosis.numbers import mm
+from bodyschema.diagnosis.report.numbers import mm
 
 from .diagnosing import Diagnosed, Done, Told
 from .summary import Row, Summary, Type

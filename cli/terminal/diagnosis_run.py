@@ -19,14 +19,14 @@ from bodyschema.calibration.plausibility.limits import require_units
 from bodyschema.cli.recordings.recorder import History
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.transport.bus import client
-from bodyschema.diagnosis.conclusion import conclusion
 from bodyschema.diagnosis.diagnosis import Diagnosis
 from bodyschema.diagnosis.diagnosis import diagnose as diagnosed
-from bodyschema.diagnosis.hypotheses import STILL
-from bodyschema.diagnosis.observations import ticks
+from bodyschema.diagnosis.fit.observations import ticks
+from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.diagnosis.report.page import About, page
-from bodyschema.diagnosis.result import DiagnosisFile
-from bodyschema.diagnosis.text import modelled, remedies
+from bodyschema.diagnosis.report.result import DiagnosisFile
+from bodyschema.diagnosis.report.text import modelled, remedies
+from bodyschema.diagnosis.search.hypotheses import STILL
 from bodyschema.effects import EFFECT_TYPES, write_corrected, write_extended
 from bodyschema.interfaces.errors import BodyschemaError, RecordingError, RequestError
 from bodyschema.interfaces.records import Pair

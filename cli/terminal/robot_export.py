@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from bodyschema.cli.hardware.driver_snippets import write_snippets
-from bodyschema.diagnosis.alignment import aligned
-from bodyschema.diagnosis.observations import Observations
+from bodyschema.diagnosis.fit.alignment import aligned
+from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.effects import Motion, Simulation
 from bodyschema.effects.exports import replayed, write_correction, write_mjcf, write_urdf
 from bodyschema.effects.exports.correction import held_by_correction

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from bodyschema.diagnosis.diagnosis import Diagnosis
-from bodyschema.diagnosis.numbers import chance, mm, share, told_values
-from bodyschema.diagnosis.presenters.outliers import outlier_panel
-from bodyschema.diagnosis.presenters.registry import presenter_of
-from bodyschema.diagnosis.result import Cause, DiagnosisFile, Verdict
-from bodyschema.diagnosis.text import beside_geometry, finding, made_to, modelled
+from bodyschema.diagnosis.report.numbers import chance, mm, share, told_values
+from bodyschema.diagnosis.report.presenters.outliers import outlier_panel
+from bodyschema.diagnosis.report.presenters.registry import presenter_of
+from bodyschema.diagnosis.report.result import Cause, DiagnosisFile, Verdict
+from bodyschema.diagnosis.report.text import beside_geometry, finding, made_to, modelled
 from bodyschema.effects import Effect
 
 from . import tables

@@ -5,8 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from bodyschema.diagnosis.numbers import Number, chance, mm, numbers_of, percent, place, rival_named, share, telling
-from bodyschema.diagnosis.result import Cause, DiagnosisFile, Indistinguishable, Rejected
+from bodyschema.diagnosis.report.numbers import (
+    Number,
+    chance,
+    mm,
+    numbers_of,
+    percent,
+    place,
+    rival_named,
+    share,
+    telling,
+)
+from bodyschema.diagnosis.report.result import Cause, DiagnosisFile, Indistinguishable, Rejected
 
 # Rows to omit where they equal another.
 _SAME_AS = {"aligned": "nominal", "extended": "aligned"}

@@ -10,9 +10,9 @@ from functools import cached_property
 
 import numpy as np
 
-from bodyschema.diagnosis.conclusion import conclusion
 from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
-from bodyschema.diagnosis.result import Cause, DiagnosisFile, Indistinguishable, Interval
+from bodyschema.diagnosis.report.conclusion import conclusion
+from bodyschema.diagnosis.report.result import Cause, DiagnosisFile, Indistinguishable, Interval
 from bodyschema.effects import Effect, Motion, Simulation
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.description import RobotDescription

@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from bodyschema.diagnosis.result import (
+from bodyschema.diagnosis.report.result import (
     Cause,
     DiagnosisFile,
     Errors,

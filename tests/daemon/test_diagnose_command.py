@@ -24,7 +24,7 @@ from bodyschema.daemon.config import Config
 from bodyschema.daemon.transport.bus import Request, ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.wire import PairsReply, encode, pair_to_wire
-from bodyschema.diagnosis.result import DiagnosisFile, Indistinguishable, Unexplained
+from bodyschema.diagnosis.report.result import DiagnosisFile, Indistinguishable, Unexplained
 from bodyschema.effects import Effect
 from bodyschema.interfaces.records import Pair
 from bodyschema.recordings.recording import Recording

@@ -14,7 +14,7 @@ import pytest
 from hidden_units import DESK_ARM, unit
 
 from bodyschema.cli.main import main
-from bodyschema.diagnosis.result import Cause, DiagnosisFile, Errors, Gain, Interval, Pairs, Unexplained
+from bodyschema.diagnosis.report.result import Cause, DiagnosisFile, Errors, Gain, Interval, Pairs, Unexplained
 from bodyschema.fleet.diagnosing import Diagnosed
 from bodyschema.fleet.recordings import Job, jobs
 from bodyschema.fleet.summary import summary

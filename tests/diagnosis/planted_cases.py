@@ -8,9 +8,9 @@ from collections.abc import Mapping
 import numpy as np
 from walked import DESK_ARM
 
-from bodyschema.diagnosis.alignment import aligned
-from bodyschema.diagnosis.fit import Fit
-from bodyschema.diagnosis.observations import Observations
+from bodyschema.diagnosis.fit.alignment import aligned
+from bodyschema.diagnosis.fit.fit import Fit
+from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.effects import Effect, Motion, Simulation
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.recordings.recording import Recording

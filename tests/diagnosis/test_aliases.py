@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from planted_cases import motion_of, seen, surveyed_arm
 
-from bodyschema.diagnosis.aliases import alias_sentences, aliases
-from bodyschema.diagnosis.alignment import aligned
-from bodyschema.diagnosis.observations import Observations
+from bodyschema.diagnosis.fit.alignment import aligned
+from bodyschema.diagnosis.fit.observations import Observations
+from bodyschema.diagnosis.search.aliases import alias_sentences, aliases
 from bodyschema.effects import Effect, Simulation
 
 GRID_RAD = np.radians(5.0)  # 72 angles a turn

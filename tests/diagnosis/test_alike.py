@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from planted_cases import ELBOW, SHOULDER, desk_arm, start_of, walk
 
-from bodyschema.diagnosis.alike import alike
-from bodyschema.diagnosis.hypotheses import Hypotheses
-from bodyschema.diagnosis.result import Alike, Errors
-from bodyschema.diagnosis.text import beside_geometry
+from bodyschema.diagnosis.report.result import Alike, Errors
+from bodyschema.diagnosis.report.text import beside_geometry
+from bodyschema.diagnosis.search.alike import alike
+from bodyschema.diagnosis.search.hypotheses import Hypotheses
 from bodyschema.effects import Effect
 
 HELD = {'"torque_free"': '"held"'}

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from planted_cases import INTERVAL_S, SHOULDER, desk_arm, measured, motion_of, seen, walk
 
-from bodyschema.diagnosis.alignment import aligned
-from bodyschema.diagnosis.contact import doubtful
-from bodyschema.diagnosis.fit import Fit
-from bodyschema.diagnosis.observations import Observations
+from bodyschema.diagnosis.fit.alignment import aligned
+from bodyschema.diagnosis.fit.contact import doubtful
+from bodyschema.diagnosis.fit.fit import Fit
+from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.effects import Effect, Motion, Simulation
 from bodyschema.robot.description import RobotDescription
 

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from planted_cases import ELBOW, SHOULDER, SIGMA_M, desk_arm, measured, motion_of, start_of, walk
 
-from bodyschema.diagnosis import explanation
-from bodyschema.diagnosis.alignment import aligned
-from bodyschema.diagnosis.explanation import Explanation, explain
-from bodyschema.diagnosis.families import families
-from bodyschema.diagnosis.fit import Fit
-from bodyschema.diagnosis.observations import Observations
-from bodyschema.diagnosis.unknown import Unknowns, Way
-from bodyschema.diagnosis.worth import NAMED
+from bodyschema.diagnosis.assess import explanation
+from bodyschema.diagnosis.assess.explanation import Explanation, explain
+from bodyschema.diagnosis.fit.alignment import aligned
+from bodyschema.diagnosis.fit.fit import Fit
+from bodyschema.diagnosis.fit.observations import Observations
+from bodyschema.diagnosis.fit.worth import NAMED
+from bodyschema.diagnosis.unnamed.families import families
+from bodyschema.diagnosis.unnamed.unknown import Unknowns, Way
 from bodyschema.effects import Effect, Simulation
 
 

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from planted_cases import SIGMA_M, measured, surveyed_arm, walk
 from scipy.spatial.transform import Rotation
 
-from bodyschema.diagnosis.conclusion import conclusion
 from bodyschema.diagnosis.diagnosis import diagnose
-from bodyschema.diagnosis.eyes import by_turn, reported, undone
-from bodyschema.diagnosis.result import DiagnosisFile
+from bodyschema.diagnosis.report.conclusion import conclusion
+from bodyschema.diagnosis.report.result import DiagnosisFile
+from bodyschema.diagnosis.unnamed.eyes import by_turn, reported, undone
 from bodyschema.effects import Effect, Simulation
 from bodyschema.interfaces.records import FloatArray
 

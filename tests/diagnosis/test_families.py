@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from planted_cases import desk_arm, start_of, walk
 
-from bodyschema.diagnosis.families import Family, families
-from bodyschema.diagnosis.fit import Fit
-from bodyschema.diagnosis.unknown import Way
+from bodyschema.diagnosis.fit.fit import Fit
+from bodyschema.diagnosis.unnamed.families import Family, families
+from bodyschema.diagnosis.unnamed.unknown import Way
 from bodyschema.robot.description import RobotDescription
 from bodyschema.sim_backend import model_file
 

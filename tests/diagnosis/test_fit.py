@@ -9,11 +9,11 @@ import pytest
 from planted_cases import BASE, ELBOW, SHOULDER, at_rest, desk_arm, observed, start_of, walk
 from scipy import stats
 
-from bodyschema.diagnosis.alignment import aligned
-from bodyschema.diagnosis.fit import Fit, improved
-from bodyschema.diagnosis.observations import Observations, stereo_covariances
-from bodyschema.diagnosis.scan import Scan
-from bodyschema.diagnosis.tangent import solved
+from bodyschema.diagnosis.fit.alignment import aligned
+from bodyschema.diagnosis.fit.fit import Fit, improved
+from bodyschema.diagnosis.fit.observations import Observations, stereo_covariances
+from bodyschema.diagnosis.fit.tangent import solved
+from bodyschema.diagnosis.search.scan import Scan
 from bodyschema.effects import Effect, Simulation
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray

@@ -21,11 +21,11 @@ from planted_cases import (
 )
 from scipy import stats
 
-from bodyschema.diagnosis.alignment import aligned
-from bodyschema.diagnosis.fit import Fit, fitted
-from bodyschema.diagnosis.held_out import Blocks, block_p_value, gain_percent, held_out_errors
-from bodyschema.diagnosis.observations import Observations
-from bodyschema.diagnosis.scan import Scan
+from bodyschema.diagnosis.fit.alignment import aligned
+from bodyschema.diagnosis.fit.fit import Fit, fitted
+from bodyschema.diagnosis.fit.observations import Observations
+from bodyschema.diagnosis.search.held_out import Blocks, block_p_value, gain_percent, held_out_errors
+from bodyschema.diagnosis.search.scan import Scan
 from bodyschema.effects import Effect, Motion, Simulation
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription

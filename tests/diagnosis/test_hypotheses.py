@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from planted_cases import ELBOW, SHOULDER, desk_arm, motion_of, observed, surveyed_arm, walk
 
-from bodyschema.diagnosis.hypotheses import Hypotheses
-from bodyschema.diagnosis.observations import Observations
+from bodyschema.diagnosis.fit.observations import Observations
+from bodyschema.diagnosis.search.hypotheses import Hypotheses
 from bodyschema.effects import EFFECT_TYPES, Motion, Simulation
 from bodyschema.robot.description import RobotDescription
 

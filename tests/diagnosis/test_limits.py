@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from planted_cases import SHOULDER, Motion, desk_arm, seen, walk
 
-from bodyschema.diagnosis.conclusion import conclusion
+from bodyschema.diagnosis.assess.explanation import Explanation, useful
 from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
-from bodyschema.diagnosis.explanation import Explanation, useful
-from bodyschema.diagnosis.search import Search
+from bodyschema.diagnosis.report.conclusion import conclusion
+from bodyschema.diagnosis.search.search import Search
 from bodyschema.effects import Effect, Simulation
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bodyschema.diagnosis.low_rank import low_rank, numbers_of
+from bodyschema.diagnosis.unnamed.low_rank import low_rank, numbers_of
 from bodyschema.interfaces.records import FloatArray
 
 MOVES, AMOUNTS = 6, 7

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from planted_cases import SIGMA_M, measured, scattered, surveyed_arm
 
-from bodyschema.diagnosis import presenters
-from bodyschema.diagnosis.conclusion import conclusion
 from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
-from bodyschema.diagnosis.presenters import registry as presenting
+from bodyschema.diagnosis.report import presenters
+from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.diagnosis.report.page import About, page
-from bodyschema.diagnosis.text import remedies
+from bodyschema.diagnosis.report.presenters import registry as presenting
+from bodyschema.diagnosis.report.text import remedies
 from bodyschema.effects import EFFECT_TYPES, Effect, Simulation, catalogue, load_simulation, registry, write_extended
 from bodyschema.robot.description import RobotDescription
 
@@ -37,7 +37,7 @@ class CameraSkew(CameraEffect):
         return x
 """
 PRESENTER = """
-from bodyschema.diagnosis.presenters.presenter import Presenter
+from bodyschema.diagnosis.report.presenters.presenter import Presenter
 
 
 class CameraSkew(Presenter):

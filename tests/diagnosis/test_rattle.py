@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from planted_cases import SIGMA_M, measured, scattered, surveyed_arm
 
-from bodyschema.diagnosis.conclusion import conclusion
 from bodyschema.diagnosis.diagnosis import diagnose
-from bodyschema.diagnosis.result import DiagnosisFile
+from bodyschema.diagnosis.report.conclusion import conclusion
+from bodyschema.diagnosis.report.result import DiagnosisFile
 from bodyschema.effects import Effect, Simulation
 
 HALF_M = 2e-3

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from walked import DESK_ARM
 
-from bodyschema.diagnosis.numbers import number, numbers_of, percent, telling
-from bodyschema.diagnosis.result import (
+from bodyschema.diagnosis.report.numbers import number, numbers_of, percent, telling
+from bodyschema.diagnosis.report.result import (
     Cause,
     DiagnosisFile,
     Errors,
@@ -21,7 +21,7 @@ from bodyschema.diagnosis.result import (
     Pairs,
     Unexplained,
 )
-from bodyschema.diagnosis.text import finding, remedies
+from bodyschema.diagnosis.report.text import finding, remedies
 from bodyschema.effects import Effect, Motion, Simulation
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from planted_cases import BASE, SHOULDER, desk_arm, motion_of, seen, surveyed_arm, walk
 
-from bodyschema.diagnosis.conclusion import conclusion
+from bodyschema.diagnosis.assess.rivals import whole_range
 from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
-from bodyschema.diagnosis.rivals import whole_range
+from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.effects import Effect, Motion, Simulation
 from bodyschema.robot.description import RobotDescription
 

@@ -7,7 +7,7 @@ import pytest
 from planted_cases import BASE, ELBOW, SHOULDER, desk_arm, start_of, surveyed_arm, walk
 from scipy import stats
 
-from bodyschema.diagnosis.scan import Candidate, Scan
+from bodyschema.diagnosis.search.scan import Candidate, Scan
 from bodyschema.effects import Effect
 from bodyschema.robot.description import RobotDescription
 

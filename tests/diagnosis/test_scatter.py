@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from planted_cases import ELBOW, desk_arm, measured, motion_of
 
-from bodyschema.diagnosis.alignment import aligned
-from bodyschema.diagnosis.fit import Fit
-from bodyschema.diagnosis.held_out import Blocks, block_p_value
-from bodyschema.diagnosis.observations import Observations
-from bodyschema.diagnosis.rivals import standings
-from bodyschema.diagnosis.scatter import instruments
-from bodyschema.diagnosis.search import Search
-from bodyschema.diagnosis.worth import NAMED, nats
+from bodyschema.diagnosis.assess.rivals import standings
+from bodyschema.diagnosis.fit.alignment import aligned
+from bodyschema.diagnosis.fit.fit import Fit
+from bodyschema.diagnosis.fit.observations import Observations
+from bodyschema.diagnosis.fit.scatter import instruments
+from bodyschema.diagnosis.fit.worth import NAMED, nats
+from bodyschema.diagnosis.search.held_out import Blocks, block_p_value
+from bodyschema.diagnosis.search.search import Search
 from bodyschema.effects import Effect, Motion, Simulation
 from bodyschema.effects.catalogue.settling import Settling
 from bodyschema.robot.description import RobotDescription

@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from planted_cases import BASE, ELBOW, INTERVAL_S, SHOULDER, at_rest, desk_arm, start_of, surveyed_arm, walk
 
-from bodyschema.diagnosis.fit import Fit
-from bodyschema.diagnosis.scan import Scan
-from bodyschema.diagnosis.search import Search, simplicity
-from bodyschema.diagnosis.worth import NAMED, nats, rise_for
+from bodyschema.diagnosis.fit.fit import Fit
+from bodyschema.diagnosis.fit.worth import NAMED, nats, rise_for
+from bodyschema.diagnosis.search.scan import Scan
+from bodyschema.diagnosis.search.search import Search, simplicity
 from bodyschema.effects import Effect
 from bodyschema.robot.description import RobotDescription
 

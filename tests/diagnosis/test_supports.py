@@ -9,9 +9,9 @@ import pytest
 from planted_cases import DESK_ARM, ELBOW, SHOULDER, SIGMA_M, measured, seen, walk
 from scipy.spatial.transform import Rotation
 
-from bodyschema.diagnosis.conclusion import conclusion
 from bodyschema.diagnosis.diagnosis import diagnose
-from bodyschema.diagnosis.result import DiagnosisFile
+from bodyschema.diagnosis.report.conclusion import conclusion
+from bodyschema.diagnosis.report.result import DiagnosisFile
 from bodyschema.effects import Effect, Simulation
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.description import RobotDescription

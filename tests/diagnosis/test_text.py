@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from bodyschema.diagnosis.result import Cause, Errors, Gain, Indistinguishable, Interval, Tolerances
-from bodyschema.diagnosis.text import finding, made_to, sentence
+from bodyschema.diagnosis.report.result import Cause, Errors, Gain, Indistinguishable, Interval, Tolerances
+from bodyschema.diagnosis.report.text import finding, made_to, sentence
 
 SHIFT = {"x_m": 0.001, "y_m": 0.0, "z_m": 0.0}
 TURN = {"rx_rad": 0.0, "ry_rad": 0.01, "rz_rad": 0.0}

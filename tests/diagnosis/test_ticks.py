@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from planted_cases import SIGMA_M, desk_arm, measured, walk
 
-from bodyschema.diagnosis.alignment import aligned
-from bodyschema.diagnosis.instrument import instrument_factor
-from bodyschema.diagnosis.observations import Observations, ticks
+from bodyschema.diagnosis.fit.alignment import aligned
+from bodyschema.diagnosis.fit.instrument import instrument_factor
+from bodyschema.diagnosis.fit.observations import Observations, ticks
 from bodyschema.effects import Simulation
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from planted_cases import ELBOW, SHOULDER, desk_arm, measured, motion_of, scattered, surveyed_arm
 
-from bodyschema.diagnosis.alignment import aligned
-from bodyschema.diagnosis.background import Scales
-from bodyschema.diagnosis.conclusion import conclusion
 from bodyschema.diagnosis.diagnosis import diagnose
-from bodyschema.diagnosis.observations import Observations
-from bodyschema.diagnosis.result import DiagnosisFile
+from bodyschema.diagnosis.fit.alignment import aligned
+from bodyschema.diagnosis.fit.background import Scales
+from bodyschema.diagnosis.fit.observations import Observations
+from bodyschema.diagnosis.report.conclusion import conclusion
+from bodyschema.diagnosis.report.result import DiagnosisFile
 from bodyschema.effects import Effect, Simulation, load_simulation, write_extended
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.description import RobotDescription
@@ -96,7 +96,7 @@ def test_an_interval_allows_for_other_sizes_of_the_tolerances(robot: RobotDescri
     fit = start.with_causes([offset]).tolerating(Scales(0.5, 0.5, 0.5))
     (place,) = fit.places(fit.causes[0])
     integrated = fit.covariance[place, place]
-    monkeypatch.setattr("bodyschema.diagnosis.fit._NODES", np.zeros(1))
+    monkeypatch.setattr("bodyschema.diagnosis.fit.fit._NODES", np.zeros(1))
     assert integrated > 1.2 * replace(fit).covariance[place, place]
 
 

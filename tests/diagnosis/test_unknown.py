@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from planted_cases import ELBOW, SHOULDER, SIGMA_M, desk_arm, measured, motion_of, seen, surveyed_arm, walk
 
-from bodyschema.diagnosis.conclusion import conclusion
 from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
-from bodyschema.diagnosis.result import DiagnosisFile
-from bodyschema.diagnosis.text import modelled
+from bodyschema.diagnosis.report.conclusion import conclusion
+from bodyschema.diagnosis.report.result import DiagnosisFile
+from bodyschema.diagnosis.report.text import modelled
 from bodyschema.effects import Effect, Motion, Simulation, load_simulation, write_extended
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.recordings.recording import Recording

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from bodyschema.diagnosis.presenters.registry import PRESENTERS
+from bodyschema.diagnosis.report.presenters.registry import PRESENTERS
 from bodyschema.effects import EFFECT_TYPES
 from bodyschema.effects.effect_type import STAGES
 
@@ -16,8 +16,8 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.mark.parametrize("name", list(EFFECT_TYPES))
 def test_an_effect_has_a_file_and_a_presenter(name: str) -> None:
-    for file in (ROOT / "effects" / "catalogue" / f"{name}.py", ROOT / "diagnosis" / "presenters" / f"{name}.py"):
-        assert file.exists()
+    for folder in ("effects/catalogue", "diagnosis/report/presenters"):
+        assert (ROOT / folder / f"{name}.py").exists()
     assert type(EFFECT_TYPES[name]).__module__.endswith(f"catalogue.{name}")
     assert type(PRESENTERS[name]).__module__.endswith(f"presenters.{name}")
 

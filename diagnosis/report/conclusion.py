@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from bodyschema.diagnosis.assess.rivals import Rival, Standing
+from bodyschema.diagnosis.diagnosis import MOST_DOUBTFUL, Diagnosis
+from bodyschema.diagnosis.fit.background import ANGLE_RAD, DRIVE_RAD, LENGTH_M
+from bodyschema.diagnosis.fit.contact import doubtful
+from bodyschema.diagnosis.fit.worth import NAMED, nats
+from bodyschema.diagnosis.search.aliases import alias_sentences
+from bodyschema.diagnosis.search.scan import Candidate
 from bodyschema.effects import Effect
 from bodyschema.interfaces.records import FloatArray
 
-from .aliases import alias_sentences
-from .background import ANGLE_RAD, DRIVE_RAD, LENGTH_M
-from .contact import doubtful
-from .diagnosis import MOST_DOUBTFUL, Diagnosis
 from .result import (
     Alike,
     Cause,
@@ -26,10 +29,7 @@ from .result import (
     Unexplained,
     Verdict,
 )
-from .rivals import Rival, Standing
-from .scan import Candidate
 from .text import advice, evidence, is_unsure, sentence
-from .worth import NAMED, nats
 
 _HALF_WIDTH_95 = 1.959964
 # Below this p-value, the report explains why a hypothesis is not a cause.

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bodyschema.diagnosis.fit.fit import Fit, amount_columns
+from bodyschema.diagnosis.search.search import Search
+from bodyschema.diagnosis.unnamed.unknown import SPECIFIC, Apart, Unknowns
 from bodyschema.effects import Effect, Motion
 from bodyschema.interfaces.records import FloatArray
 
 from .explanation import cost_of_names
-from .fit import Fit, amount_columns
-from .search import Search
-from .unknown import SPECIFIC, Apart, Unknowns
 
 # Prior penalty against a named cause [nats]. Accepting one in place of a cause takes `SPECIFIC` instead, so that a
 # cause is not given up for something that fits as well by chance.

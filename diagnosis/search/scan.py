@@ -13,13 +13,12 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyschema.diagnosis.fit.fit import LARGEST, Fit
+from bodyschema.diagnosis.fit.products import Products, System
+from bodyschema.diagnosis.fit.worth import choices, nats, ways_to_choose
 from bodyschema.effects import Effect, Identity
 from bodyschema.effects.flank import flanks
 from bodyschema.interfaces.records import FloatArray
-
-from .fit import LARGEST, Fit
-from .products import Products, System
-from .worth import choices, nats, ways_to_choose
 
 # Ripples are searched at every whole number of cycles per turn up to the first limit. Finer ones, up to twice per turn
 # of a strain wave gear of 120, are searched as coarsely as they can be resolved.

@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 
 from scipy.special import chdtrc
 
+from bodyschema.diagnosis.fit.fit import Fit
+from bodyschema.diagnosis.search.held_out import Blocks
+from bodyschema.diagnosis.unnamed.rattle import Rattle
+from bodyschema.diagnosis.unnamed.sensitivity import joints_of
+from bodyschema.diagnosis.unnamed.smooth import SmoothModel, smooth_model
+from bodyschema.diagnosis.unnamed.unknown import Apart, Unknowns
+
 from .explanation import Explanation
-from .fit import Fit
-from .held_out import Blocks
-from .rattle import Rattle
-from .sensitivity import joints_of
-from .smooth import SmoothModel, smooth_model
-from .unknown import Apart, Unknowns
 
 
 @dataclass(frozen=True, eq=False)

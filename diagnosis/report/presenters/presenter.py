@@ -12,7 +12,7 @@ import numpy as np
 
 from bodyschema.diagnosis.report.panels import Panel
 from bodyschema.diagnosis.report.residuals import Residuals
-from bodyschema.diagnosis.result import Cause
+from bodyschema.diagnosis.report.result import Cause
 from bodyschema.effects import Effect, corrected_file
 from bodyschema.effects.effect_type import EffectType
 from bodyschema.effects.poses import transforms

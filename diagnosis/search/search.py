@@ -10,14 +10,14 @@ from functools import cached_property
 import numpy as np
 from scipy.special import chdtri
 
+from bodyschema.diagnosis.fit.fit import Fit, improved
+from bodyschema.diagnosis.fit.observations import Observations
+from bodyschema.diagnosis.fit.scatter import beyond_single_rows, instruments, remembers
+from bodyschema.diagnosis.fit.worth import ANOTHER, NAMED, choices, nats, rise_for
 from bodyschema.effects import Effect, Identity
 
-from .fit import Fit, improved
 from .held_out import Blocks, block_p_value
-from .observations import Observations
 from .scan import Candidate, Scan
-from .scatter import beyond_single_rows, instruments, remembers
-from .worth import ANOTHER, NAMED, choices, nats, rise_for
 
 # Candidates within this share of the best gain are refitted, up to this number.
 _NEAR, _MOST = 0.4, 6

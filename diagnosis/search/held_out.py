@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import fdtrc
 
+from bodyschema.diagnosis.fit.fit import LARGEST, Fit, solved
+from bodyschema.diagnosis.fit.observations import IntArray
+from bodyschema.diagnosis.fit.scatter import instruments
 from bodyschema.effects import Effect
 from bodyschema.interfaces.records import FloatArray
 
-from .fit import LARGEST, Fit, solved
-from .observations import IntArray
 from .scan import Candidate
-from .scatter import instruments
 
 # Maximum of blocks of time, and the number of folds they are dealt to in turn.
 _MOST_BLOCKS, _FOLDS = 80, 5

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.effects import Effect
 from bodyschema.interfaces.records import FloatArray
 
-from .fit import Fit
 from .scan import FINEST
 
 # Waves whose phases agree this well over all readings are the same wave.

@@ -13,15 +13,15 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from scipy.special import chdtri
 
+from bodyschema.diagnosis.fit.background import weighted_products
+from bodyschema.diagnosis.fit.fit import Fit, solved
+from bodyschema.diagnosis.fit.observations import Observations
+from bodyschema.diagnosis.fit.worth import nats
+from bodyschema.diagnosis.search.held_out import FEWEST_ROWS_A_BLOCK, Blocks, held_out_square, scores_p_value
 from bodyschema.interfaces.records import FloatArray
 
-from .background import weighted_products
 from .families import Family, families
-from .fit import Fit, solved
-from .held_out import FEWEST_ROWS_A_BLOCK, Blocks, held_out_square, scores_p_value
 from .low_rank import low_rank, numbers_of
-from .observations import Observations
-from .worth import nats
 
 # Prior penalty of an unnamed family, and of one as specific as a named effect [nats].
 _NO_NAME, SPECIFIC = 8.0, 5.0

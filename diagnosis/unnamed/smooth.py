@@ -13,12 +13,12 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 
+from bodyschema.diagnosis.fit.fit import Fit, solved
+from bodyschema.diagnosis.search.held_out import Blocks
 from bodyschema.effects import Motion, Simulated, Unexplained, place_map, smooth_map
 from bodyschema.interfaces.records import FloatArray
 
 from .families import Family
-from .fit import Fit, solved
-from .held_out import Blocks
 from .unknown import Apart
 
 # Prior sizes of a function's displacement, in units of the noise; held-out rows choose among them.

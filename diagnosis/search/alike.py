@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.effects import Effect
 from bodyschema.interfaces.records import FloatArray
 
-from .fit import Fit
 from .scan import Candidate, Scan
 
 # Smallest Δχ² beside the geometry, and smallest explained share of its residuals, that count.

@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve, get_lapack_funcs
 
+from bodyschema.diagnosis.fit.background import MOST, SPREAD, Scales
+from bodyschema.diagnosis.fit.fit import Fit
+from bodyschema.diagnosis.fit.worth import ANOTHER, NAMED, ways_to_choose
 from bodyschema.effects import Effect, EffectType, Identity
 from bodyschema.interfaces.records import FloatArray
 
-from .background import MOST, SPREAD, Scales
-from .fit import Fit
 from .scan import Candidate, Scan
 from .search import Key
-from .worth import ANOTHER, NAMED, ways_to_choose
 
 # Rounds for scales and noise, from afar and beside a similar set; stop when their logarithms change by less.
 _ROUNDS, _ROUNDS_NEAR, _STILL = 25, 8, 0.02

@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from pkgutil import iter_modules
 
-from bodyschema.diagnosis import presenters
+from bodyschema.diagnosis.report import presenters
 from bodyschema.effects import EFFECT_TYPES
 
 from .presenter import PlainPresenter, Presenter

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .fit import Fit
-from .held_out import Blocks
-from .worth import NAMED, nats
+from bodyschema.diagnosis.fit.fit import Fit
+from bodyschema.diagnosis.fit.worth import NAMED, nats
+from bodyschema.diagnosis.search.held_out import Blocks
 
 RESAMPLED = 50
 # Rivals within this margin count as equally probable [nats].

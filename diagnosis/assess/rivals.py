@@ -8,18 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyschema.diagnosis.fit.fit import Fit, amount_columns
+from bodyschema.diagnosis.fit.scatter import beyond_single_rows, remembers
+from bodyschema.diagnosis.fit.worth import nats
+from bodyschema.diagnosis.search.held_out import Blocks
+from bodyschema.diagnosis.search.scan import Candidate
+from bodyschema.diagnosis.search.search import Search, describe
+from bodyschema.diagnosis.unnamed.unknown import Unknowns
 from bodyschema.effects import Effect, Motion
 from bodyschema.interfaces.records import FloatArray
 
-from .fit import Fit, amount_columns
-from .held_out import Blocks
 from .nameless import Nameless
-from .scan import Candidate
-from .scatter import beyond_single_rows, remembers
-from .search import Search, describe
 from .stability import Instead, named_again
-from .unknown import Unknowns
-from .worth import nats
 
 # Signals that differ by less than this, twice the log-likelihood that the right one is expected to gain, are one.
 SAME = 6.0

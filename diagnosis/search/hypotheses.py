@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.effects import EFFECT_TYPES, Effect, EffectType, Simulation
-
-from .observations import Observations
 
 # A joint that moves less than this cannot be tested [rad, m].
 STILL = 1e-4

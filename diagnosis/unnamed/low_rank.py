@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from bodyschema.diagnosis.fit.fit import solved
 from bodyschema.interfaces.records import FloatArray
-
-from .fit import solved
 
 # Maximum of alternating rounds; stop when the explained sum rises by less.
 _ROUNDS, _ENOUGH = 12, 0.1

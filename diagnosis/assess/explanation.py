@@ -7,15 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from bodyschema.diagnosis.fit.fit import Fit
+from bodyschema.diagnosis.fit.worth import NAMED
+from bodyschema.diagnosis.search.held_out import Blocks, held_out_errors, is_marker
+from bodyschema.diagnosis.search.search import Search, describe, named
+from bodyschema.diagnosis.search.together import beyond_tolerances, is_at_limit, tolerated
+from bodyschema.diagnosis.unnamed.unknown import Apart, Unknowns, Way
 from bodyschema.effects import Effect
 from bodyschema.interfaces.records import FloatArray
-
-from .fit import Fit
-from .held_out import Blocks, held_out_errors, is_marker
-from .search import Search, describe, named
-from .together import beyond_tolerances, is_at_limit, tolerated
-from .unknown import Apart, Unknowns, Way
-from .worth import NAMED
 
 # Unnamed causes are accepted if they are more probable than named ones alone by this [nats].
 _MARGIN = 8.0

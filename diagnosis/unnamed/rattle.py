@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.interfaces.records import FloatArray
-
-from .fit import Fit
 
 # Distance of the two sides in standard deviations about each, and the worth of two sides over one [nats], from which a
 # marker is called loose.

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from bodyschema.diagnosis.fit.fit import Fit
+from bodyschema.diagnosis.fit.worth import NAMED, nats
 from bodyschema.effects import Effect
 
-from .fit import Fit
 from .scan import Scan
-from .worth import NAMED, nats
 
 # Maximum of rounds; each may add one ripple per joint.
 _ROUNDS = 8

@@ -6,19 +6,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from bodyschema.diagnosis.assess.nameless import Nameless
+from bodyschema.diagnosis.assess.rivals import Rival, Standing, apart_on, whole_range, widened
+from bodyschema.diagnosis.diagnosis import Diagnosis
+from bodyschema.diagnosis.report.presenters.presenter import Found, Workshop
+from bodyschema.diagnosis.report.presenters.registry import presenter_of
+from bodyschema.diagnosis.search.search import describe
 from bodyschema.effects import Effect
 from bodyschema.effects.unexplained import PLACE
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 
-from .diagnosis import Diagnosis
-from .nameless import Nameless
 from .numbers import named, rival_named, told_values
-from .presenters.presenter import Found, Workshop
-from .presenters.registry import presenter_of
 from .result import Alike, Cause, DiagnosisFile, Errors, Gain, Interval, Tolerances, Unexplained, Verdict
-from .rivals import Rival, Standing, apart_on, whole_range, widened
-from .search import describe
 
 # Tolerances that leave at most this share of the error are mentioned.
 _BY_TOLERANCES = 0.95

@@ -1,0 +1,1 @@
+"""Assess causes against alternatives, and what they leave unexplained."""

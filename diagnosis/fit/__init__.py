@@ -1,0 +1,1 @@
+"""Fit a simulation with tolerances to observations."""

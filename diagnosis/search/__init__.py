@@ -1,0 +1,1 @@
+"""Search for the sets of causes that explain the observations."""

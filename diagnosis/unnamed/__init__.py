@@ -1,0 +1,1 @@
+"""Model discrepancies that no effect names."""
