@@ -259,7 +259,7 @@ class Sets:
     def _costs_beside(self, chosen: Sequence[int], groups: Sequence[tuple[int, ...]]) -> FloatArray:
         """Return the cost of naming each of some groups in addition to a set [nats]."""
         present = [self.effects[k] for k in chosen]
-        kinds = {effect.name for effect in present if not effect.kind.in_parts}
+        kinds = {effect.kind for effect in present if not effect.kind.in_parts}
         numbers = Counter(effect.key for effect in present if effect.kind.in_parts)
         costs = []
         for group in groups:
@@ -269,7 +269,7 @@ class Sets:
                 known = self._first + float(np.log(ways_to_choose(before, of))) if before else 0.0
                 costs.append(self._first + float(np.log(ways_to_choose(before + len(group), of))) - known)
             else:
-                first = min(self._first, ANOTHER) if effect.name in kinds else self._first
+                first = min(self._first, ANOTHER) if effect.kind in kinds else self._first
                 costs.append(self._trials[group[0]] + first)
         return np.array(costs)
 
