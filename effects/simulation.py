@@ -226,10 +226,11 @@ class Simulation:
 
     def torques(self, q: FloatArray) -> FloatArray:
         """Return torques of gravity about the joints (n, d) [N·m, N], with payloads, at q (n, d)."""
-        return sum((load.torques(q) for load in self._payloads), self.gravity.torques(q))
+        return sum((load.torques(q) for load in self.payloads), self.gravity.torques(q))
 
     @cached_property
-    def _payloads(self) -> list[GravityLoad]:
+    def payloads(self) -> list[GravityLoad]:
+        """Loads that the URDF lacks."""
         return [
             GravityLoad.of_payload(self.robot, float(effect.values[0]), effect.values[1:])
             for effect in self._of("payload")

@@ -18,7 +18,7 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.urdf import inverse
 
 from .geometry import geometry_without_zeros
-from .joint_errors import LeftOut, moment_notes, residual_note, sentences, why_not
+from .joint_errors import HAND_BORE_IT, LeftOut, moment_notes, residual_note, sentences, why_not
 
 FORMAT, VERSION = "bodyschema correction", 1
 # Values as in extended.toml; a ripple's cycles become radians per unit of the reading.
@@ -30,15 +30,19 @@ _OF_READINGS = (
     "joint_coupling",
     "backlash",
     "settling",
+    "hysteresis",
 )
-_HELD = {*_OF_READINGS, *RIGID, "joint_compliance"}
+_OF_WEIGHT = ("joint_compliance", "gravity_backlash", "payload")
+_ENTRIES = (*_OF_READINGS, "gravity_backlash")
 
 
 def held_by_correction(simulation: Simulation) -> Simulation:
     """Return the simulation with only the effects that correction.json holds."""
-    stayed = simulation.after_moments
+    stayed, held = simulation.after_moments, {*_OF_READINGS, *RIGID}
+    if simulation.bears_weight:
+        held.update(_OF_WEIGHT)
     own, background = (
-        tuple(effect for effect in effects if effect.name in _HELD) for effects in (stayed.effects, stayed.background)
+        tuple(effect for effect in effects if effect.name in held) for effects in (stayed.effects, stayed.background)
     )
     return Simulation(simulation.robot, own, None, background)
 
@@ -57,24 +61,20 @@ def write_correction(simulation: Simulation, file: Path, heading: str) -> list[s
     """
     kept, left_out = held_by_correction(simulation), []
     for effect in simulation.after_moments.all_effects:
-        if effect.name == "joint_compliance" and not simulation.bears_weight:
-            left_out.append(LeftOut(effect, 'with hold = "torque_free" the guiding hand bore the weight'))
-        elif effect.name not in _HELD:
+        if effect.name in _OF_WEIGHT and not simulation.bears_weight:
+            left_out.append(LeftOut(effect, HAND_BORE_IT))
+        elif effect.name not in (*_OF_READINGS, *RIGID, *_OF_WEIGHT):
             left_out.append(LeftOut(effect, why_not(effect)))
     told = [*sentences(left_out), *residual_note(simulation), *moment_notes(simulation)]
-    springs = np.zeros(len(simulation.robot.joints))
-    for effect in kept.all_effects:
-        if effect.name == "joint_compliance" and simulation.bears_weight:
-            springs[kept.place(effect).joint] += effect.values[0]
     contents = {
         "format": FORMAT,
         "version": VERSION,
         "robot": simulation.robot.name,
         "from": heading,
         "notes": told,
-        "effects": [_entry(kept, effect) for effect in kept.all_effects if effect.name in _OF_READINGS],
+        "effects": [_entry(kept, effect) for effect in kept.all_effects if effect.name in _ENTRIES],
         "gravity_m_s2": GRAVITY_M_S2,
-    } | _chain(kept, springs)
+    } | _chain(kept)
     file.write_text(json.dumps(contents, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     return told
 
@@ -83,14 +83,15 @@ def _entry(simulation: Simulation, effect: Effect) -> dict[str, Any]:
     place, values = simulation.place(effect), effect.values.tolist()
     if effect.name == "joint_ripple" and effect.prismatic:
         values[2] *= 2.0 * np.pi
-    # Settling and backlash have a state; it is unknown before the first reading.
+    # Some effects have a state; it is unknown before the first reading.
     entry = {"effect": effect.name, "joint": place.joint, "values": values, "state": []}
     return entry if place.source is None else entry | {"source": place.source}
 
 
-def _chain(simulation: Simulation, springs: FloatArray) -> dict[str, Any]:
+def _chain(simulation: Simulation) -> dict[str, Any]:
     """Return the joints, in the order of the readings, and the frames of camera and marker."""
     robot, gravity, geometry = simulation.robot, simulation.gravity, geometry_without_zeros(simulation)
+    loads = [load.bodies for load in (gravity, *simulation.payloads)]
     aligned: dict[int | None, FloatArray] = {None: np.eye(4)}
     for k, name in enumerate(robot.joints):
         aligned[k] = _onto_z(robot.tree.joint(name).axis)
@@ -105,9 +106,9 @@ def _chain(simulation: Simulation, springs: FloatArray) -> dict[str, Any]:
                 "slides": bool(robot.chain.prismatic[k]),
                 "parent": _numbered(body.carrier),
                 "pose": _numbers(inverse(aligned[body.carrier]) @ pose @ aligned[k]),
-                "compliance": float(springs[k]),
-                "mass_kg": float(body.mass_kg),
-                "moment_kg_m": (aligned[k][:3, :3].T @ body.moment).tolist(),
+                "compliance": float(simulation.springs[k]),
+                "mass_kg": float(sum(bodies[k].mass_kg for bodies in loads)),
+                "moment_kg_m": (aligned[k][:3, :3].T @ sum(bodies[k].moment for bodies in loads)).tolist(),
             }
         )
     T_link_marker = np.eye(4)

@@ -10,10 +10,12 @@ import numpy as np
 
 from bodyschema.effects.effect import Effect
 from bodyschema.effects.simulation import RIGID, Simulation
+from bodyschema.robot.urdf import PointMass
 
 _OF_THE_MEASUREMENT = "an error of the measurement, not of the arm"
 _WHY_NOT = {
     "settling": "it depends on the moves between readings",
+    "hysteresis": "friction whose lag depends on the way is not in a rigid-body simulator",
     "camera_latency": "it depends on time",
     "thermal_drift": "it depends on time",
     "camera_scale": _OF_THE_MEASUREMENT,
@@ -21,6 +23,7 @@ _WHY_NOT = {
     "lens_distortion": _OF_THE_MEASUREMENT,
 }
 _UNKNOWN = "this effect has no counterpart there"
+HAND_BORE_IT = 'with hold = "torque_free" the guiding hand bore the weight'
 
 
 def why_not(effect: Effect) -> str:
@@ -54,6 +57,7 @@ class JointErrors:
         ratios: share of each joint's reading that is added, by the joint; the joint's own is its scale error.
         waves: periodic errors.
         play: width of the backlash [rad, m].
+        loose: width [rad, m] of the backlash under gravity, and the friction [N·m, N] that holds it on its side.
         compliance: [rad/(N·m), m/N].
     """
 
@@ -61,6 +65,7 @@ class JointErrors:
     ratios: dict[str, float] = field(default_factory=dict)
     waves: list[Wave] = field(default_factory=list)
     play: float = 0.0
+    loose: tuple[float, float] | None = None
     compliance: float = 0.0
 
     def take(self, effect: Effect) -> str | None:
@@ -77,6 +82,10 @@ class JointErrors:
                 if self.play or effect.values[0] < 0.0:
                     return "a joint has one backlash there"
                 self.play = float(effect.values[0])
+            case "gravity_backlash":
+                if self.loose or effect.values[0] < 0.0:
+                    return "a joint has one backlash under gravity there"
+                self.loose = float(effect.values[0]), max(float(effect.values[1]), 0.0)
             case "joint_compliance":
                 self.compliance += float(effect.values[0])
             case _:
@@ -123,12 +132,14 @@ class ArmErrors:
 
     Attributes:
         joints: errors of every joint of the robot.
+        payloads: masses at the marker's link [kg], and their centres in its frame [m].
         left_out: effects that a rigid-body simulator cannot hold.
         notes: sentences on effects that are held in another form than found.
     """
 
     simulation: Simulation
     joints: dict[str, JointErrors]
+    payloads: tuple[PointMass, ...]
     left_out: tuple[LeftOut, ...]
     notes: tuple[str, ...]
 
@@ -137,19 +148,23 @@ class ArmErrors:
         """Sort the effects of a simulation."""
         stayed = simulation.after_moments
         joints = {joint: JointErrors() for joint in simulation.robot.joints}
+        payloads: list[PointMass] = []
         left_out: list[LeftOut] = []
         for effect in stayed.all_effects:
             if effect.name in RIGID and effect.name != "joint_offset":
                 continue
-            if effect.name == "joint_compliance" and not simulation.bears_weight:
-                why = 'with hold = "torque_free" the guiding hand bore the weight'
+            if effect.kind.needs_weight and not simulation.bears_weight:
+                why = HAND_BORE_IT
+            elif effect.name == "payload" and effect.values[0] > 0.0:
+                payloads.append(PointMass(float(effect.values[0]), effect.values[1:] / effect.values[0]))
+                why = None
             elif effect.where is None:
                 why = why_not(effect)
             else:
                 why = joints[effect.where].take(effect)
             if why is not None:
                 left_out.append(LeftOut(effect, why))
-        return cls(stayed, joints, tuple(left_out), tuple(moment_notes(simulation)))
+        return cls(stayed, joints, tuple(payloads), tuple(left_out), tuple(moment_notes(simulation)))
 
     def told(self) -> list[str]:
         """Return sentences on effects that are not in the file, or in another form."""
