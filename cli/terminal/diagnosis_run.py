@@ -6,14 +6,14 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from importlib.metadata import version
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
-from bodyschema.calibration.hand_eye import HandEye
+from bodyschema.calibration.hand_eye import HandEye, pose_covariance
 from bodyschema.calibration.plausibility.check import plausibility, told_sigma
 from bodyschema.calibration.plausibility.limits import require_units
 from bodyschema.cli.recordings.recorder import History
@@ -29,8 +29,9 @@ from bodyschema.diagnosis.report import About, page
 from bodyschema.diagnosis.result import DiagnosisFile
 from bodyschema.diagnosis.words import modelled
 from bodyschema.effects import KINDS, write_corrected, write_extended
+from bodyschema.effects.poses import transforms
 from bodyschema.interfaces.errors import BodyschemaError, RecordingError, RequestError
-from bodyschema.interfaces.records import Pair
+from bodyschema.interfaces.records import FloatArray, Pair
 from bodyschema.interfaces.whole_files import write_whole
 from bodyschema.learning.nominal import NominalModel
 from bodyschema.recordings import files as recordings
@@ -155,9 +156,19 @@ class Found:
 
     @property
     def hand_eye(self) -> HandEye:
-        """The camera's pose with what was found in it; how sure it is, `bodyschema calibrate` tells."""
-        placed = self.diagnosis.extended.simulation.placed
-        return HandEye.of(self.robot.camera.parent_link, CAMERA_LINK, placed.robot.camera.pose @ placed.camera_pose)
+        """The camera's pose with what was found in it. Without a fitted pose it has no covariance."""
+        fit, covariance = self.diagnosis.extended, None
+        shifts = [effect for effect in fit.simulation.effects if effect.name == "camera_pose"]
+        start = self.robot.camera.pose @ fit.simulation.with_effects(()).camera_pose
+
+        def pose(values: FloatArray) -> FloatArray:
+            return reduce(np.matmul, transforms(values.reshape(-1, 6)), start)
+
+        values = np.array([effect.values for effect in shifts]).ravel()
+        if shifts:
+            places = [place for effect in shifts for place in fit.places(effect)]
+            covariance = pose_covariance(pose, values, fit.covariance[np.ix_(places, places)])
+        return HandEye.of(self.robot.camera.parent_link, CAMERA_LINK, pose(values), covariance)
 
     @property
     def timed(self) -> bool:
