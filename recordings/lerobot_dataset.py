@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from bodyschema.interfaces.errors import RecordingError
+from bodyschema.interfaces.extras import install_command
 from bodyschema.robot.lerobot import Calibrations, JointServo, Unit
 from bodyschema.robot.limited import MOST_MEMORY_BYTES, bounded_memory, opened, read_at_most
 
@@ -128,7 +129,7 @@ def _rows(source: Path, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, n
         import pyarrow.parquet
     except ImportError as error:
         raise RecordingError(
-            "a LeRobotDataset needs the extra `export`", file=source, remedy="Type: pip install 'bodyschema[export]'"
+            "a LeRobotDataset needs the extra `export`", file=source, remedy=f"Type: {install_command('export')}"
         ) from error
     files = sorted((source / "data").rglob("*.parquet"))
     if not files:
