@@ -20,8 +20,8 @@ import numpy as np
 from bodyschema.cli.recordings.synthesis import simulated, with_noise
 from bodyschema.diagnosis.conclusion import conclusion
 from bodyschema.diagnosis.diagnosis import diagnose
-from bodyschema.diagnosis.remedies import remedies
-from bodyschema.diagnosis.report import About, page
+from bodyschema.diagnosis.report.page import About, page
+from bodyschema.diagnosis.text import remedies
 from bodyschema.effects import Effect, Motion, Simulation
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.recordings.recording import Recording

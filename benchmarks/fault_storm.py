@@ -22,14 +22,14 @@ from bodyschema.drivers.bench.device import Device
 from bodyschema.drivers.bench.faults import Storm, mute
 from bodyschema.drivers.bench.faults import storm as storm_of_lines
 from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
+from bodyschema.drivers.dynamixel.bench.arm import storm as storm_of_dynamixel
 from bodyschema.drivers.dynamixel.bench.chain import Chain
-from bodyschema.drivers.dynamixel.bench.faults import storm as storm_of_dynamixel
 from bodyschema.drivers.dynamixel.bench.servo import Servo
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from bodyschema.drivers.dynamixel.joints import DynamixelJoints
 from bodyschema.drivers.dynamixel.models import BY_NAME
-from bodyschema.drivers.feetech.bench.chain import Chain as FeetechChain
-from bodyschema.drivers.feetech.bench.faults import storm as storm_of_feetech
+from bodyschema.drivers.feetech.bench.arm import Chain as FeetechChain
+from bodyschema.drivers.feetech.bench.arm import storm as storm_of_feetech
 from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
 from bodyschema.drivers.feetech.config import BusConfig as FeetechBus
 from bodyschema.drivers.feetech.config import FeetechConfig

@@ -180,7 +180,7 @@ def measure(robots: int, course: Course, processes: int) -> str:
             write_robot(Path(folder) / f"arm_{k}", f"arm_{k}", sampler, ends[k % processes]) for k in range(robots)
         ]
         walks = [Walk(Config.load(file), k) for k, file in enumerate(files)]
-        command = module_command("bodyschema", "learner", "--robot", str(folder), "--processes", str(processes))
+        command = module_command("bodyschema", "run", "learner", "--robot", str(folder), "--processes", str(processes))
         with ZenohSession(listen=sampler) as bus:
             publish = [bus.publisher(Keys(f"arm_{k}").pair, cache=256) for k in range(robots)]
             for k, walk in enumerate(walks):

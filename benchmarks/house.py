@@ -69,7 +69,8 @@ def leaves() -> int:
 
     def of(command: object) -> int:
         names = [name for name in command if not name.startswith("-")]  # type: ignore[attr-defined]
-        return sum(of(command[name]) for name in names) if names else 1  # type: ignore[index]
+        own = not names or command.default_command is not None  # type: ignore[attr-defined]
+        return own + sum(of(command[name]) for name in names)  # type: ignore[index]
 
     return of(app)
 

@@ -106,8 +106,8 @@ def asked(robot_file: Path) -> FloatArray:
 
 @contextmanager
 def running_learner(robot_file: Path, endpoint: str) -> Iterator[None]:
-    """Run `bodyschema learner`, from its first answer to the end of the with statement."""
-    command = module_command("bodyschema", "learner", "--robot", str(robot_file))
+    """Run `bodyschema run learner`, from its first answer to the end of the with statement."""
+    command = module_command("bodyschema", "run", "learner", "--robot", str(robot_file))
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
     try:
         while process.poll() is None:

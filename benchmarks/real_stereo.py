@@ -1,79 +1,145 @@
-"""The calibration of OpenCV's own sample pairs: `python benchmarks/real_stereo.py FOLDER`.
+"""The calibration of public stereo pairs of a chessboard beside OpenCV's.
 
-FOLDER has left01.jpg to right14.jpg, which OpenCV's sources have in samples/data and Debian's package opencv-doc in
-/usr/share/doc/opencv-doc/examples/data. They are not in this repository. 9x6 inner corners, squares of 25 mm.
+Run `python benchmarks/real_stereo.py [FOLDER] [--left PATTERN --right PATTERN] [--squares 10x7] [--square-mm 25]`.
+
+The default is OpenCV's own sample pairs: left01.jpg to right14.jpg, which its sources have in samples/data and Debian's
+package opencv-doc in /usr/share/doc/opencv-doc/examples/data. No images are in this repository.
+
+Both calibrate from the same corners: once from all views, then from three quarters of the pairs, with which the corners
+of every fourth pair are predicted. OpenCV takes the lens model that is chosen here.
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from bodyschema.cli.cameras.calibration import board_of
+from bodyschema.interfaces.records import FloatArray
 from bodyschema.vision.board import Board
-from bodyschema.vision.calibration.calibrate import Asked, Calibrated, calibrate
+from bodyschema.vision.calibration.bundle import view_residuals
+from bodyschema.vision.calibration.calibrate import Asked, Calibrated, calibrate, fit
 from bodyschema.vision.calibration.gather import gathered
 from bodyschema.vision.calibration.images import pair_files, read_pairs
+from bodyschema.vision.calibration.start import pose_of
 from bodyschema.vision.calibration.view import View
-from bodyschema.vision.rig import StereoRig
+from bodyschema.vision.lens import DISTORTION_NAMES, Model
+from bodyschema.vision.rig import StereoRig, parameter_names, split
 
-BOARD = Board(10, 7, 0.025, pattern="chessboard")
 USUAL = Path("/usr/share/doc/opencv-doc/examples/data")
+EVERY = 4
 
 
 def main() -> None:
     """Calibrate, and print the figures beside those of OpenCV from the same corners."""
-    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else USUAL
-    if not folder.is_dir():
-        print(f"{folder} is not there: name the folder with OpenCV's left01.jpg and right01.jpg")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, nargs="?", default=USUAL)
+    parser.add_argument("--left", default="left[0-9]*.jpg")
+    parser.add_argument("--right", default="right[0-9]*.jpg")
+    parser.add_argument("--squares", default="10x7")
+    parser.add_argument("--square-mm", type=float, default=25.0)
+    given = parser.parse_args()
+    if not given.folder.is_dir():
+        print(f"{given.folder} is not there: name the folder with OpenCV's left01.jpg and right01.jpg")
         return
-    pairs = pair_files(folder, "left[0-9]*.jpg", "right[0-9]*.jpg", side_by_side=False)
-    found = gathered(read_pairs(pairs, side_by_side=False), BOARD, print)
-    asked = Asked(found.image_size_px, ("", ""), "", scale_sigma=0.0)
-    ours = calibrate(found.views, BOARD, asked)
-    for row in (("", "ours", "1 sigma", "OpenCV"), *rows(ours, opencv(found.views, found.image_size_px))):
+    board = board_of(given.squares, given.square_mm, pattern="chessboard")
+    pairs = pair_files(given.folder, given.left, given.right, side_by_side=False)
+    found = gathered(read_pairs(pairs, side_by_side=False), board, print)
+    show(found.views, board, found.image_size_px)
+
+
+def show(views: Sequence[View], board: Board, size_px: tuple[int, int]) -> None:
+    """Print the table of both calibrations."""
+    ours = calibrate(views, board, Asked(size_px, ("", ""), "", scale_sigma=0.0), print)
+    pairs = [view for view in views if view.is_stereo]
+    theirs = opencv(pairs, board, size_px, ours.rig.model)
+    for row in (("", "ours", "1 sigma", "OpenCV"), *rows(ours, theirs)):
         print("{:28s}{:>12s}{:>12s}{:>12s}".format(*row))
+    kept = [view for view in ours.fitted.views if view.is_stereo]
+    taken = [view for k, view in enumerate(kept) if k % EVERY]
+    part = fit(taken, board.corners_m, size_px, ours.rig.model).bundle.vector
+    apart = [
+        "" if vector is None else f"{predicted(kept[::EVERY], board, ours.rig.model, vector):.3f}"
+        for vector in (part, opencv(taken, board, size_px, ours.rig.model))
+    ]
+    print("{:28s}{:>12s}{:>12s}{:>12s}".format("RMS a point, every fourth", apart[0], "", apart[1]))
 
 
-def rows(ours: Calibrated, theirs: dict[str, float]) -> list[tuple[str, str, str, str]]:
+def rows(ours: Calibrated, theirs: FloatArray | None) -> list[tuple[str, str, str, str]]:
     """Name, our value, its sigma and OpenCV's value."""
     rig = ours.rig
     assert isinstance(rig, StereoRig)
-    values = dict(zip(rig.names, zip(rig.vector.tolist(), rig.sigma.tolist(), strict=True), strict=True))
-    wanted = (
-        "left.fx_px",
-        "left.cx_px",
-        "left.cy_px",
-        "left.k1",
-        "right.fx_px",
-        "right.cx_px",
-        "right.cy_px",
-        "right.k1",
-    )
-    table = [(name, f"{values[name][0]:.3f}", f"{values[name][1]:.3f}", f"{theirs[name]:.3f}") for name in wanted]
-    baseline = f"{1e3 * rig.baseline_m:.3f}", f"{1e3 * rig.baseline_sigma_m:.3f}", f"{1e3 * theirs['baseline_m']:.3f}"
-    table.append(("baseline [mm]", *baseline))
-    # OpenCV counts a point's distance, of two coordinates.
-    table.append(("RMS a point [px]", f"{np.sqrt(2) * rig.made.reprojection_px:.3f}", "", f"{theirs['rms_px']:.3f}"))
-    table.append(("RMS a point, held out [px]", f"{np.sqrt(2) * rig.made.held_out_px:.3f}", "", ""))
-    return table
+    n = len(rig.vector) if theirs is None else len(theirs)
+    other = np.full(n, np.nan) if theirs is None else theirs
+    table = [
+        (name, f"{value:.3f}", f"{sigma:.3f}", f"{its:.3f}")
+        for name, value, sigma, its in zip(rig.names, rig.vector, rig.sigma, other, strict=True)
+        if name.endswith(("f_px", "fx_px", "fy_px", "cx_px", "cy_px"))
+    ]
+    distance = 1e3 * float(np.linalg.norm(other[-3:]))
+    baseline = f"{1e3 * rig.baseline_m:.3f}", f"{1e3 * rig.baseline_sigma_m:.3f}", f"{distance:.3f}"
+    # A point's distance is of two coordinates.
+    errors = [f"{np.sqrt(2) * each:.3f}" for each in (rig.made.reprojection_px, rig.made.held_out_px)]
+    return [
+        *table,
+        ("baseline [mm]", *baseline),
+        ("RMS a point [px]", errors[0], "", ""),
+        ("RMS a point, held out [px]", errors[1], "", ""),
+    ]
 
 
-def opencv(views: list[View], size_px: tuple[int, int]) -> dict[str, float]:
-    """Calibrate with cv2.calibrateCamera, then cv2.stereoCalibrate, from the views that both cameras saw."""
-    eyes = [(view.left.px, view.right.px) for view in views if view.left is not None and view.right is not None]
-    model = [BOARD.corners_m.astype(np.float32)] * len(eyes)
-    left, right = ([px[eye].astype(np.float32) for px in eyes] for eye in range(2))
-    start = [cv2.calibrateCamera(model, px, size_px, np.eye(3), np.zeros(5))[1:3] for px in (left, right)]
-    flags = cv2.CALIB_USE_INTRINSIC_GUESS
-    rms, K1, D1, K2, D2, _, t, *_ = cv2.stereoCalibrate(model, left, right, *start[0], *start[1], size_px, flags=flags)
-    found = {"rms_px": float(rms), "baseline_m": float(np.linalg.norm(t))}
-    for eye, K, D in (("left", K1, D1), ("right", K2, D2)):
-        values = {"fx_px": K[0, 0], "cx_px": K[0, 2], "cy_px": K[1, 2], "k1": np.ravel(D)[0]}
-        found |= {f"{eye}.{name}": float(value) for name, value in values.items()}
-    return found
+def predicted(views: Sequence[View], board: Board, model: Model, vector: FloatArray) -> float:
+    """Return the RMS error of a point [px] of views whose poses alone are fitted."""
+    left = split(model, vector)[0]
+    squares, points = 0.0, 0
+    for view in views:
+        assert view.left is not None
+        start = pose_of(view.left, board.corners_m, left)
+        off = view_residuals(view, board.corners_m, model, vector, start, np.ones(view.corner_count))
+        squares, points = squares + float(np.sum(off**2)), points + len(off)
+    return float(np.sqrt(squares / points))
+
+
+def opencv(views: Sequence[View], board: Board, size_px: tuple[int, int], model: Model) -> FloatArray | None:
+    """Return the rig, as `StereoRig.vector` has it, of OpenCV's own calibration; None if it fails."""
+    eyes = [(view.left, view.right) for view in views if view.left is not None and view.right is not None]
+    corners = [board.corners_m[each.numbers][None].astype(np.float32) for each, _ in eyes]
+    left, right = ([each[eye].px[None].astype(np.float32) for each in eyes] for eye in range(2))
+    try:
+        if model == "fisheye":
+            flags = cv2.CALIB_RECOMPUTE_EXTRINSIC
+            start = [
+                cv2.fisheye.calibrate(corners, px, size_px, np.eye(3), np.zeros(4), flags=flags)[1:3]
+                for px in (left, right)
+            ]
+            flags |= cv2.CALIB_USE_INTRINSIC_GUESS
+            found = cv2.fisheye.stereoCalibrate(corners, left, right, *start[0], *start[1], size_px, flags=flags)
+        else:
+            flags = cv2.CALIB_RATIONAL_MODEL if model == "rational" else 0
+            count = len(DISTORTION_NAMES[model])
+            start = [
+                cv2.calibrateCamera(corners, px, size_px, np.eye(3), np.zeros(count), flags=flags)[1:3]
+                for px in (left, right)
+            ]
+            flags |= cv2.CALIB_USE_INTRINSIC_GUESS
+            found = cv2.stereoCalibrate(corners, left, right, *start[0], *start[1], size_px, flags=flags)
+    except cv2.error as error:
+        print(f"OpenCV fails: {error.err}")
+        return None
+    count = len(DISTORTION_NAMES[model])
+    lenses = [
+        [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *np.ravel(D)[:count]]
+        for K, D in ((found[1], found[2]), (found[3], found[4]))
+    ]
+    turn = Rotation.from_matrix(np.asarray(found[5])).as_rotvec()
+    vector = np.concatenate([*lenses, turn, np.ravel(found[6])])
+    assert len(vector) == len(parameter_names(model))
+    return vector
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from bodyschema.drivers.dynamixel.joints import DynamixelJoints
 from bodyschema.drivers.dynamixel.models import BY_NAME
 from bodyschema.drivers.dynamixel.powered_config import FloatingJoint, ZeroForceConfig
 from bodyschema.drivers.dynamixel.zero_force import ZeroForce
-from bodyschema.drivers.feetech.bench.chain import Chain as FeetechChain
+from bodyschema.drivers.feetech.bench.arm import Chain as FeetechChain
 from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
 from bodyschema.drivers.feetech.config import BusConfig as FeetechBus
 from bodyschema.drivers.feetech.config import FeetechConfig

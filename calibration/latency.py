@@ -319,8 +319,8 @@ def _require_motion(wiggle: Wiggle, chain: RigidChain) -> None:
         turned = np.degrees(span[~chain.prismatic])
         most = f"{turned.max():.1f}° at most" if len(turned) else f"{1e3 * span.max():.1f} mm at most"
         raise LatencyError(
-            f"the joints hardly moved: {most}. Move the arm while the time runs; `bodyschema joints` shows whether "
-            "the encoders follow"
+            f"the joints hardly moved: {most}. Move the arm while the time runs; `bodyschema watch joints` shows "
+            "whether the encoders follow"
         )
 
 
@@ -344,8 +344,8 @@ def _strange(fit: _Fit, cost: float) -> str:
     return (
         f"the marker does not follow the joints: of {1e3 * moved_m:.0f} mm of motion (RMS) {1e3 * residual_m:.0f} mm "
         f"do not go with them at any latency from {1e3 * EARLIEST_S:.0f} to {1e3 * LATEST_S:.0f} ms. Is it the marker "
-        "that is found (`bodyschema watch cameras`), are the joints in the order of robot.toml (`bodyschema joints`), "
-        "and do the cameras stand still?"
+        "that is found (`bodyschema watch cameras`), are the joints in the order of robot.toml (`bodyschema watch "
+        "joints`), and do the cameras stand still?"
     )
 
 

@@ -30,19 +30,16 @@ GROUPS = {
         "doctor": "Check ports, servos, disk, clock and network.",
     },
     "Calibrate and diagnose": {
-        "calibrate": "Calibrate arm, hand-eye and tool, or stereo cameras.",
+        "calibrate": "Calibrate arm, hand-eye and tool, or cameras.",
         "diagnose": "Find what the simulation gets wrong, and the causes.",
         "replay": "Learn from a recording; report the held-out error.",
         "simulate": "Predict the marker for recorded joint angles.",
         "compare": "Compare two recordings row by row.",
-        "board": "Print a board for camera calibration.",
-        "marker": "Print tags, measure a cluster, learn a ball's colour.",
+        "marker": "Print tags; learn a cluster's shape or a ball's colour.",
         "reproduce": "Run the paper's experiments again.",
     },
     "Run": {
-        "run": "Start sampler and learner, and keep them running.",
-        "sampler": "Run the sampler: encoders and cameras in, pairs out.",
-        "learner": "Run the learner: pairs in, predictions out.",
+        "run": "Run sampler and learner, or one of them.",
         "status": "Show the state of sampler and learner.",
         "view": "Serve a live page: errors, next poses, controls.",
         "predict": "Predict the marker position at given joint angles.",
@@ -53,21 +50,38 @@ GROUPS = {
     },
     "Hardware": {
         "scan": "Find servos on all ports, rates and protocols.",
-        "joints": "Show joint angles live: signs, ranges, health.",
-        "watch": "Show what cameras and other marker sources see.",
+        "watch": "Show joints, cameras or other marker sources live.",
         "servos": "Read and write servo EEPROM settings, with undo.",
         "bench": "Emulate the servos of robot.toml on a port.",
     },
     "Data and fleet": {
         "record": "Save the running sampler's pairs to a file.",
         "export": "Convert pairs or a robot: CSV, Parquet, MCAP, MJCF, URDF.",
-        "backup": "Save pairs, checkpoint and robot.toml to one file.",
-        "restore": "Restore a backup; existing files are kept.",
-        "fleet": "Monitor and diagnose many robots.",
+        "backup": "Save pairs, checkpoint and robot.toml, or restore them.",
+        "fleet": "List, compare and diagnose many robots.",
     },
 }
 # Names of earlier releases, for one more.
-RENAMED = {("config", "init"): ("init",), ("robot", "new"): ("init", "--from", "scan")}
+RENAMED = {
+    ("config", "init"): ("init",),
+    ("config", "check"): ("config",),
+    ("config", "show"): ("config", "--json"),
+    ("robot", "new"): ("init", "--from", "scan"),
+    ("board",): ("calibrate", "cameras", "--print-board"),
+    ("calibrate", "check"): ("calibrate", "cameras", "--check"),
+    ("marker", "cluster"): ("marker", "learn"),
+    ("sampler",): ("run", "sampler"),
+    ("learner",): ("run", "learner"),
+    ("joints",): ("watch", "joints"),
+    ("servos", "show"): ("servos",),
+    ("servos", "set"): ("servos",),
+    ("servos", "zero"): ("servos", "--zero"),
+    ("servos", "undo"): ("servos", "--undo"),
+    ("restore",): ("backup", "--restore"),
+    ("fleet", "list"): ("fleet",),
+    ("fleet", "compare"): ("fleet", "--compare"),
+    ("fleet", "diagnose"): ("fleet",),
+}
 COMMANDS = {name: summary for group in GROUPS.values() for name, summary in group.items()}
 # One object each: commands that are apps keep theirs, and two of the same name are refused.
 _SECTIONS = {title: cyclopts.Group(title, sort_key=place) for place, title in enumerate(GROUPS)}

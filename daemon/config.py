@@ -285,7 +285,7 @@ def _require_size(robot: RobotDescription, tables: Tables, vision: Mapping[str, 
             return
     if not said:
         raise ConfigError(
-            f"{'.'.join(place)} is missing: one camera alone tells the depth from the marker's size",
+            f"{'.'.join(place)} is missing: one camera alone takes the depth from the marker's size",
             file=file,
             line=line_of(text, place[:-1]),
             remedy=f"Measure it with a caliper, and give {what}",

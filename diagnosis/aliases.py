@@ -19,7 +19,7 @@ def alias_sentences(fit: Fit) -> list[str]:
     """Return a sentence for each ripple of a fit that has an alias."""
     told = []
     for cause in fit.causes:
-        others = aliases(fit, cause) if cause.name == "joint_ripple" and not cause.prismatic else []
+        others = aliases(fit, cause) if cause.kind.is_periodic and not cause.prismatic else []
         if others:
             listed = ", ".join(f"{cycles:.0f}" for cycles in others[:3])
             told.append(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bodyschema.effects import Effect, Simulation
+from bodyschema.effects import EFFECT_TYPES, Effect, Simulation
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 
@@ -20,19 +20,17 @@ def aligned(observations: Observations, simulation: Simulation) -> Fit:
     robot = simulation.robot
     nuisances = free_effects(robot)
     if not robot.camera.pose_known:
-        predicted = simulation.positions(observations.motion)
-        nuisances = [
-            e.with_values(placed(predicted, observations.x)) if e.name == "camera_pose" else e for e in nuisances
-        ]
+        pose = placed(simulation.positions(observations.motion), observations.x)
+        nuisances = [one.with_values(pose) if one.kind.stage == "camera" else one for one in nuisances]
     own = list(simulation.effects)
     return fitted(observations, simulation.with_effects([*nuisances, *own]), len(nuisances) + len(own))
 
 
 def free_effects(robot: RobotDescription) -> list[Effect]:
     """Return the effects that stand for what robot.toml does not know."""
-    names = [] if robot.camera.pose_known else ["camera_pose"]
-    names += [] if robot.robot.marker_known else ["tool_offset"]
-    return [Effect.at(robot, name) for name in names]
+    free = [kind.name for kind in EFFECT_TYPES.values() if kind.is_free(robot)]
+    # The camera's pose first, from which the rest is fitted.
+    return [Effect.at(robot, name) for name in reversed(free)]
 
 
 def placed(predicted: FloatArray, x: FloatArray) -> FloatArray:

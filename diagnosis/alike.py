@@ -24,7 +24,6 @@ _WORTH, _EXPLAINS = 25.0, 0.01
 _DIRECTION, _SHARED = 0.5, 0.7
 # A ripple with fewer cycles per turn acts like an eccentric encoder.
 _FEWEST_CYCLES = 1.5
-_GEOMETRIC = ("link_geometry", "joint_offset")
 # A direction with a smaller remaining share counts as zero.
 _TOLD = 1e-7
 
@@ -67,7 +66,7 @@ def alike(geometry: Fit, hypotheses: Iterable[Effect]) -> tuple[Alike, ...]:
     by_joint: dict[str, list[_Direction]] = {}
     for candidate in Scan(geometry).candidates(h for h in hypotheses if _stays_at_a_joint(h)):
         effect = candidate.effect
-        if candidate.gain < _WORTH or (effect.name == "joint_ripple" and effect.values[-1] < _FEWEST_CYCLES):
+        if candidate.gain < _WORTH or (effect.kind.is_periodic and effect.values[-1] < _FEWEST_CYCLES):
             continue
         basis = _beside(geometry, flat, effect)
         explained = float(np.square(basis.T @ left).sum()) / whole
@@ -79,7 +78,7 @@ def alike(geometry: Fit, hypotheses: Iterable[Effect]) -> tuple[Alike, ...]:
 
 def _stays_at_a_joint(effect: Effect) -> bool:
     kind = effect.kind
-    return kind.at_joint and not kind.takes_source and not kind.begins and effect.name not in _GEOMETRIC
+    return kind.at_joint and not kind.takes_source and not kind.begins and not kind.rigid
 
 
 def _beside(geometry: Fit, flat: FloatArray, effect: Effect) -> FloatArray:

@@ -21,13 +21,14 @@ LENGTH_M, ANGLE_RAD, DRIVE_RAD = 0.3e-3, float(np.radians(0.06)), float(np.radia
 _DRIVE_M = 0.03e-3
 # Periodic errors of every drive: once and twice per turn of the joint.
 _TWICE = 2.0
-_PERIODIC = ("joint_eccentricity", "joint_ripple")
 # A drive error within this multiple of the usual size is a tolerance.
 _LIKE_OTHERS = 3.0
 # A row counts in full if its weight differs from 1 by less.
 _COUNTS_IN_FULL = 1e-9
 # Prior standard deviation of the logarithms of the scales.
 SPREAD = 2.0
+# Largest scale.
+MOST = 10.0
 
 
 class Scales(NamedTuple):
@@ -104,7 +105,7 @@ class Background:
 
     def tolerates(self, effect: Effect) -> bool:
         """Return True if an effect is a periodic drive error no larger than those of other drives."""
-        if self.scales is None or effect.name not in _PERIODIC:
+        if self.scales is None or not effect.kind.of_drive:
             return False
         usual = self.scales.lengths * _DRIVE_M if effect.prismatic else self.scales.drives * DRIVE_RAD
         return float(np.linalg.norm(effect.values[effect.amounts])) < _LIKE_OTHERS * usual
@@ -112,7 +113,7 @@ class Background:
     def resembles(self, effect: Effect) -> bool:
         """Return True if large tolerances could stand for an effect: a joint's zero is a turn of its link."""
         names = {own.name for own in self.effects}
-        return effect.name in names or ("link_geometry" in names and effect.name == "joint_offset")
+        return not names.isdisjoint({effect.name, *effect.kind.absorbed_by})
 
     @cached_property
     def precision(self) -> FloatArray:
@@ -179,13 +180,13 @@ def _with(effect: Effect, amounts: FloatArray) -> Effect:
 
 
 def _groups(effect: Effect) -> np.ndarray:
-    if effect.name != "link_geometry":
+    if effect.kind.of_drive:
         # A ball screw's ripple is a length; the drive scale of gears does not apply.
         return np.full(len(effect.amounts), 0 if effect.prismatic else 2)
     return np.array([0, 0, 0, 1, 1, 1])
 
 
 def _units(effect: Effect) -> FloatArray:
-    if effect.name != "link_geometry":
+    if effect.kind.of_drive:
         return np.full(len(effect.amounts), _DRIVE_M if effect.prismatic else DRIVE_RAD)
     return np.repeat([LENGTH_M, ANGLE_RAD], 3)

@@ -7,10 +7,9 @@ import numpy as np
 from bodyschema.effects import Effect
 from bodyschema.interfaces.records import FloatArray
 
-from .advice import advice
 from .aliases import alias_sentences
 from .background import ANGLE_RAD, DRIVE_RAD, LENGTH_M
-from .contact import before_contact
+from .contact import doubtful
 from .diagnosis import MOST_DOUBTFUL, Diagnosis
 from .result import (
     Alike,
@@ -29,7 +28,7 @@ from .result import (
 )
 from .rivals import Rival, Standing
 from .scan import Candidate
-from .words import evidence, is_unsure, sentence
+from .text import advice, evidence, is_unsure, sentence
 from .worth import NAMED, nats
 
 _HALF_WIDTH_95 = 1.959964
@@ -239,9 +238,10 @@ def _why_not(diagnosis: Diagnosis, candidate: Candidate, tried: int) -> str:
 
 def _limitations(diagnosis: Diagnosis) -> tuple[str, ...]:
     told = list(diagnosis.hypotheses.limitations)
-    unknown_side = before_contact(diagnosis.extended).mean()
+    sided = [cause for cause in diagnosis.causes if cause.kind.by_direction]
+    unknown_side = doubtful(diagnosis.extended, sided).mean()
     if unknown_side > MOST_DOUBTFUL:
-        joints = ", ".join(str(cause.where) for cause in diagnosis.causes if cause.name == "backlash")
+        joints = ", ".join(str(cause.where) for cause in sided)
         told.append(
             f"At {100.0 * unknown_side:.0f} % of the pairs it is unknown on which side of its backlash {joints} rests: "
             "few runs cross it. What seems to jump or to change with time there may be that. Record longer runs, "

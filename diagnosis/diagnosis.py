@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 
 import numpy as np
-from scipy import stats
 
 from bodyschema.effects import Effect, Identity, Simulation
 from bodyschema.interfaces.records import FloatArray
@@ -157,9 +156,7 @@ class Diagnosis:
         duration = np.ones(len(motion)) if motion.t is None else np.append(np.inf, np.diff(motion.t))
         speed = steps / np.maximum(duration, 1e-9)
         on, off = self.markers, self._off
-        # Probability that an outlier row is faster than another row.
-        faster = [stats.mannwhitneyu(v[off], v[on]).statistic / (off.sum() * on.sum()) for v in (steps, speed)]
-        return max(faster) > _MOSTLY
+        return max(_exceeds(v[off], v[on]) for v in (steps, speed)) > _MOSTLY
 
     def gain(self) -> tuple[float, tuple[float, float]]:
         """Return the reduction of the RMS from aligned to extended [%], with its 95 % interval."""
@@ -258,7 +255,7 @@ def diagnose(
         told(loose.what)
         # Begin again: causes may have been named for it, and the noise is smaller without it.
         # What rattles has no place of its own, and does not slip.
-        fixed = [effect for effect in hypotheses.effects if effect.name not in ("tool_slip", "tool_offset")]
+        fixed = [effect for effect in hypotheses.effects if effect.kind.stage != "tool"]
         search = Search(fixed, told)
         observations = observations.with_rattle(loose.ratio, loose.ways)
         start = aligned(observations, simulation)
@@ -313,6 +310,13 @@ def _searched(begun: Fit, search: Search, enough: Callable[[Sequence[Fit], float
             break
         begun = extended.tolerating(scales, small)
     return extended
+
+
+def _exceeds(some: FloatArray, others: FloatArray) -> float:
+    """Return the probability that one of `some` is larger than one of `others`; ties count half."""
+    ordered = np.sort(others)
+    below = np.searchsorted(ordered, some, "left") + np.searchsorted(ordered, some, "right")
+    return float(0.5 * below.mean() / len(ordered))
 
 
 def _geometry(start: Fit) -> Fit:

@@ -41,7 +41,7 @@ def _is_there(fit: Fit, ripple: Effect) -> bool:
     """Return True if a fit already has a ripple of so similar a period that the two could cancel."""
     joint = fit.simulation.robot.joints.index(str(ripple.where))
     span = float(np.ptp(fit.observations.motion.q[:, joint])) / (1.0 if ripple.prismatic else 2.0 * np.pi)
-    others = [effect for effect in (*fit.causes, *fit.background.effects) if effect.name == ripple.name]
+    others = [effect for effect in (*fit.causes, *fit.background.effects) if effect.kind is ripple.kind]
     return any(
         effect.where == ripple.where and abs(float(effect.values[-1] - ripple.values[-1])) * span < _APART
         for effect in others

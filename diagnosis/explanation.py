@@ -27,7 +27,6 @@ _NUMBER = 3.0
 # The imperfect shape of large causes is not an unnamed cause, up to a share of all causes, and a larger share of those
 # that depend on the unobserved path between two readings.
 _OF_THE_CAUSES, _OF_THE_WAY = 0.05, 0.12
-_BY_THE_WAY = ("backlash", "settling", "hysteresis", "camera_latency")
 # A smaller share than this is a remainder.
 _REST = 0.25
 # Causes that the same unnamed families explain as well, to within this, are dropped [nats].
@@ -199,7 +198,7 @@ def changed_by_the_way(fit: Fit) -> FloatArray:
     """Return the change (n, 3) [m] by causes that depend on the path between two readings."""
     change = np.zeros_like(fit.residuals)
     for cause in fit.causes:
-        if cause.name in _BY_THE_WAY:
+        if cause.kind.depends_on_path:
             change += fit.run.columns(cause)[:, :, cause.amounts] @ cause.values[cause.amounts]
     return change
 

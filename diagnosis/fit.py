@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -12,8 +14,9 @@ from scipy.ndimage import uniform_filter1d
 from bodyschema.effects import Effect, Simulated, Simulation
 from bodyschema.interfaces.records import FloatArray
 
-from .background import Background, Scales
-from .observations import Observations
+from .background import MOST, SPREAD, Background, Scales
+from .observations import IntArray, Observations
+from .tangent import Tangent, solved
 
 # Prior limit of an effect, in units of its usual size; unidentifiable parameters stay near zero.
 LARGEST = 10.0
@@ -23,18 +26,18 @@ _ROUNDS, _ENOUGH = 12, 0.02
 _SLACK, _LITTLE = 2.0, 5.0
 # A step that promises a smaller rise is not tried [nats].
 _NOT_TRIED = 1e-3
-# Step limits: phase of a ripple over its range [rad], remaining share of a settling, relative change of a time
-# constant.
-_OF_A_PEAK, _OF_A_MEMORY, _OF_A_TIME = 0.5, 0.1, 0.3
-_LONGEST_MEMORY, _FEWEST_CYCLES = 0.95, 1.5
-# Uncertainty, in such steps, of a period or a time constant that is not identifiable.
+# Largest share of a step's squares that kept derivatives may leave to the next: the square of their relative error.
+_LEFT_OVER = 3e-3
+# Uncertainty, in steps that are still valid, of a period or a time constant that is not identifiable.
 _UNTOLD = 10.0
-# A drift that ends within a smaller share of the recording is an offset from the beginning.
-SHORTEST_DRIFT = 0.03
 _FEWEST_OUTLIERS = 1e-4
 # Blocks of time whose disagreement widens the intervals.
 _BLOCKS = 60
 _EM_ROUNDS = 6
+# Scales of the tolerances over which intervals are integrated, in standard deviations of their logarithm.
+_NODES = np.linspace(-3.0, 3.0, 13)
+# Relative rounding of products, and of logarithms.
+_ROUNDED_OFF, _STILL = 1e-12, 1e-6
 # Floor of the residuals, in units of the stated noise: numerical rounding.
 ROUNDED = 1e-9
 # A larger share of outliers within such a window is a change and not outliers.
@@ -109,6 +112,7 @@ class Fit:
         run: the simulation over the observed motion.
         residuals: (n, 3) in units of the stated noise.
         noise: the fitted noise model.
+        tangent: derivatives about a similar fit, for the first steps; None where there is none.
     """
 
     observations: Observations
@@ -119,6 +123,7 @@ class Fit:
     run: Simulated
     residuals: FloatArray
     noise: Noise
+    tangent: Tangent | None = None
 
     @property
     def causes(self) -> tuple[Effect, ...]:
@@ -180,7 +185,12 @@ class Fit:
     @cached_property
     def effect_columns(self) -> FloatArray:
         """Derivatives (n, 3, p) of the predictions by the amounts of all effects, whitened and weighted."""
-        return self.weighted(amount_columns(self.run, self.simulation.effects))
+        return self._white_columns * self.root_weights[:, :, None]
+
+    @cached_property
+    def _white_columns(self) -> FloatArray:
+        """Derivatives (n, 3, p) of the predictions by the amounts of all effects, whitened."""
+        return self.observations.whitened(amount_columns(self.run, self.simulation.effects))
 
     @property
     def tolerance_columns(self) -> FloatArray:
@@ -264,7 +274,8 @@ class Fit:
     def covariance(self) -> FloatArray:
         """Covariance of all amounts (p, p), nuisances first, then of periods and time constants.
 
-        It is widened where blocks of time disagree by more than independent rows would (Liang and Zeger 1986).
+        It is widened where blocks of time disagree by more than independent rows would (Liang and Zeger 1986), and by
+        what other scales of the tolerances would give.
         """
         columns = np.concatenate([self.columns, self.shape_columns], axis=2)
         flat, variance = columns.reshape(self.left.size, -1), self.noise.sigma**2
@@ -277,47 +288,133 @@ class Fit:
         firsts = np.unique(np.linspace(0, len(scores), _BLOCKS, endpoint=False).astype(int))
         moved = np.add.reduceat(scores, firsts, axis=0) @ covariance
         ratio = np.square(moved).sum(axis=0) / np.maximum(np.diag(covariance), 1e-300)
-        wider = np.sqrt(np.maximum(ratio, 1.0))
+        products = information - np.diag(precision)
+        wider = np.sqrt(np.maximum(ratio, 1.0) * self._wider_by_scales(products, scores.sum(axis=0), precision))
         return covariance * np.outer(wider, wider)
+
+    def _wider_by_scales(self, products: FloatArray, scores: FloatArray, precision: FloatArray) -> FloatArray:
+        """Return the factors (p,) of the variances when the scales of the tolerances are integrated over.
+
+        Where a zero is wrong, the turn of its link within tolerances is known no better than their scale.
+
+        Args:
+            products: information (p, p) of the data about all parameters.
+            scores: derivatives (p,) of the log-likelihood.
+            precision: prior precision (p,).
+        """
+        if self.background.scales is None:
+            return np.ones(len(precision))
+        own = [effect.values[effect.amounts] for effect in self.simulation.effects]
+        now = np.concatenate([*own, self.tolerated])
+        now = np.append(now, np.zeros(len(precision) - len(now)))
+        first = self._amounts
+        groups = np.full(len(precision), -1)
+        groups[first : first + len(self.tolerated)] = self.background.group
+        units = 1.0 / np.sqrt(np.diag(products) + precision)
+        inner, toward = products * np.outer(units, units), (products @ now + scores) * units
+        factors = np.ones(len(precision))
+        here = _posteriors(inner, toward, (precision * units**2)[None])
+        for g, scale in enumerate(self.background.scales):
+            mine = groups == g
+            spent = float(mine.sum() - (here.variances[0] * precision * units**2)[mine].sum())
+            unsure = 1.0 / np.sqrt(2.0 * max(spent, 0.0) + 1.0 / SPREAD**2)
+            logs = np.log(scale) + unsure * _NODES
+            logs = logs[logs < np.log(MOST) + _STILL]
+            other = np.where(mine, np.exp(-2.0 * (logs - np.log(scale)))[:, None], 1.0) * precision * units**2
+            tried = _posteriors(inner, toward, other)
+            evidence = tried.evidence + 0.5 * np.log(other[:, mine]).sum(axis=1) - 0.5 * np.square(logs / SPREAD)
+            weights = np.exp(evidence - evidence.max())
+            weights /= weights.sum()
+            squares = tried.variances + np.square(tried.means - here.means[0])
+            factors += np.maximum(weights @ squares / here.variances[0] - 1.0, 0.0)
+        return factors
 
     @property
     def _shape_precision(self) -> FloatArray:
         """Prior precision of periods and time constants (s,), from the limit of one step."""
-        reaches = [_reach(self.run, effect, k) for effect in self.causes for k in effect.shapes]
+        reaches = [effect.kind.shape_step(self.run, effect, k) for effect in self.causes for k in effect.shapes]
         return 1.0 / np.square(np.array(reaches))
 
-    def step(self) -> tuple[FloatArray, float]:
+    @cached_property
+    def own_tangent(self) -> Tangent:
+        """Derivatives about this fit."""
+        return Tangent.of(self.simulation.effects, self._columns_of_each(None), self.background, self.noise.weights)
+
+    @property
+    def near_tangent(self) -> Tangent:
+        """Derivatives about this fit, those of effects that `tangent` has taken from there."""
+        if self.tangent is None or len(self.tangent.weights) != len(self.left):
+            return self.own_tangent
+        columns = self._columns_of_each(self.tangent)
+        return Tangent.of(self.simulation.effects, columns, self.background, self.noise.weights, self.tangent)
+
+    def _columns_of_each(self, near: Tangent | None) -> list[FloatArray]:
+        """Return derivatives (3 n, k) by the amounts and shapes of each effect, whitened, or taken from `near`."""
+        known = {} if near is None else dict(zip(map(id, near.effects), near.columns, strict=True))
+        shaped = {id(effect) for effect in self.causes if effect.shapes}
+        ends = np.cumsum([0, *(len(effect.amounts) for effect in self.simulation.effects)])
+        found = []
+        for effect, (first, end) in zip(self.simulation.effects, pairwise(ends), strict=True):
+            if id(effect) in known:
+                found.append(known[id(effect)])
+                continue
+            if near is None:
+                own = self._white_columns[:, :, first:end]
+            else:
+                own = self.observations.whitened(amount_columns(self.run, [effect]))
+            if id(effect) in shaped:
+                own = np.concatenate([own, self.observations.whitened(self.run.by_shape(effect))], axis=2)
+            found.append(own.reshape(self.left.size, -1))
+        return found
+
+    def step(self, tangent: Tangent | None = None) -> tuple[FloatArray, float]:
         """Return the Gauss-Newton step of amounts, periods and time constants, and its promised rise of the likelihood.
+
+        Args:
+            tangent: derivatives about a similar fit with the same effects; this fit's own by default.
 
         Returns:
             The step (p + s,), and the rise [nats].
         """
+        tangent = tangent or self.own_tangent
         precision = np.append(self.precision, self._shape_precision) * self.noise.sigma**2
         own = [effect.values[effect.amounts] for effect in self.simulation.effects]
         values = np.concatenate([*own, self.tolerated])
-        normal, gradient = self._products()
+        places = self._places_in_tangent
+        normal = tangent.normal[np.ix_(places, places)]
+        gradient = tangent.gradient(self.left * self.root_weights)[places]
         normal[np.diag_indices_from(normal)] += precision
         gradient[: len(values)] -= precision[: len(values)] * values
         step = solved(normal, gradient)
         return step, 0.5 * float(step @ gradient) / self.noise.sigma**2
 
-    def _products(self) -> tuple[FloatArray, FloatArray]:
-        """Return the products of all columns with one another (p + s, p + s), and with the residuals (p + s,)."""
-        flat = np.concatenate([self.effect_columns, self.shape_columns], axis=2).reshape(self.left.size, -1)
-        roots = np.repeat(self.root_weights, 3, axis=0)
-        across = (flat * roots).T @ self.background.white
-        amounts, tolerances = self._amounts, len(self.tolerated)
-        places = np.r_[0:amounts, amounts + tolerances : flat.shape[1] + tolerances]
-        between = np.arange(amounts, amounts + tolerances)
-        normal = np.empty((flat.shape[1] + tolerances, flat.shape[1] + tolerances))
-        normal[np.ix_(places, places)] = flat.T @ flat
-        normal[np.ix_(places, between)] = across
-        normal[np.ix_(between, places)] = across.T
-        normal[np.ix_(between, between)] = self.background.inner(self.noise.weights)
-        gradient = np.empty(len(normal))
-        gradient[places] = flat.T @ self.left.ravel()
-        gradient[between] = self.background.white.T @ (self.left * self.root_weights).ravel()
-        return normal, gradient
+    def loss(self, cause: Effect) -> float:
+        """Return the fall of the log-likelihood without a cause, all else refitted, to first order [nats]."""
+        places = self.places(cause)[: len(cause.amounts)]
+        own = cause.values[cause.amounts]
+        lost = 0.5 * float(own @ solved(self._posterior[np.ix_(places, places)], own))
+        half_square = 1.5 * float(self.noise.weights.sum())
+        return half_square * float(np.log1p(lost / max(half_square, 1e-300)))
+
+    @cached_property
+    def _posterior(self) -> FloatArray:
+        """Covariance (p + s, p + s) of all amounts, tolerances, periods and time constants, for independent rows."""
+        places = self._places_in_tangent
+        normal = self.own_tangent.normal[np.ix_(places, places)] / self.noise.sigma**2
+        normal[np.diag_indices_from(normal)] += np.append(self.precision, self._shape_precision)
+        scales = np.sqrt(np.diag(normal))
+        return np.asarray(np.linalg.pinv(normal / np.outer(scales, scales), 1e-12, True)) / np.outer(scales, scales)
+
+    @property
+    def _places_in_tangent(self) -> IntArray:
+        """Places in a tangent of all amounts, then of the tolerances, then of periods and time constants (p + s,)."""
+        amounts, shapes, last = [], [], 0
+        for index, effect in enumerate(self.simulation.effects):
+            own = len(effect.shapes) if index >= self.nuisances else 0
+            amounts += [*range(last, last + len(effect.amounts))]
+            last += len(effect.amounts) + own
+            shapes += [*range(last - own, last)]
+        return np.array([*amounts, *range(last, last + len(self.tolerated)), *shapes], dtype=np.intp)
 
     def places(self, cause: Effect) -> list[int]:
         """Return the indices in `covariance` of a cause's amounts, then of its periods and time constants."""
@@ -339,7 +436,7 @@ class Fit:
             first += len(effect.amounts)
             if index >= self.nuisances:
                 for k in effect.shapes:
-                    values[k] = _bounded(effect, k, values[k] + step[shape], self.observations.motion.clock)
+                    values[k] = effect.kind.bounded(effect, k, values[k] + step[shape], self.observations.motion)
                     shape += 1
             effects.append(effect.with_values(values))
         return self.simulation.with_effects(effects), self.tolerated + step[first : first + len(self.tolerated)]
@@ -359,7 +456,7 @@ class Fit:
         """Refit to other observations of the same motion, optionally from another simulation."""
         simulation = start or self.simulation
         fit = _at(observations, simulation, self.nuisances, self.noise, self.background, self.tolerated)
-        return improved(fit)
+        return improved(replace(fit, tangent=self.own_tangent))
 
     def tolerating(self, scales: Scales, also: Collection[Effect] = ()) -> Fit:
         """Refit with tolerances of these scales, linearised about their present values.
@@ -416,7 +513,8 @@ class Fit:
 
     def starting(self, causes: Sequence[Effect]) -> Fit:
         """Replace the causes, without fitting."""
-        return self.at(self.simulation.with_effects((*self.simulation.effects[: self.nuisances], *causes)))
+        started = self.at(self.simulation.with_effects((*self.simulation.effects[: self.nuisances], *causes)))
+        return replace(started, tangent=self.own_tangent)
 
 
 def fitted(observations: Observations, simulation: Simulation, nuisances: int, start: Noise | None = None) -> Fit:
@@ -431,29 +529,62 @@ def fitted(observations: Observations, simulation: Simulation, nuisances: int, s
 def improved(fit: Fit, least: float = -np.inf) -> Fit:
     """Refit the parameters of a fit by Gauss-Newton steps, as in `fitted`.
 
+    Derivatives are computed again only when a step leaves more than they should (Shamanskii 1967).
+
     Args:
         least: log-likelihood to reach; the fit is given up early once it cannot be expected to [nats].
     """
+    if not fit.simulation.effects and not len(fit.tolerated):
+        return fit
+    tangent, is_fresh, before = fit.near_tangent, fit.tangent is None, np.inf
     for done in range(_ROUNDS):
-        if not fit.simulation.effects and not len(fit.tolerated):
-            return fit
-        step, promised = fit.step()
+        step, promised = fit.step(tangent)
+        # In squares, since the noise falls as well.
+        square = promised * fit.noise.sigma**2
+        if not is_fresh and square > _LEFT_OVER * before:
+            tangent, is_fresh = fit.own_tangent, True
+            step, promised = fit.step(tangent)
+            square = promised * fit.noise.sigma**2
         hopeless = fit.log_likelihood + _SLACK * _rise(promised, fit) + _LITTLE < least
         if promised < _NOT_TRIED or (done and hopeless):
             return fit
-        best = None
-        for shortened in (1.0, 0.3, 0.05):
-            tried = fit.stepped(shortened * step)
-            if tried.log_likelihood > fit.log_likelihood:
-                best = tried
-                break
+        best = _best_of(fit, step)
+        if best is None and not is_fresh:
+            tangent, is_fresh, before = fit.own_tangent, True, np.inf
+            best = _best_of(fit, fit.step(tangent)[0])
         if best is None:
             return fit
         gained = best.log_likelihood - fit.log_likelihood
-        fit = best
+        fit, is_fresh, before = best, False, square
         if gained < _ENOUGH:
             break
     return fit
+
+
+def _best_of(fit: Fit, step: FloatArray) -> Fit | None:
+    """Return the fit after as much of a step as raises its likelihood; None where nothing does."""
+    for shortened in (1.0, 0.3, 0.05):
+        tried = fit.stepped(shortened * step)
+        if tried.log_likelihood > fit.log_likelihood:
+            return tried
+    return None
+
+
+class _Posteriors(NamedTuple):
+    """Gaussian posteriors for m priors: means and variances (m, p), and log-evidence without prior volumes (m,)."""
+
+    means: FloatArray
+    variances: FloatArray
+    evidence: FloatArray
+
+
+def _posteriors(inner: FloatArray, toward: FloatArray, precision: FloatArray) -> _Posteriors:
+    """Return the posteriors of amounts with products (p, p), (p,) with the data, under prior precisions (m, p)."""
+    information = inner + (precision + _ROUNDED_OFF)[:, :, None] * np.eye(len(toward))
+    covariances = np.linalg.inv(information)
+    means = covariances @ toward
+    evidence = 0.5 * means @ toward - 0.5 * np.linalg.slogdet(information)[1]
+    return _Posteriors(means, np.einsum("mpp->mp", covariances), evidence)
 
 
 def _rise(promised: float, fit: Fit) -> float:
@@ -475,31 +606,6 @@ def _at(
     residuals = observations.residuals(run.measured + background.shift(tolerated))
     noise = Noise.of(residuals, observations, start, background.spent)
     return Fit(observations, simulation, nuisances, background, tolerated, run, residuals, noise)
-
-
-def solved(normal: FloatArray, gradient: FloatArray) -> FloatArray:
-    """Return the shortest solution (p,) of normal equations, with columns scaled to equal length."""
-    scales = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    return np.linalg.lstsq(normal / np.outer(scales, scales), gradient / scales, rcond=1e-12)[0] / scales
-
-
-def _reach(run: Simulated, effect: Effect, k: int) -> float:
-    """Return the largest step of a period or a time constant for which its derivative is still valid."""
-    if effect.name == "joint_ripple":
-        return _OF_A_PEAK / max(float(np.ptp(run.readings.q[:, run.simulation.place(effect).joint])), 1e-6)
-    return _OF_A_MEMORY if effect.name == "settling" else _OF_A_TIME * float(effect.values[k])
-
-
-def _bounded(effect: Effect, k: int, value: float, clock: FloatArray) -> float:
-    """Limit a period or a time constant to its valid range."""
-    if effect.name == "settling":
-        return float(np.clip(value, 0.0, _LONGEST_MEMORY))
-    if effect.parameters[k].name == "cycles_per_turn":
-        # At once per turn it would be an eccentricity.
-        value = max(value, _FEWEST_CYCLES)
-    if effect.name == "thermal_drift":
-        value = max(value, SHORTEST_DRIFT * float(clock[-1] - clock[0]))
-    return float(np.clip(value, 0.5 * effect.values[k], 2.0 * effect.values[k]))
 
 
 def prior_precision(simulation: Simulation, nuisances: int) -> FloatArray:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy.special import fdtrc
 
 from bodyschema.effects import Effect
 from bodyschema.interfaces.records import FloatArray
@@ -215,7 +215,7 @@ def scores_p_value(columns: FloatArray, left: FloatArray, blocks: Blocks) -> flo
     spread = blocks.sums(fitted)
     spread = spread.T @ spread * blocks.count / (blocks.count - 1.0)
     statistic = float(total @ np.linalg.lstsq(spread, total, rcond=1e-12)[0])
-    return float(stats.f.sf(statistic * (blocks.count - k) / (k * (blocks.count - 1.0)), k, blocks.count - k))
+    return float(fdtrc(k, blocks.count - k, max(statistic, 0.0) * (blocks.count - k) / (k * (blocks.count - 1.0))))
 
 
 def is_marker(fit: Fit) -> np.ndarray:

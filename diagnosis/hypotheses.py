@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodyschema.effects import KINDS, Effect, Kind, Simulation
+from bodyschema.effects import EFFECT_TYPES, Effect, EffectType, Simulation
 
 from .observations import Observations
 
@@ -40,9 +40,10 @@ class Hypotheses:
         """List all requested effects that this recording of this robot can test."""
         limits = _Limits(simulation, observations)
         robot = simulation.robot
+        wanted = [name for name in EFFECT_TYPES if (not only or name in only) and name not in without]
         effects = []
-        for kind in KINDS.values():
-            if (only and kind.name not in only) or kind.name in without or limits.excludes(kind):
+        for kind in map(EFFECT_TYPES.__getitem__, wanted):
+            if limits.excludes(kind):
                 continue
             if not kind.at_joint:
                 effects.append(Effect.at(robot, kind.name))
@@ -83,15 +84,13 @@ class _Limits:
                 "The URDF states no masses: joints that give under the arm's weight cannot be tested."
             )
 
-    def excludes(self, kind: Kind) -> bool:
+    def excludes(self, kind: EffectType) -> bool:
         """Return True if no effect of this kind can be tested, or if all of it is free anyway."""
         robot = self._simulation.robot
         if kind.needs_weight:
             return robot.robot.hold == "torque_free" or not self._simulation.gravity.known
-        if kind.name == "camera_pose":
-            return not robot.camera.pose_known
-        if kind.name == "tool_offset":
-            return not robot.robot.marker_known
+        if kind.rigid and not kind.at_joint:
+            return kind.is_free(robot)
         if kind.needs_times and self._motion.t is None:
             return True
         if kind.needs_stereo and robot.calibration is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from scipy import stats
+from scipy.special import chdtrc
 
 from .explanation import Explanation
 from .fit import Fit
@@ -81,4 +81,4 @@ def _of_families(explanation: Explanation, unknowns: Unknowns, blocks: Blocks) -
 def _chance(fit: Fit, apart: Apart, unknowns: Unknowns) -> float:
     """Return the p-value of this structure arising by chance."""
     gain = 2.0 * (apart.fit.log_likelihood - fit.log_likelihood)
-    return float(stats.chi2.sf(max(gain, 0.0), max(unknowns.told(apart).shape[2] + apart.choice, 1)))
+    return float(chdtrc(max(unknowns.told(apart).shape[2] + apart.choice, 1), max(gain, 0.0)))

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from bodyschema.effects import Effect, Identity
 from bodyschema.effects.flank import flanks
-from bodyschema.effects.moments import settled
 from bodyschema.interfaces.records import FloatArray
 
-from .fit import LARGEST, SHORTEST_DRIFT, Fit
+from .fit import LARGEST, Fit
 from .products import Products, System
 from .worth import choices, nats, ways_to_choose
 
@@ -27,14 +26,6 @@ from .worth import choices, nats, ways_to_choose
 _MOST_CYCLES, FINEST = 100, 240
 # Largest loss factor halfway between two shapes tried: for waves, one over sinc² of a half.
 _BETWEEN = 2.5
-# Backlash widths tried [rad, m], and time constants as shares of the recording's duration.
-_WIDTHS = np.geomspace(2e-4, 0.15, 14)
-_TIME_CONSTANTS = np.geomspace(SHORTEST_DRIFT, 4.0, 24)
-# Shares of a lag that remain at the next reading.
-_MEMORIES = np.linspace(0.0, 0.9, 19)
-# Hysteresis lengths tried [rad, m], and frictions that hold a loaded backlash, as shares of the largest load.
-_LENGTHS = np.geomspace(5e-4, 0.3, 14)
-_HOLDS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35)
 # Effective number of independent shapes of a smooth family.
 _COARSE = 5
 # Number of moments tried first, before all those next to the best.
@@ -114,24 +105,16 @@ class Scan:
         Args:
             least: gain from which its period or time constant is refined fully.
         """
-        match effect.name:
-            case "joint_ripple":
+        match effect.kind.search:
+            case "cycles":
                 return self._ripple(effect, least)
-            case "encoder_jump" | "tool_slip" | "camera_moved":
+            case "moment":
                 return self._moment(effect)
-            case "backlash":
+            case "width":
                 return self._play(effect)
-            case "thermal_drift":
-                clock = self._fit.observations.motion.clock
-                span = float(clock[-1] - clock[0])
-                return self._finely(effect, span * _TIME_CONSTANTS, least)
-            case "settling":
-                return self._finely(effect, _MEMORIES, least)
-            case "hysteresis":
-                found = self._finely(effect, _LENGTHS, least)
-                # It has one shape parameter more than a backlash, which must pay for itself.
-                return None if found is None else replace(found, trials=_COARSE * len(_WIDTHS))
-            case "gravity_backlash":
+            case "shape":
+                return self._finely(effect, effect.kind.trial_shapes(self._fit.observations.motion), least)
+            case "load":
                 return self._hung(effect)
             case _ if effect.kind.in_parts and effect.free is None:
                 return self._in_parts(effect)
@@ -237,7 +220,7 @@ class Scan:
         """Return an effect of one amount as one of a pair, with its moment if any; None if not identifiable."""
         if effect.kind.begins:
             return self._moment(effect)
-        return None if effect.name == "backlash" else Candidate(effect, 0.0, 1)
+        return Candidate(effect, 0.0, 1) if effect.kind.is_linear else None
 
     def _finely(self, effect: Effect, shapes: FloatArray, least: float) -> Candidate | None:
         """Return the best of an effect with one shape parameter, over increasing shapes (m,), then between them."""
@@ -252,18 +235,18 @@ class Scan:
             gains, amounts, dofs = self._solved(self._each(effect, shapes), effect)
             best = int(np.argmax(gains))
         values = np.append(amounts[best], shapes[best])
-        return Candidate(effect.with_values(values), float(gains[best]), int(dofs[best]), _COARSE)
+        trials = _COARSE * effect.kind.further_trials
+        return Candidate(effect.with_values(values), float(gains[best]), int(dofs[best]), trials)
 
     def _each(self, effect: Effect, shapes: FloatArray) -> System:
         """Return the system of each shape (m,), which scales the same columns row by row."""
         run = self._fit.run
-        if effect.name == "thermal_drift":
+        if effect.kind.encoder is None:
             constant = np.broadcast_to(np.eye(3), (len(run.motion), 3, 3))
             rows = self._products.rows_of(self._fit.weighted(constant))
-            factors = [settled(run.motion, float(shape)) for shape in shapes]
+            factors = [effect.kind.growth(run.motion, float(shape)) for shape in shapes]
         else:
             place, encoder = self._fit.simulation.place(effect), effect.kind.encoder
-            assert encoder is not None
             rows = self._products.port(place.joint)
             shaped = (np.append(effect.values[:-1], shape) for shape in shapes)
             factors = [encoder.columns(run.readings, place, values)[:, 0] for values in shaped]
@@ -273,26 +256,27 @@ class Scan:
         """Return the best backlash over widths; the amount is the width itself."""
         place, encoder = self._fit.simulation.place(effect), effect.kind.encoder
         assert encoder is not None
+        widths = encoder.trial_shapes(self._fit.observations.motion)
 
         def bent() -> System:
-            by_width = [encoder.correction(self._fit.run.readings, place, np.array([w])) / w for w in _WIDTHS]
+            by_width = [encoder.correction(self._fit.run.readings, place, np.array([w])) / w for w in widths]
             return self._products.port(place.joint).scaled(np.stack(by_width, axis=1))
 
         gains, amounts, dofs = self._solved(self._products.kept(effect, bent), effect)
         # Compare the width used to build the shape with the fitted one.
-        off = np.abs(np.log(np.maximum(amounts[:, 0], 1e-12) / _WIDTHS))
+        off = np.abs(np.log(np.maximum(amounts[:, 0], 1e-12) / widths))
         gains = np.where(dofs > 0, np.where(off < np.log(3.0), gains, 0.5 * gains), -np.inf)
         best = int(np.argmax(gains))
         if not dofs[best]:
             return None
-        return Candidate(effect.with_values(amounts[best]), float(gains[best]), int(dofs[best]), len(_WIDTHS))
+        return Candidate(effect.with_values(amounts[best]), float(gains[best]), int(dofs[best]), len(widths))
 
     def _hung(self, effect: Effect) -> Candidate | None:
         """Return the best loaded backlash over frictions; None where the load never changes sides."""
         run = self._fit.run
         k = self._fit.simulation.place(effect).joint
         torque = run.torques[:, k]
-        holds = np.abs(torque).max() * np.array(_HOLDS)
+        holds = np.abs(torque).max() * effect.kind.trial_shapes(run.motion)
         sides = np.stack([flanks(torque, hold) for hold in holds], axis=1)
         changing = np.ptp(sides, axis=0) > 0.0
         if not changing.any() or not run.simulation.bears_weight:

@@ -20,7 +20,7 @@ _MOST_OF_A_ROW = 1.0
 
 def remembers(effect: Effect) -> bool:
     """Return True if an effect derives a joint's position from past readings, so that reading noise looks like it."""
-    return effect.kind.encoder is not None and effect.kind.encoder.remembers
+    return effect.kind.remembers
 
 
 def instruments(fit: Fit, effect: Effect) -> FloatArray:
@@ -35,7 +35,7 @@ def instruments(fit: Fit, effect: Effect) -> FloatArray:
     if not remembers(effect):
         return fit.weighted(fit.run.columns(effect)[:, :, effect.amounts])
     motion, joint = fit.observations.motion, fit.simulation.robot.joints.index(str(effect.where))
-    between = _between(fit, motion, joint, _PLAY_FAR if effect.name in ("backlash", "hysteresis") else _FAR)
+    between = _between(fit, motion, joint, _PLAY_FAR if effect.kind.by_direction else _FAR)
     columns = np.empty((len(motion), 3, len(effect.amounts)))
     # Replace alternate rows, so that each row's neighbours keep their own readings.
     for every_other in (slice(0, None, 2), slice(1, None, 2)):

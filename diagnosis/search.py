@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri
 
 from bodyschema.effects import Effect, Identity
 
 from .fit import Fit, improved
 from .held_out import Blocks, block_p_value
+from .observations import Observations
 from .scan import Candidate, Scan
 from .scatter import beyond_single_rows, instruments, remembers
 from .worth import ANOTHER, NAMED, choices, nats, rise_for
@@ -27,10 +29,10 @@ _MOST_CAUSES, _MOST_STEPS = 12, 20
 _ASKED_EACH = 3
 # Maximum of sets of causes to examine; none is examined twice.
 _MOST_SETS = 60
+# Multiple of a limit, and the margin to it [nats], beyond which the first order decides.
+_CLEARLY, _AT_LEAST = 2.0, 10.0
 Key = tuple[str, str | None, str | None]
 Named = frozenset[tuple[Key, int]]
-# Maximum of effects at one place that begin at a moment, and of ripples, which differ in their periods.
-_MOST_MOMENTS, _MOST_RIPPLES = 2, 4
 # A rival must explain this share of a cause's gain; differences within this count as equal [nats].
 _COMES_NEAR, _EQUAL = 0.8, 0.3
 # Largest part of the evidence between two memory effects of a joint that may lie in a few rows [nats].
@@ -66,7 +68,7 @@ class Beside:
         in_parts: Candidate | None,
         candidates: list[Candidate],
     ) -> None:
-        self._fit = fit
+        self._fit, self._cause = fit, cause
         self._others = [effect for effect in fit.causes if effect is not cause]
         self._tried: dict[Identity, Fit] = {}
         self.itself = itself or Candidate(cause, 0.0, 1)
@@ -77,9 +79,17 @@ class Beside:
         """Return the fit without the cause."""
         return improved(self._fit.starting(self._others))
 
+    @property
+    def lead(self) -> float:
+        """First-order lead of the cause over the best candidate for its place [nats]."""
+        return 0.5 * (self.itself.gain - max((one.gain for one in self.candidates), default=0.0))
+
     def is_lost_for(self, worth: float) -> bool:
         """Return True if the cause is worth less than `worth` [nats]."""
-        least = self._fit.log_likelihood - rise_for(worth, self.itself.dof)
+        rise = rise_for(worth, self.itself.dof)
+        if self._fit.loss(self._cause) > _CLEARLY * rise + _AT_LEAST:
+            return False
+        least = self._fit.log_likelihood - rise
         return improved(self._fit.starting(self._others), least).log_likelihood > least
 
     def with_instead(self, *effects: Effect, least: float = -np.inf) -> Fit:
@@ -113,6 +123,8 @@ class Search:
         self.multiplicity = float(np.log(max(len(hypotheses), 1)))
         self._trials: dict[Key, int] = {}
         self._known: tuple[Fit | None, Scan | None, dict[Identity, Beside]] = (None, None, {})
+        # Lead of each cause when it was last reviewed, the log-likelihood then, and the observations [nats].
+        self._leads: dict[Identity, tuple[float, float, Observations]] = {}
         self.path: list[Fit] = []
         self.ended_early = False
 
@@ -129,7 +141,7 @@ class Search:
         self.path = [start]
         if start.causes:
             fit = self._reviewed(start)
-            self.path.append(fit)
+            self._went_to(fit)
         while len(self.path) <= _MOST_STEPS and len(fit.causes) <= _MOST_CAUSES and len(self._seen) < _MOST_SETS:
             added, worth = self._added(fit)
             if added is not None and len(fit.causes) >= asked + _ASKED_EACH:
@@ -146,10 +158,15 @@ class Search:
                 self._tell(f"found {describe(added.causes[-1])}")
             self._seen.add(causes)
             fit = self._reviewed(better)
-            self.path.append(fit)
+            self._went_to(fit)
         is_long = len(self.path) > _MOST_STEPS or len(self._seen) >= _MOST_SETS
         self.ended_early = is_long or len(fit.causes) > _MOST_CAUSES
         return fit
+
+    def _went_to(self, fit: Fit) -> None:
+        """Append a fit to the path; the one before drops its cached results, which are large for many rows."""
+        self.path[-1] = replace(self.path[-1])
+        self.path.append(fit)
 
     def _added(self, fit: Fit) -> tuple[Fit | None, float]:
         """Add one more cause and return its worth [nats]; None if no candidate is probable enough."""
@@ -195,7 +212,7 @@ class Search:
 
     def _doubt_of_pair(self, one: Candidate, other: Candidate) -> float:
         """Return the multiplicity penalty of two causes named together [nats]."""
-        alike = one.effect.name == other.effect.name
+        alike = one.effect.kind is other.effect.kind
         further = min(self.doubt(other), ANOTHER + float(np.log(other.trials))) if alike else self.doubt(other)
         return self.doubt(one) + further
 
@@ -246,7 +263,7 @@ class Search:
             count = present[effect.key]
             if count == 0:
                 others.append(effect)
-            elif count < most_of_a_kind(effect):
+            elif count < effect.kind.most_at_one_place:
                 more = (effect.one_more(ordinal) for ordinal in range(count + 1))
                 others.append(next(one for one in more if one.identity not in taken))
         return others
@@ -273,7 +290,7 @@ class Search:
         effect, blocks = candidate.effect, Blocks.cut(len(fit.observations))
         columns = instruments(fit, effect)
         chance = block_p_value(fit, columns, blocks)
-        gain = float(stats.chi2.isf(max(chance, 1e-290), candidate.dof))
+        gain = float(chdtri(candidate.dof, max(chance, 1e-290)))
         worth = nats(gain, candidate.dof) - self.doubt(candidate)
         if blocks.count < _FEW_BLOCKS and worth < NAMED:
             # Few blocks cannot give a small p-value; a large gain counts without them.
@@ -283,7 +300,7 @@ class Search:
 
     def _counted(self, fit: Fit, effect: Effect) -> float:
         """Return the share of a gain that counts: correlated noise looks like a change with time."""
-        return fit.independence if effect.kind.begins or effect.name == "thermal_drift" else 1.0
+        return fit.independence if effect.kind.changes_with_time else 1.0
 
     def shortlist(self, scan: Scan, hypotheses: Sequence[Effect]) -> list[Candidate]:
         """Return the candidates that may be best after a refit, the most probable first."""
@@ -297,14 +314,35 @@ class Search:
         return [c for c in ranked[: 3 * _MOST] if c.gain >= floor][:_MOST]
 
     def _reviewed(self, fit: Fit) -> Fit:
-        """Remove redundant causes and exchange others for better ones."""
-        changed = len(fit.causes) > 0
-        while changed and len(self._seen) < _MOST_SETS:
-            fit, changed = self._second_thoughts(fit)
-            causes = named(fit.causes)
-            changed = changed and causes not in self._seen
+        """Review one cause after another, until each has been since the last change that may concern it."""
+        waiting = [cause.identity for cause in fit.causes]
+        while waiting and len(self._seen) < _MOST_SETS:
+            cause = next(effect for effect in fit.causes if effect.identity == waiting[0])
+            better = None if self._leads_clearly(fit, cause) else self._second_thoughts(fit, cause)
+            later = waiting[1:]
+            if better is None:
+                waiting = later
+                continue
+            causes = named(better.causes)
+            is_seen = causes in self._seen and causes != named(fit.causes)
+            fit = better
+            if is_seen:
+                break
             self._seen.add(causes)
+            there = [effect.identity for effect in fit.causes]
+            waiting = [one for one in later if one in there] + [one for one in there if one not in later]
         return fit
+
+    def _leads_clearly(self, fit: Fit, cause: Effect) -> bool:
+        """Return True if a cause led by more, when it was last reviewed, than the fit has changed since.
+
+        A moment, and the choice of a link's numbers, may be better elsewhere however clear the cause is.
+        """
+        if cause.kind.begins or cause.kind.in_parts or cause.identity not in self._leads:
+            return False
+        lead, then, observations = self._leads[cause.identity]
+        changed = abs(fit.log_likelihood - then)
+        return observations is fit.observations and lead > _CLEARLY * changed + _AT_LEAST
 
     def _scan(self, fit: Fit) -> Scan:
         """Return the scan of a fit and of the fit without each of its causes; the last one is kept."""
@@ -324,34 +362,36 @@ class Search:
             known[cause.identity] = Beside(fit, cause, itself, scan.as_it_is(cause), in_parts, candidates)
         return known[cause.identity]
 
-    def _second_thoughts(self, fit: Fit) -> tuple[Fit, bool]:
-        for cause in fit.causes:
-            beside = self.beside(fit, cause)
-            if beside.itself.gain > beside.gain + _ELSEWHERE:
-                tried = beside.with_instead(beside.itself.effect, least=fit.log_likelihood + _ELSEWHERE)
-                if tried.log_likelihood > fit.log_likelihood + _ELSEWHERE:
-                    return self._second_thoughts(tried)
-            if beside.in_parts is not None and beside.in_parts.effect.free != cause.free:
-                tried, worth = self._exchanged(fit, beside, beside.in_parts, _ELSEWHERE)
-                if worth > _ELSEWHERE:
-                    return self._second_thoughts(tried)
-            counted = self._counted(fit, cause)
-            least = NAMED + self.doubt(beside.itself)
-            lost = beside.is_lost_for(least if counted == 1.0 else _rise(least, beside.itself.dof, counted))
-            lost = lost or not cause.is_possible
-            if lost or (remembers(cause) and self.agreed(beside.without, beside.itself) < NAMED):
-                self._tell(f"dropped {describe(cause)}")
-                return beside.without, True
-            for candidate in beside.candidates:
-                if candidate.gain < _COMES_NEAR * beside.itself.gain:
-                    continue
-                simpler = simplicity(candidate.effect) < simplicity(cause)
-                tried, worth = self._exchanged(fit, beside, candidate, -_EQUAL if simpler else 1.0)
-                better = worth > 1.0 or (abs(worth) < _EQUAL and simpler)
-                if better and tried.causes[-1].is_possible:
-                    self._tell(f"exchanged {describe(cause)} for {describe(candidate.effect)}")
-                    return tried, True
-        return fit, False
+    def _second_thoughts(self, fit: Fit, cause: Effect) -> Fit | None:
+        """Return the fit with a cause refined, dropped or exchanged; None if it stays as it is."""
+        beside = self.beside(fit, cause)
+        if beside.itself.gain > beside.gain + _ELSEWHERE:
+            tried = beside.with_instead(beside.itself.effect, least=fit.log_likelihood + _ELSEWHERE)
+            if tried.log_likelihood > fit.log_likelihood + _ELSEWHERE:
+                return tried
+        if beside.in_parts is not None and beside.in_parts.effect.free != cause.free:
+            tried, worth = self._exchanged(fit, beside, beside.in_parts, _ELSEWHERE)
+            if worth > _ELSEWHERE:
+                return tried
+        counted = self._counted(fit, cause)
+        least = NAMED + self.doubt(beside.itself)
+        lost = beside.is_lost_for(least if counted == 1.0 else _rise(least, beside.itself.dof, counted))
+        lost = lost or not cause.is_possible
+        if lost or (remembers(cause) and self.agreed(beside.without, beside.itself) < NAMED):
+            self._tell(f"dropped {describe(cause)}")
+            return beside.without
+        for candidate in beside.candidates:
+            if candidate.gain < _COMES_NEAR * beside.itself.gain:
+                continue
+            simpler = simplicity(candidate.effect) < simplicity(cause)
+            tried, worth = self._exchanged(fit, beside, candidate, -_EQUAL if simpler else 1.0)
+            better = worth > 1.0 or (abs(worth) < _EQUAL and simpler)
+            if better and tried.causes[-1].is_possible:
+                self._tell(f"exchanged {describe(cause)} for {describe(candidate.effect)}")
+                return tried
+        lead = min(beside.lead, 0.5 * beside.itself.gain - rise_for(least, beside.itself.dof))
+        self._leads[cause.identity] = lead, fit.log_likelihood, fit.observations
+        return None
 
 
 def _rise(worth: float, dof: int, counted: float) -> float:
@@ -382,16 +422,9 @@ def named(causes: Sequence[Effect]) -> Named:
     return frozenset(Counter(effect.key for effect in causes).items())
 
 
-def most_of_a_kind(effect: Effect) -> int:
-    """Return the maximum of effects of a kind at one place."""
-    if effect.kind.begins:
-        return _MOST_MOMENTS
-    return _MOST_RIPPLES if effect.name == "joint_ripple" else 1
-
-
 def simplicity(effect: Effect) -> int:
     """Return a complexity score; of equally probable causes the one with the lowest is named."""
-    return len(effect.amounts) + len(effect.shapes) + (_OF_A_LINK if effect.name == "link_geometry" else 0)
+    return len(effect.amounts) + len(effect.shapes) + (_OF_A_LINK if effect.kind.in_parts else 0)
 
 
 def describe(effect: Effect) -> str:

@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve, get_lapack_funcs
 
-from bodyschema.effects import Effect, Identity
+from bodyschema.effects import Effect, EffectType, Identity
 from bodyschema.interfaces.records import FloatArray
 
-from .background import SPREAD, Scales
+from .background import MOST, SPREAD, Scales
 from .fit import Fit
 from .scan import Candidate, Scan
 from .search import Key
@@ -32,8 +32,8 @@ from .worth import ANOTHER, NAMED, ways_to_choose
 _ROUNDS, _ROUNDS_NEAR, _STILL = 25, 8, 0.02
 # Limit of a step in the logarithms.
 _FARTHEST = 1.0
-# Limits of the scales, and the lower limit of the noise as a share of that of the fit.
-_SMALLEST, _LARGEST, _QUIETEST = 1e-3, 10.0, 1e-3
+# Lower limits of the scales, and of the noise as a share of that of the fit.
+_SMALLEST, _QUIETEST = 1e-3, 1e-3
 # Number of the most promising moves that are tried with their own scales.
 _TRIED = 4
 # With all scales below this, also try an arm exactly as described, such as a simulated one.
@@ -46,8 +46,6 @@ _SHOWN = 3.0
 _MOST_MOVES, _MOST_TOGETHER = 60, 8
 # Maximum of refitted sets, and the margin to the best within which a set is refitted [nats].
 _MOST_REFITTED, _COMES_NEAR = 8, 15.0
-# To first order it looks like backlash; the search tries it in place of one.
-_LEFT_TO_THE_SEARCH = ("hysteresis",)
 
 dpotrf, dpotri, dpotrs = get_lapack_funcs(("potrf", "potri", "potrs"), dtype=np.float64)
 
@@ -91,6 +89,11 @@ class Together:
     factor: tuple[FloatArray, bool]
     columns: NDArray[np.intp]
 
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Covariance of the amounts (p, p)."""
+        return cho_solve(self.factor, np.eye(len(self.columns)))
+
 
 class Sets:
     """Sets of causes beside one fit, to first order.
@@ -132,6 +135,7 @@ class Sets:
             for group in (k,), *_parts(effect):
                 groups.setdefault(group, []).append(k)
         self._groups = [tuple(group) for group in dict.fromkeys(map(tuple, groups.values()))]
+        self._known: dict[frozenset[int], Together] = {}
         known = {cause.identity for cause in fit.causes}
         # The moment of each was sought without the others, so it is right for one of them at most.
         self._begins = {k for k, one in enumerate(self.effects) if one.kind.begins and one.identity not in known}
@@ -156,10 +160,10 @@ class Sets:
         yield own
         yield ()
         steady = [effect for k, effect in enumerate(self.effects) if k not in self._begins]
-        kinds = dict.fromkeys(effect.name for effect in steady if effect.kind.at_joint and not effect.source)
-        zeros = tuple(k for k, effect in enumerate(self.effects) if effect.name == "joint_offset")
+        kinds = dict.fromkeys(effect.kind for effect in steady if effect.kind.at_joint and not effect.source)
+        zeros = tuple(k for k, effect in enumerate(self.effects) if effect.kind.is_zero)
         for kind in kinds:
-            yield tuple(k for k, effect in enumerate(self.effects) if effect.name == kind)
+            yield tuple(k for k, effect in enumerate(self.effects) if effect.kind is kind)
         yield tuple(dict.fromkeys((*own, *zeros)))
         whole = dict.fromkeys(effect.key for effect in self.effects if effect.kind.in_parts and links)
         for key in whole:
@@ -208,9 +212,7 @@ class Sets:
     def _loss(self, here: Together, group: tuple[int, ...]) -> float:
         """Return the worth of some numbers with scales and noise held fixed [nats]."""
         places = np.searchsorted(here.columns, np.concatenate([self._places[k] for k in group]))
-        unit = np.zeros((len(here.columns), len(places)))
-        unit[places, np.arange(len(places))] = 1.0
-        covariance = cho_solve(here.factor, unit)[places]
+        covariance = here.covariance[np.ix_(places, places)]
         amounts = here.amounts[places]
         gained = 0.5 * float(amounts @ np.linalg.solve(covariance, amounts))
         cost = self._cost(here.chosen) - self._cost(_without(here.chosen, group))
@@ -218,15 +220,15 @@ class Sets:
 
     def _cost(self, chosen: Sequence[int]) -> float:
         """Return the cost of naming the causes of a set [nats]."""
-        total, kinds = 0.0, set[str]()
+        total, kinds = 0.0, set[EffectType]()
         numbers: Counter[Key] = Counter()
         for k in chosen:
             effect = self.effects[k]
             if effect.kind.in_parts:
                 numbers[effect.key] += len(effect.amounts)
                 continue
-            total += self._trials[k] + (min(self._first, ANOTHER) if effect.name in kinds else self._first)
-            kinds.add(effect.name)
+            total += self._trials[k] + (min(self._first, ANOTHER) if effect.kind in kinds else self._first)
+            kinds.add(effect.kind)
         return total + sum(
             self._first + float(np.log(ways_to_choose(n, self._numbers[key]))) for key, n in numbers.items()
         )
@@ -239,28 +241,46 @@ class Sets:
     def _promising(self, here: Together) -> list[tuple[int, ...]]:
         """Return the groups of candidates worth most with scales and noise held fixed, the best first."""
         present = frozenset(here.chosen)
-        groups = list(dict.fromkeys(_without(group, here.chosen) for group in self._groups))
         closed = present | (self._begins if present & self._begins else set())
-        open_ones = [k for k in range(len(self._places)) if k not in closed]
-        if not open_ones:
+        groups = dict.fromkeys(_without(group, here.chosen) for group in self._groups)
+        open_groups = [group for group in groups if group and closed.isdisjoint(group)]
+        if not open_groups:
             return []
-        places = np.concatenate([self._places[k] for k in open_ones])
+        places = np.concatenate([self._places[k] for k in sorted(frozenset[int]().union(*open_groups))])
         across = self._inner[np.ix_(here.columns, places)] / here.sigma**2
         solved = cho_solve(here.factor, across)
         inner = self._inner[np.ix_(places, places)] / here.sigma**2 - across.T @ solved
+        inner[np.diag_indices_from(inner)] += 1.0
         gradient = self._toward[places] / here.sigma**2 - solved.T @ (self._toward[here.columns] / here.sigma**2)
-        worths, now = [], self._cost(here.chosen)
-        groups = [group for group in groups if group and closed.isdisjoint(group)]
+        own = [np.searchsorted(places, np.concatenate([self._places[k] for k in group])) for group in open_groups]
+        worths = _gained(inner, gradient, own) - self._costs_beside(here.chosen, open_groups)
+        return [open_groups[k] for k in np.argsort(worths)[::-1].tolist()]
+
+    def _costs_beside(self, chosen: Sequence[int], groups: Sequence[tuple[int, ...]]) -> FloatArray:
+        """Return the cost of naming each of some groups in addition to a set [nats]."""
+        present = [self.effects[k] for k in chosen]
+        kinds = {effect.kind for effect in present if not effect.kind.in_parts}
+        numbers = Counter(effect.key for effect in present if effect.kind.in_parts)
+        costs = []
         for group in groups:
-            own = np.searchsorted(places, np.concatenate([self._places[k] for k in group]))
-            precision = inner[np.ix_(own, own)] + np.eye(len(own))
-            gained = 0.5 * float(gradient[own] @ np.linalg.solve(precision, gradient[own]))
-            cost = self._cost((*here.chosen, *group)) - now
-            worths.append(gained - 0.5 * float(np.linalg.slogdet(precision)[1]) - cost)
-        return [groups[k] for k in np.argsort(worths)[::-1]]
+            effect = self.effects[group[0]]
+            if effect.kind.in_parts:
+                before, of = numbers[effect.key], self._numbers[effect.key]
+                known = self._first + float(np.log(ways_to_choose(before, of))) if before else 0.0
+                costs.append(self._first + float(np.log(ways_to_choose(before + len(group), of))) - known)
+            else:
+                first = min(self._first, ANOTHER) if effect.kind in kinds else self._first
+                costs.append(self._trials[group[0]] + first)
+        return np.array(costs)
 
     def of(self, chosen: tuple[int, ...], near: Together | None = None) -> Together:
-        """Fit the scales and the noise of a set of causes by maximum evidence."""
+        """Fit the scales and the noise of a set of causes by maximum evidence; each set once, whatever is near."""
+        key = frozenset(chosen)
+        if key not in self._known:
+            self._known[key] = self._fitted(chosen, near)
+        return self._known[key]
+
+    def _fitted(self, chosen: tuple[int, ...], near: Together | None) -> Together:
         own = [self._places[k] for k in chosen]
         columns = np.sort(np.concatenate([np.arange(self._nuisances + self._tolerances), *own]).astype(np.intp))
         group = self._group(columns)
@@ -282,11 +302,11 @@ class Sets:
             quieter = float(np.clip(0.5 * np.log(max(rss, 1e-300) / free) - np.log(sigma), -_FARTHEST, _FARTHEST))
             if done and max(np.abs(steps).max(), abs(quieter)) < _STILL:
                 break
-            logs = np.clip(logs + steps, np.log(_SMALLEST), np.log(_LARGEST))
+            logs = np.clip(logs + steps, np.log(_SMALLEST), np.log(MOST))
             sigma = max(sigma * float(np.exp(quieter)), _QUIETEST * self._fit.noise.sigma)
         worth, factor, amounts = self._worth(inner, toward, group, logs, sigma)
         scales = Scales(*np.exp(logs).tolist())
-        worth -= scales.doubt
+        worth -= scales.doubt + _volume(spent)
         if max(scales) < _MAY_BE_EXACT:
             exact = self._worth(inner, toward, group, np.full(3, np.log(_SMALLEST)), sigma)
             if exact[0] > worth:
@@ -366,6 +386,23 @@ def _parts(effect: Effect) -> list[tuple[object, ...]]:
     return [(effect.key, unit), (effect.key,)]
 
 
+def _volume(spent: FloatArray) -> float:
+    """Return what integrating over the scales costs beyond taking the best, from the data spent on each (3,) [nats]."""
+    return float(0.5 * np.log1p(2.0 * spent * SPREAD**2).sum())
+
+
+def _gained(inner: FloatArray, gradient: FloatArray, groups: Sequence[NDArray[np.intp]]) -> FloatArray:
+    """Return the evidence that each group of columns adds, from products that include the prior [nats]."""
+    sizes, gained = np.array([len(group) for group in groups]), np.empty(len(groups))
+    for size in np.unique(sizes).tolist():
+        some = np.flatnonzero(sizes == size)
+        places = np.stack([groups[k] for k in some.tolist()])
+        precision, toward = inner[places[:, :, None], places[:, None, :]], gradient[places]
+        step = np.linalg.solve(precision, toward[:, :, None])[:, :, 0]
+        gained[some] = 0.5 * (toward * step).sum(axis=1) - 0.5 * np.linalg.slogdet(precision)[1]
+    return gained
+
+
 def _without(chosen: tuple[int, ...], group: Sequence[int]) -> tuple[int, ...]:
     return tuple(k for k in chosen if k not in group)
 
@@ -410,7 +447,7 @@ def tolerated(fit: Fit) -> Tolerated:
 
 def is_at_limit(scales: Scales | None) -> bool:
     """Return True if tolerances of links or axes are as large as they may be."""
-    return scales is not None and max(scales.lengths, scales.angles) > (1.0 - _STILL) * _LARGEST
+    return scales is not None and max(scales.lengths, scales.angles) > (1.0 - _STILL) * MOST
 
 
 def beyond_tolerances(fit: Fit, cause: Effect, doubt: float) -> bool:
@@ -433,7 +470,7 @@ class _Place:
     def __init__(self, fit: Fit, hypotheses: Sequence[Effect]) -> None:
         self.fit = fit
         present = {cause.key for cause in fit.causes}
-        others = [one for one in hypotheses if one.key not in present and one.name not in _LEFT_TO_THE_SEARCH]
+        others = [one for one in hypotheses if one.key not in present and not one.kind.refines]
         scanned = Scan(fit).candidates(others)
         candidates = [Candidate(cause, 0.0, 1) for cause in fit.causes] + [_at_rest(one) for one in scanned]
         candidates = [part for candidate in candidates for part in _in_parts(candidate)]
@@ -453,7 +490,7 @@ class _Place:
     def refitted(self, one: Together) -> Fit:
         """Refit one of the sets about its own parameters."""
         possible = [cause for cause in self._sets.causes(one) if cause.is_possible]
-        return self.fit.with_causes(possible).tolerating(one.scales).tolerating(one.scales)
+        return self.fit.starting(possible).tolerating(one.scales).tolerating(one.scales)
 
 
 def _in_parts(candidate: Candidate) -> list[Candidate]:
@@ -468,7 +505,7 @@ def _in_parts(candidate: Candidate) -> list[Candidate]:
 def _at_rest(candidate: Candidate) -> Candidate:
     """Return the candidate at zero amounts, where it is linear in them."""
     effect = candidate.effect
-    if effect.name in ("backlash",):
+    if not effect.kind.is_linear:
         return candidate
     values = effect.values.copy()
     values[effect.amounts] = 0.0

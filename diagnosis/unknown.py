@@ -11,7 +11,7 @@ from functools import cached_property
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri
 
 from bodyschema.interfaces.records import FloatArray
 
@@ -316,7 +316,7 @@ class Unknowns:
         columns = fresh[:, strongest].reshape(*fit.left.shape, -1)
         chance = scores_p_value(columns, left.reshape(fit.left.shape), Blocks.cut(len(fit.left)))
         # The strongest directions were selected; each costs one choice among all.
-        gain = float(stats.chi2.isf(max(chance, 1e-290), len(strongest)))
+        gain = float(chdtri(len(strongest), max(chance, 1e-290)))
         choice = len(strongest) * float(np.log(fresh.shape[1])) + _NUMBER * way.choice
         return nats(gain, len(strongest)) - choice - self._doubt_of(way)
 

@@ -103,7 +103,7 @@ class TurnCount:
                 continue
             was, now = self.pose[place], sensor.angle(count)
             if abs(now - was) > math.radians(self._max_move_deg) and self._is_accepted:
-                log.warning("joint %r: at %.0f°, as somebody said", sensor.joint, math.degrees(now))
+                log.warning("joint %r: at %.0f°, as a command stated", sensor.joint, math.degrees(now))
             elif abs(now - was) > math.radians(self._max_move_deg):
                 self.lost = sensor.joint
                 raise SourceLost(

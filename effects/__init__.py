@@ -7,22 +7,23 @@ from bodyschema.effects.simulation import Simulated
 
 from .corrected import corrected_file, write_corrected
 from .effect import Effect, Identity
+from .effect_type import EffectType
 from .files import load_simulation, read_effects, read_unexplained, simulation_of, write_extended
 from .gravity import GravityLoad
-from .kinds import KINDS, Kind
 from .live import LiveEncoders
 from .motion import Motion
 from .parameter import Parameter
+from .registry import EFFECT_TYPES
 from .simulation import Residual, Simulation
 from .smooth_map import place_map, smooth_map
 from .unexplained import StoredModel, Unexplained
 
 __all__ = [
-    "KINDS",
+    "EFFECT_TYPES",
     "Effect",
+    "EffectType",
     "GravityLoad",
     "Identity",
-    "Kind",
     "LiveEncoders",
     "Motion",
     "Parameter",

@@ -17,8 +17,9 @@ from bodyschema.robot.calibrated_files import calibrated_urdf
 from bodyschema.robot.description import RobotDescription
 
 from .effect import Effect
+from .effect_type import StructureEffect, ToolEffect
 from .poses import transforms
-from .simulation import RIGID, Simulation
+from .simulation import Simulation
 
 
 def corrected_file(robot: RobotDescription) -> str:
@@ -33,19 +34,19 @@ def corrected_geometry(simulation: Simulation) -> CalibratedGeometry | None:
     """
     simulation = simulation.placed
     robot = simulation.robot
-    rigid = [effect for effect in simulation.all_effects if effect.name in RIGID]
+    rigid = [effect for effect in simulation.all_effects if effect.kind.rigid]
     if not rigid:
         return None
     origins: dict[str, FloatArray] = {}
     # An offset turns about the axis as corrected by the link's own effect, so it is applied last.
-    for effect in sorted(rigid, key=lambda effect: effect.name == "joint_offset"):
+    for effect in sorted(rigid, key=lambda effect: effect.kind.is_zero):
         if effect.where is not None:
             origin = origins.get(effect.where, robot.tree.joint(effect.where).T_parent_joint)
             origins[effect.where] = origin @ _moved(robot, effect)
     marker = np.array(robot.robot.marker_xyz)
     for effect in rigid:
-        if effect.name == "tool_offset":
-            marker = marker + effect.values
+        if isinstance(effect.kind, ToolEffect):
+            marker = marker + effect.kind.shift(effect.values)
     return CalibratedGeometry(origins, robot.camera.pose @ simulation.camera_pose, marker)
 
 
@@ -76,8 +77,8 @@ def write_corrected(simulation: Simulation, folder: Path, heading: str) -> Path 
 
 def _moved(robot: RobotDescription, effect: Effect) -> FloatArray:
     """Return the transform (4, 4) by which an effect moves its joint's frame."""
-    if effect.name == "link_geometry":
-        return transforms(effect.values[None])[0]
+    if isinstance(effect.kind, StructureEffect) and (frame := effect.kind.frame(effect.values)) is not None:
+        return frame
     along = effect.values[0] * robot.tree.joint(str(effect.where)).axis
     slides = robot.chain.prismatic[robot.joints.index(str(effect.where))]
     none = np.zeros(3)

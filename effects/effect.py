@@ -13,11 +13,9 @@ from bodyschema.interfaces.records import FloatArray, frozen_array
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.suggest import did_you_mean
 
-from .kinds import KINDS, Kind
+from .effect_type import EffectType
 from .parameter import Parameter
-
-# Parameters that must be positive.
-_POSITIVE = frozenset({"cycles_per_turn", "cycles_per_m", "time_constant_s", "length_rad", "length_m"})
+from .registry import EFFECT_TYPES
 
 # Name, where, source, and ordinal among effects of one kind at one place.
 Identity = tuple[str, str | None, str | None, int]
@@ -28,7 +26,7 @@ class Effect:
     """An effect of a robot.
 
     Attributes:
-        kind: its row of the table.
+        kind: what it is.
         where, source: the joint it acts on, and the joint that causes it; None where there is none.
         values: its numbers (p,), in the order of `parameters`.
         prismatic: True for a prismatic joint.
@@ -36,7 +34,7 @@ class Effect:
         free: indices of the amounts that may differ from nominal; None for all.
     """
 
-    kind: Kind
+    kind: EffectType
     where: str | None
     source: str | None
     values: FloatArray
@@ -58,9 +56,9 @@ class Effect:
         Raises:
             RobotError: the effect, joint or number does not exist, or the effect cannot act there.
         """
-        if name not in KINDS:
-            raise RobotError(f"there is no effect {name!r}", remedy=did_you_mean(name, KINDS))
-        kind = KINDS[name]
+        if name not in EFFECT_TYPES:
+            raise RobotError(f"there is no effect {name!r}", remedy=did_you_mean(name, EFFECT_TYPES))
+        kind = EFFECT_TYPES[name]
         for joint, wanted, what in ((where, kind.at_joint, "where"), (source, kind.takes_source, "source")):
             if wanted and joint is None:
                 raise RobotError(f"{name} needs a joint: {what} is missing", remedy=f"Name one of {_list(robot)}")
@@ -78,11 +76,12 @@ class Effect:
             raise RobotError(f"{name} cannot sit at {where!r}, which slides", remedy=remedy)
         if kind.needs_stereo and robot.calibration is None:
             raise RobotError(f"{name} needs a stereo camera", remedy="Add focal_px and its fellows to [camera]")
-        return cls(kind, where, source, _values(kind.parameters(prismatic), values, name), prismatic)
+        parameters = kind.sliding if prismatic else kind.turning
+        return cls(kind, where, source, _values(parameters, values, name), prismatic)
 
     @property
     def name(self) -> str:
-        """Name of its row of the table."""
+        """Name of its type."""
         return self.kind.name
 
     @property
@@ -98,12 +97,17 @@ class Effect:
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Parameters of its values."""
-        return self.kind.parameters(self.prismatic)
+        return self.kind.sliding if self.prismatic else self.kind.turning
+
+    @property
+    def all_amounts(self) -> list[int]:
+        """Indices of the values that are amounts."""
+        return [k for k, parameter in enumerate(self.parameters) if parameter.is_amount]
 
     @property
     def amounts(self) -> list[int]:
         """Indices of the values that are amounts, and free."""
-        own = [k for k, parameter in enumerate(self.parameters) if parameter.is_amount]
+        own = self.all_amounts
         return own if self.free is None else [k for k in own if k in self.free]
 
     @property
@@ -140,10 +144,8 @@ class Effect:
 
     def value(self, name: str) -> float:
         """Return the value called `name`; raise KeyError if there is none."""
-        for parameter, value in zip(self.parameters, self.values, strict=True):
-            if parameter.name == name:
-                return float(value)
-        raise KeyError(name)
+        named = dict(zip([parameter.name for parameter in self.parameters], self.values.tolist(), strict=True))
+        return named[name]
 
     def table(self) -> dict[str, Any]:
         """Return the effect as a table of `extended.toml`."""
@@ -168,7 +170,7 @@ def _values(
     if values.shape != (len(parameters),):
         raise RobotError(f"{name} has {len(parameters)} numbers, not {values.size}")
     for parameter, value in zip(parameters, values, strict=True):
-        if not np.isfinite(value) or (parameter.name in _POSITIVE and value <= 0.0):
+        if not np.isfinite(value) or (parameter.positive and value <= 0.0):
             raise RobotError(f"{name}: {parameter.name} = {value:g} cannot be")
     return frozen_array(values)
 

@@ -37,8 +37,9 @@ from bodyschema.robot.toml_text import toml_text
 from kbmaps import ModelFormatError
 
 from .effect import Effect
-from .kinds import KINDS
+from .effect_type import CameraEffect
 from .parameter import Parameter
+from .registry import EFFECT_TYPES
 from .simulation import Simulation
 from .unexplained import Unexplained, stored_model
 
@@ -218,9 +219,9 @@ class _WrongEntry(Exception):
 def _effect(robot: RobotDescription, entry: Mapping[str, Any]) -> Effect:
     name, where, source = (_text(entry, key) for key in _HEAD)
     if name is None:
-        raise _WrongEntry("the key effect is missing", remedy=f"Name one of {', '.join(KINDS)}")
-    if name not in KINDS:
-        raise _WrongEntry(f"there is no effect {name!r}", "effect", did_you_mean(name, KINDS))
+        raise _WrongEntry("the key effect is missing", remedy=f"Name one of {', '.join(EFFECT_TYPES)}")
+    if name not in EFFECT_TYPES:
+        raise _WrongEntry(f"there is no effect {name!r}", "effect", did_you_mean(name, EFFECT_TYPES))
     try:
         resting = Effect.at(robot, name, where, source)
     except RobotError as error:
@@ -229,8 +230,9 @@ def _effect(robot: RobotDescription, entry: Mapping[str, Any]) -> Effect:
     for key in entry:
         if key not in (*names, *_HEAD):
             raise _WrongEntry(f"{name} has no number {key!r}", key, did_you_mean(key, names))
-    values = [_number(entry, p, name) for p in resting.parameters]
-    if not any(p.name in entry for p in resting.parameters if p.is_amount):
+    values = [_number(entry, p, resting) for p in resting.parameters]
+    amounts = {resting.parameters[k].name for k in resting.all_amounts}
+    if amounts.isdisjoint(entry):
         raise _WrongEntry(f"{name} says of nothing how much", remedy=f"Give {', '.join(names)}")
     try:
         return Effect.at(robot, name, where, source, values)
@@ -250,11 +252,11 @@ def _text(entry: Mapping[str, Any], key: str) -> str | None:
     return value
 
 
-def _number(entry: Mapping[str, Any], parameter: Parameter, effect: str) -> float:
-    name, of_camera = parameter.name, effect.startswith("camera_")
+def _number(entry: Mapping[str, Any], parameter: Parameter, effect: Effect) -> float:
+    name, of_camera = parameter.name, isinstance(effect.kind, CameraEffect)
     if name not in entry:
         if parameter.nominal is None:
-            raise _WrongEntry(f"{effect}: {name} is missing", remedy="It has no usual value: give it")
+            raise _WrongEntry(f"{effect.name}: {name} is missing", remedy="It has no usual value: give it")
         return parameter.nominal
     value = entry[name]
     if isinstance(value, bool) or not isinstance(value, int | float):
@@ -263,7 +265,7 @@ def _number(entry: Mapping[str, Any], parameter: Parameter, effect: str) -> floa
         raise _WrongEntry(f"{name} = {value} is not finite", name)
     if parameter.never_negative and value < 0.0:
         raise _WrongEntry(f"{name} = {value:g}: it is never negative", name, "Take the minus away, or the effect")
-    if name == "memory" and not 0.0 <= value < 1.0:
+    if parameter.below_one and not 0.0 <= value < 1.0:
         raise _WrongEntry(f"{name} = {value:g} is no share", name, "Give a number from 0 to below 1")
     for ending, largest, unit, remedy in _UNITS:
         if parameter.is_amount and name.endswith(ending):

@@ -162,11 +162,12 @@ def _borne(
     The last joint is a read one, or None where the base bears the link.
     """
     above = {joint.child: joint for joint in tree.joints.values()}
+    unread = tree.joints.keys() - set(joints)
     T = np.eye(4)
     while True:
         joint = above.get(link)
         yield joint, T
-        if joint is None or joint.name in joints:
+        if joint is None or joint.name not in unread:
             return
         T = standing(joint, False, held_at.get(joint.name, 0.0)) @ T
         link = joint.parent

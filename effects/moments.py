@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray
 
-from .effect import Effect
 from .motion import Motion
+
+if TYPE_CHECKING:
+    from .effect import Effect
 
 
 def settled(motion: Motion, time_constant_s: float) -> FloatArray:
@@ -19,3 +23,13 @@ def settled(motion: Motion, time_constant_s: float) -> FloatArray:
 def after(motion: Motion, effect: Effect) -> NDArray[np.bool_]:
     """Return True for rows (n,) after the moment at which an effect begins."""
     return motion.clock >= effect.values[-1]
+
+
+def since(motion: Motion, effect: Effect) -> FloatArray:
+    """Return 1 for rows (n, 1, 1) after the moment at which an effect begins, else 0."""
+    return after(motion, effect)[:, None, None].astype(np.float64)
+
+
+def with_moment(columns: FloatArray) -> FloatArray:
+    """Return derivatives (n, 3, p) with zeros appended for the moment, or for another shape that comes last."""
+    return np.concatenate([columns, np.zeros_like(columns[:, :, :1])], axis=2)

@@ -88,6 +88,14 @@ class Motion:
         firsts = np.flatnonzero(self.begins)
         return list(zip(firsts.tolist(), [*firsts[1:].tolist(), len(self.q)], strict=True))
 
+    def before_travel(self, joint: int, travel: float) -> NDArray[np.bool_]:
+        """Return rows (n,) before a joint has covered a range of `travel` [rad, m] in their run."""
+        rows = np.zeros(len(self), dtype=np.bool_)
+        for first, end in self.runs:
+            q = self.q[first:end, joint]
+            rows[first:end] = np.maximum.accumulate(q) - np.minimum.accumulate(q) < travel
+        return rows
+
     @cached_property
     def cubics(self) -> FloatArray:
         """Path from each row to the next of its run (4, n, d), as coefficients of powers of the time since, highest

@@ -26,6 +26,15 @@ class Optics:
     k1: float = 0.0
     k2: float = 0.0
 
+    def __add__(self, other: Optics) -> Optics:
+        """Return the sum of both differences."""
+        return Optics(
+            self.scale_error + other.scale_error,
+            self.focal_error + other.focal_error,
+            self.k1 + other.k1,
+            self.k2 + other.k2,
+        )
+
     @property
     def inside(self) -> bool:
         """True if the errors require a stereo calibration."""

@@ -16,6 +16,8 @@ class Parameter:
         never_negative: True for a backlash, a spring or a lag, which cannot be negative.
         smooth: True for a shape on which the measured position depends smoothly: a period or a time constant, but not a
             moment.
+        positive: True for a period or a length, which cannot be zero either.
+        below_one: True for a share that remains, from 0 to below 1.
     """
 
     name: str
@@ -23,8 +25,24 @@ class Parameter:
     nominal: float | None = 0.0
     never_negative: bool = False
     smooth: bool = False
+    positive: bool = False
+    below_one: bool = False
 
     @property
     def is_amount(self) -> bool:
         """True for an amount: the measured position depends on it smoothly, and `nominal` has no influence."""
         return self.nominal is not None
+
+
+# The moment at which an effect begins [s], or the row where a recording has no times.
+T0 = Parameter("t0", 0.0, None)
+
+
+def shifts(usual_m: float) -> tuple[Parameter, ...]:
+    """Return the parameters of a shift."""
+    return tuple(Parameter(f"{axis}_m", usual_m) for axis in "xyz")
+
+
+def turns(usual_rad: float) -> tuple[Parameter, ...]:
+    """Return the parameters of a rotation vector."""
+    return tuple(Parameter(f"r{axis}_rad", usual_rad) for axis in "xyz")

@@ -5,10 +5,10 @@ x_measured = drift(t) + residual(q(t)) + optics(camera(tool(structure(encoder(q(
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -18,27 +18,21 @@ from bodyschema.robot.urdf import inverse
 from kbmaps import RigidChain
 
 from .effect import Effect, Identity
+from .effect_type import STAGES, CameraEffect, EffectType, Stage, StructureEffect, TimeEffect, ToolEffect
 from .encoder import Place
-from .flank import flanks
 from .gravity import GravityLoad
-from .moments import after, settled
+from .moments import after, since
 from .motion import Motion
 from .optics import Optics
-from .poses import rotation, transforms
+from .poses import transforms
 
 # Step of numerical derivatives by the optics' parameters and by a point.
 _STEP = 1e-6
-# Step by a latency [s].
-_STEP_S = 1e-5
 # Relative step by a period or a time constant.
 _SHAPE_STEP = 1e-3
 # A spring's deflection changes its own load; each round adds the next order.
 _SPRING_ROUNDS = 3
-# Effects that a rigid chain can hold.
-RIGID = ("joint_offset", "link_geometry", "tool_offset", "camera_pose")
-# Permanent form of effects with a moment; effects that exist only in motion.
-_STAYS = {"encoder_jump": "joint_offset", "tool_slip": "tool_offset", "camera_moved": "camera_pose"}
-_OF_MOTION = ("backlash", "settling", "hysteresis", "camera_latency", "thermal_drift")
+Staged = TypeVar("Staged", bound=EffectType)
 
 
 class Residual(Protocol):
@@ -92,7 +86,7 @@ class Simulation:
     def rigid(self) -> Simulation:
         """The simulation with only the effects that a rigid chain can hold, and without the residual."""
         own, background = (
-            tuple(effect for effect in effects if effect.name in RIGID) for effects in (self.effects, self.background)
+            tuple(effect for effect in effects if effect.kind.rigid) for effects in (self.effects, self.background)
         )
         rigid = Simulation(self.robot, own, None, background)
         rigid.__dict__["gravity"] = self.gravity
@@ -105,16 +99,16 @@ class Simulation:
         Jumps, slips and bumps stay; effects of motion or of warming up are removed.
         """
         stayed = self.after_moments
-        return replace(stayed, effects=tuple(effect for effect in stayed.effects if effect.name not in _OF_MOTION))
+        return replace(stayed, effects=tuple(effect for effect in stayed.effects if not effect.kind.is_transient))
 
     @property
     def after_moments(self) -> Simulation:
         """The same simulation with jumps, slips and bumps made permanent."""
-        own = [effect for effect in self.effects if effect.name not in _STAYS]
+        own = [effect for effect in self.effects if effect.kind.stays_as is None]
         later = [
-            Effect.at(self.robot, _STAYS[effect.name], effect.where, values=effect.values[:-1].tolist())
+            Effect.at(self.robot, effect.kind.stays_as, effect.where, values=effect.values[:-1].tolist())
             for effect in self.effects
-            if effect.name in _STAYS
+            if effect.kind.stays_as is not None
         ]
         return replace(self, effects=(*own, *later))
 
@@ -124,16 +118,29 @@ class Simulation:
 
         This is exact for the camera's pose and the marker's position: both are the frames at the ends of the chain.
         """
-        robot, gone = self.robot, set[str]()
-        pose, marker = robot.camera.pose, np.array(robot.robot.marker_xyz)
-        if not robot.camera.pose_known and self._of("camera_pose"):
-            pose, gone = pose @ self.camera_pose, gone | {"camera_pose"}
-        if not robot.robot.marker_known and (shifts := self._of("tool_offset")):
-            marker, gone = marker + sum(effect.values for effect in shifts), gone | {"tool_offset"}
-        if not gone:
+        robot = self.robot
+        if not any(effect.kind.is_free(robot) for effect in self.all_effects):
             return self
-        effects = tuple(effect for effect in self.effects if effect.name not in gone)
+        pose, marker = robot.camera.pose, np.array(robot.robot.marker_xyz)
+        for effect in self.all_effects:
+            if not effect.kind.is_free(robot):
+                continue
+            if isinstance(effect.kind, CameraEffect) and (moved := effect.kind.pose(effect.values)) is not None:
+                pose = pose @ moved
+            elif isinstance(effect.kind, ToolEffect):
+                marker = marker + effect.kind.shift(effect.values)
+        effects = tuple(effect for effect in self.effects if not effect.kind.is_free(robot))
         return replace(self, robot=robot.with_placement(pose, marker), effects=effects)
+
+    def having(self, effect: Effect) -> Simulation:
+        """Return the same simulation with an effect in the place of the one that has its identity, or added."""
+        own, background = (
+            tuple(effect if one.identity == effect.identity else one for one in effects)
+            for effects in (self.effects, self.background)
+        )
+        if effect not in (*own, *background):
+            own = (*own, effect)
+        return self.with_effects(own).with_background(background)
 
     def positions(self, motion: Motion) -> FloatArray:
         """Return the simulated measurements (n, 3) [m] in the measurement frame."""
@@ -150,10 +157,10 @@ class Simulation:
         x_true = marker[:, :3, 3] + np.einsum("nij,nj->ni", marker[:, :3, :3], self.tool_shift(motion))
         x_placed = (x_true - self.camera_pose[:3, 3]) @ self.camera_pose[:3, :3]
         x_camera = x_placed
-        if self._of("camera_moved"):
+        if any(effect.kind.begins for effect, _ in self._of(CameraEffect)):
             T_placed_camera = self.camera_moves(motion)
             x_camera = np.einsum("nji,nj->ni", T_placed_camera[:, :3, :3], x_placed - T_placed_camera[:, :3, 3])
-        measured = self.optics.reported(x_camera, self.robot.calibration) + self.added(motion)
+        measured = self.reported(x_camera, motion) + self.added(motion)
         return Simulated(self, motion, readings, q, chain, frames, x_true, x_placed, x_camera, measured)
 
     def unloaded(self, readings: Motion) -> FloatArray:
@@ -171,23 +178,48 @@ class Simulation:
         source = None if effect.source is None else self.robot.joints.index(effect.source)
         return Place(self.robot.joints.index(effect.where), effect.prismatic, source)
 
+    def reported(self, x: FloatArray, motion: Motion, optics: Optics | None = None) -> FloatArray:
+        """Return the positions (n, 3) [m] that the camera reports of points x (n, 3) in its present frame.
+
+        Args:
+            optics: in the place of its own.
+        """
+        return self.altered((self.optics if optics is None else optics).reported(x, self.robot.calibration), motion)
+
+    def altered(self, x: FloatArray, motion: Motion) -> FloatArray:
+        """Return the positions (n, 3) [m] that are reported in the place of x (n, 3), by effects beyond the optics."""
+        for effect, kind in self._of(CameraEffect):
+            if kind.alters_report:
+                x = kind.reported(x, motion, effect.values, self.robot.calibration)
+        return x
+
+    @cached_property
+    def alters_report(self) -> bool:
+        """True if an effect alters what the camera reports beyond the optics."""
+        return any(kind.alters_report for _, kind in self._of(CameraEffect))
+
     @cached_property
     def optics(self) -> Optics:
         """Errors of the cameras."""
-        return Optics(
-            sum(e.value("scale_error") for e in self._of("camera_scale")),
-            sum(e.value("focal_error") for e in self._of("camera_focal")),
-            sum(e.value("k1") for e in self._of("lens_distortion")),
-            sum(e.value("k2") for e in self._of("lens_distortion")),
-        )
+        parts = [kind.optics(effect.values) for effect, kind in self._of(CameraEffect)]
+        return sum((part for part in parts if part is not None), Optics())
 
     @property
     def latency_s(self) -> float:
         """Delay of the images' time stamps [s]."""
-        return sum(e.value("latency_s") for e in self._of("camera_latency"))
+        return sum(kind.delay_s(effect.values) for effect, kind in self._of(TimeEffect))
 
-    def _of(self, name: str) -> list[Effect]:
-        return [effect for effect in self.all_effects if effect.name == name]
+    def _of(self, stage: type[Staged]) -> list[tuple[Effect, Staged]]:
+        """Return the effects of a stage, each with its type."""
+        return [(effect, effect.kind) for effect in self._staged[stage.stage] if isinstance(effect.kind, stage)]
+
+    @cached_property
+    def _staged(self) -> dict[Stage, list[Effect]]:
+        """All effects by their stage."""
+        staged: dict[Stage, list[Effect]] = {stage: [] for stage in STAGES}
+        for effect in self.all_effects:
+            staged[effect.kind.stage].append(effect)
+        return staged
 
     @property
     def bears_weight(self) -> bool:
@@ -207,21 +239,22 @@ class Simulation:
         if self.springs.any():
             for _ in range(_SPRING_ROUNDS):
                 given = self.springs * self.torques(q + given)
-        if loose := self._of("gravity_backlash"):
-            torques, sides = self.torques(q + given), {} if hung is None else hung
-            for effect in loose:
-                k = self.place(effect).joint
-                side = flanks(torques[:, k], float(effect.values[1]), sides.get(effect.identity, 0.0))
-                given[:, k] += 0.5 * effect.values[0] * side
-                sides[effect.identity] = float(side[-1])
+        loose = [(effect, kind) for effect, kind in self._of(StructureEffect) if kind.has_slack]
+        torques, sides = self.torques(q + given) if loose else given, {} if hung is None else hung
+        for effect, kind in loose:
+            k = self.place(effect).joint
+            slack, side = kind.slack(torques[:, k], effect.values, sides.get(effect.identity, 0.0))
+            given[:, k] += slack
+            sides[effect.identity] = side
         return given
 
     @cached_property
     def springs(self) -> FloatArray:
         """Compliance of each joint (d,) [rad/(N·m), m/N]."""
         springs = np.zeros(len(self.robot.joints))
-        for effect in self._of("joint_compliance"):
-            springs[self.place(effect).joint] += effect.values[0]
+        for effect, kind in self._of(StructureEffect):
+            if effect.where is not None:
+                springs[self.place(effect).joint] += kind.compliance(effect.values)
         return springs
 
     def torques(self, q: FloatArray) -> FloatArray:
@@ -230,12 +263,9 @@ class Simulation:
 
     @cached_property
     def payloads(self) -> list[GravityLoad]:
-        """Loads that the URDF lacks."""
-        return [
-            GravityLoad.of_payload(self.robot, float(effect.values[0]), effect.values[1:])
-            for effect in self._of("payload")
-            if effect.values.any()
-        ]
+        """Loads of masses that the URDF does not state."""
+        loads = [kind.load(self.robot, effect.values) for effect, kind in self._of(StructureEffect)]
+        return [load for load in loads if load is not None]
 
     @property
     def rigid_chain(self) -> RigidChain:
@@ -245,11 +275,11 @@ class Simulation:
         fixed = chain.fixed.copy()
         fixed[0] = inverse(rigid.camera_pose) @ fixed[0]
         for effect in rigid.all_effects:
-            if effect.name == "joint_offset":
+            if effect.kind.is_zero:
                 k = rigid.place(effect).joint
                 fixed[k] = fixed[k] @ self._turned(k, effect.values[0])
-            elif effect.name == "tool_offset":
-                fixed[-1, :3, 3] += fixed[-1, :3, :3] @ effect.values
+            elif isinstance(effect.kind, ToolEffect):
+                fixed[-1, :3, 3] += fixed[-1, :3, :3] @ effect.kind.shift(effect.values)
         return RigidChain(fixed, chain.axes, chain.prismatic)
 
     def _turned(self, joint: int, value: float) -> FloatArray:
@@ -272,43 +302,47 @@ class Simulation:
     @cached_property
     def link_moves(self) -> list[tuple[int, FloatArray]]:
         """Corrections of joint frames: the index in q, and the pose (4, 4) in the nominal frame."""
-        return [(self.place(effect).joint, transforms(effect.values[None])[0]) for effect in self._of("link_geometry")]
+        frames = [(effect, kind.frame(effect.values)) for effect, kind in self._of(StructureEffect)]
+        return [(self.place(effect).joint, frame) for effect, frame in frames if frame is not None]
 
     @cached_property
     def upward(self) -> list[bool]:
         """True for joints passed from child to parent on the path from camera to marker (d,)."""
         way = self.robot.tree.path(self.robot.camera.parent_link, self.robot.robot.marker_link)
-        return [upward for joint, upward in way if joint.name in self.robot.joints]
+        upward = {joint.name: passed_upward for joint, passed_upward in way}
+        return [upward[name] for name in upward if name in self.robot.joints]
 
     def tool_shift(self, motion: Motion) -> FloatArray:
         """Return the displacement of the marker from its nominal position (n, 3) [m], in its link."""
         shift = np.zeros((len(motion), 3))
-        for effect in self._of("tool_offset"):
-            shift += effect.values
-        for effect in self._of("tool_slip"):
-            shift[after(motion, effect)] += effect.values[:3]
+        for effect, kind in self._of(ToolEffect):
+            shift[after(motion, effect) if kind.begins else slice(None)] += kind.shift(effect.values)
         return shift
 
     @property
     def camera_pose(self) -> FloatArray:
         """Initial camera pose (4, 4), in the frame that the description gives it."""
         T = np.eye(4)
-        for effect in self._of("camera_pose"):
-            T = T @ transforms(effect.values[None])[0]
+        for effect, kind in self._of(CameraEffect):
+            if not kind.begins and (pose := kind.pose(effect.values)) is not None:
+                T = T @ pose
         return T
 
     def camera_moves(self, motion: Motion) -> FloatArray:
         """Return the camera's pose (n, 4, 4) in its initial frame."""
         T = np.tile(np.eye(4), (len(motion), 1, 1))
-        for effect in self._of("camera_moved"):
-            T[after(motion, effect)] @= transforms(effect.values[None, :6])[0]
+        for effect, kind in self._of(CameraEffect):
+            if kind.begins and (pose := kind.pose(effect.values)) is not None:
+                T[after(motion, effect)] @= pose
         return T
 
     def added(self, motion: Motion) -> FloatArray:
         """Return the shift added to the camera's report (n, 3) [m]: drift and residual."""
         shift = np.zeros((len(motion), 3)) if self.residual is None else self.residual.predict(motion.q)
-        for effect in self._of("thermal_drift"):
-            shift = shift + settled(motion, effect.values[3])[:, None] * effect.values[:3]
+        for effect, kind in self._of(TimeEffect):
+            drift = kind.drift(motion, effect.values)
+            if drift is not None:
+                shift = shift + drift
         return shift
 
 
@@ -343,7 +377,7 @@ class Simulated:
         axes = np.einsum("nkij,kj->nki", frames[:, :-1, :3, :3], chain.axes)
         levers = self.x_true[:, None] - frames[:, :-1, :3, 3]
         moved = np.where(chain.prismatic[:, None], axes, np.cross(axes, levers))
-        return self._seen(np.swapaxes(moved, 1, 2))
+        return self.seen(np.swapaxes(moved, 1, 2))
 
     @cached_property
     def torques(self) -> FloatArray:
@@ -362,12 +396,7 @@ class Simulated:
         """Return derivatives (n, 3, p) of the measurements by the effect's values; zeros for values that are not
         amounts.
         """
-        simulation = self.simulation
-        if effect.kind.encoder is not None:
-            place = simulation.place(effect)
-            by_value = effect.kind.encoder.columns(self.readings, place, effect.values)
-            return self.by_joint[:, :, [place.joint]] * by_value[:, None, :]
-        return self._BY_NAME[effect.name](self, effect)
+        return effect.kind.jacobian(self, effect)
 
     def by_shape(self, effect: Effect) -> FloatArray:
         """Return derivatives (n, 3, s) of the measurements by the effect's `shapes`."""
@@ -380,136 +409,55 @@ class Simulated:
             derivatives.append(change / (2.0 * step[k]))
         return np.stack(derivatives, axis=2) if derivatives else np.empty((len(self.q), 3, 0))
 
-    def _compliance(self, effect: Effect) -> FloatArray:
-        k = self.simulation.place(effect).joint
-        if not self.simulation.bears_weight:
-            return np.zeros((len(self.q), 3, 1))
-        return self.by_joint[:, :, [k]] * self.torques[:, None, [k]]
+    @cached_property
+    def by_marker(self) -> FloatArray:
+        """Derivatives (n, 3, 3) of the measurements by the marker's place in its link."""
+        return self.seen(self.frames[:, -1, :3, :3])
 
-    def _gravity_backlash(self, effect: Effect) -> FloatArray:
-        k = self.simulation.place(effect).joint
-        if not self.simulation.bears_weight:
-            return np.zeros((len(self.q), 3, 2))
-        side = flanks(self.torques[:, k], float(effect.values[1]))
-        return _with_moment(self.by_joint[:, :, [k]] * 0.5 * side[:, None, None])
-
-    def _payload(self, effect: Effect) -> FloatArray:
-        springs = self.simulation.springs
-        if not (springs.any() and self.simulation.bears_weight):
-            return np.zeros((len(self.q), 3, len(effect.values)))
-        robot = self.simulation.robot
-        units = [GravityLoad.of_payload(robot, float(unit[0]), unit[1:]) for unit in np.eye(len(effect.values))]
-        return np.stack([self.by_joint @ (springs * one.torques(self.q))[:, :, None] for one in units], axis=2)[..., 0]
-
-    def _link(self, effect: Effect) -> FloatArray:
-        simulation = self.simulation
-        k = simulation.place(effect).joint
-        turn, by_turn = rotation(effect.values)
-        if simulation.upward[k]:
-            # Frame after the joint's own motion, in which the link above begins.
-            frame = self.frames[:, k + 1] @ inverse(self.chain.fixed[k + 1])
-            axes = -frame[:, :3, :3] @ turn.T
-        else:
-            frame = self.frames[:, k]
-            axes = frame[:, :3, :3] @ turn.T
-        lever = self.x_true - frame[:, :3, 3]
-        return self._seen(_moved_and_turned(axes, axes @ by_turn, lever))
-
-    def _tool(self, effect: Effect) -> FloatArray:
-        return self._seen(self.frames[:, -1, :3, :3])
-
-    def _tool_slip(self, effect: Effect) -> FloatArray:
-        return _with_moment(self._tool(effect) * self._after(effect))
-
-    def _camera(self, effect: Effect) -> FloatArray:
-        return self._optical(self._since_moved(_of_camera(effect, self.x_placed)))
-
-    def _camera_moved(self, effect: Effect) -> FloatArray:
-        return _with_moment(self._optical(_of_camera(effect, self.x_camera)) * self._after(effect))
-
-    def _optics(self, effect: Effect) -> FloatArray:
-        optics, calibration = self.simulation.optics, self.simulation.robot.calibration
+    def by_optics(self, effect: Effect) -> FloatArray:
+        """Return derivatives (n, 3, p) of the measurements by an effect's values, each one a number of the optics."""
+        simulation, optics = self.simulation, self.simulation.optics
         columns = []
         for parameter in effect.parameters:
             number = getattr(optics, parameter.name)
             more, less = (replace(optics, **{parameter.name: number + step}) for step in (_STEP, -_STEP))
-            change = more.reported(self.x_camera, calibration) - less.reported(self.x_camera, calibration)
+            change = simulation.reported(self.x_camera, self.motion, more)
+            change = change - simulation.reported(self.x_camera, self.motion, less)
             columns.append(change / (2.0 * _STEP))
         return np.stack(columns, axis=2)
 
-    def _latency(self, effect: Effect) -> FloatArray:
-        # Include the encoder errors: they too are those of the earlier moment.
-        latency = self.simulation.latency_s
-        later, sooner = (self.simulation.unloaded(self.motion.earlier(latency + s)) for s in (_STEP_S, -_STEP_S))
-        return np.einsum("nij,nj->ni", self.by_joint, (later - sooner) / (2.0 * _STEP_S))[:, :, None]
-
-    def _drift(self, effect: Effect) -> FloatArray:
-        return _with_moment(settled(self.motion, effect.values[3])[:, None, None] * np.eye(3))
-
-    def _after(self, effect: Effect) -> FloatArray:
-        return after(self.motion, effect)[:, None, None].astype(np.float64)
-
-    def _seen(self, moved: FloatArray) -> FloatArray:
+    def seen(self, moved: FloatArray) -> FloatArray:
         """Return the change of the measurements by moves (n, 3, p) [m] of the point in the nominal camera's frame."""
         for effect in self.simulation.effects:
-            if effect.name == "camera_pose":
-                moved = rotation(effect.values)[0].T @ moved
-        return self._optical(self._since_moved(moved))
+            if (pose := _observer(effect)) is not None and not effect.kind.begins:
+                moved = pose[:3, :3].T @ moved
+        return self.optical(self.since_moved(moved))
 
-    def _since_moved(self, moved: FloatArray) -> FloatArray:
+    def since_moved(self, moved: FloatArray) -> FloatArray:
         """Return moves (n, 3, p) in the present camera frame, from moves in the frame where it was set up."""
         for effect in self.simulation.effects:
-            if effect.name == "camera_moved":
-                moved = np.where(self._after(effect) > 0.0, rotation(effect.values)[0].T @ moved, moved)
+            if (pose := _observer(effect)) is not None and effect.kind.begins:
+                moved = np.where(since(self.motion, effect) > 0.0, pose[:3, :3].T @ moved, moved)
         return moved
 
-    def _optical(self, moved: FloatArray) -> FloatArray:
+    def optical(self, moved: FloatArray) -> FloatArray:
         """Return the change of the measurements by moves (n, 3, p) of the point in the camera's frame [m]."""
         optics = self.simulation.optics
-        if not optics.inside:
+        if not optics.inside and not self.simulation.alters_report:
             return moved * (1.0 + optics.scale_error)
         return np.einsum("nij,njp->nip", self._by_point, moved)
 
     @cached_property
     def _by_point(self) -> FloatArray:
         """Derivatives (n, 3, 3) of the reported position by the point."""
-        optics, calibration = self.simulation.optics, self.simulation.robot.calibration
+        reported = self.simulation.reported
         changes = [
-            optics.reported(self.x_camera + step, calibration) - optics.reported(self.x_camera - step, calibration)
+            reported(self.x_camera + step, self.motion) - reported(self.x_camera - step, self.motion)
             for step in _STEP * np.eye(3)
         ]
         return np.stack(changes, axis=2) / (2.0 * _STEP)
 
-    _BY_NAME: ClassVar[dict[str, Callable[[Simulated, Effect], FloatArray]]] = {
-        "joint_compliance": _compliance,
-        "gravity_backlash": _gravity_backlash,
-        "payload": _payload,
-        "link_geometry": _link,
-        "tool_offset": _tool,
-        "tool_slip": _tool_slip,
-        "camera_pose": _camera,
-        "camera_moved": _camera_moved,
-        "camera_scale": _optics,
-        "camera_focal": _optics,
-        "lens_distortion": _optics,
-        "camera_latency": _latency,
-        "thermal_drift": _drift,
-    }
 
-
-def _of_camera(effect: Effect, x: FloatArray) -> FloatArray:
-    """Return moves (n, 3, 6) of points x (n, 3) in a camera's frame, by the parameters of its pose."""
-    turn, by_turn = rotation(effect.values)
-    axes = np.broadcast_to(-turn.T, (len(x), 3, 3))
-    return _moved_and_turned(axes, axes @ by_turn, x)
-
-
-def _moved_and_turned(shifts: FloatArray, axes: FloatArray, lever: FloatArray) -> FloatArray:
-    """Return moves (n, 3, 6) at levers (n, 3): shifts (n, 3, 3), and turns about the columns of axes (n, 3, 3)."""
-    turned = np.cross(np.swapaxes(axes, 1, 2), lever[:, None, :])
-    return np.concatenate([shifts, np.swapaxes(turned, 1, 2)], axis=2)
-
-
-def _with_moment(columns: FloatArray) -> FloatArray:
-    """Return derivatives (n, 3, p) with zeros appended for the moment."""
-    return np.concatenate([columns, np.zeros_like(columns[:, :, :1])], axis=2)
+def _observer(effect: Effect) -> FloatArray | None:
+    """Return the pose (4, 4) of the camera that an effect gives it; None for another effect."""
+    return effect.kind.pose(effect.values) if isinstance(effect.kind, CameraEffect) else None

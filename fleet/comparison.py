@@ -1,4 +1,4 @@
-"""Comparison of the models of robots of one type: distance from the median model, and outlying figures."""
+"""Ask the robots of one type, and compare their models: distance from the median model, and outlying figures."""
 
 from __future__ import annotations
 
@@ -9,11 +9,20 @@ from statistics import NormalDist
 
 import msgspec
 import numpy as np
+from rich import box
+from rich.console import Group, RenderableType
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
 from scipy.spatial.transform import Rotation
 
 from bodyschema.calibration.comparison import Distances, laid_on
+from bodyschema.cli.terminal.screen import mm
+from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import JointRange
-from bodyschema.interfaces.errors import RequestError
+from bodyschema.daemon.transport.wire import PredictReply, decode, encode
+from bodyschema.fleet.roster import Fleet, Member
+from bodyschema.interfaces.errors import BusError, RequestError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.status import ChainCalibration
 
@@ -228,3 +237,114 @@ def _camera_turned(found: ChainCalibration | None) -> float | None:
         Rotation.from_euler("xyz", [getattr(each, which) for each in found.camera_rpy]) for which in ("drawn", "learnt")
     )
     return math.degrees((drawn.inv() * learnt).magnitude())
+
+
+def by_type(members: Sequence[Member]) -> tuple[dict[tuple[str, ...], list[Member]], list[str]]:
+    """Group the robots whose learners answer by the names of their joints; return also why others are left out."""
+    types: dict[tuple[str, ...], list[Member]] = {}
+    left_out: list[str] = []
+    for member in members:
+        if member.learner is None:
+            left_out.append(f"{member.name}: no learner of it answers")
+        elif member.joints is None:
+            left_out.append(f"{member.name}: no sampler or solution has reported its joints yet")
+        else:
+            types.setdefault(member.joints, []).append(member)
+    return types, left_out
+
+
+def compare_types(fleet: Fleet, members: Sequence[Member]) -> tuple[list[TypeComparison], list[str]]:
+    """Return a comparison for each type with at least two answering models, and who was left out and why."""
+    types, left_out = by_type(members)
+    found: list[TypeComparison] = []
+    for joints, robots in types.items():
+        try:
+            coverages = [robot.sampler.coverage for robot in robots if robot.sampler is not None]
+            q = common_poses([each for each in coverages if tuple(each) == joints], joints)
+        except RequestError as error:
+            left_out += [f"{robot.name}: {error}" for robot in robots]
+            continue
+        models: list[Model] = []
+        for robot in robots:
+            try:
+                models.append(_model(fleet, robot, q))
+            except (BusError, RequestError) as error:
+                left_out.append(f"{robot.name}: {error}")
+        if len(models) < 2:
+            left_out += [f"{model.robot}: there is no other of its type" for model in models]
+            continue
+        found.append(compared(joints, q, models))
+    return found, left_out
+
+
+def _model(fleet: Fleet, robot: Member, q: FloatArray) -> Model:
+    if robot.route is None:
+        raise BusError("its learner was not found")
+    payload = fleet.bus(robot.route).ask_one(Keys(robot.name).predict, encode({"q": q.tolist()}))
+    said = decode(payload, PredictReply)
+    x, sigma = np.array(said.x), np.array(said.sigma)
+    if x.shape != (len(q), 3) or sigma.shape != x.shape or not np.isfinite(x).all():
+        raise RequestError("its learner's predictions are not one position a pose")
+    calibration = None if robot.learner is None else robot.learner.calibration
+    distance = float(np.sqrt(np.square(sigma).sum(axis=1).mean()))
+    return Model(robot.name, x, distance, float(np.mean(said.in_support)), calibration)
+
+
+def view(comparisons: Sequence[TypeComparison], left_out: Sequence[str]) -> RenderableType:
+    """Return a table for each type, then who was left out."""
+    parts: list[RenderableType] = []
+    for comparison in comparisons:
+        parts += [*map(Text, sentences(comparison)), Padding(_table(comparison.units), (1, 0, 1, 0))]
+    parts += [Text(f"! not compared: {reason}", style="yellow") for reason in left_out]
+    return Group(*parts)
+
+
+def sentences(comparison: TypeComparison) -> list[str]:
+    """Return the compared robots and the outliers, in words."""
+    units = comparison.units
+    said = [
+        f"{len(units)} robots with the joints {', '.join(comparison.joints)}, at {comparison.poses} common poses, each "
+        "model laid on their median as a whole."
+    ]
+    if len(units) < FEWEST_TO_JUDGE:
+        return [*said, "Of two robots, it is not possible to say which is the odd one."]
+    off = [unit for unit in units if unit.is_off]
+    if not off:
+        said.append("None is farther from the others than the models claim to be wrong, and no figure stands out.")
+    for unit in off:
+        why = [figure_told(odd) for odd in unit.odd[:3]]
+        told = f": {'; '.join(why)}" if why else "; none of its figures stands out alone"
+        said.append(f"{unit.robot} is off by {mm(unit.apart.rms_mm / 1e3)} (RMS){told}.")
+    return said
+
+
+def figure_told(odd: Odd) -> str:
+    """Return a figure that stands out, as `zero of elbow +2.1 ± 0.2°`."""
+    factor, unit = (math.degrees(1.0), "°") if odd.unit == "rad" else (1e3, " mm")
+    half = factor * odd.half_width
+    digits = min(max(1 - math.floor(math.log10(half)), 0), 4) if half > 0.0 else 3
+    return f"{odd.figure} {factor * odd.difference:+.{digits}f} ± {half:.{digits}f}{unit}"
+
+
+def _table(units: Sequence[Unit]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    table.add_column("robot", overflow="fold")
+    for name in ("RMS", "max", "claimed", "has data"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("camera moved", justify="right", no_wrap=True)
+    table.add_column("stands out from the median by", overflow="fold")
+    for unit in units:
+        moved = "-"
+        if unit.camera_moved_mm is not None and unit.camera_turned_deg is not None:
+            moved = f"{mm(unit.camera_moved_mm / 1e3)}, {unit.camera_turned_deg:.2g}°"
+        style = "bold red" if unit.is_off else ""
+        table.add_row(
+            Text(unit.robot, style=style),
+            Text(mm(unit.apart.rms_mm / 1e3), style=style),
+            mm(unit.apart.max_mm / 1e3),
+            mm(unit.claimed_mm / 1e3),
+            f"{unit.in_support:.0%}",
+            moved,
+            "\n".join(map(figure_told, unit.odd)) or "-",
+        )
+    return table

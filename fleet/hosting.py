@@ -89,7 +89,7 @@ def spread(configs: Sequence[Config], processes: int, options: Sequence[str]) ->
     children: list[Child] = []
     for number, share in enumerate(shares(configs, processes), 1):
         session_settings(share)  # refuse here what would end the process
-        command = module_command("bodyschema", "learner", *options)
+        command = module_command("bodyschema", "run", "learner", *options)
         for config in share:
             command += ["--robot", str(config.file)]
         if share[0].given_state_dir is not None:

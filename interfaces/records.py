@@ -29,7 +29,11 @@ class Reason(StrEnum):
 
     NO_MARKER = "no_marker"  # nothing of the marker's colour, or too few pixels
     AT_BORDER = "at_border"  # the marker touches the image border
-    OCCLUDED = "occluded"  # its outline is not a whole disc
+    OCCLUDED = "occluded"  # something covers a part of it
+    NOT_ROUND = "not_round"  # the ball's outline is whole but no ellipse
+    NOT_STRAIGHT = "not_straight"  # a tag's edges scatter or are bent
+    LOW_CONTRAST = "low_contrast"  # too little difference from what surrounds it
+    BLURRED = "blurred"  # too little detail is left
     SATURATED = "saturated"  # too much of it is over-exposed
     REFLECTION = "reflection"  # a dimmer copy of the marker, or one at a place that it cannot have
     EPIPOLAR = "epipolar"  # the two eyes' rows disagree

@@ -10,6 +10,10 @@ WORDS: Mapping[Reason, str] = {
     Reason.NO_MARKER: "no marker",
     Reason.AT_BORDER: "at the border",
     Reason.OCCLUDED: "not all to be seen",
+    Reason.NOT_ROUND: "not round",
+    Reason.NOT_STRAIGHT: "edges not straight",
+    Reason.LOW_CONTRAST: "too little contrast",
+    Reason.BLURRED: "too blurred",
     Reason.SATURATED: "over-exposed",
     Reason.REFLECTION: "a reflection",
     Reason.REPROJECTION: "not the marker's shape",
@@ -32,16 +36,23 @@ REMEDIES: Mapping[Reason, str] = {
     Reason.NO_MARKER: "Is it in sight of both eyes, large enough in both images, and are [vision] marker, colour, "
     "number and light right?",
     Reason.AT_BORDER: "Bring it nearer to the middle of both images.",
-    Reason.OCCLUDED: "Is a hand, a cable or the tool before it, or does it move too fast for the exposure?",
+    Reason.OCCLUDED: "Is a hand, a cable or the tool before it?",
+    Reason.NOT_ROUND: "Is a finger or a cable before its edge, or does it move too fast for the exposure? Light its "
+    "dark side, and take a plain, matt ball.",
+    Reason.NOT_STRAIGHT: "Glue the paper flat, and take away what covers an edge.",
+    Reason.LOW_CONTRAST: "More light, and a background that is neither black nor of its colour. A tag needs its white "
+    "margin.",
+    Reason.BLURRED: "Focus the lens, expose for a shorter time, or take a larger tag.",
     Reason.SATURATED: "Shorten exposure_s, less light.",
     Reason.REFLECTION: "Turn the lamp or what mirrors it away, or mask it.",
     Reason.REPROJECTION: "Is the paper flat, the light not too bright, and is each tag where robot.toml has it?",
     Reason.DISAGREEING: "The sampler's health says by how much, and what would make them agree: `bodyschema status`.",
     Reason.IMPLAUSIBLE_SPEED: "Is another thing of its colour in sight? If it really is so fast, raise [vision] "
     "max_speed_m_s and [daemon] max_marker_speed_m_s.",
-    Reason.EPIPOLAR: "Are the cameras exchanged, one upside down, or moved? `bodyschema calibrate check` tells.",
+    Reason.EPIPOLAR: "Are the cameras exchanged, one upside down, or moved? `bodyschema calibrate cameras --check` "
+    "shows it.",
     Reason.SIZE_MISMATCH: "Is its size in [vision] right? Else it is the calibration of other cameras, or they were "
-    "moved: `bodyschema calibrate check`.",
+    "moved: `bodyschema calibrate cameras --check`.",
     Reason.AMBIGUOUS: "Take other things of its colour, or the second tag of its number, out of sight.",
     Reason.NO_JOINTS: "Do the encoders answer, and is [vision.cameras] latency_s right? `bodyschema calibrate latency` "
     "measures it.",

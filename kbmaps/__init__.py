@@ -14,12 +14,11 @@ if TYPE_CHECKING:
     from kbmaps.chains.chain import RigidChain
     from kbmaps.chains.oriented import OrientedChain, fitted_orientation
     from kbmaps.chains.parameters import ChainParameters, ChainTolerances
-    from kbmaps.chains.refitted_tool import with_refitted_tool
     from kbmaps.chains.report import ChainReport, Interval
     from kbmaps.chains.rigid_learner import RigidLearner
     from kbmaps.chains.rigid_recursive import RecursiveRigidLearner
     from kbmaps.chains.search import find_chain
-    from kbmaps.chains.tool_layer import ToolLayer
+    from kbmaps.chains.tool_layer import ToolLayer, with_refitted_tool
     from kbmaps.changes.detector import ChangeDetector, Suspicion
     from kbmaps.changes.kinds import ChangeKind, any_change, change_kinds
     from kbmaps.changes.naming import Explanation, explanations
@@ -57,8 +56,7 @@ if TYPE_CHECKING:
     from kbmaps.model import Estimate, Model, PoseModel, PositionModel
     from kbmaps.planning.design import ExperimentDesign, next_pose, next_poses, next_stretch
     from kbmaps.planning.expected_gain import ExpectedError, Forecast, candidate_motions, expected_gain
-    from kbmaps.planning.lack_of_fit import systematic_error
-    from kbmaps.planning.posterior import ChainPosterior, Posterior
+    from kbmaps.planning.posterior import ChainPosterior, Posterior, systematic_error
     from kbmaps.residual.learner import ResidualLearner
     from kbmaps.residual.model import ResidualModel
     from kbmaps.robust import unexplained_variance
@@ -170,12 +168,11 @@ _MODULES = {
     "chains.chain": ["RigidChain"],
     "chains.oriented": ["OrientedChain", "fitted_orientation"],
     "chains.parameters": ["ChainParameters", "ChainTolerances"],
-    "chains.refitted_tool": ["with_refitted_tool"],
     "chains.report": ["ChainReport", "Interval"],
     "chains.rigid_learner": ["RigidLearner"],
     "chains.rigid_recursive": ["RecursiveRigidLearner"],
     "chains.search": ["find_chain"],
-    "chains.tool_layer": ["ToolLayer"],
+    "chains.tool_layer": ["ToolLayer", "with_refitted_tool"],
     "changes.detector": ["ChangeDetector", "Suspicion"],
     "changes.kinds": ["ChangeKind", "any_change", "change_kinds"],
     "changes.naming": ["Explanation", "explanations"],
@@ -213,8 +210,7 @@ _MODULES = {
     "model": ["Estimate", "Model", "PoseModel", "PositionModel"],
     "planning.design": ["ExperimentDesign", "next_pose", "next_poses", "next_stretch"],
     "planning.expected_gain": ["ExpectedError", "Forecast", "candidate_motions", "expected_gain"],
-    "planning.lack_of_fit": ["systematic_error"],
-    "planning.posterior": ["ChainPosterior", "Posterior"],
+    "planning.posterior": ["ChainPosterior", "Posterior", "systematic_error"],
     "residual.learner": ["ResidualLearner"],
     "residual.model": ["ResidualModel"],
     "robust": ["unexplained_variance"],

@@ -309,7 +309,7 @@ class Ladder:
         self._failures = {name: failure for name, failure in failures.items() if failure is not None}
         judges, errors = fields["judges"], arrays["errors"]
         if errors.ndim != 2 or not (errors >= 0.0)[~np.isnan(errors)].all() or not set(judges) <= set(self._rungs):
-            raise ModelFormatError("its contest is none of its models'")
+            raise ModelFormatError("its contest names unknown models")
         self._contest = Contest(dict(zip(judges, errors, strict=True)), count(fields["judged"], "judged"))
         self._answering = fields["answering"]
         if len(self._rungs) != len(entries) or self._answering not in self._rungs:

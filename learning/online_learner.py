@@ -368,5 +368,6 @@ class OnlineLearner:
         needed, have = self._nominal.pairs_to_align, self._core.regimes.waiting.count
         return (
             f"there is no model yet: robot.toml says {self._nominal.unknown}, so positions have no frame until about "
-            f"{needed} pairs have come ({have} so far). Start the sampler with `bodyschema sampler` and guide the arm"
+            f"{needed} pairs have come ({have} so far). Start the sampler with `bodyschema run sampler` and guide "
+            "the arm"
         )

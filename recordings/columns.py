@@ -95,7 +95,9 @@ def check_joints(joints: tuple[str, ...]) -> None:
         if "," in joint or joint != joint.strip() or not joint.isprintable():
             raise Fault(f"a joint called {joint!r} cannot name a column", remedy="Rename the joint")
         if joint in RESERVED or joint in extra_columns(joints):
-            raise Fault(f"a joint called {joint!r} cannot be told from the column {joint!r}", remedy="Rename the joint")
+            raise Fault(
+                f"a joint called {joint!r} would have the name of the column {joint!r}", remedy="Rename the joint"
+            )
 
 
 def check_width(names: Sequence[str]) -> None:

@@ -177,7 +177,7 @@ def _info(source: Path) -> _Info:
         raise RecordingError(
             f"it was recorded on {info.robot_type!r} by LeRobot before version 0.3, which counted angles otherwise",
             file=file,
-            remedy="Record it again; the old calibration does not tell where 0 was",
+            remedy="Record it again; the old calibration does not contain the zero",
         )
     return info
 

@@ -110,7 +110,7 @@ def _nanoseconds(recording: Recording, file: Path) -> list[int]:
     shifted = t - min(float(t[0]), 0.0)
     if shifted[-1] > LATEST_S:
         raise RecordingError(
-            f"MCAP cannot tell the time {shifted[-1]:g} s in nanoseconds", file=file, remedy="Give times in seconds"
+            f"MCAP cannot store the time {shifted[-1]:g} s in nanoseconds", file=file, remedy="Give times in seconds"
         )
     return [int(ns) for ns in np.round(shifted * 1e9)]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from colorsys import rgb_to_hsv
 
 import cv2
@@ -12,13 +12,116 @@ from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, ImageArray
+from bodyschema.sim_backend.ball import cast_ball
+from bodyschema.sim_backend.config import CameraConfig, SimTag
+from bodyschema.sim_backend.randomness import Stream, generator
+from bodyschema.sim_backend.raster import EmptyWorld, Grid, Raster
 
-from .ball import cast_ball
-from .config import CameraConfig
-from .panorama import background, cluttered_room
-from .randomness import Stream, generator
-from .raster import EmptyWorld, Grid, Raster
-from .tags import TagSheets
+_WIDTH, _HEIGHT = 2048, 1024
+
+
+def cluttered_room(
+    objects: int, rng: np.random.Generator, *, ball_hue_deg: float = 0.0, gap_deg: float = 36.0
+) -> ImageArray:
+    """Return a picture (1024, 2048, 3), BGR, of a wall with coloured objects: rectangles, discs and bars.
+
+    Args:
+        ball_hue_deg: hue of the ball [deg].
+        gap_deg: smallest difference between the hue of an object and that of the ball [deg].
+    """
+    rows = np.linspace(205, 120, _HEIGHT)[:, None, None]
+    picture = np.ascontiguousarray(np.broadcast_to(rows * [0.93, 0.97, 1.0], (_HEIGHT, _WIDTH, 3)).astype(np.uint8))
+    for _ in range(objects):
+        colour = _colour(rng, round(ball_hue_deg / 2), round(gap_deg / 2))
+        x, y = int(rng.integers(_WIDTH)), int(rng.integers(_HEIGHT))
+        w, h = (int(size) for size in rng.integers(15, 160, 2))
+        shape = rng.integers(3)
+        if shape == 0:
+            cv2.rectangle(picture, (x, y), (x + w, y + h), colour, -1)
+        elif shape == 1:
+            cv2.circle(picture, (x, y), w // 2, colour, -1)
+        else:
+            cv2.line(picture, (x, y), (x + 2 * w - 160, y + h), colour, 2 + w // 12)
+    return cv2.GaussianBlur(picture, (5, 5), 0).astype(np.uint8)
+
+
+def background(room: ImageArray, directions: FloatArray, R_world_camera: FloatArray) -> ImageArray:
+    """Return the room's image as seen by a camera with this orientation (3, 3).
+
+    Args:
+        directions: viewing direction of each pixel in the camera, shape (height, width, 3), any length.
+    """
+    x, y, z = np.moveaxis(directions.astype(np.float32) @ R_world_camera.T.astype(np.float32), -1, 0)
+    across = np.sqrt(x * x + y * y)
+    columns = (0.5 - cv2.phase(x, y) / (2 * np.pi)) % 1.0 * (_WIDTH - 1)
+    rows = np.arctan2(across, z) / np.pi * (_HEIGHT - 1)
+    seen = cv2.remap(room, columns.astype(np.float32), rows.astype(np.float32), cv2.INTER_LINEAR, None, cv2.BORDER_WRAP)
+    return seen.astype(np.uint8, copy=False)
+
+
+def _colour(rng: np.random.Generator, ball: int, gap: int) -> tuple[int, int, int]:
+    """Return a random BGR colour whose hue is not near the ball's; OpenCV's hue circle has 180 steps, red at 0."""
+    # Hues mix at an edge: leave a wider gap on the side of the shorter wavelengths.
+    hue = (ball + rng.integers(gap, 168 - gap)) % 180
+    hsv = np.array([[[hue, rng.integers(20, 230), rng.integers(40, 240)]]], dtype=np.uint8)
+    blue, green, red = cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR)[0, 0]
+    return int(blue), int(green), int(red)
+
+
+_BLACK, _WHITE = 0.06, 0.86
+_AMBIENT, _DIFFUSE = 0.6, 0.4
+# Squares across a tag: black border, data, black border.
+_SQUARES = 8
+
+
+class TagSheets:
+    """Tags on a rigid body, each on a sheet of its own that is seen from its front alone."""
+
+    def __init__(self, tags: Sequence[SimTag], dictionary: int) -> None:
+        patterns = cv2.aruco.getPredefinedDictionary(dictionary)
+        self._tags = tuple(tags)
+        self._turns = [Rotation.from_euler("xyz", tag.rpy).as_matrix() for tag in tags]
+        # One pixel a square, from the top left; True where it is black.
+        self._black = [patterns.generateImageMarker(tag.id, _SQUARES, borderBits=1) < 128 for tag in tags]
+
+    def cast(
+        self, directions: FloatArray, x: FloatArray, R: FloatArray, depth: FloatArray, to_light: FloatArray
+    ) -> tuple[np.ndarray, FloatArray]:
+        """Return the mask of the rays that hit a sheet before anything else, and its colour there.
+
+        Args:
+            directions: rays (n, m, 3) in the eye's optical frame with z = 1.
+            x, R: the marker's pose in that frame, (3,) [m] and (3, 3).
+            depth: distance along z of everything else (n, m) [m].
+            to_light: unit vector to the light (3,) in that frame.
+
+        Returns:
+            The mask (n, m) and the colours (k, 3), 0 to 255, of the rays in the mask.
+        """
+        nearest, level = depth.copy(), np.full(depth.shape, np.nan)
+        for tag, turn, black in zip(self._tags, self._turns, self._black, strict=True):
+            axes, centre = R @ turn, x + R @ np.array(tag.xyz)
+            facing = directions @ axes[:, 2]
+            seen = facing < 0.0
+            z = np.divide(centre @ axes[:, 2], facing, out=np.full(depth.shape, np.inf), where=seen)
+            seen &= (z > 0.0) & (z < nearest)
+            place = (directions[seen] * z[seen][:, None] - centre) @ axes[:, :2]
+            on_sheet = np.abs(place).max(axis=1) < tag.half_sheet_m
+            seen[seen] = on_sheet
+            lit = _AMBIENT + _DIFFUSE * max(float(axes[:, 2] @ to_light), 0.0)
+            level[seen] = lit * np.where(_is_black(place[on_sheet] / tag.side_m, black), _BLACK, _WHITE)
+            nearest[seen] = z[seen]
+        mask = np.isfinite(level)
+        return mask, np.repeat(255.0 * level[mask][:, None], 3, axis=1)
+
+
+def _is_black(place: FloatArray, black: np.ndarray) -> np.ndarray:
+    """Return a mask (k,) of the points (k, 2) that are black on a tag of side 1, x right and y up from its middle."""
+    column = np.floor((place[:, 0] + 0.5) * _SQUARES).astype(np.intp)
+    row = np.floor((0.5 - place[:, 1]) * _SQUARES).astype(np.intp)
+    inside = (column >= 0) & (column < _SQUARES) & (row >= 0) & (row < _SQUARES)
+    return inside & black[row.clip(0, _SQUARES - 1), column.clip(0, _SQUARES - 1)]
+
 
 TO_LIGHT = np.array([0.35, 0.45, 0.82]) / np.linalg.norm([0.35, 0.45, 0.82])
 # Free pixels around the marker in its finely sampled rectangle, and the most samples across it.

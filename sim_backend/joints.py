@@ -45,10 +45,7 @@ class JointPaths:
     @property
     def plain(self) -> bool:
         """True if the joints are at the drive positions: no effect moves them."""
-        return not any(
-            effect.kind.encoder is not None or effect.name in ("joint_compliance", "gravity_backlash", "camera_latency")
-            for effect in self._truth.beyond.all_effects
-        )
+        return not any(effect.kind.moves_joints for effect in self._truth.beyond.all_effects)
 
     def record(self, angles: FloatArray, t: float) -> None:
         """Record the drive positions `angles` (d,) [rad or m] at the time t [s], one step after the last record."""

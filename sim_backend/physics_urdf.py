@@ -169,7 +169,7 @@ class _Writer:
         else:
             sizes = {key: _sizes(geometry.get(key), 3 if key == "size" else 1) for key in _SIZES.get(geometry.tag, ())}
             if not sizes or not all(sizes.values()):
-                self._leave_out(f"a {geometry.tag} of the link {link!r} with a size that cannot be drawn")
+                self._leave_out(f"a {geometry.tag} of the link {link!r} with an invalid size")
                 return None
             ElementTree.SubElement(into, geometry.tag, {key: _numbers(size or ()) for key, size in sizes.items()})
         if source.tag == "visual":

@@ -53,24 +53,25 @@ def scene_of(
     T_world_camera = T_world_placed @ beyond.camera_moves(row)[0]
     x_world = T_world_hand[:3, :3] @ tip + T_world_hand[:3, 3]
     x_camera = T_world_camera[:3, :3].T @ (x_world - T_world_camera[:3, 3])
-    x_eyes, x_seen = _through_lenses(beyond, calibration, x_camera, beyond.added(row)[0])
+    x_eyes, x_seen = _through_lenses(beyond, calibration, x_camera, row)
     R_camera_marker = T_world_camera[:3, :3].T @ T_world_hand[:3, :3] @ truth.tool_turn
     return Scene(body.angles(), T_world_camera, x_world, tip, x_eyes, R_camera_marker, x_seen)
 
 
 def _through_lenses(
-    simulation: Simulation, calibration: StereoCalibration, x_camera: FloatArray, added: FloatArray
+    simulation: Simulation, calibration: StereoCalibration, x_camera: FloatArray, row: Motion
 ) -> tuple[FloatArray, FloatArray]:
     """Return a point's apparent position in each eye (eyes, 3) and its triangulated position (3,) [m].
 
-    The shift `added` (3,) [m] of the triangulated position moves the images accordingly. A longer focal length makes
+    What shifts the triangulated position beyond the lenses moves the images accordingly. A longer focal length makes
     the image larger, so the point appears nearer.
     """
     optics = simulation.optics
     eyes = calibration.eyes_m
     rays = np.concatenate(optics.rays(x_camera[None], calibration))[: len(eyes)]
-    reported = optics.reported(x_camera[None], calibration)[0]
-    before, after = reported - eyes, reported + added - eyes
+    by_lenses = optics.reported(x_camera[None], calibration)
+    seen = (simulation.altered(by_lenses, row) + simulation.added(row))[0]
+    before, after = by_lenses[0] - eyes, seen - eyes
     rays += after[:, :2] / after[:, 2:] - before[:, :2] / before[:, 2:]
     x_eyes = np.column_stack([rays, np.ones(len(eyes))]) * (x_camera[2] / (1.0 + optics.focal_error))
-    return x_eyes, reported + added
+    return x_eyes, seen

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bodyschema.effects import Effect, Simulation
+from bodyschema.effects.effect_type import ToolEffect
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, frozen_array
 from bodyschema.robot.description import RobotDescription
@@ -21,8 +22,6 @@ from .randomness import Stream, generator
 
 # The offset of a prismatic joint is known better than that of a revolute one: metres of error per radian.
 _METRES_PER_RADIAN = 0.1
-# Effects that the true kinematic chain includes.
-GEOMETRY = frozenset({"joint_offset", "link_geometry", "tool_offset", "camera_pose"})
 
 
 @dataclass(frozen=True)
@@ -60,8 +59,9 @@ class TrueRobot:
         way = [joint.name for joint, _ in robot.tree.path(robot.camera.parent_link, robot.robot.marker_link)]
         moving = [name for name in way if robot.tree.joints[name].kind in MOVING]
         offsets = {name: _offset(robot.tree.joints[name], errors, rng) for name in moving}
-        for effect in _named(extension, "joint_offset"):
-            offsets[effect.where or ""] -= effect.values[0]
+        for effect in extension.all_effects:
+            if effect.kind.is_zero:
+                offsets[effect.where or ""] -= effect.values[0]
         joints = dict(robot.tree.joints)
         for place, moved in extension.link_moves:
             joint = joints[robot.joints[place]]
@@ -71,8 +71,9 @@ class TrueRobot:
             joints[name] = replace(joints[name], T_parent_joint=frozen_array(joints[name].T_parent_joint @ error))
         camera_error = _pose_error(errors.camera_position_m, errors.camera_rotation_rad, rng)
         tool_error = errors.tool_m * rng.standard_normal(3)
-        for effect in _named(extension, "tool_offset"):
-            tool_error = tool_error + effect.values
+        for effect in extension.all_effects:
+            if effect.kind.rigid and isinstance(effect.kind, ToolEffect):
+                tool_error = tool_error + effect.kind.shift(effect.values)
         tool_turn = Rotation.from_rotvec(errors.tool_rotation_rad * rng.standard_normal(3)).as_matrix()
         for name, joint in joints.items():
             if joint.kind in MOVING and name not in robot.joints:
@@ -123,11 +124,7 @@ def with_offsets(chain: RigidChain, offsets: FloatArray) -> RigidChain:
 
 def _bent(effects: Iterable[Effect]) -> list[Effect]:
     """Return the effects that no tree of rigid links can represent."""
-    return [effect for effect in effects if effect.name not in GEOMETRY]
-
-
-def _named(simulation: Simulation, name: str) -> list[Effect]:
-    return [effect for effect in simulation.all_effects if effect.name == name]
+    return [effect for effect in effects if not effect.kind.rigid]
 
 
 def _offset(joint: UrdfJoint, errors: ErrorConfig, rng: np.random.Generator) -> float:

@@ -29,6 +29,8 @@ _MOST_UNEVEN = 0.3
 _MOST_OFF = 0.15
 # Grey level of an over-exposed pixel, and the largest share of such pixels on a ball that can be measured.
 _WHITE, _MOST_WHITE = 250, 0.35
+# Radius of the ball to which `max_centre_sigma_px` applies [px].
+_SMALL_PX = 5.0
 # 1-sigma of the centre of a patch that could not be measured, as a share of its radius.
 _ROUGH_SIGMA = 0.1
 # A patch at the border is a partly visible ball if this many outline points lie on a circle, within this share of the
@@ -156,10 +158,14 @@ def measure(image: ImageArray, patch: Patch, eye: Pinhole, gate: Gate, config: V
     corner = np.array([around.left, around.top], dtype=np.float64)
     pixels, shape = around.crop(image).astype(np.float32), eye.shape(patch.centre_px)
     outline = fit_outline(pixels, gate, patch.centre_px - corner, patch.radius_px, shape)
-    if outline is not None:
-        outline = refine_outline(pixels, gate, outline, shape) if _is_whole(outline, config) else None
-    if outline is None or math.sqrt(float(outline.cov_px.diagonal().max())) > config.max_centre_sigma_px:
+    if outline is None:
         return Reason.OCCLUDED
+    reason = _not_whole(outline, config)
+    if reason is not None:
+        return reason
+    outline = refine_outline(pixels, gate, outline, shape)
+    if outline is None or not _is_sure(outline, config):
+        return Reason.NOT_ROUND
     centre_px = outline.centre_px + corner
     reach = outline.radius_px + config.border_margin_px
     if (centre_px - reach < 0).any() or (centre_px + reach > (width - 1, height - 1)).any():
@@ -206,8 +212,17 @@ def _cut_circle(image: ImageArray, patch: Patch, gate: Gate) -> tuple[FloatArray
     return centre_px, radius_px + 0.5
 
 
-def _is_whole(outline: Outline, config: VisionConfig) -> bool:
-    return outline.visible >= config.min_visible and outline.uneven <= _MOST_UNEVEN and outline.off <= _MOST_OFF
+def _is_sure(outline: Outline, config: VisionConfig) -> bool:
+    """Return True if the centre is sure enough; the limit is that of a small ball and grows with the radius."""
+    limit_px = config.max_centre_sigma_px * max(1.0, outline.radius_px / _SMALL_PX)
+    return math.sqrt(float(outline.cov_px.diagonal().max())) <= limit_px
+
+
+def _not_whole(outline: Outline, config: VisionConfig) -> Reason | None:
+    """Return the reason why an outline is not that of a whole ball, or None."""
+    if outline.visible < config.min_visible or outline.off > _MOST_OFF:
+        return Reason.OCCLUDED
+    return Reason.LOW_CONTRAST if outline.uneven > _MOST_UNEVEN else None
 
 
 def _level(image: ImageArray, box: Region, centre_px: FloatArray, radius_px: float, gate: Gate) -> float:

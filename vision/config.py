@@ -59,7 +59,8 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         min_pixels: a patch of the marker's colour smaller than this is no candidate [px²].
         border_margin_px: how far the ball's outline has to stay from the image border [px].
         min_visible: share of the outline that has to be seen where the fitted ellipse says.
-        max_centre_sigma_px: a centre less certain than this is doubtful: what was fitted is no ellipse [px].
+        max_centre_sigma_px: a centre less certain than this is doubtful: what was fitted is no ellipse [px]. It applies
+            up to a radius of 5 px, and in proportion to larger ones.
         epipolar_px: largest difference of the eyes' rows [px], on top of the noise of the two centres ...
         epipolar_sigmas: ... which counts this many times, in sizes too.
         eye_size_ratio: largest ratio of the sizes the two eyes claim for the ball, besides noise.

@@ -11,13 +11,18 @@ from numpy.typing import ArrayLike
 
 from bodyschema.interfaces.records import FloatArray
 
-Model = Literal["pinhole", "fisheye"]
+Model = Literal["pinhole", "fisheye", "rational"]
 
-# k1, k2, p1, p2, k3 of the radial and tangential model; k1 to k4 of Kannala & Brandt 2006.
+# k1, k2, p1, p2, k3 of the radial and tangential model; k1 to k4 of Kannala & Brandt 2006; the radial and tangential
+# model over 1 + k4 r² + k5 r⁴ + k6 r⁶. The simpler ones stand first.
 DISTORTION_NAMES: dict[Model, tuple[str, ...]] = {
     "pinhole": ("k1", "k2", "p1", "p2", "k3"),
     "fisheye": ("k1", "k2", "k3", "k4"),
+    "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
+# The largest x/z and y/z that a rectified image shows: beyond, a fisheye's image is stretched out.
+WIDEST = 1.2
+_RAYS, _STEPS = 64, 64
 _ITERATIONS = 30
 _CONVERGED = 1e-12
 _WIDEST_RAD = 1.5
@@ -26,10 +31,10 @@ _LEAST_SLOPE = 0.05
 
 @dataclass(frozen=True)
 class Lens:
-    """OpenCV's pinhole model with five coefficients, or its fisheye model with four.
+    """OpenCV's pinhole model with five coefficients, its fisheye model with four, or its rational model with eight.
 
     Attributes:
-        model: which of the two.
+        model: which of them.
         focal_px: (fx, fy).
         principal_point_px: (cx, cy); integer coordinates are pixel centres.
         distortion: in the order of `DISTORTION_NAMES`.
@@ -75,7 +80,7 @@ class Lens:
             `vector`, with u and v of one point in neighbouring rows.
         """
         points, distortion = np.ascontiguousarray(x, dtype=np.float64).reshape(-1, 1, 3), np.array(self.distortion)
-        if self.model == "pinhole":
+        if self.model != "fisheye":
             seen = cv2.projectPoints(points, rotation, translation, self.matrix, distortion)
             px, J = (np.asarray(each, dtype=np.float64) for each in seen[:2])
             return px.reshape(-1, 2), J[:, :6], J[:, 6 : 10 + len(distortion)]
@@ -91,6 +96,23 @@ class Lens:
             seen = np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
             return flat / seen * np.tan(self._angle(seen))
         return self._undistorted(flat, px)
+
+    def is_one_to_one(self, image_size_px: tuple[int, int]) -> bool:
+        """Return False if the lens folds over within the image: two directions would be seen at one point of it.
+
+        A polynomial of the distortion turns back somewhere; a fit to corners does not keep that out of the image.
+        Directions beyond `WIDEST` do not count.
+        """
+        turn = 2.0 * np.pi * np.arange(_RAYS) / _RAYS
+        across = WIDEST / np.maximum(np.abs(np.cos(turn)), np.abs(np.sin(turn)))
+        rays = np.stack([np.cos(turn), np.sin(turn)], axis=1) * across[:, None]
+        ahead = np.linspace(0.0, 1.0, _STEPS)[:, None, None] * rays
+        px = self.project(np.concatenate([ahead, np.ones((*ahead.shape[:2], 1))], axis=2).reshape(-1, 3))
+        px = px.reshape(*ahead.shape[:2], 2)
+        outward = np.sum(np.diff(px, axis=0) * rays, axis=2) > 0.0
+        inside = ((px >= 0.0) & (px <= np.array(image_size_px) - 1.0)).all(axis=2)[:-1]
+        # What comes back into the image behind the fold is no worse than the fold.
+        return bool(np.all(outward | ~np.logical_and.accumulate(inside, axis=0)))
 
     def _angle(self, seen: FloatArray) -> FloatArray:
         """Return the angle off the axis [rad] for a distance from the principal point in focal lengths."""

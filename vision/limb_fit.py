@@ -38,8 +38,8 @@ _LEAST_SLOPE = 0.4
 # arcs, in the slow ones, which the claim follows. Beyond so many times the variance of the samples, as far as the
 # channels agree on that, it is no ball's limb alone.
 _LARGEST_DENSITY = 10.0
-# A larger deviation from the circle (RMS without noise, share of the radius) is angular: a small, blurred square.
-_MOST_ANGULAR = 0.05
+# A larger deviation from the circle (RMS without noise, share of the radius, and of the blur) is angular: a square.
+_MOST_ANGULAR, _MOST_ANGULAR_BLURS = 0.05, 0.25
 # What a lens leaves of its distortion makes a limb oval, by this part of its radius at most, but fits all around.
 _MOST_OVAL, _CLEAN_DENSITY = 0.015, 3.0
 # Smaller deviations (RMS, share of the radius) occur on every ball (seams, dust, dents) and are no occlusion.
@@ -120,7 +120,7 @@ def fit_limb(
     aliased = blur_px < _ALIASED_PX
     if fit is None:
         return None
-    is_angular = fit.off_px > _MOST_ANGULAR * radius_px
+    is_angular = fit.off_px > max(_MOST_ANGULAR * radius_px, _MOST_ANGULAR_BLURS * blur_px)
     if (is_angular or fit.waves.quick > _LARGEST_DENSITY * excess) and not aliased:
         return None
     told = waves(fit.pulls, radius_px, fit.first).mean

@@ -48,8 +48,8 @@ _UNEVEN_PX = 0.4
 # Residuals beyond this are no longer edge noise [px], whatever the spread is.
 _LEAST_GATE_PX, _LARGEST_GATE_PX, _GATE_SIGMAS = 0.8, 2.0, 3.5
 # An arc is not the ball's edge if its mean is off by more than this: arc's share of the outline, least number of rays
-# to either side, limit [px].
-_ARC, _LEAST_HALF_ARC, _OFF_PX = 0.1, 3, 0.35
+# to either side, limit [px], and limit as a share of the radius: real balls have seams, dimples and dark undersides.
+_ARC, _LEAST_HALF_ARC, _OFF_PX, _OFF_SHARE = 0.1, 3, 0.35, 0.05
 # Number of arcs of the outline; any three give a candidate circle.
 _ARCS = 10
 # If no point is farther than this from the circle through all, none is left out [px].
@@ -255,11 +255,11 @@ def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> Outl
         radius_sigma_px=math.sqrt(inverse[2, 2]),
         visible=1.0 - float(np.mean(hidden)),
         uneven=float(np.mean(edges.uneven | (apart & ~hidden))),
-        off=_share_off(edges.weight, residual),
+        off=_share_off(edges.weight, residual, max(_OFF_PX, _OFF_SHARE * float(solution[2]))),
     )
 
 
-def _share_off(weight: FloatArray, residual: FloatArray) -> float:
+def _share_off(weight: FloatArray, residual: FloatArray, limit_px: float) -> float:
     """Return the share of the weights (n,) where the residuals (n,) [px], averaged over an arc, exceed edge noise.
 
     Noise and aliasing change from ray to ray; an object that covers part of the ball moves the edge in a whole arc.
@@ -267,7 +267,7 @@ def _share_off(weight: FloatArray, residual: FloatArray) -> float:
     half = max(_LEAST_HALF_ARC, round(len(weight) * _ARC / 2))
     clipped = weight * np.clip(residual, -_LARGEST_GATE_PX, _LARGEST_GATE_PX)
     moved, among = _arc_sums(clipped, half), _arc_sums(weight, half)
-    return float(weight @ (np.abs(moved) > _OFF_PX * among) / weight.sum())
+    return float(weight @ (np.abs(moved) > limit_px * among) / weight.sum())
 
 
 def _arc_sums(values: FloatArray, half: int) -> FloatArray:

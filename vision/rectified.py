@@ -16,12 +16,10 @@ from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import StereoEyes
 from bodyschema.interfaces.records import FloatArray, ImageArray, StereoFrame
 
-from .lens import Lens
+from .lens import WIDEST, Lens
 from .rig import CalibrationError, OneEyeRig, Rig
 
 _BORDER_POINTS = 64
-# Of directions that a rectified image may show, the largest x/z and y/z: beyond, a fisheye's image is stretched out.
-_WIDEST = 1.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,12 +63,12 @@ class Rectification:
         Its `pixel_sigma` is the error of views that were not calibrated with, at the rectified focal length.
 
         Raises:
-            CalibrationError: the eyes do not look the same way.
+            CalibrationError: the eyes share no view, or a lens folds over within its image.
         """
         width, height = self.rig.image_size_px
         low, high = self._common_view()
         if np.any(high - low < 0.1):
-            raise CalibrationError("the cameras do not look the same way: both see almost nothing. Turn them parallel")
+            raise CalibrationError(self._why_no_view())
         focal = float(max((width - 1) / (high[0] - low[0]), (height - 1) / (high[1] - low[1])))
         centre = 0.5 * np.array([width - 1, height - 1]) - 0.5 * focal * (low + high)
         own = float(np.mean([lens.focal_px for lens, _ in self.eyes]))
@@ -104,6 +102,15 @@ class Rectification:
         x, y = (own[:, k].reshape(height, width).astype(np.float32) for k in range(2))
         return cv2.convertMaps(x, y, cv2.CV_16SC2)  # pyright: ignore
 
+    def _why_no_view(self) -> str:
+        if not all(lens.is_one_to_one(self.rig.image_size_px) for lens, _ in self.eyes):
+            return (
+                f"the {self.rig.model} lens model folds over within the image. Calibrate again, with the board in the "
+                "image's corners too"
+            )
+        apart = np.degrees(np.arccos(np.clip(self.eyes[-1][1][2] @ self.eyes[0][1][2], -1.0, 1.0)))
+        return f"the cameras share almost no view: their lines of sight are {apart:.0f}° apart. Turn them parallel"
+
     def _common_view(self) -> tuple[FloatArray, FloatArray]:
         """Return the limits (x/z, y/z) of the largest upright rectangle that all eyes' images fill."""
         views = [_filled(lens, R, self.rig.image_size_px) for lens, R in self.eyes]
@@ -120,7 +127,7 @@ def _filled(lens: Lens, R: FloatArray, size_px: tuple[int, int]) -> tuple[FloatA
         np.column_stack([x * (width - 1), y * (height - 1)])
         for x, y in ((ends, along), (along, ends), (ends + 1.0, along), (along, ends + 1.0))
     ]
-    left, top, right, bottom = (np.clip(_turned(lens.directions(side), R), -_WIDEST, _WIDEST) for side in sides)
+    left, top, right, bottom = (np.clip(_turned(lens.directions(side), R), -WIDEST, WIDEST) for side in sides)
     low = np.array([left[:, 0].max(), top[:, 1].max()])
     return low, np.array([right[:, 0].min(), bottom[:, 1].min()])
 
@@ -137,7 +144,7 @@ class RectifiedCamera:
         """Compute the maps. Whether these are the cameras that were calibrated is seen when they are opened.
 
         Raises:
-            CalibrationError: the calibrated eyes do not look the same way.
+            CalibrationError: the calibrated eyes share no view, or a lens folds over within its image.
         """
         self._eyes, self._rig = eyes, rig
         rectification = Rectification(rig)

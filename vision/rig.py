@@ -229,3 +229,9 @@ def split(model: Model, vector: FloatArray) -> tuple[Lens, Lens, FloatArray, Flo
     n = 4 + len(DISTORTION_NAMES[model])
     left, right = Lens.from_vector(model, vector[:n]), Lens.from_vector(model, vector[n : 2 * n])
     return left, right, vector[2 * n : 2 * n + 3], vector[2 * n + 3 :]
+
+
+def lenses_of(model: Model, vector: FloatArray) -> tuple[Lens, ...]:
+    """Return the lenses in a vector of all parameters: one, or left and right."""
+    alone = lens_of_one(model, vector)
+    return split(model, vector)[:2] if alone is None else (alone,)

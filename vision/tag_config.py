@@ -25,8 +25,8 @@ class TagConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         side_m: side of its black square as printed [m]: measure it.
         min_side_px: a shorter side is too small to be measured [px].
         min_contrast: least difference of white and black [grey levels].
-        min_visible: share of each edge that has to be straight.
-        max_edge_px: an edge whose points scatter more is covered by something, or blurred by motion [px].
+        min_visible: share of each edge that has to be on a line.
+        max_corner_sigma: largest 1-sigma of a corner, as a share of the side: edges that are not straight.
         epipolar_px: largest difference of the eyes' rows [px], on top of the noise ...
         epipolar_sigmas: ... which counts this many times.
         size_tolerance: largest part by which the printed size may contradict the stereo depth, on top of its noise.
@@ -39,7 +39,7 @@ class TagConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     min_side_px: Annotated[float, Meta(ge=12)] = 20.0
     min_contrast: Annotated[float, Meta(ge=10)] = 40.0
     min_visible: Annotated[float, Meta(ge=0.5, le=1)] = 0.7
-    max_edge_px: Positive = 0.35
+    max_corner_sigma: Positive = 0.02
     epipolar_px: Annotated[float, Meta(ge=0)] = 0.5
     epipolar_sigmas: Annotated[float, Meta(ge=0)] = 4.0
     size_tolerance: Annotated[float, Meta(ge=0)] = 0.03

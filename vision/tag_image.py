@@ -6,6 +6,7 @@ is estimated from the edges themselves. The corners are the intersections of the
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,18 +15,28 @@ from scipy.fft import dct
 from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
 
 from .tag_config import TagConfig
-from .tag_edge import LONGEST_REACH_PX, SHARPEST_PX, Edge, find_edge
+from .tag_edge import LONGEST_REACH_PX, MODULES, SHARPEST_PX, Edge, Light, find_edge
 
 # Most iterations; converged when no corner moved by more than this [px] and the blur by no more than this share.
 _ROUNDS, _SETTLED_PX, _SETTLED_BLUR = 8, 0.01, 0.02
-# Initial blur of lens and interpolation (1-sigma), and the largest [px].
-_USUAL_BLUR_PX, _WIDEST_PX = 0.85, 3.0
-# Weight of the initial blur; an edge whose lines reach twice as far as its blur has weight 1.
-_USUAL_WEIGHT = 0.1
+# Corners are rough until they move by less than this [px], for at most these rounds more than one.
+_ROUGH_PX, _ROUGH_ROUNDS = 0.7, 2
+# Usual blur of lens and interpolation (1-sigma); its prior spread, in an image with a noise of one grey level; the
+# largest blur [px].
+_USUAL_BLUR_PX, _USUAL_SIGMA_PX, _WIDEST_PX = 0.85, 0.1, 3.0
+# A blur that is a larger share of a module is the cause where corners are not sure.
+_MOST_BLUR = 0.5
+# Largest factor of the blur's change from one round to the next.
+_LARGEST_WIDENING = 1.5
 # Prior factor by which interpolation correlates neighbouring points' errors, and its weight in waves along the edges.
 _SMOOTHED, _SMOOTHED_WAVES = 1.5, 10
 # Slow waves have half-periods of at least this many points; least upper bound of their indices.
 _SLOW, _LEAST_QUICKEST = 4, 4
+# Power of the wave number with which the waves' weights fall.
+_STEEPNESS = 1.0
+
+
+_EVEN = Light(np.zeros((2, 2)), np.zeros((2, 2, 2)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +58,9 @@ def measure_tag(grey: ImageArray, id: int, corners_px: FloatArray, config: TagCo
     """Measure the tag whose corners are near `corners_px` (4, 2) in a grey image, or return why it is doubtful."""
     edges: list[Edge] = []
     blur_px = _USUAL_BLUR_PX
-    for _ in range(_ROUNDS):
-        found = [find_edge(grey, corners_px, side, blur_px, config) for side in range(4)]
+    light: Light | None = None
+    for number in range(_ROUNDS):
+        found = [find_edge(grey, corners_px, side, blur_px, light, config) for side in range(4)]
         reasons = [edge for edge in found if isinstance(edge, Reason)]
         if reasons:
             return reasons[0]
@@ -57,34 +69,59 @@ def measure_tag(grey: ImageArray, id: int, corners_px: FloatArray, config: TagCo
         moved_px, before_px = float(np.abs(moved - corners_px).max()), blur_px
         if moved_px > LONGEST_REACH_PX:
             return Reason.OCCLUDED
-        corners_px, blur_px = moved, _blur(edges, blur_px)
-        if moved_px < _SETTLED_PX and abs(blur_px - before_px) < _SETTLED_BLUR * blur_px:
+        rough = light is None
+        if not rough:
+            light = _light(edges)
+        elif moved_px < _ROUGH_PX or number == _ROUGH_ROUNDS:
+            light = _EVEN
+        corners_px, blur_px = moved, blur_px if rough else _blur(edges, blur_px)
+        if not rough and moved_px < _SETTLED_PX and abs(blur_px - before_px) < _SETTLED_BLUR * blur_px:
             break
-    return TagImage(id, corners_px, _corner_covariance(edges))
+    shortest_px = min(2.0 * edge.half_length for edge in edges)
+    if shortest_px < config.min_side_px:
+        return Reason.NO_MARKER
+    cov_px = _corner_covariance(edges)
+    if math.sqrt(float(np.diag(cov_px).max())) > config.max_corner_sigma * shortest_px:
+        return Reason.BLURRED if blur_px * MODULES > _MOST_BLUR * shortest_px else Reason.NOT_STRAIGHT
+    return TagImage(id, corners_px, cov_px)
 
 
 def _blur(edges: list[Edge], before_px: float) -> float:
-    """Estimate the blur (1-sigma) [px] of all edges, from the previous estimate `before_px`.
+    """Estimate the blur (1-sigma) [px] of all edges, from the previous estimate `before_px`."""
+    usual = _USUAL_SIGMA_PX**-2
+    wider = sum(edge.widening for edge in edges) + usual * (_USUAL_BLUR_PX - before_px)
+    factor = 1.0 + wider / (usual + sum(edge.information for edge in edges)) / before_px
+    factor = min(max(factor, 1.0 / _LARGEST_WIDENING), _LARGEST_WIDENING)
+    return min(max(factor * before_px, SHARPEST_PX), _WIDEST_PX)
 
-    An edge whose lines hardly reach beyond its blur has little weight.
-    """
-    weights = [max(edge.reach_px / before_px - 1.0, 0.0) ** 2 for edge in edges]
-    ratios = [edge.area_px / edge.expected_area_px for edge in edges]
-    change = (_USUAL_WEIGHT * _USUAL_BLUR_PX / before_px + np.dot(weights, ratios)) / (_USUAL_WEIGHT + sum(weights))
-    return min(max(before_px * float(change), SHARPEST_PX), _WIDEST_PX)
+
+def _light(edges: list[Edge]) -> Light:
+    """Return the light that the levels along the edges show."""
+    places = np.concatenate([edge.places for edge in edges])
+    levels = np.concatenate([edge.levels for edge in edges])
+    design = places - places.mean(axis=0)
+    inverse = np.linalg.inv(design.T @ design)
+    gradients = inverse @ design.T @ levels
+    left = levels - levels.mean(axis=0) - design @ gradients
+    variance = np.square(left).sum(axis=0) / (len(places) - 3)
+    return Light(np.asarray(gradients.T, np.float64), variance[:, None, None] * inverse)
 
 
 def _likeness(edges: list[Edge]) -> float:
     """Return the variance of neighbouring points' mean relative to that of independent points.
 
-    Interpolation and blur spread a pixel's noise to its neighbours. So slow waves along the edges, of which place and
-    slope are the slowest, have more noise than quick ones.
+    Interpolation and blur spread a pixel's noise to its neighbours, and neither a print nor a lens is straight. So slow
+    waves along the edges have more noise than quick ones. Place and slope are the slowest; the next ones, the slower
+    the more, tell their noise.
     """
     power, count = _SMOOTHED_WAVES * _SMOOTHED, float(_SMOOTHED_WAVES)
     for edge in edges:
         quickest = max(len(edge.residuals) // _SLOW, _LEAST_QUICKEST)
-        slow = np.asarray(dct(edge.residuals, norm="ortho"))[2:quickest]
-        power, count = power + float(np.square(slow).sum()), count + len(slow)
+        slow = np.square(np.asarray(dct(edge.residuals, norm="ortho"))[2:quickest])
+        weight = np.arange(2, 2 + len(slow)) ** -_STEEPNESS
+        share = weight / weight.sum()
+        told = 1.0 / float(share @ share)
+        power, count = power + told * float(share @ slow), count + told
     return power / count
 
 

@@ -43,7 +43,16 @@ _TWO_POSES_RAD, _CLEARLY_WORSE = 0.05, 12.0
 # share of the angle between the two.
 _STAYED = 1.0 / 3.0
 # Reasons, the most informative first, for a frame in which all tags were rejected.
-_TELLING = (Reason.AMBIGUOUS, Reason.EPIPOLAR, Reason.OCCLUDED, Reason.AT_BORDER, Reason.NO_MARKER)
+_TELLING = (
+    Reason.AMBIGUOUS,
+    Reason.EPIPOLAR,
+    Reason.OCCLUDED,
+    Reason.NOT_STRAIGHT,
+    Reason.BLURRED,
+    Reason.LOW_CONTRAST,
+    Reason.AT_BORDER,
+    Reason.NO_MARKER,
+)
 
 
 class TagTracker:

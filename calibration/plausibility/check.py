@@ -200,7 +200,7 @@ def plausibility(
             found = _turned_last(names, fit, *held)
     if found.refusal is None or len(q) >= FEWEST_ROWS:
         return found
-    few = f"{found.refusal}. {found.remedy}. (These are {len(q)} pairs: {FEWEST_ROWS} would tell.)"
+    few = f"{found.refusal}. {found.remedy}. (These are {len(q)} pairs: {FEWEST_ROWS} are needed to decide.)"
     return Plausibility(warnings=(few,))
 
 

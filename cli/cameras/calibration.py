@@ -105,7 +105,7 @@ class CamerasFile(msgspec.Struct):
 
 
 class CheckFile(msgspec.Struct):
-    """Output of `bodyschema calibrate check --json`. Half widths are those of 95 % intervals."""
+    """Output of `bodyschema calibrate cameras --check --json`. Half widths are those of 95 % intervals."""
 
     holds: bool
     wrong: list[str]
@@ -155,7 +155,7 @@ def as_printed(drawn: Board, ruler_mm: float | None) -> Board:
     scale = ruler_mm / length
     if not 0.5 < scale < 2.0:
         raise ConfigError(
-            f"--ruler-mm {ruler_mm:g}: the ruler across of this page is {length:g} mm as drawn",
+            f"--ruler-mm {ruler_mm:g}: the ruler across of this page is nominally {length:g} mm",
             remedy="Measure the line below the board, from the outer edge of its first tick to that of its last",
         )
     return replace(drawn, square_m=scale * drawn.square_m, marker_m=scale * drawn.marker_side_m)

@@ -70,7 +70,7 @@ def _sentences(found: CamerasFile) -> list[str]:
     # The size of the board moves it nearer or farther, and changes nothing of a lens.
     if not found.size_was_measured and found.baseline_mm is not None:
         said.append(
-            "No image tells whether the board is as large as it says: measure the line below it and give --ruler-mm, "
+            "No image shows whether the board has its stated size: measure the line below it and give --ruler-mm, "
             "or the distance of the lenses and give --baseline-mm."
         )
     if found.missing:

@@ -105,7 +105,7 @@ def as_printed(tags: Tags, drawn_mm: float, measured_mm: float) -> Tags:
     scale = measured_mm / drawn_mm
     if not 0.5 < scale < 2.0:
         raise ConfigError(
-            f"--ruler-mm {measured_mm:g}: the ruler across of this page is {drawn_mm:g} mm as drawn",
+            f"--ruler-mm {measured_mm:g}: the ruler across of this page is nominally {drawn_mm:g} mm",
             remedy="Measure the line below the drawing, from the outer edge of its first tick to that of its last",
         )
     return replace(tags, side_mm=scale * tags.side_mm)

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class DrawnBoard:
-    """The board as it is drawn."""
+class PrintedBoard:
+    """The board: as its page was written, and as it came out of the printer."""
 
     squares: Annotated[str, Parameter(help="Columns and rows of the board's squares, as in 8x6.")] = "8x6"
     square_mm: Annotated[float, Parameter(help="Nominal side of a square [mm].", validator=Number(gt=0))] = 30.0
@@ -34,8 +34,17 @@ class DrawnBoard:
         Parameter(help="`chessboard` has no markers; all of it has to be in view."),
     ] = "charuco"
 
-    def board(self) -> Board:
-        """Return the board. Raise ConfigError if the options describe no valid one."""
+    ruler_mm: Annotated[
+        float | None,
+        Parameter(
+            help="What the line below the board measures on the print [mm]; else it is what it says.",
+            validator=Number(gt=0),
+            show_default=False,
+        ),
+    ] = None
+
+    def drawn(self) -> Board:
+        """Return the board in its nominal size. Raise ConfigError if the options describe no valid one."""
         from bodyschema.cli.cameras.calibration import board_of
 
         return board_of(
@@ -46,26 +55,11 @@ class DrawnBoard:
             pattern=self.pattern,
         )
 
-
-@Parameter(name="*")
-@dataclass(frozen=True)
-class PrintedBoard(DrawnBoard):
-    """The board as it came out of the printer."""
-
-    ruler_mm: Annotated[
-        float | None,
-        Parameter(
-            help="What the line below the board measures on the print [mm]; else it is what it says.",
-            validator=Number(gt=0),
-            show_default=False,
-        ),
-    ] = None
-
     def board(self) -> Board:
         """Return the board in its printed size. Raise ConfigError if the options describe no valid one."""
         from bodyschema.cli.cameras.calibration import as_printed
 
-        return as_printed(super().board(), self.ruler_mm)
+        return as_printed(self.drawn(), self.ruler_mm)
 
 
 @Parameter(name="*")
@@ -76,7 +70,7 @@ class EyeFiles:
     left: Annotated[str | None, Parameter(help="Pattern of the left eye's files in it, as in cam0_*.png.")] = None
     right: Annotated[str | None, Parameter(help="Pattern of the right eye's.")] = None
     side_by_side: Annotated[bool, flag("Each image shows both eyes, the left one in its left half.")] = False
-    one: Annotated[bool, flag("All images are of one camera alone; --left may tell which of the folder's.")] = False
+    one: Annotated[bool, flag("All images are of one camera alone; --left may select them in the folder.")] = False
 
     def of(self, folder: Path) -> Images:
         """Return the images in `folder` that these options select."""
@@ -85,7 +79,7 @@ class EyeFiles:
         return Images(folder, self.left, self.right, self.side_by_side, self.one)
 
 
-AS_DRAWN, AS_PRINTED, BY_NAME = DrawnBoard(), PrintedBoard(), EyeFiles()
+AS_PRINTED, BY_NAME = PrintedBoard(), EyeFiles()
 
 EyeImages = Annotated[
     Path | None,

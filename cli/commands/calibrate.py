@@ -9,7 +9,7 @@ import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from bodyschema.cli.commands.calibrate_cameras import cameras, check
+from bodyschema.cli.commands.calibrate_cameras import cameras
 from bodyschema.cli.commands.latency import latency
 from bodyschema.cli.commands.options import (
     AS_THEY_ARE,
@@ -18,6 +18,7 @@ from bodyschema.cli.commands.options import (
     SourceRobotFile,
     flag,
     lerobot_lines,
+    print_json,
     robot_file,
 )
 
@@ -26,8 +27,7 @@ CAMERA_FRAME = "calibrated_camera"
 # Without a help of its own its page shows what `arm` says, beside the commands.
 calibrate = cyclopts.App(name="calibrate")
 calibrate.command(cameras, sort_key=1)
-calibrate.command(check, sort_key=2)
-calibrate.command(latency, sort_key=3)
+calibrate.command(latency, sort_key=2)
 
 
 @calibrate.default
@@ -104,7 +104,6 @@ def arm(
     the servos instead, by LeRobot's own calibration file.
     """
     import math
-    import sys
 
     from rich.console import Console
 
@@ -113,10 +112,9 @@ def arm(
     from bodyschema.calibration.plausibility.limits import require_units
     from bodyschema.calibration.report import CalibrationReport
     from bodyschema.calibration.rigid_chain import Calibration, CalibrationError
-    from bodyschema.cli.recordings.present_tool import first_pair
     from bodyschema.cli.terminal.calibration_view import two_tools, view
     from bodyschema.daemon.config import Config
-    from bodyschema.daemon.transport.wire import encode
+    from bodyschema.daemon.learner.checkpoint import first_pair
     from bodyschema.interfaces.errors import RequestError
     from bodyschema.recordings import files as recordings
     from bodyschema.robot.calibrated_files import write_calibrated
@@ -164,7 +162,7 @@ def arm(
         offsets = {zero.joint: math.radians(zero.zero) for zero in report.zeros if zero.half_width is not None}
         lines = lerobot_lines(config, lerobot, offsets, write=write)
     if as_json:
-        sys.stdout.write(encode(report).decode() + "\n")
+        print_json(report)
         return
     console = Console(highlight=False)
     console.print(view(report))

@@ -1,4 +1,4 @@
-"""`bodyschema calibrate cameras` and `bodyschema calibrate check`."""
+"""`bodyschema calibrate cameras`."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from bodyschema.cli.commands.board_options import AS_PRINTED, BY_NAME, EyeFiles, EyeImages, PrintedBoard
-from bodyschema.cli.commands.options import HERE, RobotFile, flag
+from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
 
 if TYPE_CHECKING:
     from bodyschema.cli.cameras.calibration import Board, Calibrated, CheckFile, Gathered, Wanted
     from bodyschema.daemon.config import Config
 
-CAMERAS = Path("cameras.toml")
+CAMERAS, BOARD = Path("cameras.toml"), Path("board.pdf")
 
 
 def cameras(
@@ -34,12 +34,13 @@ def cameras(
         float, Parameter(help="How well the size of a square is known, 1-sigma [%].", validator=Number(gte=0, lt=10))
     ] = 0.1,
     lens: Annotated[
-        Literal["auto", "pinhole", "fisheye"], Parameter(help="`auto`: what foretells views better.")
+        Literal["auto", "pinhole", "fisheye", "rational"], Parameter(help="`auto`: what foretells views better.")
     ] = "auto",
     left_serial: Annotated[
-        str, Parameter(help="What tells the left camera from all others; live, it is known.", show_default=False)
+        str,
+        Parameter(help="Serial number of the left camera, kept in the file; live, it is known.", show_default=False),
     ] = "",
-    right_serial: Annotated[str, Parameter(help="The same of the right camera.", show_default=False)] = "",
+    right_serial: Annotated[str, Parameter(help="Serial number of the right camera.", show_default=False)] = "",
     save: Annotated[
         Path | None, Parameter(help="Live: keep the images of all views in this folder, as IMAGES has them.")
     ] = None,
@@ -47,30 +48,55 @@ def cameras(
         Path | None,
         Parameter(help="The file to write, with a report beside it; else cameras.toml, live beside robot.toml."),
     ] = None,
+    check: Annotated[bool, flag("Check that a calibration still holds, from one look at the board.")] = False,
+    calibration: Annotated[
+        Path | None,
+        Parameter(help="With --check: the calibration; else cameras.toml, live the one in robot.toml."),
+    ] = None,
+    seconds: Annotated[
+        float, Parameter(help="With --check, live: how long the board is waited for [s].", validator=Number(gt=0))
+    ] = 60.0,
+    print_board: Annotated[bool, flag("Write the board as a page to print, OUT.pdf or OUT.svg, and end.")] = False,
+    paper: Annotated[str, Parameter(help="Of --print-board: A4, A3, A2, A1, A0, letter, legal or tabloid.")] = "A4",
     as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
 ) -> None:
     """Calibrate two cameras, or the lens of one, from views of a board: writes cameras.toml and a report.
 
     About 20 pairs of images, or 20 images of one camera alone (--one), the board held still in each: all over the
-    images, tilted by 20° to 40° each way, near and far. Without IMAGES the robot's own cameras look: it is said what to
-    show next, and a view is taken by itself as soon as the board is still and the view is new; it ends when the
-    calibration is good enough, or with Ctrl-C. Views that do not fit the others are left out and named. It is refused,
-    with the reasons, when it is not good enough; what is wrong with the board's size no image can tell, so measure the
-    ruler on the print. One camera alone does not need to know it.
+    images, tilted by 20° to 40° each way, near and far. Without IMAGES the robot's own cameras look: the command says
+    what to show next, and takes a view as soon as the board is still and the view is new; it ends when the calibration
+    is good enough, or with Ctrl-C. Views that do not fit the others are left out and named. A calibration that is not
+    good enough is refused, with the reasons. No image shows an error of the board's size, so measure the ruler on the
+    print. One camera alone does not need to know it.
 
-    Needs: the board that `bodyschema board` wrote (or a plain chessboard), and images of it, no hardware; or
-    robot.toml with cameras, and no sampler that runs.
+    --print-board writes the board in true size to --out, else board.pdf. Print it at 100 % ("actual size"), measure the
+    two rulers on the page, and glue the sheet onto something flat and stiff: glass, aluminium, thick board. A bent
+    sheet gives a wrong calibration that looks like a good one. Calibrate with the same options; add --ruler-mm if a
+    ruler does not have its stated length.
 
-    Next: open the report; `bodyschema calibrate check` whenever a camera may have been touched.
+    --check takes the last pair of images that shows the board to both eyes; without IMAGES the robot's own cameras look
+    until the board is held still. A camera that was turned up or down or about its line of sight moves the rows apart;
+    one that was turned inwards or outwards changes the size that a square seems to have. Exit code 1 when the
+    calibration does not hold.
+
+    Needs: the printed board (or a plain chessboard), and images of it, no hardware; or robot.toml with cameras, and no
+    running sampler.
+
+    Next: open the report; `bodyschema calibrate cameras --check` whenever a camera may have been touched.
     """
     from rich.console import Console
 
     from bodyschema.cli.cameras.calibration import Wanted, figures, write_calibrated_cameras
     from bodyschema.cli.cameras.calibration_view import cameras_view
     from bodyschema.daemon.config import Config
-    from bodyschema.daemon.transport.wire import encode
     from bodyschema.daemon.wiring.cameras import calibration_file, names_calibration
 
+    if print_board:
+        _print_board(printed.drawn(), paper, out or BOARD)
+        return
+    if check:
+        _check(images, files, printed, robot, calibration, seconds, as_json=as_json)
+        return
     board = printed.board()
     wanted = Wanted((left_serial, right_serial), lens, 0.01 * scale_sigma_percent, baseline_mm)
     named = True
@@ -84,7 +110,7 @@ def cameras(
     report = write_calibrated_cameras(result, found, out)
     told = figures(result, found, size_was_measured=printed.ruler_mm is not None or baseline_mm is not None)
     if as_json:
-        sys.stdout.write(encode(told).decode() + "\n")
+        print_json(told)
         return
     console = Console(highlight=False)
     console.print(cameras_view(told))
@@ -93,39 +119,21 @@ def cameras(
         console.print(f'In [vision.cameras] write\ncalibration = "{out.name}"', markup=False, soft_wrap=True)
 
 
-def check(
-    images: EyeImages = None,
-    /,
+def _check(
+    images: Path | None,
+    files: EyeFiles,
+    printed: PrintedBoard,
+    robot: Path,
+    calibration: Path | None,
+    seconds: float,
     *,
-    robot: RobotFile = HERE,
-    calibration: Annotated[
-        Path | None, Parameter(help="The calibration to check; else cameras.toml, live the one in robot.toml.")
-    ] = None,
-    files: EyeFiles = BY_NAME,
-    printed: PrintedBoard = AS_PRINTED,
-    seconds: Annotated[
-        float, Parameter(help="Live: how long the board is waited for [s].", validator=Number(gt=0))
-    ] = 60.0,
-    as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
+    as_json: bool,
 ) -> None:
-    """Check that a camera calibration still holds, from one look at the board.
-
-    The last pair of images that shows the board to both eyes is taken; without IMAGES the robot's own cameras look
-    until the board is held still. A camera that was turned up or down or about its line of sight moves the rows apart;
-    one that was turned inwards or outwards changes the size that a square seems to have. Exit code 1 when the
-    calibration does not hold.
-
-    Needs: cameras.toml, and a pair of images of the board, no hardware; or robot.toml with cameras, and no sampler that
-    runs.
-
-    Next: `bodyschema calibrate cameras` again, when it does not hold.
-    """
     from rich.console import Console
 
     from bodyschema.cli.cameras.calibration import checked
     from bodyschema.cli.cameras.calibration_view import check_view
     from bodyschema.daemon.config import Config
-    from bodyschema.daemon.transport.wire import encode
     from bodyschema.daemon.wiring.cameras import calibration_file
 
     board = printed.board()
@@ -135,11 +143,25 @@ def check(
         config = Config.load(robot)
         found, name = _checked_live(config, calibration or calibration_file(config), board, seconds)
     if as_json:
-        sys.stdout.write(encode(found).decode() + "\n")
+        print_json(found)
     else:
         Console(highlight=False).print(check_view(found, name))
     if not found.holds:
         sys.exit(1)
+
+
+def _print_board(made: Board, paper: str, out: Path) -> None:
+    from rich.console import Console
+
+    from bodyschema.cli.cameras.calibration import write_board
+
+    across, upright = write_board(made, paper, out)
+    Console(highlight=False).print(
+        f"{out} written: {made.name}. Print it at 100 %, then measure: the line below the board is {across:g} mm, the "
+        f"one beside it {upright:g} mm.",
+        markup=False,
+        soft_wrap=True,
+    )
 
 
 def _of_images(images: Path, files: EyeFiles, board: Board, wanted: Wanted) -> tuple[Gathered, Calibrated]:

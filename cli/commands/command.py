@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from bodyschema.cli.commands.options import HERE, RobotFile
+from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
 from bodyschema.daemon.transport.command_names import BOTHS, SAMPLERS, CommandName
 
 Process = Literal["sampler", "learner"]
@@ -21,6 +21,7 @@ def command(
         Parameter(help="Who is to do it; else who knows the command, and for pause, resume and reload the sampler."),
     ] = None,
     robot: RobotFile = HERE,
+    as_json: Annotated[bool, flag("Print the result as JSON.", name="--json")] = False,
 ) -> None:
     """Send a command to a running process.
 
@@ -52,4 +53,7 @@ def command(
     with client(config.route(process)) as bus:
         reply = bus.ask_one(Keys(config.robot.name).command(process), encode(CommandRequest(name)))
     done = decode(reply, CommandReply)
+    if as_json:
+        print_json(done)
+        return
     Console(highlight=False, soft_wrap=True).print(f"{process}: {done.message}", markup=False)

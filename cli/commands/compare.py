@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from bodyschema.cli.commands.options import flag
+from bodyschema.cli.commands.options import flag, print_json
 
 
 def compare(
@@ -29,13 +29,11 @@ def compare(
 
     Next: `bodyschema simulate` with another robot.toml; `bodyschema calibrate`.
     """
-    import sys
 
     from rich.console import Console
 
     from bodyschema.calibration.comparison import compared
     from bodyschema.cli.terminal.comparison_view import view
-    from bodyschema.daemon.transport.wire import encode
     from bodyschema.recordings import files as recordings
     from bodyschema.robot.description import RobotDescription
 
@@ -43,6 +41,6 @@ def compare(
     one, other = (recordings.opened(file, joints) for file in (first, second))
     report = compared(one, other, (str(first), str(second)))
     if as_json:
-        sys.stdout.write(encode(report).decode() + "\n")
+        print_json(report)
         return
     Console(highlight=False).print(view(report))

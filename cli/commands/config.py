@@ -3,48 +3,65 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-import cyclopts
-
-from bodyschema.cli.commands.options import HERE, RobotFile
+from bodyschema.cli.commands.options import HERE, RobotFile, flag
 
 if TYPE_CHECKING:
     from bodyschema.daemon.config import Config
     from bodyschema.effects import Effect
     from bodyschema.robot.description import RobotDescription
 
-config = cyclopts.App(
-    name="config",
-    help="""Check or show robot.toml.
-
-    Needs: robot.toml (`bodyschema init`) and the URDF that it names.
-
-    Next: `bodyschema config check`, then `bodyschema run`, or `bodyschema replay` for a recording.
-    """,
-)
+SCHEMA = 1  # of --json: robot.toml's tables, and this number
 
 
-@config.command(sort_key=2)
-def check(*, robot: RobotFile = HERE) -> None:
+def config(
+    *,
+    robot: RobotFile = HERE,
+    as_json: Annotated[
+        bool, flag("Print all settings in force as JSON, defaults and environment included.", name="--json")
+    ] = False,
+) -> None:
     """Check robot.toml: print what was understood, or the line to correct.
+
+    A setting can be changed for one call: `BODYSCHEMA_TABLE_KEY=value bodyschema COMMAND`.
 
     Needs: robot.toml (`bodyschema init`) and the URDF that it names.
 
     Next: `bodyschema replay` for a recording that you have; `bodyschema run`.
     """
-    from bodyschema.cli.recordings.synthesis import without_consequence
     from bodyschema.daemon.config import Config
+
+    loaded = Config.load(robot)
+    if as_json:
+        sys.stdout.write(_settings(loaded) + "\n")
+        return
+    loaded.require_learnable()
+    _say_understood(loaded)
+
+
+def _settings(config: Config) -> str:
+    """Return all settings as they are in force, as JSON."""
+    import msgspec
+
+    tables = {"schema": SCHEMA, **msgspec.to_builtins(config.tables)}
+    tables["robot"] = msgspec.to_builtins(config.robot.robot)
+    tables["camera"] = msgspec.to_builtins(config.robot.camera)
+    return msgspec.json.format(msgspec.json.encode(tables)).decode()
+
+
+def _say_understood(checked: Config) -> None:
+    """Print how the description is understood."""
+    from bodyschema.cli.recordings.synthesis import without_consequence
     from bodyschema.daemon.wiring.wiring import marker_source_lines
     from bodyschema.robot.urdf import REVOLUTE
 
-    checked = Config.load(robot)
-    checked.require_learnable()
     description, zenoh = checked.robot, checked.tables.zenoh
     cameras = checked.tables.vision.cameras
     camera_lines = _camera_lines(checked)
-    say(f"{robot} is in order: robot {description.name}, {len(description.joints)} joints")
+    say(f"{checked.file} is in order: robot {description.name}, {len(description.joints)} joints")
     for name, lower, upper in zip(description.joints, description.lower, description.upper, strict=True):
         unit, scale = ("°", 57.29577951) if description.tree.joint(name).kind in REVOLUTE else (" m", 1.0)
         say(f"  {name}: {scale * lower:.4g}{unit} to {scale * upper:.4g}{unit}")
@@ -75,25 +92,6 @@ def check(*, robot: RobotFile = HERE) -> None:
         say(f"  what is unexplained is learnt over {', '.join(checked.tables.unexplained['joints'])}")
     say(f"  sampler on {zenoh.sampler}, learner on {zenoh.learner}")
     say(f"  state in {checked.state_dir}")
-
-
-@config.command(sort_key=3)
-def show(*, robot: RobotFile = HERE) -> None:
-    """Print all settings as they are in force, defaults and environment included, as JSON.
-
-    Needs: robot.toml (`bodyschema init`) and the URDF that it names.
-
-    Next: change a setting in the file, or for once as `BODYSCHEMA_TABLE_KEY=value bodyschema COMMAND`.
-    """
-    import msgspec
-
-    from bodyschema.daemon.config import Config
-
-    checked = Config.load(robot)
-    tables = msgspec.to_builtins(checked.tables)
-    tables["robot"] = msgspec.to_builtins(checked.robot.robot)
-    tables["camera"] = msgspec.to_builtins(checked.robot.camera)
-    say(msgspec.json.format(msgspec.json.encode(tables)).decode())
 
 
 def _effect_line(effect: Effect) -> str:

@@ -47,7 +47,7 @@ def demo(
     With --marker cluster the ball is a cube of AprilTags, and how it is turned is learnt too. With --marker
     tag it is one tag alone, seen only while it faces the cameras: the hand turns it to them.
 
-    With --camera mono one eye is closed: the size of the tag tells how far away it is.
+    With --camera mono one eye is closed: its distance follows from the size of the tag.
 
     With --bus the joints are read as on a real arm, by the driver: from Dynamixel or Feetech servos or a board of
     encoders (serial) on a serial port, or from a ROS 2 robot behind a zenoh router. All of these are a bench at the
@@ -72,7 +72,7 @@ def demo(
     marker = marker or ("tag" if camera == "mono" else "ball")
     scene = prepare(out, seed, bus=bus, marker=marker, camera=camera)
     if bus is not None:
-        console.print(f"The joints are {WHAT[bus]} on a bench; {scene.log_file} tells of them.", soft_wrap=True)
+        console.print(f"The joints are {WHAT[bus]} on a bench; their log is {scene.log_file}.", soft_wrap=True)
     with shown_on(console) as show:
         outcome = play(scene, first=pairs, second=pairs_after, seed=seed, show=show)
     write_curve(outcome.rows, scene.curve_file)

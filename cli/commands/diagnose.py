@@ -50,7 +50,7 @@ def diagnose(
 ) -> None:
     """Find what the simulation gets wrong in a recording, why, and how much correcting it helps.
 
-    Every effect that is known is tried at every joint, alone and together, and judged by blocks of rows that were not
+    Every known effect is tried at every joint, alone and together, and evaluated on blocks of rows that were not
     fitted. What remains are causes with their numbers and how sure they are; or that nothing is wrong; or that this
     recording cannot decide, or that no known effect explains it. The exit code is 0 whatever is found.
 

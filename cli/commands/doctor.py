@@ -20,8 +20,7 @@ def doctor(*, robot: RobotFile = HERE, json: Annotated[bool, flag("As JSON.")] =
     """
     from rich.console import Console
 
-    from bodyschema.cli.hardware.doctor import as_json, run
-    from bodyschema.cli.hardware.doctor_view import show
+    from bodyschema.cli.hardware.doctor import as_json, run, show
     from bodyschema.daemon.config import Config
 
     config = Config.load(robot)

@@ -6,61 +6,101 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from bodyschema.cli.commands.options import HERE, VARIABLE, flag, several
+from bodyschema.cli.commands.options import HERE, VARIABLE, flag, print_json, several
 
 if TYPE_CHECKING:
+    from bodyschema.cli.terminal.diagnosis_run import Asked
+    from bodyschema.fleet.recordings import Job
     from bodyschema.fleet.roster import Place
 
-fleet = cyclopts.App(
-    name="fleet",
-    help="""Many robots: who is there, which unit is off, and why.
 
-    Needs: robots whose processes run, at a router or on this machine; for `diagnose` only their recordings.
-
-    Next: `bodyschema fleet list`, `bodyschema fleet compare`, `bodyschema fleet diagnose RECORDING...`.
-    """,
-)
-
-Connect = Annotated[
-    tuple[str, ...], several("A router, or a robot's process, to look for robots at, like tcp/127.0.0.1:7447")
-]
-Robots = Annotated[
-    tuple[Path, ...],
-    several(f"robot.toml that names where to look, and its certificates; else {VARIABLE} or the one here"),
-]
-
-
-@fleet.command(name="list", sort_key=1)
-def list_robots(
-    *,
-    connect: Connect = (),
-    robot: Robots = (),
-    watch: Annotated[bool, flag("Go on showing it, until Ctrl-C.")] = False,
-    json: Annotated[bool, flag("As JSON, a list with both processes' states.")] = False,
+def fleet(
+    *recordings: Annotated[Path, Parameter(help="Recordings (.csv, .parquet) or pair stores (.sqlite) to diagnose.")],
+    folder: Annotated[
+        Path | None, Parameter(name="--from", help="Diagnose all recordings in this folder and those in it.")
+    ] = None,
+    connect: Annotated[
+        tuple[str, ...], several("A router, or a robot's process, to look for robots at, like tcp/127.0.0.1:7447")
+    ] = (),
+    robot: Annotated[
+        tuple[Path, ...],
+        several(
+            f"robot.toml that names where to look, and its certificates; else {VARIABLE} or the one here. Of "
+            "recordings: the one of all; else the one beside each"
+        ),
+    ] = (),
+    compare: Annotated[bool, flag("Compare the models of running robots of one type.")] = False,
+    watch: Annotated[bool, flag("Go on showing the list, until Ctrl-C.")] = False,
+    out: Annotated[
+        Path | None, Parameter(help="Of recordings: write a folder for each, with report.html and the rest, here.")
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        Parameter(help="Of recordings: a Dask scheduler's address, tcp://HOST:8786; else this machine's cores."),
+    ] = None,
+    workers: Annotated[
+        int | None, Parameter(help="Processes on this machine; else one for each core.", validator=Number(gte=1))
+    ] = None,
+    effects: Annotated[str | None, Parameter(help="Look for these alone, as in backlash,joint_offset.")] = None,
+    exclude: Annotated[str | None, Parameter(help="Do not look for these.")] = None,
+    seed: Annotated[int, Parameter(help="Of the resampling behind the intervals.", validator=Number(gte=0))] = 0,
+    as_json: Annotated[bool, flag("Print it as JSON.", name="--json")] = False,
 ) -> None:
-    """List all running robots: pairs, rate, error, answering model, health.
+    """List all running robots; compare them; or diagnose many recordings in parallel.
 
-    Robots are found by their liveliness tokens. With --watch --json, prints one line about every second. Exit code 1 if
-    no robot is found.
+    Without recordings, robots are found by their liveliness tokens: pairs, rate, error, answering model, health. With
+    --watch --json, prints one line about every second. Exit code 1 if no robot is found.
 
-    Needs: running robots (`bodyschema run`), and a network route to them.
+    --compare finds the unit that differs, and in which figures. Robots are of one type if their joints have the same
+    names. Their learners are queried at the same poses, from the ranges that most of them have moved in. Each model is
+    rigidly aligned with the median of all, since the cameras stand in different places. Joint offsets and tools that
+    differ from the others' are named. Two robots of a type can be compared; three show which one differs.
 
-    Next: `bodyschema fleet compare`; `bodyschema status --robot` for one of them.
+    With recordings, `bodyschema diagnose` runs on each of them, and the unit of a type that differs is named, with the
+    cause. A recording that fails is a row with the reason. An error that more than half of the units of a type share is
+    attributed to their description. Ctrl-C ends it and keeps the reports already written. Exit code 1 if no recording
+    could be diagnosed.
+
+    Needs: running robots (`bodyschema run`), and a network route to them; or recordings and the extra `fleet`
+    (`pip install 'bodyschema[fleet]'`); workers elsewhere need this package, not the files.
+
+    Next: `bodyschema fleet --compare`; `bodyschema status --robot` for one of them; open OUT/NAME/report.html.
     """
+    from bodyschema.interfaces.errors import RequestError
+
+    if recordings or folder is not None:
+        if connect or compare or watch:
+            raise RequestError("recordings do not go with --connect, --compare or --watch")
+        if len(robot) > 1:
+            raise RequestError("recordings take one --robot, that of all")
+        from bodyschema.cli.terminal.diagnosis_run import Asked
+        from bodyschema.fleet.recordings import jobs
+        from bodyschema.interfaces.extras import require_extra
+
+        require_extra("fleet", "diagnosing many recordings")
+        wanted = jobs(recordings, folder, robot[0] if robot else None)
+        _diagnose(wanted, Asked.of(effects, exclude, seed), out, scheduler, workers, as_json=as_json)
+    elif out is not None or scheduler is not None or effects is not None or exclude is not None:
+        raise RequestError("--out, --scheduler, --effects and --exclude go with recordings; give some, or --from")
+    elif compare:
+        _compare(_places(connect, robot), as_json=as_json)
+    else:
+        _list(_places(connect, robot), watch=watch, json=as_json)
+
+
+def _list(looked_at: list[Place], *, watch: bool, json: bool) -> None:
     import time
 
     from rich.console import Console
     from rich.live import Live
 
     from bodyschema.cli.terminal.status_view import EVERY_S
-    from bodyschema.fleet.roster import Fleet
-    from bodyschema.fleet.roster_view import as_json, screen
+    from bodyschema.fleet.roster import Fleet, as_json, screen
 
-    looked_at, console = _places(connect, robot), Console(highlight=False)
+    console = Console(highlight=False)
     with Fleet(looked_at) as robots:
         if watch and not json:
             with Live(console=console, auto_refresh=False, screen=console.is_terminal) as live:
@@ -81,33 +121,13 @@ def list_robots(
         _nobody(looked_at)
 
 
-@fleet.command(sort_key=2)
-def compare(
-    *,
-    connect: Connect = (),
-    robot: Robots = (),
-    as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
-) -> None:
-    """Compare the models of robots of one type; find the unit that differs, and in which figures.
-
-    Robots are of one type if their joints have the same names. Their learners are queried at the same poses, from the
-    ranges that most of them have moved in. Each model is rigidly aligned with the median of all, since the cameras
-    stand in different places. Joint offsets and tools that differ from the others' are named.
-
-    Needs: at least two robots of a type with running learners, and the sampler of one of them; three to find which
-    differs.
-
-    Next: `bodyschema fleet diagnose` with their recordings, for causes.
-    """
+def _compare(looked_at: list[Place], *, as_json: bool) -> None:
     from rich.console import Console
 
-    from bodyschema.daemon.transport.wire import encode
-    from bodyschema.fleet.asking import compare_types
-    from bodyschema.fleet.comparison_view import view
+    from bodyschema.fleet.comparison import compare_types, view
     from bodyschema.fleet.roster import Fleet
     from bodyschema.interfaces.errors import RequestError
 
-    looked_at = _places(connect, robot)
     with Fleet(looked_at) as robots:
         members = robots.look()
         if not any(member.alive for member in members):
@@ -116,56 +136,27 @@ def compare(
     if not found:
         raise RequestError(f"nothing to compare. {'; '.join(left_out)}")
     if as_json:
-        sys.stdout.write(encode({"types": found, "not_compared": left_out}).decode() + "\n")
+        print_json({"types": found, "not_compared": left_out})
         return
     Console(highlight=False).print(view(found, left_out))
 
 
-@fleet.command(sort_key=3)
-def diagnose(
-    *recordings: Annotated[Path, Parameter(help="Recordings (.csv, .parquet) or pair stores (.sqlite).")],
-    folder: Annotated[
-        Path | None, Parameter(name="--from", help="All recordings in this folder and those in it.")
-    ] = None,
-    robot: Annotated[
-        Path | None,
-        Parameter(show_default=False, help=f"robot.toml of all; else the one beside each, {VARIABLE}, or here."),
-    ] = None,
-    out: Annotated[Path | None, Parameter(help="Write a folder for each, with report.html and the rest, here.")] = None,
-    scheduler: Annotated[
-        str | None, Parameter(help="A Dask scheduler's address, tcp://HOST:8786; else this machine's cores.")
-    ] = None,
-    workers: Annotated[
-        int | None, Parameter(help="Processes on this machine; else one for each core.", validator=Number(gte=1))
-    ] = None,
-    effects: Annotated[str | None, Parameter(help="Look for these alone, as in backlash,joint_offset.")] = None,
-    exclude: Annotated[str | None, Parameter(help="Do not look for these.")] = None,
-    seed: Annotated[int, Parameter(help="Of the resampling behind the intervals.", validator=Number(gte=0))] = 0,
-    as_json: Annotated[bool, flag("Print the summary as JSON.", name="--json")] = False,
+def _diagnose(
+    wanted: list[Job],
+    asked: Asked,
+    out: Path | None,
+    scheduler: str | None,
+    workers: int | None,
+    *,
+    as_json: bool,
 ) -> None:
-    """Run `bodyschema diagnose` on many recordings in parallel; find the unit of a type that differs, and why.
-
-    A recording that fails is a row with the reason. An error that more than half of the units of a type share is
-    attributed to their description. Ctrl-C ends it and keeps the reports already written. Exit code 1 if no recording
-    could be diagnosed.
-
-    Needs: the extra `fleet` (`pip install 'bodyschema[fleet]'`); workers elsewhere need this package, not the files.
-
-    Next: open OUT/NAME/report.html.
-    """
     from rich.console import Console
 
-    from bodyschema.cli.terminal.diagnosis_run import Asked
-    from bodyschema.daemon.transport.wire import encode
     from bodyschema.fleet.diagnosing import diagnose_all
     from bodyschema.fleet.diagnosing import workers as cluster
-    from bodyschema.fleet.recordings import jobs
     from bodyschema.fleet.summary import summary
     from bodyschema.fleet.summary_view import progress, view
-    from bodyschema.interfaces.extras import require_extra
 
-    require_extra("fleet", "diagnosing many recordings")
-    wanted, asked = jobs(recordings, folder, robot), Asked.of(effects, exclude, seed)
     with (
         progress(Console(stderr=True, highlight=False), len(wanted)) as (told, done),
         cluster(scheduler, len(wanted), workers) as client,
@@ -173,7 +164,7 @@ def diagnose(
         results = diagnose_all(wanted, asked, out, client, told, done)
     found = summary(results)
     if as_json:
-        sys.stdout.write(encode(found).decode() + "\n")
+        print_json(found)
     else:
         console = Console(highlight=False)
         console.print(view(found))

@@ -38,7 +38,7 @@ def ik(
     The angles are within the URDF's limits. If the position cannot be reached, shows the closest solution and ends with
     exit code 1. Nothing moves. Write negative values after `--`, as in `bodyschema ik -- -0.1 0.2 0.7`.
 
-    Needs: a running learner (`bodyschema run` or `bodyschema learner`).
+    Needs: a running learner (`bodyschema run` or `bodyschema run learner`).
 
     Next: the same from your own program, starting at your arm's current angles: docs/zenoh.md.
     """

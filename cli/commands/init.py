@@ -50,7 +50,7 @@ def init(
     Needs: your robot's URDF; with --from scan, powered servos; with --lerobot, LeRobot's calibration of the arm; with
     --sim, nothing.
 
-    Next: correct what is marked CHECK, then `bodyschema config check`. With servos: `bodyschema joints`. With --sim
+    Next: correct what is marked CHECK, then `bodyschema config`. With servos: `bodyschema watch joints`. With --sim
     nothing is left to correct: `bodyschema run --sim`.
     """
     from bodyschema.interfaces.errors import ConfigError
@@ -71,7 +71,7 @@ def init(
             write_new(robot, robot_toml(EXAMPLE if urdf is None else _guess(urdf, robot, marker_link, camera_link)))
     except OSError as error:
         raise ConfigError(f"cannot be written: {error.strerror}", file=robot, remedy="Give another --robot") from error
-    following = "run --sim" if sim else "joints" if lerobot or source else "config check"
+    following = "run --sim" if sim else "watch joints" if lerobot or source else "config"
     say(f"{robot} written. Next: `bodyschema {following} --robot {robot}`")
 
 

@@ -6,7 +6,6 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import cyclopts
 from cyclopts import Parameter
 
 from bodyschema.cli.commands.options import HERE, VARIABLE, flag, several
@@ -19,31 +18,58 @@ if TYPE_CHECKING:
 
 Root = Annotated[Path, Parameter(help="Of the file system, for images of other machines.")]
 
-install = cyclopts.App(
-    name="install",
-    help="""What this machine has to know: of serial adapters, and of sampler, learner and router as services.
 
-    Needs: the right to write to /etc (sudo).
-
-    Next: `bodyschema install udev --dry-run` and `bodyschema install service --dry-run` show what they would write.
-    """,
-)
-
-
-@install.command(sort_key=1)
-def udev(
+def install(
+    what: Annotated[
+        Literal["service", "udev", "router"],
+        Parameter(help="This robot's sampler and learner; rules for serial adapters; the zenoh router."),
+    ],
+    file: Annotated[Path, Parameter(help="Of the router: who may connect, and do what.")] = Path("router.toml"),
+    /,
     *,
+    robot: Annotated[
+        tuple[Path, ...],
+        several(f"Of the service: the robot's description, or a folder of them; else {VARIABLE} or robot.toml"),
+    ] = (),
+    user: Annotated[
+        str | None, Parameter(help="The user that a service runs as; else the one who called sudo.", show_default=False)
+    ] = None,
+    only: Annotated[
+        Literal["sampler", "learner"] | None,
+        Parameter(help="One of the two services, where the other runs on another machine.", show_default=False),
+    ] = None,
+    name: Annotated[str, Parameter(help="Name of the learner of several robots.")] = "fleet",
     yes: Annotated[bool, flag("Do not ask.")] = False,
     dry_run: Annotated[bool, flag("Show, and change nothing.")] = False,
-    uninstall: Annotated[bool, flag("Remove the rules.")] = False,
+    uninstall: Annotated[bool, flag("Stop the services and remove them, or remove the rules; pairs stay.")] = False,
     root: Root = Path("/"),
 ) -> None:
-    """Install udev rules that let you open servo adapters and reduce their latency. Shows them and asks first.
+    """Install systemd services or udev rules. Shows what it would write, and asks first.
 
-    Needs: permission to write to /etc/udev/rules.d, by sudo.
+    `service`: sampler and learner of this robot from boot on, restarted on failure, sandboxed. The sampler may open
+    only the ports and cameras that robot.toml names; install again when they change. State is kept in
+    /var/lib/bodyschema/ROBOT unless robot.toml names another folder. For several robots, one learner serves them all;
+    their samplers are installed on the robots' machines.
 
-    Next: plug the adapter in again; `bodyschema doctor`.
+    `udev`: rules that let you open servo adapters and reduce their latency.
+
+    `router`: the zenoh router from boot on, restarted on failure, sandboxed.
+
+    Needs: the right to write to /etc (sudo); robot.toml that works with `bodyschema run`, or router.toml that works
+    with `bodyschema router` and keys that --user can read.
+
+    Next: the `systemctl enable --now` that it prints, or plug the adapter in again; then `bodyschema doctor`.
+    docs/operation.md describes logs, upgrades and backups.
     """
+    if what == "udev":
+        _udev(root, uninstall=uninstall, yes=yes, dry_run=dry_run)
+    elif what == "router":
+        _router(file, user, root, uninstall=uninstall, yes=yes, dry_run=dry_run)
+    else:
+        _service(robot, user, only, name, root, uninstall=uninstall, yes=yes, dry_run=dry_run)
+
+
+def _udev(root: Path, *, uninstall: bool, yes: bool, dry_run: bool) -> None:
     from rich.console import Console
     from rich.prompt import Confirm
 
@@ -66,41 +92,20 @@ def udev(
         console.print("Nothing was changed.")
         return
     of_machine.install()
-    console.print("Written. Plug the adapter in again; `bodyschema doctor` tells whether all is well.")
+    console.print("Written. Plug the adapter in again; `bodyschema doctor` checks it.")
 
 
-User = Annotated[str | None, Parameter(help="Who it runs as; else who called sudo.", show_default=False)]
-Yes = Annotated[bool, flag("Do not ask.")]
-DryRun = Annotated[bool, flag("Show, and change nothing.")]
-
-
-@install.command(sort_key=2)
-def service(
+def _service(
+    robot: tuple[Path, ...],
+    user: str | None,
+    only: Literal["sampler", "learner"] | None,
+    name: str,
+    root: Path,
     *,
-    robot: Annotated[
-        tuple[Path, ...], several(f"The robot's description, or a folder of them; else {VARIABLE} or robot.toml")
-    ] = (),
-    user: User = None,
-    only: Annotated[
-        Literal["sampler", "learner"] | None,
-        Parameter(help="One of the two, where the other runs on another machine.", show_default=False),
-    ] = None,
-    name: Annotated[str, Parameter(help="What the learner of several robots is called.")] = "fleet",
-    yes: Yes = False,
-    dry_run: DryRun = False,
-    uninstall: Annotated[bool, flag("Stop the services and remove them; pairs stay.")] = False,
-    root: Root = Path("/"),
+    uninstall: bool,
+    yes: bool,
+    dry_run: bool,
 ) -> None:
-    """Install systemd units: sampler and learner of this robot from boot on, restarted on failure, sandboxed.
-
-    The sampler may open only the ports and cameras that robot.toml names; install again when they change. State is kept
-    in /var/lib/bodyschema/ROBOT unless robot.toml names another folder. For several robots, one learner serves them
-    all; their samplers are installed on the robots' machines.
-
-    Needs: robot.toml that works with `bodyschema run`, and permission to write to /etc/systemd/system, by sudo.
-
-    Next: the `systemctl enable --now` that it prints; docs/operation.md describes logs, upgrades and backups.
-    """
     from bodyschema.cli.install.service_files import (
         ServiceFiles,
         UnitFolder,
@@ -144,24 +149,7 @@ def service(
         make_state_folders(configs, user_for(user), root)
 
 
-@install.command(sort_key=3)
-def router(
-    file: Annotated[Path, Parameter(help="Who may connect, and do what.")] = Path("router.toml"),
-    /,
-    *,
-    user: User = None,
-    yes: Yes = False,
-    dry_run: DryRun = False,
-    uninstall: Annotated[bool, flag("Stop the router and remove its unit.")] = False,
-    root: Root = Path("/"),
-) -> None:
-    """Install a systemd unit: the zenoh router from boot on, restarted on failure, sandboxed.
-
-    Needs: router.toml that works with `bodyschema router`, keys that --user can read, and permission to write to
-    /etc/systemd/system, by sudo.
-
-    Next: the `systemctl enable --now` that it prints; `bodyschema doctor` on the machines that connect.
-    """
+def _router(file: Path, user: str | None, root: Path, *, uninstall: bool, yes: bool, dry_run: bool) -> None:
     from bodyschema.cli.install.router import RouterConfig
     from bodyschema.cli.install.service_files import RouterFiles, UnitFolder, systemd_version, user_for
     from bodyschema.cli.install.units import Installed

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from bodyschema.cli.commands.options import HERE, RobotFile, flag
+from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
 
 if TYPE_CHECKING:
     from bodyschema.calibration.latency import Wiggle
@@ -47,7 +46,6 @@ def latency(
     from bodyschema.calibration.latency import latency_of
     from bodyschema.cli.hardware.wiggling import write_wiggle
     from bodyschema.daemon.config import Config
-    from bodyschema.daemon.transport.wire import encode
 
     config = Config.load(robot)
     is_sent = not sim and config.tables.vision.cameras is None and bool(config.tables.marker_source)
@@ -58,7 +56,7 @@ def latency(
         write_wiggle(wiggle, config.robot.joints, save)
     found = latency_of(wiggle, config.robot.chain)
     if as_json:
-        sys.stdout.write(encode(found).decode() + "\n")
+        print_json(found)
         return
     console.print(
         f"{found.fixes} fixes at {found.speed_m_s:.2f} m/s, {1e3 * found.residual_m:.1f} mm from where the angles "

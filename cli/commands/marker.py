@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from bodyschema.cli.commands.board_options import BY_NAME, EyeFiles
-from bodyschema.cli.commands.options import HERE, RobotFile, flag
+from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
+
+if TYPE_CHECKING:
+    from bodyschema.cli.cameras.calibration import Images
+    from bodyschema.daemon.wiring.markers import Wanted
 
 marker = cyclopts.App(
     name="marker",
@@ -65,11 +69,11 @@ def print_tags(
 
     Cut along solid lines and fold along dashed ones. Print at 100 % ("actual size") and measure the two rulers. Paper
     alone is not rigid: glue the sheet around a block, or onto a plate, with faces of the stated width. The tables hold
-    for the nominal shape; `bodyschema marker cluster` measures where the tags really are.
+    for the nominal shape; `bodyschema marker learn` measures where the tags really are.
 
     Needs: a printer.
 
-    Next: put the printed tables into robot.toml; `bodyschema marker cluster` for tags glued by hand.
+    Next: put the printed tables into robot.toml; `bodyschema marker learn` for tags glued by hand.
     """
     from rich.console import Console
 
@@ -86,78 +90,87 @@ def print_tags(
 
 
 @marker.command(sort_key=2)
-def cluster(
-    images: Annotated[Path, Parameter(help="Folder with the images: left01.png and right01.png, or left/ and right/.")],
-    /,
-    *,
-    side_mm: Annotated[float, Parameter(help="Side of the black squares as measured [mm].", validator=Number(gt=0))],
-    other_sides_mm: Annotated[
-        str | None, Parameter(help="Tags of another side [mm], as in 7=25,8=25.", show_default=False)
-    ] = None,
-    calibration: Annotated[Path, Parameter(help="The calibration of the cameras.")] = Path("cameras.toml"),
-    files: EyeFiles = BY_NAME,
-    ids: Annotated[
-        str | None, Parameter(help="Numbers of its tags, as in 0-5,9; else all that are seen.", show_default=False)
-    ] = None,
-    family: Family = "apriltag_36h11",
-    as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
-) -> None:
-    """Measure the poses of a cluster's tags from images, and print its tables for robot.toml.
-
-    Take about 20 pairs of images and turn the cluster from one to the next, so that every two neighbouring tags are
-    seen together at some time. The tags' poses and all cluster poses are fitted together; the marker's frame is that of
-    the tag with the lowest number. Observations that do not fit one rigid body are left out and named.
-
-    Needs: cameras.toml, and images of those cameras; no hardware.
-
-    Next: put the printed tables into robot.toml; `bodyschema watch cameras`.
-    """
-    from rich.console import Console
-
-    from bodyschema.cli.cameras.tag_pages import numbers_of
-    from bodyschema.daemon.transport.wire import encode
-    from bodyschema.daemon.wiring.clusters import Wanted, figures, measured, said, sides_of, tables
-
-    progress = Console(stderr=True, highlight=False, soft_wrap=True)
-    numbers = None if ids is None else tuple(numbers_of(ids))
-    wanted = Wanted(family, 1e-3 * side_mm, numbers, sides_of(other_sides_mm) if other_sides_mm else {})
-    found = measured(files.of(images), calibration, wanted, lambda text: progress.print(text, markup=False))
-    if as_json:
-        sys.stdout.write(encode(figures(found)).decode() + "\n")
-        return
-    progress.print(said(found), markup=False)
-    sys.stdout.write(tables(found, wanted))
-
-
-@marker.command(sort_key=3)
 def learn(
-    *images: Annotated[Path, Parameter(help="Image files of one camera; with --auto in the order of time.")],
+    *images: Annotated[
+        Path,
+        Parameter(
+            help="Of a ball: image files of one camera, with --auto in the order of time. Of a cluster: the folder "
+            "with left01.png and right01.png, or left/ and right/."
+        ),
+    ],
     at: Annotated[
         tuple[float, float] | None,
-        Parameter(help="Column and row of a pixel in the middle of the ball, in the first image [px]."),
+        Parameter(help="Ball: column and row of a pixel in the middle of it, in the first image [px]."),
     ] = None,
-    auto: Annotated[bool, flag("Learn the colour of what moves; the camera stands still.")] = False,
+    auto: Annotated[bool, flag("Ball: learn the colour of what moves; the camera stands still.")] = False,
     robot: RobotFile = HERE,
     seconds: Annotated[
-        float, Parameter(help="Without IMAGES: how long the ball is moved [s].", validator=Number(gte=1, lte=120))
+        float, Parameter(help="Ball, without IMAGES: how long it is moved [s].", validator=Number(gte=1, lte=120))
     ] = 5.0,
+    side_mm: Annotated[
+        float | None,
+        Parameter(help="Cluster: side of the black squares as measured [mm].", validator=Number(gt=0)),
+    ] = None,
+    other_sides_mm: Annotated[
+        str | None, Parameter(help="Cluster: tags of another side [mm], as in 7=25,8=25.", show_default=False)
+    ] = None,
+    calibration: Annotated[Path, Parameter(help="Cluster: the calibration of the cameras.")] = Path("cameras.toml"),
+    files: EyeFiles = BY_NAME,
+    ids: Annotated[
+        str | None,
+        Parameter(help="Cluster: numbers of its tags, as in 0-5,9; else all that are seen.", show_default=False),
+    ] = None,
+    family: Family = "apriltag_36h11",
+    as_json: Annotated[bool, flag("Cluster: print the figures as JSON.", name="--json")] = False,
 ) -> None:
-    """Learn a ball's colour from images, and print the table [vision.colour] for robot.toml.
+    """Learn a ball's colour or a cluster's shape from images, and print the table for robot.toml.
 
-    With --at, the ball is the region that has the colour of that pixel and is connected to it. With --auto, give three
+    Ball: with --at, it is the region that has the colour of that pixel and is connected to it. With --auto, give three
     images or more in which the ball moves; the most colourful moving object is taken. With --auto and no images, the
     robot's own cameras watch while you move the ball.
 
-    Needs: image files, no hardware; or robot.toml with cameras, and no running sampler.
+    Cluster (--side-mm): the poses of its tags. Take about 20 pairs of images and turn the cluster from one to the next,
+    so that every two neighbouring tags are seen together at some time. The tags' poses and all cluster poses are fitted
+    together; the marker's frame is that of the tag with the lowest number. Observations that do not fit one rigid body
+    are left out and named.
 
-    Next: put the printed table into robot.toml, in place of `colour = ...`.
+    Needs: images, and for a cluster cameras.toml of those cameras; or robot.toml with cameras, and no running sampler.
+
+    Next: put the printed tables into robot.toml, a colour in place of `colour = ...`; `bodyschema watch cameras`.
     """
     from bodyschema.daemon.wiring.markers import learnt_colour_table
-    from bodyschema.interfaces.errors import BodyschemaError
+    from bodyschema.interfaces.errors import RequestError
 
+    if side_mm is not None:
+        if auto or at is not None or len(images) != 1:
+            raise RequestError("--side-mm measures a cluster: give one folder of images, and neither --at nor --auto")
+        from bodyschema.cli.cameras.tag_pages import numbers_of
+        from bodyschema.daemon.wiring.markers import Wanted, sides_of
+
+        numbers = None if ids is None else tuple(numbers_of(ids))
+        wanted = Wanted(family, 1e-3 * side_mm, numbers, sides_of(other_sides_mm) if other_sides_mm else {})
+        _measure_cluster(files.of(images[0]), calibration, wanted, as_json=as_json)
+        return
     if auto == (at is not None) or (not images and not auto):
-        raise BodyschemaError("give image files and --at COLUMN ROW, or --auto; the robot's own cameras need --auto")
+        raise RequestError(
+            "give image files and --at COLUMN ROW, or --auto; the robot's own cameras need --auto; a cluster of tags "
+            "needs --side-mm"
+        )
     sys.stdout.write(learnt_colour_table(images, at) if images else _learnt_live(robot, seconds))
+
+
+def _measure_cluster(images: Images, calibration: Path, wanted: Wanted, *, as_json: bool) -> None:
+    from rich.console import Console
+
+    from bodyschema.daemon.wiring.markers import figures, measured, said, tables
+
+    progress = Console(stderr=True, highlight=False, soft_wrap=True)
+    found = measured(images, calibration, wanted, lambda text: progress.print(text, markup=False))
+    if as_json:
+        print_json(figures(found))
+        return
+    progress.print(said(found), markup=False)
+    sys.stdout.write(tables(found, wanted))
 
 
 def _learnt_live(robot: Path, seconds: float) -> str:

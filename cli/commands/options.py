@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,6 +91,17 @@ AS_THEY_ARE = SourceOptions()
 def flag(text: str, *, name: str | None = None) -> Parameter:
     """Return an option without a value, off by default."""
     return Parameter(name=name, help=text, negative="", show_default=False)
+
+
+def print_json(value: object) -> None:
+    """Print `value`, which becomes a JSON object, as one line, with the key `schema` for the version of its keys."""
+    import msgspec
+
+    from bodyschema.daemon.transport.wire import SCHEMA, encode
+
+    fields = msgspec.json.decode(encode(value), type=dict[str, msgspec.Raw])
+    version = msgspec.Raw(str(SCHEMA).encode())
+    sys.stdout.write(msgspec.json.encode({"schema": version, **fields}).decode() + "\n")
 
 
 def several(text: str) -> Parameter:

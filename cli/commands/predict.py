@@ -27,7 +27,7 @@ def predict(
     Without values, reads them from standard input as JSON: one vector, or a list of them. Write negative values
     after `--`, as in `bodyschema predict --deg -- 10 -20 30 40 0 15 5`.
 
-    Needs: a running learner (`bodyschema run` or `bodyschema learner`).
+    Needs: a running learner (`bodyschema run` or `bodyschema run learner`).
 
     Next: the same from your own program, over zenoh: docs/zenoh.md.
     """

@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from bodyschema.cli.commands.options import HERE, RobotFile, flag
+from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
 
 
 def record(
@@ -21,12 +21,13 @@ def record(
     ] = 1,
     follow: Annotated[bool, flag("Go on with the pairs to come, until Ctrl-C.")] = False,
     force: Annotated[bool, flag("Replace OUT when it is there.")] = False,
+    as_json: Annotated[bool, flag("Print the result as JSON.", name="--json")] = False,
 ) -> None:
     """Copy the running sampler's pairs into a file.
 
     For the store of a sampler that is not running, use `bodyschema export`.
 
-    Needs: a running sampler (`bodyschema run` or `bodyschema sampler`).
+    Needs: a running sampler (`bodyschema run` or `bodyschema run sampler`).
 
     Next: `bodyschema replay` on a CSV or Parquet file.
     """
@@ -47,10 +48,16 @@ def record(
         if follow:
             wishes = SignalFlags()
             with on_termination(wishes.end):
-                console.print(f"writing pairs to {out} as they come; Ctrl-C ends it", markup=False)
+                if not as_json:
+                    console.print(f"writing pairs to {out} as they come; Ctrl-C ends it", markup=False)
                 count = follow_history(history, joints, out, lambda: wishes.ending)
         else:
             count = copy_history(history, joints, out)
+    if as_json:
+        print_json(
+            {"file": str(out), "pairs": count, "last_seq": history.next_seq - 1, "missing": history.missing.count}
+        )
+        return
     last = f", the last has the number {history.next_seq - 1}" if count else "; no file was left"
     console.print(f"{count} pairs written to {out}{last}", markup=False)
     if history.missing.count:
@@ -58,6 +65,6 @@ def record(
         console.print(
             f"{history.missing.count} pair{'' if one else 's'} between them {'is' if one else 'are'} missing "
             f"(number{'' if one else 's'} {history.missing}): the sampler's disk changed them, or they were deleted "
-            "([daemon] keep_days, keep_mb); `bodyschema status` tells which",
+            "([daemon] keep_days, keep_mb); `bodyschema status` shows which",
             markup=False,
         )

@@ -45,7 +45,7 @@ def replay(
         Parameter(help="1-sigma of the positions where the recording has none [mm].", validator=Number(gt=0, lte=1000)),
     ] = None,
     any_step: Annotated[bool, flag("Accept rows whatever their step and speed: single poses far apart.")] = False,
-    held_out: Annotated[float, Parameter(help="Share of the rows to leave out and judge by.")] = 0.3,
+    held_out: Annotated[float, Parameter(help="Share of the rows to hold out for the error.")] = 0.3,
     as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
     taken: SourceOptions = AS_THEY_ARE,
     lerobot: DatasetCalibration = None,

@@ -39,7 +39,7 @@ def reproduce(
 
     Needs: no hardware; pybullet and matplotlib (pip install 'bodyschema[sim,plots]').
 
-    Next: docs/reproduced.md describes what the paper leaves open, how it was interpreted, and what --json prints.
+    Next: docs/results/paper.md describes what the paper leaves open, how it was interpreted, and what --json prints.
     """
     import sys
     import time

@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
@@ -21,125 +20,109 @@ if TYPE_CHECKING:
     from bodyschema.cli.servos.log import ServoLog
     from bodyschema.daemon.wiring.eeprom import Wanted, Workbench
 
-servos = cyclopts.App(
-    name="servos",
-    help="""What servos keep without power: show it, and change it.
-
-    The only commands that write to a servo's EEPROM. Each shows first what it would write, and asks; everything that
-    was written is kept with the old value, and `bodyschema servos undo` takes the last of it back.
-
-    Needs: robot.toml with servos, or --port and --id for one that is not in it; and no sampler that runs.
-
-    Next: `bodyschema servos show`.
-    """,
-)
-
-Joints = Annotated[tuple[str, ...], several("The servo of this joint")]
-OneBus = Annotated[str | None, Parameter(help="All servos of this bus of robot.toml.", show_default=False)]
-Port = Annotated[str | None, Parameter(help="With --id: a servo that robot.toml does not know.", show_default=False)]
-Id = Annotated[
-    int | None,
-    Parameter(help="Its ID; 1 as it leaves the factory.", show_default=False, validator=Number(gte=0, lte=252)),
-]
-Baud = Annotated[int, Parameter(help="The rate at which it listens; Dynamixel servos leave the factory at 57600.")]
-DryRun = Annotated[bool, flag("Show what would be written, and end.")]
-Yes = Annotated[bool, flag("Do not ask.")]
 RATE = 1_000_000
 
 
-@servos.command(sort_key=1)
-def show(
-    *,
-    joint: Joints = (),
-    bus: OneBus = None,
-    port: Port = None,
-    id: Id = None,
-    baud: Baud = RATE,
+def servos(
+    *settings: Annotated[str, Parameter(help="NAME=VALUE to write, as in return_delay=0, id=5, baud=2000000.")],
+    zero: Annotated[bool, flag("Set the zero of --joint to its present position: prints zero_ticks.")] = False,
+    in_servo: Annotated[bool, flag("With --zero: write the servo's homing offset instead.")] = False,
+    undo: Annotated[bool, flag("Undo what the last of these commands wrote.")] = False,
+    joint: Annotated[tuple[str, ...], several("The servo of this joint")] = (),
+    bus: Annotated[str | None, Parameter(help="All servos of this bus of robot.toml.", show_default=False)] = None,
+    port: Annotated[
+        str | None, Parameter(help="With --id: a servo that robot.toml does not know.", show_default=False)
+    ] = None,
+    id: Annotated[
+        int | None,
+        Parameter(help="Its ID; 1 as it leaves the factory.", show_default=False, validator=Number(gte=0, lte=252)),
+    ] = None,
+    baud: Annotated[
+        int, Parameter(help="The rate at which it listens; Dynamixel servos leave the factory at 57600.")
+    ] = RATE,
+    dry_run: Annotated[bool, flag("Show what would be written, and end.")] = False,
+    yes: Annotated[bool, flag("Do not ask.")] = False,
+    as_json: Annotated[bool, flag("Print the settings as JSON.", name="--json")] = False,
     robot: RobotFile = HERE,
 ) -> None:
-    """Show the writable settings of the servos of robot.toml: names, present values, permitted values. Writes nothing.
+    """Show the settings that servos keep without power; with NAME=VALUE, write them to the EEPROM.
+
+    Without NAME=VALUE nothing is written: names, present values and permitted values are listed. A write is shown
+    first and has to be confirmed; then torque is switched off (hold the arm, because it will sink), and every value is
+    read back. What was written is kept with the old value, and --undo writes it back; settings that were changed
+    otherwise since then are left alone.
+
+    `id` and `baud` are set alone. An ID that is taken is refused; after a change of rate each servo is searched at the
+    new rate. Values are register values, except for the rate in bit/s and words (operating_mode=current).
+
+    --zero prints the joint's present position as zero_ticks for robot.toml, and writes nothing. With --in-servo, the
+    servo's homing offset is written instead, so that its position here is robot.toml's zero_ticks. Either way, pairs
+    measured before have another zero. Exit code 1 if something was not written.
 
     Needs: robot.toml with servos, or --port and --id; and no running sampler.
 
-    Next: `bodyschema servos set`.
+    Next: the changes to robot.toml that it prints; `bodyschema watch joints` shows the angles.
     """
+    from bodyschema.cli.servos.changes import assignments
+    from bodyschema.interfaces.errors import ConfigError, RequestError
+
+    if bool(settings) + zero + undo > 1:
+        raise RequestError("give NAME=VALUE, --zero or --undo, one of them")
+    if in_servo and not zero:
+        raise RequestError("--in-servo goes with --zero")
+    if undo:
+        _undo(robot, port, dry_run=dry_run, yes=yes)
+        return
+    if zero:
+        _zero(robot, joint, in_servo=in_servo, dry_run=dry_run, yes=yes)
+        return
+    wishes = assignments(settings)
+    if wishes and not (joint or bus or port):
+        raise ConfigError("no servos are named", remedy="Name them with --joint, --bus, or --port and --id")
+    wanted = _wanted(robot, joint, bus, port, id, baud)
+    if wishes:
+        _set(wanted, wishes, _log(robot, port), dry_run=dry_run, yes=yes)
+    else:
+        _show(wanted, as_json=as_json)
+
+
+def _show(wanted: Sequence[Wanted], *, as_json: bool) -> None:
     from rich.console import Console
 
-    from bodyschema.cli.servos.changes_view import settings_table
+    from bodyschema.cli.servos.changes_view import settings_json, settings_table
     from bodyschema.daemon.wiring.eeprom import settings_by_name
 
-    console = Console(highlight=False)
-    wanted = _wanted(robot, joint, bus, port, id, baud)
+    found = []
     with _workbench(wanted) as workbench:
         for one in wanted:
             at = workbench.bus(one.port, one.baud)
             servo = workbench.fitted(at, one.entry, one.model)
             settings = settings_by_name(workbench, one.model).values()
-            values = [(setting, workbench.value(at, servo, setting)) for setting in settings]
-            console.print(settings_table(servo, values))
+            found.append((servo, [(setting, workbench.value(at, servo, setting)) for setting in settings]))
+            if not as_json:
+                Console(highlight=False).print(settings_table(*found[-1]))
+    if as_json:
+        sys.stdout.write(settings_json(found) + "\n")
 
 
-@servos.command(sort_key=2, name="set")
-def set_(
-    *settings: Annotated[str, Parameter(help="NAME=VALUE, as in return_delay=0, id=5, baud=2000000.")],
-    joint: Joints = (),
-    bus: OneBus = None,
-    port: Port = None,
-    id: Id = None,
-    baud: Baud = RATE,
-    dry_run: DryRun = False,
-    yes: Yes = False,
-    robot: RobotFile = HERE,
+def _set(
+    wanted: Sequence[Wanted], wishes: Sequence[tuple[str, str]], log: ServoLog, *, dry_run: bool, yes: bool
 ) -> None:
-    """Write settings to servo EEPROM: shows them first, asks, switches torque off, writes, reads back.
+    from bodyschema.cli.servos.changes import plan
 
-    `bodyschema servos show` lists the names. `id` and `baud` are set alone. An ID that is taken is refused; after a
-    change of rate each servo is searched at the new rate. Values are register values, except for the rate in bit/s and
-    words (operating_mode=current). Torque is switched off: hold the arm, because it will sink. Exit code 1 if something
-    was not written.
-
-    Needs: robot.toml with servos, or --port and --id; and no running sampler.
-
-    Next: the changes to robot.toml that it prints; `bodyschema servos undo` reverts the writes.
-    """
-    from bodyschema.cli.servos.changes import assignments, plan
-    from bodyschema.interfaces.errors import ConfigError
-
-    wishes = assignments(settings)
-    if not wishes:
-        raise ConfigError("nothing to set", remedy="Write NAME=VALUE; `bodyschema servos show` lists the names")
-    if not (joint or bus or port):
-        raise ConfigError(
-            "it is not said which servos are meant", remedy="Name them with --joint, --bus, or --port and --id"
-        )
-    wanted = _wanted(robot, joint, bus, port, id, baud)
     with _workbench(wanted) as workbench:
-        _carry_out(workbench, plan(workbench, wanted, wishes), _log(robot, port), dry_run=dry_run, yes=yes)
+        _carry_out(workbench, plan(workbench, wanted, wishes), log, dry_run=dry_run, yes=yes)
 
 
-@servos.command(sort_key=3)
-def zero(
-    *,
-    joint: Joints,
-    in_servo: Annotated[bool, flag("Write the servo's homing offset instead.")] = False,
-    dry_run: DryRun = False,
-    yes: Yes = False,
-    robot: RobotFile = HERE,
-) -> None:
-    """Set a joint's zero to its present position: prints zero_ticks for robot.toml, and writes nothing.
-
-    With --in-servo, the servo's homing offset is written instead, so that its position here is robot.toml's zero_ticks.
-    Either way, pairs measured before have another zero.
-
-    Needs: robot.toml with servos, the joint held at its intended zero, and no running sampler.
-
-    Next: put zero_ticks into robot.toml; `bodyschema joints` shows the angles.
-    """
+def _zero(robot: Path, joint: tuple[str, ...], *, in_servo: bool, dry_run: bool, yes: bool) -> None:
     from rich.console import Console
 
     from bodyschema.cli.servos.changes import plan_zeros, zero_ticks
     from bodyschema.cli.servos.changes_view import zero_lines
+    from bodyschema.interfaces.errors import ConfigError
 
+    if not joint:
+        raise ConfigError("no joint is named", remedy="Name it with --joint")
     wanted = _wanted(robot, joint, None, None, None, RATE)
     with _workbench(wanted) as workbench:
         if in_servo:
@@ -151,14 +134,7 @@ def zero(
         console.print(f"Put it into the entry of the joint in {robot}. Nothing was written.", markup=False)
 
 
-@servos.command(sort_key=4)
-def undo(*, dry_run: DryRun = False, yes: Yes = False, port: Port = None, robot: RobotFile = HERE) -> None:
-    """Undo what the last of these commands wrote. Settings that were changed otherwise since then are left alone.
-
-    Needs: the same servos on the same ports; --port if they were selected that way.
-
-    Next: `bodyschema servos show`.
-    """
+def _undo(robot: Path, port: str | None, *, dry_run: bool, yes: bool) -> None:
     from rich.console import Console
 
     from bodyschema.cli.servos.changes import plan_undo

@@ -19,7 +19,7 @@ def simulate(
         Path | None,
         Parameter(help="The file (.csv, .parquet, .mcap, .rrd); else CSV goes to standard output."),
     ] = None,
-    noise: Annotated[bool, flag("Add the noise of the positions: as LIKE tells it, else as [camera] does.")] = False,
+    noise: Annotated[bool, flag("Add the noise of the positions: as in LIKE, else as in [camera].")] = False,
     seed: Annotated[int, Parameter(help="Of the noise.", validator=Number(gte=0))] = 0,
     force: Annotated[bool, flag("Replace OUT when it is there.")] = False,
 ) -> None:

@@ -2,61 +2,121 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from bodyschema.cli.commands.options import HERE, RobotFile
+from bodyschema.cli.commands.options import HERE, RobotFile, flag
 
-watch = cyclopts.App(
-    name="watch",
-    help="""What the cameras see and the tracker makes of it, and what other marker sources send.
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
-    Needs: robot.toml with cameras (docs/cameras.md) or [marker_source] (docs/marker_sources.md).
-
-    Next: `bodyschema watch cameras` or `bodyschema watch marker`.
-    """,
-)
+    from bodyschema.cli.hardware.joints_watch import JointsWatch, Seen
+    from bodyschema.daemon.sampler.sources import Powered
 
 READ_S = 0.5
 TELL_EVERY_S = 2.0
 MARKER_EVERY_S = 1.0
+SHOW_EVERY_S = 0.1
+PRINT_EVERY_S = 0.5
+FIRST_READING_S = 5.0
 PORT = 8080
 
 
-@watch.command(sort_key=1)
-def cameras(
+def watch(
+    what: Annotated[Literal["joints", "cameras", "marker"], Parameter(help="Which part of the hardware.")],
+    /,
     *,
     robot: RobotFile = HERE,
+    once: Annotated[bool, flag("Joints: one table, then end.")] = False,
+    json: Annotated[bool, flag("Joints: a line of JSON instead, every half second.")] = False,
+    zero_force: Annotated[
+        bool, flag("Joints: the servos bear the arm meanwhile: [drivers.dynamixel.zero_force].")
+    ] = False,
     out: Annotated[
-        Path | None, Parameter(help="Write the pictures into this folder, in the place of a browser.")
+        Path | None, Parameter(help="Cameras: write the pictures into this folder, instead of showing them.")
     ] = None,
     port: Annotated[
         int,
-        Parameter(help="For the browser on this machine; 0: a free one.", validator=Number(gte=0, lte=65535)),
+        Parameter(help="Cameras: for the browser on this machine; 0: a free one.", validator=Number(gte=0, lte=65535)),
     ] = PORT,
     every: Annotated[
-        float, Parameter(help="With --out: time between two pictures [s].", validator=Number(gte=0))
+        float, Parameter(help="Cameras, with --out: time between two pictures [s].", validator=Number(gte=0))
     ] = 0.5,
     count: Annotated[
-        int | None, Parameter(help="End after so many pictures; else with Ctrl-C.", validator=Number(gte=1))
+        int | None,
+        Parameter(help="Cameras: end after this number of pictures; else with Ctrl-C.", validator=Number(gte=1)),
+    ] = None,
+    seconds: Annotated[
+        float | None, Parameter(help="Marker: end after this time [s]; else with Ctrl-C.", validator=Number(gt=0))
     ] = None,
 ) -> None:
-    """Show both cameras' images with what was detected in them: in a browser on this machine, or as files.
+    """Show what joints, cameras or other marker sources deliver, until Ctrl-C.
 
-    Yellow: a disc of the marker's colour. Green: the marker, with the corresponding row of the other image in yellow,
-    and the row difference as a red bar, ten times as long. Red: rejected detections, with the reason. Tags have their
-    numbers; the marker made of them has its axes x, y, z in red, green, blue. Without a calibration, the raw images are
-    shown.
+    `joints`: angle, speed, current and temperature of each joint while you move it by hand. Servo torque is switched
+    off first: hold the arm, because it will sink. With --zero-force the servos then hold it, until Ctrl-C or any fault:
+    stay ready to hold it. The line below the table shows where, by the URDF, the marker went when you moved the last
+    joint: if it went the other way, the sign is wrong. Angles beyond the URDF's limits are reported, too.
 
-    Needs: robot.toml with cameras, and no running sampler, because a camera can be opened only once.
+    `cameras`: the images with what was detected in them, in a browser on this machine or as files. Yellow: a disc of
+    the marker's colour. Green: the marker, with the corresponding row of the other image in yellow, and the row
+    difference as a red bar, ten times as long. Red: rejected detections, with the reason. Tags have their numbers; the
+    marker made of them has its axes x, y, z in red, green, blue. Without a calibration, the raw images are shown.
 
-    Next: correct colour, light or focus; `bodyschema calibrate cameras`; `bodyschema run`.
+    `marker`: what other marker sources send: rate, position, uncertainty, delay, and what is wrong with their messages.
+
+    Needs: robot.toml with servos, encoders or a ROS 2 robot; with cameras (docs/cameras.md); or with [marker_source]
+    (docs/marker_sources.md). No running sampler, because ports and cameras can be opened only once.
+
+    Next: correct what was named; `bodyschema calibrate cameras`, `bodyschema calibrate latency`; `bodyschema run`.
     """
+    if what == "joints":
+        _joints(robot, once=once, json=json, zero_force=zero_force)
+    elif what == "cameras":
+        _cameras(robot, out, port, every, count)
+    else:
+        _marker(robot, seconds)
+
+
+def _joints(robot: Path, *, once: bool, json: bool, zero_force: bool) -> None:
+    from rich.console import Console
+    from rich.live import Live
+
+    from bodyschema.cli.hardware.joints_watch import JointsWatch, as_json, screen
+    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.sampler.powered import find_powered
+    from bodyschema.daemon.service.signals import on_termination
+    from bodyschema.daemon.wiring.wiring import open_joints
+    from bodyschema.interfaces.clock import SystemClock
+    from bodyschema.interfaces.servos import ServoJoints
+
+    clock = SystemClock()
+    config = Config.load(robot)
+    console = Console(highlight=False)
+    ending = _Ending()
+    source = open_joints(config, clock)
+    drives = source.drives if isinstance(source, ServoJoints) else ()
+    force = find_powered(drives, "zero_force", config.file) if zero_force else None
+    with on_termination(ending.end), JointsWatch(config, source, clock) as watch:
+        seen = _first(watch)
+        if force is not None:
+            _begin(watch, force)
+        if once:
+            console.file.write(as_json(seen) + "\n") if json else console.print(screen(seen))
+        elif json or not console.is_terminal:
+            _follow(
+                watch, ending, PRINT_EVERY_S, lambda now: _line(as_json(now)) if json else console.print(screen(now))
+            )
+        else:
+            with Live(screen(seen), console=console, auto_refresh=False, screen=True) as live:
+                _follow(watch, ending, SHOW_EVERY_S, lambda now: live.update(screen(now), refresh=True))
+
+
+def _cameras(robot: Path, out: Path | None, port: int, every: float, count: int | None) -> None:
     from contextlib import ExitStack
 
     from rich.console import Console
@@ -90,21 +150,7 @@ def cameras(
         console.print(line, markup=False)
 
 
-@watch.command(sort_key=2)
-def marker(
-    *,
-    robot: RobotFile = HERE,
-    seconds: Annotated[
-        float | None, Parameter(help="End after this time [s]; else with Ctrl-C.", validator=Number(gt=0))
-    ] = None,
-) -> None:
-    """Show what the marker sources send: rate, position, uncertainty, delay, and what is wrong with their messages.
-
-    Needs: robot.toml with [marker_source] (docs/marker_sources.md), and no running sampler, because a UDP port can be
-    listened on only once.
-
-    Next: `bodyschema calibrate latency`; `bodyschema run`.
-    """
+def _marker(robot: Path, seconds: float | None) -> None:
     from contextlib import ExitStack
 
     from rich.console import Console
@@ -134,3 +180,49 @@ def marker(
             for each in watches:
                 for line in each.lines():
                     console.print(line, markup=False)
+
+
+class _Ending:
+    """Flag for a requested end."""
+
+    def __init__(self) -> None:
+        self.asked = False
+
+    def end(self) -> None:
+        self.asked = True
+
+
+def _line(text: str) -> None:
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def _first(watch: JointsWatch) -> Seen:
+    """Return the first complete state. SourceError if there is none in time."""
+    from bodyschema.interfaces.errors import SourceError
+
+    end = time.monotonic() + FIRST_READING_S
+    while time.monotonic() < end:
+        if watch.look() is not None:
+            watch.know_temperatures()
+            seen = watch.look_all_over()
+            if seen is not None:
+                return seen
+    raise SourceError("the joints cannot be read. `bodyschema doctor` shows why")
+
+
+def _begin(watch: JointsWatch, force: Powered) -> None:
+    """Switch zero-force on and print its answer. RequestError if it is refused."""
+    answer = force.ask(True)
+    while not answer.done():
+        watch.look()
+    sys.stderr.write(answer.result() + "\n")
+
+
+def _follow(watch: JointsWatch, ending: _Ending, every_s: float, show: Callable[[Seen], None]) -> None:
+    shown_at = 0.0
+    while not ending.asked:
+        seen = watch.look()
+        if seen is not None and time.monotonic() - shown_at >= every_s:
+            shown_at = time.monotonic()
+            show(seen)

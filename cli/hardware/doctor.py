@@ -7,14 +7,18 @@ import os
 import re
 import shutil
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import msgspec
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from bodyschema.cli.install.units import FOLDER
 from bodyschema.daemon.config import Config
+from bodyschema.daemon.service.remedies import as_typed
 from bodyschema.daemon.transport.bus import ZenohSession, is_alive
 from bodyschema.daemon.transport.identity import Route
 from bodyschema.daemon.transport.keys import Keys
@@ -44,7 +48,7 @@ CONNECT_S = 0.3
 OPEN_S = 0.7
 
 # One that began before an update is called by the old name.
-SAMPLER = re.compile(r"(bodyschema|-m daemon) sampler\b")
+SAMPLER = re.compile(r"(bodyschema|-m daemon) (run )?sampler\b")
 OLD_UNIT = re.compile(r"^ExecStart=.* -m daemon\b", re.MULTILINE)
 
 Step = tuple[str, Callable[[], Iterator[Check]]]
@@ -75,7 +79,7 @@ def steps(config: Config) -> Iterator[Step]:
 
 def as_json(checks: list[Check]) -> str:
     """Return the checks as JSON; `well` is true if none is wrong."""
-    contents = {"well": all(check.state != "wrong" for check in checks), "checks": checks}
+    contents = {"schema": 1, "well": all(check.state != "wrong" for check in checks), "checks": checks}
     return msgspec.json.format(msgspec.json.encode(contents)).decode()
 
 
@@ -203,7 +207,7 @@ def clock_checks(is_synchronised: Callable[[], bool | None] | None = None) -> It
     """Check that the wall clock, which dates the pairs, is synchronised. (Time stamps use the monotonic clock.)"""
     known = (_is_synchronised if is_synchronised is None else is_synchronised)()
     if known is None:
-        yield Check("clock", "ok", "the system does not tell whether the clock is kept right")
+        yield Check("clock", "ok", "the system does not report whether the clock is synchronised")
     elif known:
         yield Check("clock", "ok", "kept right by the network")
     else:
@@ -257,7 +261,7 @@ def zenoh_check(process: str, route: Route, token: str) -> Check:
     if is_alive(route, token, open_timeout_s=OPEN_S):
         return Check("zenoh", "ok", f"the {process} answers on {endpoint}")
     port = endpoint.rpartition(":")[2]
-    said = f"somebody else listens on {endpoint}, where the {process} should"
+    said = f"another program listens on {endpoint}, where the {process} should"
     return Check("zenoh", "wrong", said, f"ss -ltnp 'sport = :{port}'    # who it is; or another port in [zenoh]")
 
 
@@ -289,3 +293,30 @@ def run(config: Config, tell: Callable[[str], None]) -> list[Check]:
         except BodyschemaError as error:
             checks.append(Check(name, "wrong", str(error)))
     return checks
+
+
+MARKS = {"ok": Text("✓", "green"), "warning": Text("!", "yellow"), "wrong": Text("✗", "red")}
+INDENT = "    "
+
+
+def show(console: Console, checks: Sequence[Check]) -> None:
+    """Print a line for each check, below it the command that fixes it, and the summary."""
+    for check in checks:
+        line = Table.grid(padding=(0, 1))
+        line.add_column(no_wrap=True)
+        line.add_column(no_wrap=True, min_width=13)
+        line.add_column(overflow="fold")
+        line.add_row(MARKS[check.state], Text(check.subject), Text(as_typed(check.said)))
+        console.print(line)
+        if check.fix:  # not wrapped here, so that it can be copied
+            console.print(Text(f"{INDENT}{as_typed(check.fix)}", "bold"), soft_wrap=True)
+    console.print(_sum(checks))
+
+
+def _sum(checks: Sequence[Check]) -> str:
+    wrong = sum(check.state == "wrong" for check in checks)
+    warnings = sum(check.state == "warning" for check in checks)
+    if not wrong and not warnings:
+        return "All is well."
+    parts = [f"{wrong} wrong"] * bool(wrong) + [f"{warnings} that could be better"] * bool(warnings)
+    return f"{', '.join(parts)}: the line below each says what to do."

@@ -10,8 +10,9 @@ import numpy as np
 
 from bodyschema.daemon.config import Config
 from bodyschema.effects import Simulation
+from bodyschema.effects.exports.arm_errors import ArmErrors
 from bodyschema.effects.exports.geometry import geometry_of
-from bodyschema.effects.exports.joint_errors import ArmErrors, JointErrors
+from bodyschema.effects.joint_errors import JointErrors
 from bodyschema.robot.rpy import rpy_of
 
 # ur_description, from the base outwards: the joint's name without prefix, and its link's name in kinematics.yaml.
@@ -79,7 +80,7 @@ def _servos(simulation: Simulation, joints: dict[str, JointErrors]) -> Iterator[
         table = getattr(drivers, make)
         if table is None:
             continue
-        lines = [f"{make}: one of the two, in ticks; then torque off, and `bodyschema servos show`"]
+        lines = [f"{make}: one of the two, in ticks; then torque off, and `bodyschema servos`"]
         for servo in table.servos:
             if servo.joint not in joints or not joints[servo.joint].offset:
                 continue

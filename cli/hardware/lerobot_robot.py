@@ -157,7 +157,7 @@ def _servo_tables(arm: LeRobotArm, servos: Sequence[LeRobotServo], calibration: 
     lines = [
         "",
         f"# The servos, with IDs and zeros from LeRobot's {calibration.name}: 0 is the middle of the recorded range.",
-        "# CHECK directions with `bodyschema joints`: move a joint, and look where its angle goes.",
+        "# CHECK directions with `bodyschema watch joints`: move a joint, and look where its angle goes.",
         f"[{table}.buses.arm]",
         f"port = {quoted(port)}",
         f"baud = {BAUD:_}",

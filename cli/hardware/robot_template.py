@@ -26,7 +26,7 @@ _FINGER = re.compile(r"gripper|finger|jaw|knuckle", re.IGNORECASE)
 EXAMPLE = Guess("my_robot", "my_robot.urdf", ["joint_1", "joint_2"], "hand", "base_link")
 
 _TEMPLATE = """\
-# A robot for bodyschema. Fix what is marked CHECK, then type `bodyschema config check`.
+# A robot for bodyschema. Fix what is marked CHECK, then type `bodyschema config`.
 
 [robot]
 # Part of the zenoh keys: letters, digits, _ . -
@@ -86,7 +86,7 @@ radius_m = 0.020
 # port = 5005
 # sigma_m = 0.001
 
-# CHECK: the cameras; `bodyschema scan` names those that are plugged in, docs/cameras.md tells the rest.
+# CHECK: the cameras; `bodyschema scan` names those that are plugged in, docs/cameras.md has the rest.
 {cameras}"""
 
 _CAMERAS = """\

@@ -151,7 +151,7 @@ def _for_model(found: str | None, wanted: str) -> str:
 
 def as_json(report: ScanReport) -> str:
     """Return the report as JSON: `ports` with `servos`, `cameras`, and with a robot.toml `joints` and `strangers`."""
-    contents: dict[str, Any] = {"well": report.is_well, "ports": report.ports, "cameras": report.cameras}
+    contents: dict[str, Any] = {"schema": 1, "well": report.is_well, "ports": report.ports, "cameras": report.cameras}
     if report.joints is not None:
         contents |= {"joints": report.joints, "strangers": report.strangers}
     return msgspec.json.format(msgspec.json.encode(contents)).decode()

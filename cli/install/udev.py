@@ -40,9 +40,7 @@ Run = Callable[[Sequence[str]], None]
 def rules() -> str:
     """Return the text of the rules file."""
     lines = ["# Written by `bodyschema install udev`; `bodyschema install udev --uninstall` removes it.", "", _LATENCY]
-    lines.append(
-        "# Whoever sits at the machine, and the group dialout, may open them; modem managers leave them alone."
-    )
+    lines.append("# Users at the machine, and the group dialout, may open them; modem managers leave them alone.")
     for vendor, product, name in ADAPTERS:
         match = f'SUBSYSTEM=="tty", ATTRS{{idVendor}}=="{vendor}", ATTRS{{idProduct}}=="{product}"'
         lines += [

@@ -104,7 +104,7 @@ StartLimitIntervalSec=0
 Type=notify
 NotifyAccess=main
 SyslogIdentifier=%N
-ExecStart={command} {process}
+ExecStart={command} run {process}
 ExecReload=/bin/kill -HUP $MAINPID
 # Fed by the loops that work, so that one which hangs starves it; the abort leaves every thread's place in the journal.
 WatchdogSec={watchdog_s}
@@ -116,7 +116,7 @@ StateDirectory=bodyschema/%i
 StateDirectoryMode=0750
 Environment=XDG_STATE_HOME=%S
 
-# Nobody from outside is reached or heard, unless robot.toml has endpoints on other machines.
+# No other machine is reached, unless robot.toml has endpoints there.
 IPAddressDeny=any
 IPAddressAllow=localhost
 {devices}
@@ -205,7 +205,7 @@ def of_host(configs: Sequence[Config], user: str, installed: Installed) -> str:
         f"User={user}",
         f"MemoryMax={_MEMORY_MIB + _MORE_MIB * len(configs)}M",
         "ExecStart=",
-        f"ExecStart={_command([*installed.command, 'learner', *named])}",
+        f"ExecStart={_command([*installed.command, 'run', 'learner', *named])}",
         "StateDirectory=",
         *([f"StateDirectory={kept}"] if kept else []),
         *_seen(configs, installed),

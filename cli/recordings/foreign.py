@@ -57,7 +57,7 @@ def opened(config: Config, source: Path, taken: Taken) -> Recording:
             marker = markers_in_video(config, source, taken.video)
         if marker is None:
             raise RecordingError(
-                "a LeRobotDataset tells joints alone",
+                "a LeRobotDataset has no marker positions",
                 file=source,
                 remedy="Name its camera with --video observation.images.NAME, or give the marker's positions with "
                 "--markers FILE.csv: t, x, y, z, and the episode as segment",

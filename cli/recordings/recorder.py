@@ -146,7 +146,7 @@ class _CsvRows:
             self._stream.write(",".join(table.names) + "\n")
         if table.names != self._names:
             raise RecordingError(
-                f"from pair {pairs[0].seq} to {pairs[-1].seq} some tell how the marker is turned and some do not",
+                f"from pair {pairs[0].seq} to {pairs[-1].seq} some have a marker orientation and some do not",
                 file=Path(self._stream.name),
                 remedy=f"The {self.count} rows so far are whole; record what follows into another file",
             )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bodyschema.effects import KINDS, Motion, Simulation
+from bodyschema.effects import EFFECT_TYPES, Motion, Simulation
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import ConfigError, RecordingError
 from bodyschema.interfaces.records import FloatArray
@@ -59,11 +59,11 @@ def without_consequence(simulation: Simulation, like: Recording | None = None) -
     """Return sentences on the effects that change nothing for this robot or for a recording without times."""
     said = []
     for name in dict.fromkeys(effect.name for effect in simulation.effects):
-        if KINDS[name].needs_times and like is not None and like.t is None:
+        if EFFECT_TYPES[name].needs_times and like is not None and like.t is None:
             said.append(f"{name} changes nothing: the recording has no column t")
-        if KINDS[name].needs_weight and not simulation.bears_weight:
+        if EFFECT_TYPES[name].needs_weight and not simulation.bears_weight:
             said.append(f'{name} changes nothing: with hold = "torque_free" the guiding hand bears the weight')
-        elif KINDS[name].needs_weight and not simulation.gravity.known:
+        elif EFFECT_TYPES[name].needs_weight and not simulation.gravity.known:
             said.append(f"{name} changes nothing: the URDF states no masses")
     return said
 

@@ -63,11 +63,11 @@ class Process:
 
 @contextmanager
 def started(name: str, arguments: list[str], environment: Mapping[str, str], log: Path) -> Iterator[Process]:
-    """Run `bodyschema NAME ARGUMENTS` for the duration of the with statement."""
+    """Run `bodyschema run NAME ARGUMENTS` for the duration of the with statement."""
     with log.open("wb") as stream:
         # In a process group of its own: the parent handles Ctrl-C in a terminal.
         popen = subprocess.Popen(
-            module_command("bodyschema", name, *arguments),
+            module_command("bodyschema", "run", name, *arguments),
             stdin=subprocess.DEVNULL,
             stdout=stream,
             stderr=stream,

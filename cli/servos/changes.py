@@ -110,7 +110,7 @@ def plan_zeros(workbench: Workbench, wanted: Sequence[Wanted]) -> list[Planned]:
 
 def _require_heeded(wanted: Wanted, servo: FittedServo, setting: Setting, then: int) -> None:
     """Raise ConfigError if the servo would ignore such an offset, or cannot store it."""
-    gentle = "`bodyschema servos zero` without --in-servo tells the zero_ticks for robot.toml, which serve as well"
+    gentle = "`bodyschema servos --zero` without --in-servo prints zero_ticks for robot.toml, which serve as well"
     what = f"joint {servo.joint!r} would need the homing offset {setting.shown(then)}"
     if not setting.lowest <= then <= setting.highest:
         raise ConfigError(f"{what}, which is out of range", remedy=gentle)

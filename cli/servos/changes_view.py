@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 
@@ -12,6 +13,8 @@ from rich.text import Text
 from bodyschema.daemon.wiring.eeprom import Change, Done, FittedServo, Outcome, Setting
 
 from .changes import Planned
+
+SCHEMA = 1  # of `settings_json`
 
 
 def planned_table(planned: Sequence[Planned]) -> RenderableType:
@@ -51,6 +54,24 @@ def settings_table(servo: FittedServo, values: Sequence[tuple[Setting, int]]) ->
         table.add_row(setting.name, str(setting.register.address), setting.shown(value), bounds)
     head = f"{servo.joint}: ID {servo.id}, {servo.model.name}, firmware {servo.version}, on {servo.bus}"
     return Group(Text(head, style="bold"), table)
+
+
+def settings_json(found: Sequence[tuple[FittedServo, Sequence[tuple[Setting, int]]]]) -> str:
+    """Return the servos' writable settings as JSON; values and bounds are those of the register."""
+    servos = [
+        {
+            "joint": servo.joint,
+            "id": servo.id,
+            "model": servo.model.name,
+            "bus": servo.bus,
+            "settings": {
+                setting.name: {"value": value, "lowest": setting.lowest, "highest": setting.highest}
+                for setting, value in values
+            },
+        }
+        for servo, values in found
+    ]
+    return json.dumps({"schema": SCHEMA, "servos": servos})
 
 
 def zero_lines(found: Sequence[tuple[FittedServo, int]]) -> list[str]:

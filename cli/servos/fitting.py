@@ -112,7 +112,7 @@ def servo_tables(fitting: Fitting) -> str:
     lines = ["", "# The servos, as `bodyschema scan` found them. docs/hardware.md has all keys."]
     for (port, baud), name in names.items():
         lines += [f"[{make.table}.buses.{name}]", f"port = {toml_value(port)}", f"baud = {baud:_}", ""]
-    lines.append("# CHECK each with `bodyschema joints`: move the joint, and look where its angle goes.")
+    lines.append("# CHECK each with `bodyschema watch joints`: move the joint, and look where its angle goes.")
     for joint, servo in fitting.servos.items():
         lines += [f"[[{make.table}.servos]]", f"joint = {toml_value(joint)}", f"id = {servo.id}"]
         lines.append(f"model = {toml_value(servo.model or '')}")
@@ -156,7 +156,7 @@ def _other_rates(servos: Sequence[Candidate], port: str) -> str:
     here = [servo for servo in servos if os.path.realpath(servo.port) == os.path.realpath(port)]
     most, _ = Counter(servo.baud for servo in here).most_common(1)[0]
     commands = [
-        f"bodyschema servos set baud={most} --port {port} --id {servo.id} --baud {servo.baud}"
+        f"bodyschema servos baud={most} --port {port} --id {servo.id} --baud {servo.baud}"
         for servo in here
         if servo.baud != most
     ]

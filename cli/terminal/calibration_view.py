@@ -21,7 +21,7 @@ def view(report: CalibrationReport) -> Group:
     """Return tables of the figures, followed by sentences on their meaning."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
     table.add_column(Text(f"{report.robot}, {report.pairs} pairs of {report.source}"), overflow="fold")
-    for name in ("drawn", "learnt", "95 %"):
+    for name in ("nominal", "learnt", "95 %"):
         table.add_column(name, justify="right", no_wrap=True)
     _section(table, f"camera on {report.camera_link}")
     _figures(table, ("x [mm]", "y [mm]", "z [mm]"), report.camera_xyz_mm, 2)
@@ -38,20 +38,17 @@ def sentences(report: CalibrationReport) -> list[str]:
     """Return the report as sentences."""
     said = [_expected(report)] if report.expected_mm is not None else []
     said += [
-        f"Mean distance to the pairs: {report.drawn_error_mm:.3f} mm for the nominal arm in its best place, "
+        f"Mean distance to the pairs: {report.drawn_error_mm:.3f} mm for the nominal arm, best placed, "
         f"{report.learnt_error_mm:.3f} mm for the learnt one. {_noise(report)} {_outliers(report)}",
         _workmanship(report),
     ]
     if report.trusted == "nothing":
-        said.append(
-            f"The pairs show {report.shown} of the {report.showable} numbers that positions can show of such an arm."
-            + _advice(report)
-        )
+        said.append(f"{report.shown} of {report.showable} identifiable parameters were determined." + _advice(report))
     hidden = [zero.joint for zero in report.zeros if zero.half_width is None]
     if hidden and report.trusted != "urdf":
         said.append(
-            f"Kept at nominal: {', '.join(hidden)}. The measurements cannot tell {_such_zeros(hidden)} from a turn of "
-            "the camera, of the marker, or of a neighbouring joint. They need not: the positions are the same. "
+            f"Kept at nominal: {', '.join(hidden)}. The measurements cannot separate {_such_zeros(hidden)} from a "
+            "rotation of the camera, the marker or a neighbouring joint. Predicted positions are unaffected. "
             "The other figures are given that."
         )
     if report.undirected:
@@ -60,13 +57,13 @@ def sentences(report: CalibrationReport) -> list[str]:
             f"count{'s' if len(report.undirected) == 1 else ''}: the positions are the same either way."
         )
     if report.first > 1:
-        said.insert(0, f"Learnt from number {report.first} on.")
+        said.insert(0, f"Learnt from row {report.first} on.")
     if report.other_tool_from is not None:
         said.insert(0, two_tools(report))
     if report.misfit > MISFIT:
         said.append(
             f"The residuals are {report.misfit:.1f} times what the noise explains: the arm is not quite a rigid chain "
-            "(it sags, its encoders are eccentric), or the noise is larger than stated. The intervals are wider for it."
+            "(compliance, eccentric encoders), or the noise is larger than stated. The intervals are widened."
         )
     if report.doubt is not None:
         said.insert(0, report.doubt)
@@ -109,18 +106,18 @@ def _workmanship(report: CalibrationReport) -> str:
     if report.trusted != "nothing":
         return _trusted(report)
     if report.axes_deg is None or report.points_mm is None:
-        return "These pairs do not tell how well the arm is made; the intervals hold for a good one and for a bad one."
+        return "These pairs do not show how accurately the arm is made; the intervals hold for any accuracy."
     return (
-        f"This arm is made to about {report.axes_deg:.2g}° (axes) and {report.points_mm:.2g} mm (their places), as the "
-        "pairs have it."
+        f"Estimated deviation from the URDF (1 sigma): axis directions {report.axes_deg:.2g}°, axis positions "
+        f"{report.points_mm:.2g} mm."
     )
 
 
 def _advice(report: CalibrationReport) -> str:
     if report.still:
-        return f" Hardly moved: {', '.join(report.still)}. Pairs where they move would show more."
+        return f" Hardly moved: {', '.join(report.still)}. Move them, to determine more."
     if report.shown < report.showable:
-        return " Where axes stay parallel, or the marker sits on one, the rest does not matter; else move more joints."
+        return " If axes stay parallel, or the marker is on one, the others do not matter; else move more joints."
     return ""
 
 
@@ -155,5 +152,5 @@ def _fixed(value: float, digits: int) -> str:
 
 def _zero(zero: Zero) -> tuple[str, str]:
     if zero.half_width is None:
-        return "as drawn", "–"
+        return "nominal", "–"
     return f"{zero.zero:+.3f}", f"± {zero.half_width:.3f}"

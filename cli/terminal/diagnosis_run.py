@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 
@@ -24,12 +24,11 @@ from bodyschema.diagnosis.diagnosis import Diagnosis
 from bodyschema.diagnosis.diagnosis import diagnose as diagnosed
 from bodyschema.diagnosis.hypotheses import STILL
 from bodyschema.diagnosis.observations import ticks
-from bodyschema.diagnosis.remedies import remedies
-from bodyschema.diagnosis.report import About, page
+from bodyschema.diagnosis.report.page import About, page
 from bodyschema.diagnosis.result import DiagnosisFile
-from bodyschema.diagnosis.words import modelled
-from bodyschema.effects import KINDS, write_corrected, write_extended
-from bodyschema.effects.poses import transforms
+from bodyschema.diagnosis.text import modelled, remedies
+from bodyschema.effects import EFFECT_TYPES, write_corrected, write_extended
+from bodyschema.effects.effect_type import CameraEffect
 from bodyschema.interfaces.errors import BodyschemaError, RecordingError, RequestError
 from bodyschema.interfaces.records import FloatArray, Pair
 from bodyschema.interfaces.whole_files import write_whole
@@ -69,7 +68,7 @@ class Asked:
     def of(cls, only: str | None, without: str | None, seed: int) -> Asked:
         """Parse comma-separated names. Raise RequestError if an effect is unknown, or none remains."""
         asked = cls(_names(only, "--effects"), _names(without, "--exclude"), seed)
-        if set(asked.only or KINDS) <= set(asked.without):
+        if set(asked.only or EFFECT_TYPES) <= set(asked.without):
             raise RequestError("--effects and --exclude leave nothing to look for. Exclude fewer")
         return asked
 
@@ -79,12 +78,12 @@ def _names(text: str | None, option: str) -> tuple[str, ...]:
         return ()
     names = tuple(name.strip() for name in text.split(",") if name.strip())
     if not names:
-        raise RequestError(f"{option} names no effect. Known are: {', '.join(KINDS)}")
+        raise RequestError(f"{option} names no effect. Known are: {', '.join(EFFECT_TYPES)}")
     for name in names:
         if name in ALWAYS:
             raise RequestError(f"{option} {name}: {name} are always looked for, and left out. Take it out")
-        if name not in KINDS:
-            raise RequestError(f"{option}: there is no effect {name!r}. {did_you_mean(name, KINDS)}")
+        if name not in EFFECT_TYPES:
+            raise RequestError(f"{option}: there is no effect {name!r}. {did_you_mean(name, EFFECT_TYPES)}")
     return names
 
 
@@ -158,13 +157,16 @@ class Found:
     def hand_eye(self) -> HandEye:
         """The camera's pose with what was found in it. Without a fitted pose it has no covariance."""
         fit, covariance = self.diagnosis.extended, None
-        shifts = [effect for effect in fit.simulation.effects if effect.name == "camera_pose"]
-        start = self.robot.camera.pose @ fit.simulation.with_effects(()).camera_pose
+        effects = fit.simulation.effects
+        shifts = [effect for effect in effects if isinstance(effect.kind, CameraEffect) and effect.kind.rigid]
+        ends = np.cumsum([len(effect.values) for effect in shifts])
 
         def pose(values: FloatArray) -> FloatArray:
-            return reduce(np.matmul, transforms(values.reshape(-1, 6)), start)
+            parts = zip(shifts, np.split(values, ends), strict=False)
+            moved = fit.simulation.with_effects([effect.with_values(part) for effect, part in parts])
+            return self.robot.camera.pose @ moved.camera_pose
 
-        values = np.array([effect.values for effect in shifts]).ravel()
+        values = np.concatenate([np.empty(0), *(effect.values for effect in shifts)])
         if shifts:
             places = [place for effect in shifts for place in fit.places(effect)]
             covariance = pose_covariance(pose, values, fit.covariance[np.ix_(places, places)])

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from bodyschema.diagnosis.numbers import chance, mm, numbers_of, percent, place, rival_named, share, telling
 from bodyschema.diagnosis.result import Cause, DiagnosisFile, Errors, Indistinguishable, Verdict
-from bodyschema.diagnosis.words import beside_geometry, made_to, modelled
+from bodyschema.diagnosis.text import beside_geometry, made_to, modelled
 
 # Number of rejected hypotheses shown.
 NEAREST = 6

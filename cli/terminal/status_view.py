@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
@@ -13,20 +13,18 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from bodyschema.cli.servos.servos_view import servos_table
+from bodyschema.cli.terminal.findings_view import calibration_table, outlook_lines
+from bodyschema.cli.terminal.screen import coverage_table, degrees, mm, rejected
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.service.remedies import as_typed
 from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.identity import Route
 from bodyschema.daemon.transport.keys import Keys
-from bodyschema.daemon.transport.status import UNDECIDED, BusStatus, LearnerStatus, SamplerStatus
+from bodyschema.daemon.transport.status import UNDECIDED, BusStatus, LearnerStatus, SamplerStatus, ServoStatus
 from bodyschema.daemon.transport.wire import decode
 from bodyschema.daemon.transport.zenoh_config import PROCESSES
 from bodyschema.interfaces.errors import BusError, RequestError
 from bodyschema.learning.status import OrientationStatus
-
-from .findings_view import calibration_table, outlook_lines
-from .screen import coverage_table, degrees, mm, rejected
 
 ANSWER_LIMIT_S = 2.0
 EVERY_S = 1.0
@@ -93,7 +91,7 @@ class Watcher:
 
 def as_json(seen: Seen) -> str:
     """Return both states as one line of JSON."""
-    return msgspec.json.encode({"sampler": seen.sampler, "learner": seen.learner}).decode()
+    return msgspec.json.encode({"schema": 1, "sampler": seen.sampler, "learner": seen.learner}).decode()
 
 
 def screen(seen: Seen, config: Config) -> RenderableType:
@@ -112,7 +110,7 @@ def screen(seen: Seen, config: Config) -> RenderableType:
 
 
 def _absent(process: str, route: Route) -> list[RenderableType]:
-    said = f"does not answer on {route}. Start it with `bodyschema {process}`, or both with `bodyschema run`."
+    said = f"does not answer on {route}. Start it with `bodyschema run {process}`, or both with `bodyschema run`."
     return [Text.assemble((process, "bold"), " ", (as_typed(said), "yellow"))]
 
 
@@ -179,7 +177,7 @@ def _change(status: LearnerStatus) -> Iterator[str]:
     if change.kind == UNDECIDED:
         yield ", ".join(f"{kind} {share:.0%}" for kind, share in change.probabilities.items())
     elif change.alike is not None:
-        yield f"or {change.alike}: no motion tells them apart"
+        yield f"or {change.alike}: no motion separates them"
     if change.can_roll_back:
         yield as_typed("`bodyschema command rollback` goes back to the model before it")
 
@@ -213,3 +211,29 @@ def _orientation(status: OrientationStatus) -> str:
         f"{status.answering} answers, of {status.pairs} pairs; new pairs: {errors}; "
         f"claimed {degrees(status.claimed_rad)} where data is"
     )
+
+
+def servos_table(servos: Mapping[str, ServoStatus]) -> Table:
+    """Return a table of each joint's servo: identity, health, and problems in the last column."""
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for heading in ("servo", "ID", "model", "fw", "supply", "temp.", "current", "state"):
+        right = heading in ("ID", "fw", "supply", "temp.", "current")
+        table.add_column(heading, justify="right" if right else "left", no_wrap=heading != "state")
+    for joint, servo in servos.items():
+        figures = (
+            _or_dash(servo.voltage_v, "{:.1f} V"),
+            _or_dash(servo.temperature_c, "{:.0f} °C"),
+            _or_dash(servo.current_a, "{:.2f} A"),
+        )
+        state = Text(_short(servo), style="red") if servo.troubles else Text("well", style="green")
+        table.add_row(joint, str(servo.id), servo.model, str(servo.firmware), *figures, state)
+    return table
+
+
+def _short(servo: ServoStatus) -> str:
+    """Return the problem without its remedy, which is printed above the table."""
+    return ", ".join(trouble.split(":")[0] for trouble in servo.troubles)
+
+
+def _or_dash(value: float | None, form: str) -> str:
+    return "-" if value is None else form.format(value)

@@ -17,9 +17,11 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
+import logging
 import math
 import os
 import struct
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -28,9 +30,12 @@ import numpy as np
 
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning.state import LearningHeader, LearningState
+from bodyschema.learning.online_learner import OnlineLearner
+from bodyschema.learning.state import LearningHeader, LearningState, StateError
+from bodyschema.recordings.files import StoredPairs
 from bodyschema.recordings.kept_files import sync_folder, unused_name
 from bodyschema.robot.limited import read_at_most
+from kbmaps import KBMapsError
 
 MAGIC = b"BSCKPT\r\n"
 VERSION = 3
@@ -191,3 +196,65 @@ def _unwritable(file: Path, error: OSError) -> str:
         f"the checkpoint {file} could not be written: {error.strerror}. Learning continues; "
         "give a --state-dir that can be written"
     )
+
+
+log = logging.getLogger(__name__)
+
+# Exceptions of a checkpoint whose checksum is right but whose contents do not fit.
+DOES_NOT_FIT = (ArithmeticError, LookupError, TypeError, ValueError)
+
+
+def go_on(new: Callable[[], OnlineLearner], checkpoint: Path, robot: str) -> tuple[OnlineLearner, str | None]:
+    """Restore the learner from the newest usable checkpoint.
+
+    Args:
+        new: creates a learner without data.
+        checkpoint: the newest; an unusable one is kept next to it under another name.
+
+    Returns:
+        The learner, and a message about what was wrong, or None.
+
+    Raises:
+        CheckpointError: an unusable checkpoint cannot be moved aside.
+    """
+    said: list[str] = []
+    for file in generations(checkpoint):
+        learning = new()
+        try:
+            state = read_checkpoint(file, robot=robot)
+            if state is None:
+                continue
+            learning.restore(state)
+        except (CheckpointError, StateError, KBMapsError, *DOES_NOT_FIT) as error:
+            unfit = isinstance(error, DOES_NOT_FIT)
+            why = f"the checkpoint's parts do not fit: {error!r}" if unfit else str(error)
+            said.append(f"{why}. It was kept as {set_aside(file)}")
+            continue
+        pairs = learning.counters.pairs
+        log.info("went on from %s with %d pairs", file, pairs)
+        return learning, _told([*said, f"the learner went on from {file} with {pairs} pairs"]) if said else None
+    return new(), _told([*said, "the learner learns again from the sampler's history"]) if said else None
+
+
+def _told(said: list[str]) -> str:
+    text = "; ".join(said)
+    log.error("%s", text)
+    return text
+
+
+def first_pair(pairs: StoredPairs, checkpoint: Path, robot: str) -> int:
+    """Return the row, from 1, of the first pair with the present tool.
+
+    Returns 1 if no learner of these pairs has left a checkpoint.
+
+    Pairs from before a `reset_to_prior` do not count as pairs with the present tool.
+    """
+    try:
+        state = read_checkpoint(checkpoint, robot=robot)
+    except CheckpointError:  # the learner reports it; the recording can be calibrated without
+        return 1
+    if state is None or state.header.counters.store != pairs.store:
+        return 1
+    counters = state.header.counters
+    number = counters.last_seq - counters.since_change + 1
+    return sum(each < number for each in pairs.numbers) + 1

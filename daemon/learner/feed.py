@@ -273,7 +273,7 @@ class PairFeed:
         self._foreign = store
         self._problem = (
             f"pairs now come from the store {store}, but this learner learnt from {self._store}; they are not mixed. "
-            "Send the command reset_to_prior to begin anew with the new store, or put the old store back"
+            "Send the command reset_to_prior to start again with the new store, or restore the old store"
         )
 
 

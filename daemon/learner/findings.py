@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from bodyschema.calibration.chain_figures import ChainFigures, is_told, no_surer_than_possible
 from bodyschema.calibration.plausibility.check import FEWEST_ROWS, ROWS, plausibility
+from bodyschema.daemon.transport.status import UNDECIDED, Change
 from bodyschema.interfaces.protocols import Clock
+from bodyschema.learning.changes.record import JOINT, ChangeRecord, KindOfChange
 from bodyschema.learning.data_outlook import LearnerEvidence, Scatter, forecast
 from bodyschema.learning.model_bank import SOLVED
 from bodyschema.learning.online_learner import OnlineLearner
@@ -177,3 +180,63 @@ def figures(robot: RobotDescription, known: LearnerEvidence) -> tuple[ChainFigur
     kept, shares = probable(np.array([evidence for _, evidence in beliefs]))
     told = is_told([made[k] for k in kept])
     return ChainFigures(robot, tuple(beliefs[k][0] for k in kept), shares, prior), made[kept[0]] if told else None
+
+
+# Kinds less probable than this are not reported.
+_TOLD = 0.01
+
+
+class Changes:
+    """Logs the learner's changes, in the robot's names. Not thread-safe.
+
+    Args:
+        joints: joint names.
+        change: the last change that was already reported; None: there was none.
+    """
+
+    def __init__(self, joints: Sequence[str], change: ChangeRecord | None = None) -> None:
+        self._joints, self._told = tuple(joints), change
+
+    def note(self, change: ChangeRecord | None, *, rolled_back: bool = False) -> None:
+        """Log what is new about the last change: its detection, its cause, its rollback."""
+        was, self._told = self._told, change
+        if rolled_back:
+            log.info("rolled back to the model before %s", "the change" if was is None else f"pair {was.first_seq}")
+        elif change is not None and (was is None or was.noticed_seq != change.noticed_seq):
+            log.info("%s", self._sentence(change))
+        elif change is not None and was is not None and self._name(was) != self._name(change):
+            log.info("the change at pair %d is %s", change.first_seq, self._name(change))
+
+    def status(self, change: ChangeRecord | None, *, can_roll_back: bool) -> Change | None:
+        """Return the change for the status; None: there was none."""
+        if change is None:
+            return None
+        return Change(
+            first_seq=change.first_seq,
+            earliest_seq=change.earliest_seq,
+            latest_seq=change.latest_seq,
+            noticed_seq=change.noticed_seq,
+            found=change.found,
+            kind=self._name(change),
+            probabilities={
+                self._of(kind): round(kind.probability, 3) for kind in change.kinds if kind.probability > _TOLD
+            },
+            alike=None if change.named is None else change.alike(change.named),
+            moved_m=change.moved_m,
+            can_roll_back=can_roll_back,
+        )
+
+    def _sentence(self, change: ChangeRecord) -> str:
+        if not change.found:
+            return f"tool changed before pair {change.first_seq}, as reported by the command tool_changed"
+        moved = "" if change.moved_m is None else f", marker moved by {1e3 * change.moved_m:.1f} mm"
+        return (
+            f"change found at pair {change.first_seq} ({change.earliest_seq} to {change.latest_seq}, noticed at "
+            f"{change.noticed_seq}): {self._name(change)}{moved}"
+        )
+
+    def _name(self, change: ChangeRecord) -> str:
+        return UNDECIDED if change.named is None else self._of(change.named)
+
+    def _of(self, kind: KindOfChange) -> str:
+        return kind.name if kind.joint is None else f"{JOINT} {self._joints[kind.joint]}"

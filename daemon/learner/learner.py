@@ -15,12 +15,10 @@ from importlib.metadata import version
 
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner.answers import Answers
-from bodyschema.daemon.learner.changes import Changes
-from bodyschema.daemon.learner.checkpoint import CheckpointError, write_checkpoint
+from bodyschema.daemon.learner.checkpoint import CheckpointError, go_on, write_checkpoint
 from bodyschema.daemon.learner.expected import ExpectedMarker
 from bodyschema.daemon.learner.feed import BEHIND, PairFeed
-from bodyschema.daemon.learner.findings import Findings, FindingTurns
-from bodyschema.daemon.learner.resume import go_on
+from bodyschema.daemon.learner.findings import Changes, Findings, FindingTurns
 from bodyschema.daemon.sampler.history import Page, read_page
 from bodyschema.daemon.service.reload import reload
 from bodyschema.daemon.service.service import Service, with_health
@@ -202,7 +200,7 @@ class Learner:
         if not self._sampler_alive:
             yield (
                 f"no sampler on {self._config.tables.zenoh.sampler}, so no new pairs; start it with "
-                "`bodyschema sampler`. Predictions go on"
+                "`bodyschema run sampler`. Predictions go on"
             )
         for problem in (self._feed.problem, self._checkpoint_problem, self._set_aside):
             if problem is not None:
@@ -278,7 +276,7 @@ class Learner:
         self._feed.wake()
         self.checkpoint()
         if foreign is not None:
-            return f"the learner begins anew with the pairs of the store {foreign}"
+            return f"the learner starts again with the pairs of the store {foreign}"
         return "the learner is back at the nominal model; only pairs from now on count"
 
     def _tool_changed(self) -> str:

@@ -13,7 +13,7 @@ log = logging.getLogger(__name__)
 
 Device = Mapping[str, Any]
 
-ANEW = "or keep it, and begin anew with another --state-dir"
+ANEW = "or keep it, and start again with another --state-dir"
 IN_SERVO = {"homing_offset_ticks": "homing_offset", "drive_mode": "drive_mode"}
 IN_ROBOT_TOML = ("zero_ticks", "direction")
 
@@ -85,7 +85,7 @@ def _said(before: Device, now: Device) -> Iterator[str]:
         if key in changed:
             yield (
                 f"the zero of {joint!r} is not what the pairs before were measured with: {name} was {before[key]}, is "
-                f"{now[key]}. Write it back (`bodyschema servos set {name}={before[key]} --joint {joint}`), {ANEW}"
+                f"{now[key]}. Write it back (`bodyschema servos {name}={before[key]} --joint {joint}`), {ANEW}"
             )
     for key in IN_ROBOT_TOML:
         if key in changed:
@@ -96,5 +96,5 @@ def _said(before: Device, now: Device) -> Iterator[str]:
     if "firmware" in changed:
         yield (
             f"the firmware of {joint!r} was {before['firmware']}, is {now['firmware']}: compare its angle in a known "
-            "pose with `bodyschema joints`; pairs before may have another zero"
+            "pose with `bodyschema watch joints`; pairs before may have another zero"
         )

@@ -105,6 +105,9 @@ class JoinedHealth:
         return tuple(text for device in self.devices for text in device.health)
 
 
+THE_CAMERAS = "the cameras"
+
+
 @dataclass(frozen=True, slots=True)
 class Sources:
     """Encoders and marker, not opened yet, on one clock; and the simulated world if there is one.
@@ -126,7 +129,7 @@ class Sources:
     powered: tuple[Powered, ...] = ()
     head: Head | None = None
     cameras: TellsHealth | None = None
-    seen_by: str = "the cameras"
+    seen_by: str = THE_CAMERAS
     calibration: StereoCalibration | None = None
     picture: Picture | None = None
     live: bool = False

@@ -34,7 +34,7 @@ class Reload:
         if self.waiting:
             restart = f"systemctl restart bodyschema-{process}@{self.config.robot.name}"
             said.append(
-                f"{', '.join(self.waiting)} cannot change while the {process} runs: start it anew (`{restart}`, or "
+                f"{', '.join(self.waiting)} cannot change while the {process} runs: restart it (`{restart}`, or "
                 "Ctrl-C and again); no pair is lost by that"
             )
         return ". ".join(said) or "nothing that the process knows of is other than it was"

@@ -11,8 +11,21 @@ OPTION = "--robot"
 # The other commands take no robot.toml, or write one.
 WITH_ROBOT = frozenset(
     {
-        *("bench", "command", "doctor", "ik", "joints", "learner", "predict", "record", "run", "sampler", "scan"),
-        *("servos", "status", "watch cameras", "backup", "config check", "config show", "calibrate latency"),
+        *(
+            "bench",
+            "command",
+            "config",
+            "doctor",
+            "ik",
+            "predict",
+            "record",
+            "run",
+            "scan",
+            "servos",
+            "status",
+            "watch",
+        ),
+        *("backup", "calibrate latency"),
     }
 )
 _QUOTED = re.compile(r"`bodyschema ([^`]+)`")

@@ -9,6 +9,7 @@ import contextlib
 import json
 import logging
 import queue
+import socket
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -19,12 +20,10 @@ from typing import Any, Self
 import zenoh
 import zenoh.ext
 
+from bodyschema.daemon.transport.identity import Route
+from bodyschema.daemon.transport.query_limiter import QueryLimiter
+from bodyschema.daemon.transport.wire import JSON, MSGPACK, ErrorReply, decode, encode
 from bodyschema.interfaces.errors import BodyschemaError, BusError, RequestError
-
-from .identity import Route
-from .query_limiter import QueryLimiter
-from .unreached import unreached
-from .wire import JSON, MSGPACK, ErrorReply, decode, encode
 
 log = logging.getLogger(__name__)
 
@@ -206,7 +205,7 @@ class ZenohSession:
                     "that may ask this (docs/security.md)"
                 )
             raise BusError(
-                f"nothing answers under {key}. Is the {process} running? Start it with `bodyschema {process}`"
+                f"nothing answers under {key}. Is the {process} running? Start it with `bodyschema run {process}`"
             )
         if replies[0].error is not None:
             raise RequestError(replies[0].error)
@@ -371,3 +370,38 @@ def _taken_apart(reply: zenoh.Reply) -> Reply:
         return Reply(payload, decode(payload, ErrorReply, str(reply.err.encoding)).error)
     except RequestError:
         return Reply(payload, payload.decode(errors="replace"))
+
+
+ACCEPT_LIMIT_S = 1.0
+
+
+def unreached(route: Route) -> str:
+    """Return the reason why none of a route's endpoints could be reached."""
+    last = route.endpoints[-1]
+    if not _accepts(last):
+        return (
+            f"nothing listens on {route}. Start the daemon with `bodyschema run`, "
+            "or fix the table [zenoh] of robot.toml"
+        )
+    if route.secured:
+        return (
+            f"{last} is there, but the connection was refused: your certificate or password is not accepted there, "
+            "or its certificate is not for that name or not of your authority. docs/security.md shows how to look"
+        )
+    return (
+        f"a program listens on {last} but does not answer: it is stopped, very busy, or not bodyschema. "
+        "`ps` shows what it is"
+    )
+
+
+def _accepts(endpoint: str) -> bool:
+    """Return True if a TCP endpoint accepts connections, even from a process that never answers."""
+    protocol, _, address = endpoint.partition("/")
+    host, _, port = address.rpartition(":")
+    if protocol not in ("tcp", "tls") or not port.isdigit():
+        return False
+    try:
+        with socket.create_connection((host.strip("[]"), int(port)), ACCEPT_LIMIT_S):
+            return True
+    except OSError:
+        return False

@@ -158,7 +158,11 @@ def bench_ports(bench: DryRun) -> list[str]:
 
 def bench_commands(bench: DryRun) -> tuple[str, ...]:
     """Return the names of the commands that can talk to the devices on the ports."""
-    return ("doctor", "joints") if isinstance(bench.config, SerialLinesConfig) else ("scan", "doctor", "joints")
+    return (
+        ("doctor", "watch joints")
+        if isinstance(bench.config, SerialLinesConfig)
+        else ("scan", "doctor", "watch joints")
+    )
 
 
 def _counted(count: int, what: str) -> str:

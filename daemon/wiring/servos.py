@@ -1,4 +1,4 @@
-"""Wiring of the commands that find servos and report their health."""
+"""Wiring of the commands that find servos, of all protocols, and report their health."""
 
 from __future__ import annotations
 
@@ -14,21 +14,26 @@ from bodyschema.drivers.dynamixel.config import DynamixelConfig
 from bodyschema.drivers.dynamixel.joints import DYNAMIXEL
 from bodyschema.drivers.dynamixel.joints import open_serial as open_dynamixel
 from bodyschema.drivers.dynamixel.models import BY_NAME as DYNAMIXEL_MODELS
+from bodyschema.drivers.dynamixel.scan import PROTOCOL1, Protocol2Scanner
 from bodyschema.drivers.feetech.config import Baud as FeetechBaud
 from bodyschema.drivers.feetech.config import FeetechConfig
-from bodyschema.drivers.feetech.joints import FEETECH
+from bodyschema.drivers.feetech.joints import FEETECH, FEETECH_SERVOS
 from bodyschema.drivers.feetech.joints import open_serial as open_feetech
 from bodyschema.drivers.feetech.models import BY_NAME as FEETECH_MODELS
 from bodyschema.drivers.scan import ScannedBus, Tell, scan_port, serial_ports
-from bodyschema.drivers.scanners import SCANNERS
 from bodyschema.drivers.serial_line import adapter_latency_s
 from bodyschema.drivers.serial_lines.checks import encoder_checks as checks_of_encoders
 from bodyschema.drivers.servos.checks import servo_checks as checks_of_servos
+from bodyschema.drivers.servos.scan import PingScanner
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError
 
 if TYPE_CHECKING:
-    from bodyschema.daemon.config import Config  # takes most of a second to import, and a scan may not need it
+    from bodyschema.daemon.config import Config
+
+# PING is the same in Protocol 1.0 and in Feetech's protocol: one scan finds both.
+SCANNERS = (Protocol2Scanner(), PingScanner(PROTOCOL1, FEETECH_SERVOS))
+
 
 Servos = DynamixelConfig | FeetechConfig
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,6 +14,7 @@ import numpy as np
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler.reconnect import ReconnectingSource
 from bodyschema.daemon.sampler.sources import (
+    THE_CAMERAS,
     Head,
     JoinedHealth,
     MarkerTopic,
@@ -23,31 +24,39 @@ from bodyschema.daemon.sampler.sources import (
     StampedJoints,
     TellsHealth,
 )
+from bodyschema.daemon.wiring.bench import require_bench, through_bench
+from bodyschema.daemon.wiring.simulation import simulation_settings
 from bodyschema.drivers.checks import Check
 from bodyschema.drivers.dynamixel.config import DynamixelConfig
 from bodyschema.drivers.feetech.config import FeetechConfig
 from bodyschema.drivers.markers.checks import stream_checks
+from bodyschema.drivers.markers.config import AnySource, NatnetTable, Ros2Table, UdpTable, ZenohTable
+from bodyschema.drivers.markers.datagram import decode_datagram
 from bodyschema.drivers.markers.fusing import FusedMarkers, Member
-from bodyschema.drivers.markers.opened import stream_of
+from bodyschema.drivers.markers.keys import KeyReceiver, topic_receiver
+from bodyschema.drivers.markers.natnet.client import NatnetReceiver
 from bodyschema.drivers.markers.stream import MarkerStream
+from bodyschema.drivers.markers.udp import UdpReceiver
 from bodyschema.drivers.ros2.config import Ros2Config
 from bodyschema.drivers.serial_lines.config import SerialLinesConfig
 from bodyschema.drivers.serial_lines.joints import SerialLineJoints
+from bodyschema.effects.gravity import GravityLoad
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, StoreError
 from bodyschema.interfaces.extras import require_extra
 from bodyschema.interfaces.protocols import Clock, JointSource, MarkerSource
+from bodyschema.interfaces.records import FloatArray
 from bodyschema.interfaces.servos import EncoderJoints, ServoJoints
 from bodyschema.recordings.store.store import PairReader
+from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.plugins import PluginConfig, load
+from bodyschema.robot.toml_file import line_of, read_toml
 from kbmaps import RigidChain
 
-from .bench import require_bench, through_bench
-from .powered import open_drives
-from .simulation import simulation_settings
-
 if TYPE_CHECKING:
+    from bodyschema.drivers.dynamixel.gaze import Gaze
+    from bodyschema.drivers.dynamixel.zero_force import ZeroForce
     from bodyschema.drivers.ros2.joints import Ros2Joints
     from bodyschema.interfaces.protocols import StereoCamera
     from bodyschema.vision.cameras.config import CamerasConfig
@@ -176,7 +185,7 @@ def _require_source(config: Config, *, sim: bool) -> None:
         if config.tables.marker_source:
             return
         raise ConfigError(
-            "the joints have a driver, but nothing tells where the marker is: no cameras are configured",
+            "the joints have a driver, but nothing measures the marker's position: no cameras are configured",
             file=config.file,
             remedy="Add the table [vision.cameras] (docs/cameras.md) or [marker_source] (docs/marker_sources.md); or "
             "give --sim for the simulated robot",
@@ -270,7 +279,7 @@ def _seen_by(config: Config) -> str:
     names = [*(table.name for table in tables.vision.further_cameras), *(table.label for table in tables.marker_source)]
     if tables.vision.cameras is not None:
         if not names:
-            return Sources.seen_by
+            return THE_CAMERAS
         names.insert(0, "cameras")
     return f"the positions by {' and '.join(names)}"
 
@@ -387,3 +396,72 @@ def _recorded(config: Config, file: Path) -> Sources:
         calibration=config.robot.calibration,
     )
     return Sources(replay.joints, replay.marker, replay.clock)
+
+
+def stream_of(table: AnySource, clock: Clock) -> MarkerStream:
+    """Return the source, not opened yet; `clock` has to be the machine's monotonic one."""
+    match table:
+        case UdpTable():
+            return MarkerStream(table, UdpReceiver(table, clock), decode_datagram, clock)
+        case ZenohTable():
+            return MarkerStream(table, KeyReceiver(table, table.key, clock), decode_datagram, clock)
+        case NatnetTable():
+            motive = NatnetReceiver(table, clock)
+            return MarkerStream(table, motive, motive.decode, clock)
+        case Ros2Table():
+            return MarkerStream(table, *topic_receiver(table, clock), clock)
+
+
+def holding_torques(robot: RobotDescription) -> Callable[[FloatArray], FloatArray]:
+    """Return a function from joint angles [rad] (d,) to gravity torques [N·m] (d,), by the URDF's masses.
+
+    Raises:
+        ConfigError: the URDF states no masses that a joint bears.
+    """
+    load = GravityLoad(robot)
+    if not load.known:
+        raise ConfigError(
+            "the URDF states no masses, so the arm's weight is unknown",
+            file=robot.tree.file,
+            remedy="Give its links <inertial> with mass and origin, or take [drivers.dynamixel.zero_force] out",
+        )
+    return lambda q: -load.torques(q[None])[0]
+
+
+def open_drives(config: Config, servos: DynamixelConfig, clock: Clock) -> tuple[ZeroForce | Gaze, ...]:
+    """Return the drives that may move the joints: those that robot.toml names, inactive until a person asks.
+
+    Raises:
+        ConfigError: the URDF states no masses, or robot.toml says that the arm is held in another way.
+    """
+    joints, drives = config.robot.joints, []
+    _check_hold(config, servos)
+    if servos.zero_force is not None:
+        from bodyschema.drivers.dynamixel.zero_force import ZeroForce
+
+        torques = holding_torques(config.robot)
+        drives.append(ZeroForce(servos, servos.zero_force, joints, torques, clock))
+    if servos.gaze is not None:
+        from bodyschema.drivers.dynamixel.gaze import Gaze
+
+        limits = list(zip(config.robot.lower.tolist(), config.robot.upper.tolist(), strict=True))
+        drives.append(Gaze(servos.gaze, joints, limits, clock))
+    return tuple(drives)
+
+
+def _check_hold(config: Config, servos: DynamixelConfig) -> None:
+    """Raise ConfigError if [robot] hold, used by the diagnosis, contradicts [drivers.dynamixel]."""
+    hold, is_configured = config.robot.robot.hold, servos.zero_force is not None
+    if is_configured == (hold == "zero_force"):
+        return
+    what = (
+        f'[drivers.dynamixel.zero_force] bears the arm, but hold = "{hold}" in [robot] says otherwise to the diagnosis'
+        if is_configured
+        else 'hold = "zero_force" in [robot], but nothing bears the arm: there is no [drivers.dynamixel.zero_force]'
+    )
+    raise ConfigError(
+        what,
+        file=config.file,
+        line=line_of(read_toml(config.file)[1], ("robot", "hold")),
+        remedy='Write hold = "zero_force" in [robot]' if is_configured else "Add the table, or change hold",
+    )

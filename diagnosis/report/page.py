@@ -12,12 +12,13 @@ import numpy as np
 
 from bodyschema.diagnosis.diagnosis import Diagnosis
 from bodyschema.diagnosis.numbers import chance, mm, share, told_values
+from bodyschema.diagnosis.presenters.outliers import outlier_panel
+from bodyschema.diagnosis.presenters.registry import presenter_of
 from bodyschema.diagnosis.result import Cause, DiagnosisFile, Verdict
-from bodyschema.diagnosis.words import beside_geometry, finding, made_to, modelled
+from bodyschema.diagnosis.text import beside_geometry, finding, made_to, modelled
 from bodyschema.effects import Effect
 
 from . import tables
-from .evidence import evidence_panels, outlier_panel
 from .panels import Panel, panels
 from .residuals import Residuals
 from .spread import arrows, histogram
@@ -146,11 +147,11 @@ def _cause(
     residuals: Residuals, cause: Cause, effect: Effect | None, remedy: str, seen_by: str, *, opened: bool
 ) -> str:
     said = finding(cause.effect, cause.where, cause.source, told_values(cause), seen_by, timed=residuals.timed)
-    plots = [outlier_panel(residuals)] if effect is None else evidence_panels(residuals, effect)
+    plot = outlier_panel(residuals) if effect is None else presenter_of(effect.name).panel(residuals, effect)
     state = " open" if opened else ""
     return (
         f'<details class="cause"{state}><summary>{escape(said[0].upper() + said[1:])}</summary><div class="beside">'
-        f"{_panels(plots)}<div><p>{tables.numbers(cause, timed=residuals.timed)}</p><p>{escape(cause.evidence)}</p>"
+        f"{_panels([plot])}<div><p>{tables.numbers(cause, timed=residuals.timed)}</p><p>{escape(cause.evidence)}</p>"
         f"{tables.rivals(cause)}<p><b>What to do.</b> {escape(remedy)}</p></div></div></details>"
     )
 

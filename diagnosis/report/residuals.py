@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import fdtrc
 
 from bodyschema.diagnosis.diagnosis import Diagnosis
 from bodyschema.effects import Effect, Simulation
@@ -163,7 +163,7 @@ def structure(x: FloatArray, y: FloatArray) -> float:
     inside = float(np.square(y - means[member]).sum())
     between = float(np.square(means[member] - y.mean()).sum())
     ratio = (between / (groups - 1)) / max(inside / (n - groups), 1e-300)
-    if stats.f.sf(ratio, groups - 1, n - groups) > _SIGNIFICANT:
+    if fdtrc(groups - 1, n - groups, ratio) > _SIGNIFICANT:
         return 0.0
     share = between / max(between + inside, 1e-300)
     return max(share - (groups - 1) / (n - 1), 0.0)

@@ -86,7 +86,7 @@ class Gaze(PoweredJoints):
             raise RequestError(
                 f"joint {servo.joint!r} (ID {servo.id}) has a Homing Offset: it may turn when its watchdog stops it. "
                 "Give zero_ticks in robot.toml, and type: "
-                f"`bodyschema servos set homing_offset=0 --joint {servo.joint}`"
+                f"`bodyschema servos homing_offset=0 --joint {servo.joint}`"
             )
         # With torque on, the position is within one turn (e-Manual, Present Position).
         turn, middle = servo.model.ticks_per_turn or 0, servo.model.zero_ticks

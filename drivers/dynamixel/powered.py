@@ -234,7 +234,7 @@ class PoweredJoints(ABC):
         return (
             f"joint {servo.joint!r} (ID {servo.id}) is in operating mode {found}, not {self.mode_name} ({self.mode}). "
             f"It is kept in the servo's EEPROM; type: "
-            f"`bodyschema servos set operating_mode={self.mode} --joint {servo.joint}`"
+            f"`bodyschema servos operating_mode={self.mode} --joint {servo.joint}`"
         )
 
     # --- torque off
@@ -293,7 +293,7 @@ class PoweredJoints(ABC):
         if exchange.trouble is not None:
             self._missed[servo.joint] = self._missed.get(servo.joint, 0) + 1
             if self._missed[servo.joint] >= MISSED_LOOKS:
-                raise Drop(f"joint {servo.joint!r}: its servo does not tell its state: {exchange.trouble}")
+                raise Drop(f"joint {servo.joint!r}: its servo does not report its state: {exchange.trouble}")
             return
         self._missed[servo.joint] = 0
         data = exchange.answers[0].status.data

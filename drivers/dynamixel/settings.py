@@ -75,7 +75,7 @@ def _modes(model: Model) -> dict[str, int]:
 
 def _turns(model: Model) -> str:
     near = "" if model.series == "P" else f"; in position mode a homing_offset beyond ±{NEAR_OFFSET} is ignored"
-    return f"its whole turns may be counted anew{near}"
+    return f"its turn count may be lost{near}"
 
 
 def _of_protocol1(model: Model) -> Iterator[Setting]:

@@ -85,7 +85,7 @@ class ZeroForce(PoweredJoints):
             raise RequestError(
                 f"joint {servo.joint!r} (ID {servo.id}): its own Current Limit is {allowed * unit:.2f} A. Give at most "
                 "that as current_limit_a, or type: "
-                f"`bodyschema servos set current_limit={abs(wanted)} --joint {servo.joint}`"
+                f"`bodyschema servos current_limit={abs(wanted)} --joint {servo.joint}`"
             )
         return 0
 

@@ -2,24 +2,153 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 
+from bodyschema.drivers.feetech.config import BusConfig, FeetechConfig
+from bodyschema.drivers.feetech.models import BAUDS, BY_NUMBER, HARDWARE_ERRORS, STS
 from bodyschema.drivers.serial_line import SerialLine, adapter_latency_s
+from bodyschema.drivers.servos.bus import Answer, Request, spare_after
 from bodyschema.drivers.servos.bus import Bus as ServoBus
-from bodyschema.drivers.servos.bus import Request, spare_after
+from bodyschema.drivers.servos.channel import Channel as ServoChannel
+from bodyschema.drivers.servos.channel import Sample
 from bodyschema.drivers.servos.handshake import FittedServo
 from bodyschema.drivers.servos.joints import OpenPort, ServoJoints
 from bodyschema.drivers.servos.make import Make
-from bodyschema.drivers.servos.packets import Packets
+from bodyschema.drivers.servos.model import Model, Register
+from bodyschema.drivers.servos.packets import HEADER, Packets, Status, take_summed
 from bodyschema.drivers.servos.plan import Way
 from bodyschema.drivers.servos.port import Port
+from bodyschema.drivers.servos.scan import Kind
+from bodyschema.drivers.servos.settings import BAUD, HOMING_OFFSET, ID, Setting
 from bodyschema.interfaces.protocols import Clock
 
-from .channel import Channel
-from .config import BusConfig, FeetechConfig
-from .models import BY_NUMBER, HARDWARE_ERRORS, STS
-from .packets import FeetechPackets
-from .settings import settings_of
+BROADCAST = 0xFE
+PING, READ, WRITE, SYNC_READ = 1, 2, 3, 0x82
+
+
+class FeetechPackets:
+    """The protocol of all series, which differ only in the byte order of registers."""
+
+    overhead, ping_size = 6, 0
+    refusals, is_weak = 0xC0, True  # no servo sets these two bits
+    # They answer READ at any Response Status Level.
+    pinged_only = "answers PING but no READ: look at its cable and supply"
+
+    def ping(self, id: int) -> bytes:
+        """Build PING."""
+        return _packet(id, PING)
+
+    def read(self, id: int, address: int, size: int) -> bytes:
+        """Build READ."""
+        return _packet(id, READ, bytes((address, size)))
+
+    def write(self, id: int, address: int, data: bytes) -> bytes:
+        """Build WRITE."""
+        return _packet(id, WRITE, bytes((address,)) + data)
+
+    def sync_read(self, ids: Sequence[int], address: int, size: int) -> bytes:
+        """Build SYNC_READ: all of `ids` answer, in this order."""
+        return _packet(BROADCAST, SYNC_READ, bytes((address, size, *ids)))
+
+    def take(self, received: bytes | bytearray, at: int) -> Status | None:
+        """Return the status packet that begins at `at`; see `Packets.take`."""
+        return take_summed(received, at)
+
+
+def _packet(id: int, code: int, params: bytes = b"") -> bytes:
+    body = bytes((id, len(params) + 2, code)) + params
+    return HEADER + body + bytes((~sum(body) & 0xFF,))
+
+
+LARGEST_POSITION = 30_719  # 7.5 turns
+KNOWN_ERRORS = sum(HARDWARE_ERRORS)
+
+
+class Channel(ServoChannel):
+    """The answers of one servo since the bus was opened."""
+
+    def _sample(self, answer: Answer) -> Sample | None:
+        data, model = answer.status.data, self.servo.model
+        layout = model.layout
+
+        def told(name: str) -> int:
+            return layout.value(name, data, layout.block.address)
+
+        position, moving = told("position"), told("moving")
+        if moving > 1 or told("status") & ~KNOWN_ERRORS or not self._is_possible(position):
+            return None
+        if not self._is_steady(told("voltage"), told("temperature")):
+            return None
+        amperes = None if model.current_unit is None else told("current") * model.current_unit
+        return Sample(
+            question=self.question(answer),
+            expected=answer.earliest,
+            earliest=answer.earliest,
+            latest=answer.latest,
+            ticks=position,
+            velocity=told("velocity") * model.velocity_unit,
+            current=amperes,
+            moving=bool(moving),
+            alert=answer.status.error != 0,
+        )
+
+    def _is_possible(self, position: int) -> bool:
+        if self.servo.model.ticks_per_turn is None:
+            return 0 <= position < 2 * self.servo.model.zero_ticks
+        return abs(position) <= LARGEST_POSITION
+
+
+LARGEST_ID = 252  # 253 is legal, but no robot.toml can name it
+MODES = {"position": 0, "velocity": 1, "pwm": 2, "step": 3}
+FARTHEST_OFFSET = 2047
+
+RENAMED = "set id in robot.toml"
+OTHER_RATE = "set baud in robot.toml; all servos of a bus need the same"
+OTHER_ZERO = "the joint's zero moves: pairs measured before do not fit those after"
+
+
+def settings_of(model: Model) -> Sequence[Setting]:
+    """Return the settings of a model, in the order of their addresses."""
+    found = [*_common(model), *(_of_sts(model) if model.protocol == STS else ())]
+    return sorted(found, key=lambda setting: setting.register.address)
+
+
+def _common(model: Model) -> Iterator[Setting]:
+    layout, order = model.layout, model.layout["model"].order
+    farthest = (model.ticks_per_turn or 1024) - 1
+    yield Setting(ID, layout["id"], 0, LARGEST_ID, follows=RENAMED)
+    yield Setting(BAUD, layout["baud"], 0, 7, {str(b): place for place, b in enumerate(BAUDS)}, follows=OTHER_RATE)
+    yield Setting("return_delay", layout["return_delay"], 0, 254, per_unit=2, unit="µs")
+    # With 0 it answers reads but no writes.
+    yield Setting("status_return", layout["status_return"], 0, 1)
+    yield Setting("min_position_limit", Register(9, 2, order=order), 0, farthest)
+    yield Setting("max_position_limit", Register(11, 2, order=order), 0, farthest)
+    yield Setting("temperature_limit", Register(13, 1), 0, 100, unit="°C")
+    yield Setting("max_voltage_limit", Register(14, 1), 0, 254, per_unit=0.1, unit="V")
+    yield Setting("min_voltage_limit", Register(15, 1), 0, 254, per_unit=0.1, unit="V")
+    yield Setting("max_torque", Register(16, 2, order=order), 0, 1000, per_unit=0.1, unit="%")
+    yield Setting(
+        "drive_mode",
+        layout["drive_mode"],
+        0,
+        254,
+        follows=f"its maker calls it Phase: not without their manual. {OTHER_ZERO}",
+    )
+    yield Setting("unloading", layout["unloading"], 0, 254, follows="which troubles switch its torque off")
+    yield Setting("alarm_led", Register(20, 1), 0, 254)
+
+
+def _of_sts(model: Model) -> Iterator[Setting]:
+    layout, degrees = model.layout, math.degrees(model.rad_per_tick)
+    homing = (layout["homing_offset"], -FARTHEST_OFFSET, FARTHEST_OFFSET)
+    yield Setting("protection_current", Register(28, 2), 0, 511, per_unit=model.current_unit or 1.0, unit="A")
+    yield Setting(HOMING_OFFSET, *homing, per_unit=degrees, unit="°", follows=OTHER_ZERO)
+    modes = "in step mode the position is not the joint's"
+    yield Setting("operating_mode", layout["operating_mode"], 0, 3, MODES, follows=modes)
+    yield Setting("protective_torque", Register(34, 1), 0, 100, unit="%")
+    yield Setting("overload_torque", Register(36, 1), 0, 100, unit="%")
+
 
 PACKETS = FeetechPackets()
 SYNC_READ_FAILED = (
@@ -88,3 +217,13 @@ class FeetechJoints(ServoJoints):
     ) -> None:
         """Prepare without opening anything; arguments as in `ServoJoints`."""
         super().__init__(FEETECH, config, joints, clock, open_port=open_port, limits=limits, last_pose=last_pose)
+
+
+FEETECH_SERVOS = Kind(
+    name="Feetech",
+    bauds=BAUDS,
+    version=STS,
+    models=BY_NUMBER,
+    errors=HARDWARE_ERRORS,
+    bus=Bus,
+)

@@ -38,7 +38,7 @@ ADVICE: dict[Fault, tuple[str, str]] = {
         'send millimetres, or take out unit = "mm"',
     ),
     Fault.COVARIANCE: (
-        "have a covariance that is none, or that is not in the positions' unit squared",
+        "have an invalid covariance, or one that is not in the positions' unit squared",
         'send a symmetric, positive definite matrix in m² (mm² with unit = "mm"), or none',
     ),
     Fault.TURN: ("have a quaternion whose length is not 1", "send x, y, z, w, or none"),

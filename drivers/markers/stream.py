@@ -4,22 +4,83 @@ from __future__ import annotations
 
 import logging
 import math
-from collections import deque
-from collections.abc import Callable, Hashable, Iterable
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from types import TracebackType
 from typing import Protocol, Self
 
 import numpy as np
 
+from bodyschema.drivers.markers.config import SourceTable
+from bodyschema.drivers.markers.report import ADVICE, Fault, Packet, Report, Unusable
 from bodyschema.drivers.ros2.cdr import Malformed
 from bodyschema.drivers.ros2.senders import Refusal, Sender
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, frozen_array
 
-from .config import SourceTable
-from .ledger import USED, Ledger
-from .report import Fault, Packet, Report, Unusable
+LATELY_S = 10.0
+BUCKET_S = 1.0
+# A share of faulty messages below this costs no pairs worth a message to a person.
+MANY = 0.02
+# The first messages of a clock that is not known yet may be refused.
+WORTH_A_WORD = 4
+USED = "used"
+
+
+class Ledger:
+    """Counters of used and unused messages, in total and of the last `LATELY_S`; for any thread.
+
+    Attributes:
+        total: number of messages by fault, and the used ones.
+    """
+
+    def __init__(self) -> None:
+        self.total: Counter[str] = Counter()
+        self._buckets: deque[tuple[float, Counter[str]]] = deque()
+        self._details: dict[Fault, str] = {}
+        self._lock = threading.Lock()
+
+    def note(self, t: float, what: Fault | str, detail: str = "", count: int = 1) -> bool:
+        """Count messages at time `t` [s]; return True once there are enough of this fault to tell a person."""
+        with self._lock:
+            if not self._buckets or t - self._buckets[-1][0] >= BUCKET_S:
+                self._buckets.append((t, Counter()))
+                while t - self._buckets[0][0] > LATELY_S:
+                    self._buckets.popleft()
+            self._buckets[-1][1][what] += count
+            self.total[what] += count
+            if isinstance(what, Fault) and detail:
+                self._details[what] = detail
+            return self.total[what] - count < WORTH_A_WORD <= self.total[what]
+
+    def lately(self, now: float) -> Counter[str]:
+        """Return the counts of the last seconds."""
+        counts: Counter[str] = Counter()
+        with self._lock:
+            for t, bucket in self._buckets:
+                if now - t <= LATELY_S:
+                    counts += bucket
+        return counts
+
+    def complaints(self, now: float, name: str) -> Iterator[str]:
+        """Yield what is wrong with the messages of the last seconds, with the remedy."""
+        counts = self.lately(now)
+        # Other bodies matter only where the marker's does not come; that it is hidden counts as a rejected fix.
+        usual = {Fault.NOT_TRACKED} | ({Fault.OTHER_BODY} if counts[USED] or counts[Fault.NOT_TRACKED] else set())
+        whole = sum(count for what, count in counts.items() if what not in usual)
+        for fault in Fault:
+            if fault in usual or counts[fault] <= MANY * whole:
+                continue
+            yield f"{name}: {counts[fault]} of the last {whole} messages {self.explained(fault)}"
+
+    def explained(self, fault: Fault) -> str:
+        """Return what a fault is, with its newest detail and the remedy."""
+        what, remedy = ADVICE[fault]
+        detail = self._details.get(fault, "")
+        return f"{what}{f' ({detail})' if detail else ''}: {remedy}"
+
 
 log = logging.getLogger(__name__)
 
@@ -232,7 +293,7 @@ class MarkerStream:
         times_set = self._clock_of.times_set
         t = self._clock_of.time_of(report.stamp_ns, (0,), arrived)
         if self._clock_of.times_set != times_set:
-            log.warning("%s: the clock of its stamps was set; its time is learnt anew", self.name)
+            log.warning("%s: the clock of its stamps was set; its time is learnt again", self.name)
         if isinstance(t, Refusal):
             raise Unusable(STAMPS[t])
         return t - report.age_s - self._table.latency_s, math.hypot(self._clock_of.sigma_s, self._table.sigma_s)

@@ -87,5 +87,5 @@ def _counted(robot: Ros2Joints) -> tuple[int, int]:
 def _troubles(lost: int, messages: int) -> Check:
     said = f"{lost} of {messages} messages were lost or not used"
     if lost > MANY_TROUBLES * messages:
-        return Check("errors", "warning", said, "bodyschema joints    # its log says why, once for each reason")
+        return Check("errors", "warning", said, "bodyschema watch joints    # its log says why, once for each reason")
     return Check("errors", "ok", said)

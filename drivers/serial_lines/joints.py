@@ -322,7 +322,7 @@ class SerialLineJoints:
     def _is_sure(self, timed: Timed) -> bool:
         """Return True if the time of the reading is accurate enough."""
         if timed.sigma > LARGEST_SIGMA_S:
-            self._why = "lines that were held up, so that nothing tells their time"
+            self._why = "delayed lines, whose time is unknown"
             return False
         return True
 

@@ -77,7 +77,7 @@ def _health(make: Make, bus: Bus, servo: FittedServo) -> Iterator[Check]:
     layout = servo.model.layout
     exchange = ask_again(bus, bus.read_request(servo.model, servo.id, layout.state))
     if exchange.trouble is not None:
-        said = f"joint {servo.joint} (ID {servo.id}) does not tell how it is: {exchange.trouble}"
+        said = f"joint {servo.joint} (ID {servo.id}) does not report its state: {exchange.trouble}"
         yield Check(TYPE, "wrong", said, "look at cable and connectors, then bodyschema doctor once more")
         return
     status = exchange.answers[0].status
@@ -99,7 +99,7 @@ def _delays(servos: Sequence[FittedServo]) -> Iterator[Check]:
             worst_us = 1e6 * max(servo.return_delay_s for servo in slow)
             names = ", ".join(servo.joint for servo in slow)
             said = f"{names}: each answer comes {worst_us:.0f} µs late by Return Delay Time"
-            yield Check(TYPE, "warning", said, f"bodyschema servos set return_delay=0 --bus {name}")
+            yield Check(TYPE, "warning", said, f"bodyschema servos return_delay=0 --bus {name}")
 
 
 def _pace(
@@ -152,7 +152,7 @@ def _rate(times: Sequence[float], read_s: float, config: ServosConfig[Any]) -> C
         slow = next((name for name, bus in config.buses.items() if bus.baud < FAST_BAUD), None)
         faster = "bodyschema install udev    # an adapter's latency timer; then plug it in again"
         return Check(
-            "rate", "warning", said, faster if slow is None else f"bodyschema servos set baud={FAST_BAUD} --bus {slow}"
+            "rate", "warning", said, faster if slow is None else f"bodyschema servos baud={FAST_BAUD} --bus {slow}"
         )
     return Check("rate", "ok", said)
 

@@ -229,7 +229,7 @@ class Workbench:
 
 
 def _lost(change: Change, trouble: Trouble | None) -> Done:
-    said = f"{trouble} after it was written: look at the cable, then ask again with `bodyschema servos show`"
+    said = f"{trouble} after it was written: look at the cable, then ask again with `bodyschema servos`"
     return Done(change, Outcome.UNKNOWN, None, said)
 
 

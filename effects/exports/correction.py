@@ -13,38 +13,33 @@ import numpy as np
 
 from bodyschema.effects.effect import Effect
 from bodyschema.effects.gravity import GRAVITY_M_S2, carried
-from bodyschema.effects.simulation import RIGID, Simulation
+from bodyschema.effects.simulation import Simulation
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.urdf import inverse
 
+from .arm_errors import BORNE_BY_HAND, LeftOut, moment_notes, residual_note, sentences
 from .geometry import geometry_without_zeros
-from .joint_errors import HAND_BORE_IT, LeftOut, moment_notes, residual_note, sentences, why_not
 
 FORMAT, VERSION = "bodyschema correction", 1
-# Values as in extended.toml; a ripple's cycles become radians per unit of the reading.
-_OF_READINGS = (
-    "joint_offset",
-    "joint_scale",
-    "joint_eccentricity",
-    "joint_ripple",
-    "joint_coupling",
-    "backlash",
-    "settling",
-    "hysteresis",
-)
-_OF_WEIGHT = ("joint_compliance", "gravity_backlash", "payload")
-_ENTRIES = (*_OF_READINGS, "gravity_backlash")
 
 
 def held_by_correction(simulation: Simulation) -> Simulation:
     """Return the simulation with only the effects that correction.json holds."""
-    stayed, held = simulation.after_moments, {*_OF_READINGS, *RIGID}
-    if simulation.bears_weight:
-        held.update(_OF_WEIGHT)
+    stayed = simulation.after_moments
     own, background = (
-        tuple(effect for effect in effects if effect.name in held) for effects in (stayed.effects, stayed.background)
+        tuple(effect for effect in effects if _why_not(stayed, effect) is None)
+        for effects in (stayed.effects, stayed.background)
     )
     return Simulation(simulation.robot, own, None, background)
+
+
+def _why_not(simulation: Simulation, effect: Effect) -> str | None:
+    """Return the reason why the format cannot hold an effect; None if it can."""
+    kind = effect.kind
+    if kind.needs_weight and not simulation.bears_weight:
+        return BORNE_BY_HAND
+    held = kind.rigid or kind.is_spring or kind.is_load or kind.correction_values(effect) is not None
+    return None if held else kind.no_counterpart
 
 
 def write_correction(simulation: Simulation, file: Path, heading: str) -> list[str]:
@@ -59,30 +54,26 @@ def write_correction(simulation: Simulation, file: Path, heading: str) -> list[s
     Raises:
         OSError: the file cannot be written.
     """
-    kept, left_out = held_by_correction(simulation), []
-    for effect in simulation.after_moments.all_effects:
-        if effect.name in _OF_WEIGHT and not simulation.bears_weight:
-            left_out.append(LeftOut(effect, HAND_BORE_IT))
-        elif effect.name not in (*_OF_READINGS, *RIGID, *_OF_WEIGHT):
-            left_out.append(LeftOut(effect, why_not(effect)))
+    kept, stayed = held_by_correction(simulation), simulation.after_moments
+    reasons = [(effect, _why_not(stayed, effect)) for effect in stayed.all_effects]
+    left_out = [LeftOut(effect, why) for effect, why in reasons if why is not None]
     told = [*sentences(left_out), *residual_note(simulation), *moment_notes(simulation)]
+    entries = [(effect, effect.kind.correction_values(effect)) for effect in kept.all_effects]
     contents = {
         "format": FORMAT,
         "version": VERSION,
         "robot": simulation.robot.name,
         "from": heading,
         "notes": told,
-        "effects": [_entry(kept, effect) for effect in kept.all_effects if effect.name in _ENTRIES],
+        "effects": [_entry(kept, effect, values) for effect, values in entries if values is not None],
         "gravity_m_s2": GRAVITY_M_S2,
     } | _chain(kept)
     file.write_text(json.dumps(contents, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     return told
 
 
-def _entry(simulation: Simulation, effect: Effect) -> dict[str, Any]:
-    place, values = simulation.place(effect), effect.values.tolist()
-    if effect.name == "joint_ripple" and effect.prismatic:
-        values[2] *= 2.0 * np.pi
+def _entry(simulation: Simulation, effect: Effect, values: list[float]) -> dict[str, Any]:
+    place = simulation.place(effect)
     # Some effects have a state; it is unknown before the first reading.
     entry = {"effect": effect.name, "joint": place.joint, "values": values, "state": []}
     return entry if place.source is None else entry | {"source": place.source}

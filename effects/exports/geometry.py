@@ -19,7 +19,7 @@ def geometry_of(simulation: Simulation) -> CalibratedGeometry:
 def geometry_without_zeros(simulation: Simulation) -> CalibratedGeometry:
     """Return the geometry without joint offsets."""
     own, background = (
-        [effect for effect in effects if effect.name != "joint_offset"]
+        [effect for effect in effects if not effect.kind.is_zero]
         for effects in (simulation.effects, simulation.background)
     )
     return geometry_of(simulation.with_effects(own).with_background(background))

@@ -173,7 +173,7 @@ def _found(name: str, urdf: Path) -> Path | None:
     if scheme == "package":
         package, _, inside = rest.partition("/")
         for folder in urdf.resolve().parents:
-            places += [folder / package / inside, *([folder / inside] if folder.name == package else [])]
+            places += [folder / package / inside, *([folder / inside] if package == folder.name else [])]
     return next((place for place in places if place.is_file()), None)
 
 

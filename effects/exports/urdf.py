@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bodyschema.effects.simulation import RIGID, Simulation
+from bodyschema.effects.simulation import Simulation
 from bodyschema.robot.calibrated_files import calibrated_urdf
 
+from .arm_errors import LeftOut, moment_notes, residual_note, sentences
 from .geometry import geometry_of
-from .joint_errors import LeftOut, moment_notes, residual_note, sentences
 
 _WHY_NOT = "a URDF has zeros, links and fixed frames alone"
 
@@ -27,7 +27,7 @@ def write_urdf(simulation: Simulation, file: Path, heading: str) -> list[str]:
     """
     robot, stayed = simulation.robot, simulation.after_moments
     geometry = geometry_of(stayed)
-    left_out = [LeftOut(effect, _WHY_NOT) for effect in stayed.all_effects if effect.name not in RIGID]
+    left_out = [LeftOut(effect, _WHY_NOT) for effect in stayed.all_effects if not effect.kind.rigid]
     told = [*sentences(left_out), *residual_note(simulation), *moment_notes(simulation)]
     file.write_bytes(calibrated_urdf(robot, geometry, file.parent, "\n".join([heading, *told])))
     return told

@@ -132,7 +132,7 @@ class RigidWindow:
         farthest = self._farthest(arrays["farthest"])
         known = all(0.0 <= number < math.inf for number in (coordinates, square, excess))
         if len(q) > self.size or not known:
-            raise ModelFormatError("the stored pairs do not fit their window, or their noise is none")
+            raise ModelFormatError("the stored pairs do not fit their window, or their noise is invalid")
         if "before_mean" in arrays:
             self.begin_with(ChainBelief(self.belief.parameters, arrays["before_mean"], arrays["before_root"]))
         self.noise, self.excess, self.farthest = NoiseKnowledge(coordinates, square), excess, farthest

@@ -10,15 +10,72 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kbmaps.arrays import FloatArray, rows_or_vector
+from kbmaps.chains.carried import Predictor
 from kbmaps.errors import DegenerateDataError
-from kbmaps.kernel.grid import sampled_map
 from kbmaps.kernel.kept_pairs import KeptPairs
 from kbmaps.kernel.kernel_fit import KernelFit, Precision
 from kbmaps.kernel.product_kernel import ProductKernel
-from kbmaps.kernel.slopes import slopes
-from kbmaps.maps.basis import JointBasis
-from kbmaps.maps.kbmap import KBMap
+from kbmaps.maps.basis import JointBasis, check_net_size
+from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap
 from kbmaps.memory import Memory
+
+_THIRD_OF_A_TURN = 2.0 * math.pi / 3.0
+
+
+def sampled_map(model: Predictor, bases: Sequence[JointBasis]) -> KBMap:
+    """Return the KB-Map in these bases that agrees with a model at 3^d configurations (2 for each prismatic joint).
+
+    If the model is a KB-Map in another form, such as a rigid chain or a kernel learner around one, they agree
+    everywhere.
+
+    Raises:
+        NetSizeError: more than 3^13 control points.
+        BasisError, and errors of the model for joint values outside its domain.
+    """
+    check_net_size(bases, POSITION_OUTPUTS)
+    nodes = [_nodes(basis) for basis in bases]
+    grid = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, len(nodes))
+    net = model.predict(grid).T.reshape(3, *(len(values) for values in nodes))
+    for k, (basis, values) in enumerate(zip(bases, nodes, strict=True)):
+        solved = np.linalg.inv(basis.weights(values))
+        net = np.moveaxis(np.tensordot(solved, net, axes=(1, k + 1)), 0, k + 1)
+    return KBMap(tuple(bases), net)
+
+
+def _nodes(basis: JointBasis) -> FloatArray:
+    """Return values at which the basis functions differ well: the ends of the range and the middle [rad, m]."""
+    if basis.is_prismatic:
+        return np.array(basis.parameters[:2])
+    if basis.kind == "orthonormal":
+        low, high, _ = basis.parameters
+        centre, reach = 0.5 * (low + high), 0.5 * (high - low)
+    elif basis.kind == "bernstein":
+        reach, centre = basis.parameters
+    else:
+        centre, reach = 0.0, _THIRD_OF_A_TURN
+    return centre + min(reach, _THIRD_OF_A_TURN) * np.array([-1.0, 0.0, 1.0])
+
+
+# Large enough that rounding costs only two digits, small enough for a map that is not exactly of this form.
+_STEP = 1e-2
+
+
+def slopes(model: Predictor, q: ArrayLike, bases: Sequence[JointBasis]) -> FloatArray:
+    """Return the derivative (3, d) [m/rad, or m/m] of a model's positions at q (d,), or (n, 3, d) at q (n, d).
+
+    f(θ + h) − f(θ − h) = 2 sin h f'(θ) for any f = a + b cos θ + c sin θ and any h. So this is exact for KB-Maps in any
+    form; likewise with 2 h for a prismatic joint.
+
+    Raises:
+        ShapeError, NonFiniteError
+    """
+    angles = rows_or_vector("q", q, len(bases))
+    steps = _STEP * np.eye(len(bases))
+    flat = angles.reshape(-1, 1, len(bases))
+    ahead, behind = (model.predict((flat + way * steps).reshape(-1, len(bases))) for way in (1.0, -1.0))
+    lengths = np.array([2.0 * (_STEP if basis.is_prismatic else math.sin(_STEP)) for basis in bases])
+    columns = (ahead - behind).reshape(len(flat), len(bases), 3) / lengths[:, None]
+    return columns.swapaxes(1, 2).reshape(*angles.shape[:-1], 3, len(bases))
 
 
 class KernelRegression(ABC):

@@ -60,8 +60,9 @@ def unwritable(file: Path, number: int | None, what: str | None) -> str:
 
 def damaged(file: Path, what: str) -> str:
     return (
-        f"{file} is damaged ({what}). Put a backup back (`bodyschema restore --force` keeps this one), or keep it and "
-        f"give another --state-dir; `sqlite3 {file.name} .recover` shows what can be read. {NOTHING_CHANGED}"
+        f"{file} is damaged ({what}). Restore a backup (`bodyschema backup FILE --restore --force` keeps this one), or "
+        f"keep it and give another --state-dir; `sqlite3 {file.name} .recover` shows what can be read. "
+        f"{NOTHING_CHANGED}"
     )
 
 

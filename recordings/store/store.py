@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sqlite3
+import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -19,10 +20,9 @@ import numpy as np
 
 from bodyschema.interfaces.errors import StoreError, StoreUnwritable
 from bodyschema.interfaces.records import FloatArray, MarkerFix, Pair, frozen_array
-
-from . import schema as store_schema
-from .damage import Damage, count_pairs, oldest, rebuild, records, scan, scan_back
-from .file import (
+from bodyschema.recordings.store import schema as store_schema
+from bodyschema.recordings.store.damage import Damage, count_pairs, oldest, rebuild, records, scan, scan_back
+from bodyschema.recordings.store.file import (
     NOTHING_CHANGED,
     FileIdentities,
     damaged,
@@ -33,9 +33,36 @@ from .file import (
     lock,
     unwritable,
 )
-from .log import commits
-from .retention import Keep, delete_until
-from .rows import Checked, as_json, checked, decoded, pair_of, require_sound, row_of, sealed
+from bodyschema.recordings.store.retention import Keep, delete_until
+from bodyschema.recordings.store.rows import Checked, as_json, checked, decoded, pair_of, require_sound, row_of, sealed
+
+# Header of the file and of each frame: magic, version, page size, sequence, two salts, checksum; page, size, salts,
+# checksum.
+_HEADER, _FRAME = struct.Struct(">6I8x"), struct.Struct(">4I8x")
+
+
+def commits(store: Path) -> list[bool]:
+    """Return for each frame of a store's log whether it ended a transaction, up to the first frame of an older log.
+
+    A missing log, or one with a damaged header, has no frames.
+    """
+    found: list[bool] = []
+    try:
+        with store.with_name(f"{store.name}-wal").open("rb") as log:
+            header = log.read(_HEADER.size)
+            if len(header) < _HEADER.size:
+                return []
+            _, _, page_bytes, _, *salts = _HEADER.unpack(header)
+            while len(frame := log.read(_FRAME.size)) == _FRAME.size:
+                _, pages, *own = _FRAME.unpack(frame)
+                if own != salts:
+                    break
+                found.append(pages > 0)
+                log.seek(page_bytes, 1)
+    except OSError:
+        return []
+    return found
+
 
 log = logging.getLogger(__name__)
 
@@ -497,7 +524,7 @@ class PairStore:
 def require_store(file: Path) -> None:
     """Raise StoreError if the file does not exist."""
     if not file.is_file():
-        raise StoreError(f"there is no store {file}. The sampler makes it: start it with `bodyschema sampler`")
+        raise StoreError(f"there is no store {file}. The sampler makes it: start it with `bodyschema run sampler`")
 
 
 def leave_out_damage(file: Path, joints: Sequence[str]) -> Audit:

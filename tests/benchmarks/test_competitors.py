@@ -178,6 +178,7 @@ def lwpr_on_cross(updates: int, settings: Settings) -> tuple[float, LWPR]:
     return float(np.mean((model.predict(grid)[:, 0] - cross(grid)) ** 2) / np.var(cross(grid))), model
 
 
+@pytest.mark.soak
 def test_lwpr_learns_the_cross_function_to_its_published_level():
     error, model = lwpr_on_cross(4000, Settings(first_metric=120.0))
     assert error < 0.03

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bodyschema.effects import KINDS, Effect, Motion, Simulation
+from bodyschema.effects import EFFECT_TYPES, Effect, Motion, Simulation
 from bodyschema.robot.description import RobotDescription
 
 from .arrays import FloatArray
@@ -179,7 +179,7 @@ def hypotheses(simulation: Simulation) -> list[Effect]:
     robot = simulation.robot
     prismatic = dict(zip(robot.joints, robot.chain.prismatic, strict=True))
     found = []
-    for kind in KINDS.values():
+    for kind in EFFECT_TYPES.values():
         if kind.name == "joint_compliance" and (robot.robot.hold == "torque_free" or not simulation.gravity.known):
             continue
         if (kind.name == "camera_pose" and not robot.camera.pose_known) or (

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+from _pytest.mark.structures import ParameterSet
 
 pytest.importorskip("pybullet")
 
@@ -28,6 +30,11 @@ from .world import World
 
 FILES = ("robot.toml", "arm.urdf", "measured.csv", "fresh.csv")
 ROOT = Path(__file__).parents[2]
+
+
+def some(names: Sequence[str], every: int) -> list[str | ParameterSet]:
+    """Return the names as parameters, all but every so manieth in the soak run."""
+    return [name if k % every == 0 else pytest.param(name, marks=pytest.mark.soak) for k, name in enumerate(names)]
 
 
 def nominal(case: HiddenCase, taken: Taken) -> np.ndarray:
@@ -88,14 +95,14 @@ def test_the_folder_tells_nothing_of_the_truth(tmp_path: Path) -> None:
     assert sorted(file.name for file in tmp_path.iterdir()) == sorted(FILES)
 
 
-@pytest.mark.parametrize("effect", [name for name in EVERY if name != "outliers"])
+@pytest.mark.parametrize("effect", some([name for name in EVERY if name != "outliers"], 4))
 def test_an_effect_is_as_large_as_the_truth_says(effect: str, tmp_path: Path) -> None:
     case = hide(11, tmp_path, [effect], pairs=150, size=8.0)
     # Rounding to ticks adds up to one unit of noise; the size was taken at the spare pairs too.
     assert whitened_rms(case, case.measured) == pytest.approx(case.truth[0].size, rel=0.15, abs=0.4)
 
 
-@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("name", some(list(ARMS), len(ARMS)))
 def test_residuals_with_nothing_hidden_are_as_large_as_the_noise(name: str, tmp_path: Path) -> None:
     case = hide(27, tmp_path, (), arm=name, pairs=500)
     off = case.measured.x - nominal(case, case.measured)
@@ -171,7 +178,7 @@ def test_an_outside_effect_says_on_which_joints_it_shows(tmp_path: Path) -> None
     assert hidden.shows_on["flange_roll"] < 0.1  # beyond the elbow, and its marker stands near its axis
 
 
-@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("name", some(list(ARMS), len(ARMS)))
 def test_a_walk_goes_in_steps_of_one_to_three_degrees_through_several_regions(name: str, tmp_path: Path) -> None:
     case = hide(21, tmp_path, (), arm=name, hold="torque_free", pairs=600)
     taken, ranges = case.measured, case.arm.ranges

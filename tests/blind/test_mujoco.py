@@ -91,8 +91,9 @@ def test_outcome_follows_from_truth_and_answer(truth, answer, expected) -> None:
 # Each with and without tolerances at every link.
 @pytest.mark.parametrize(
     ("kind", "style", "rows", "dense"),
-    [("play_by_gravity", "static", 80, 1.0), pytest.param("dahl", "walk", 150, 0.0, marks=pytest.mark.soak)],
+    [("play_by_gravity", "static", 80, 1.0), ("dahl", "walk", 150, 0.0)],
 )
+@pytest.mark.soak
 def test_a_simulated_cause_is_named(kind, style, rows, dense, tmp_path: Path) -> None:
     case = hide(0, style, tmp_path, rows=rows, kind=kind, dense=dense)
     record = judged(case, Checkout(HERE.parents[1], 120.0))

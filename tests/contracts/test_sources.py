@@ -21,7 +21,7 @@ import pytest
 from fake_capture import SIZE_PX, FakeCapture
 from scripted_sources import COV, Scripted
 
-from bodyschema.cli.demo.tags import cube_tables
+from bodyschema.cli.demo.scene import cube_tables
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.bench import through_bench
 from bodyschema.daemon.wiring.wiring import driver_of
@@ -32,7 +32,7 @@ from bodyschema.drivers.dynamixel.bench.servo import Servo
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from bodyschema.drivers.dynamixel.joints import DynamixelJoints
 from bodyschema.drivers.dynamixel.models import BY_NAME
-from bodyschema.drivers.feetech.bench.chain import Chain as FeetechChain
+from bodyschema.drivers.feetech.bench.arm import Chain as FeetechChain
 from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
 from bodyschema.drivers.feetech.config import BusConfig as FeetechBus
 from bodyschema.drivers.feetech.config import FeetechConfig

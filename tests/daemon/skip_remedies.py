@@ -10,6 +10,7 @@ Report = pytest.TestReport | pytest.CollectReport
 # Where a package comes from that a test imports or is skipped without; all others are of the extra `dev`.
 EXTRAS = {
     "pybullet": "sim",
+    "pybullet_data": "sim",
     "matplotlib": "plots",
     "cv2": "cameras",
     "pyarrow": "export",
@@ -17,6 +18,7 @@ EXTRAS = {
     "starlette": "view",
     "uvicorn": "view",
     "distributed": "fleet",
+    "rosbags": "bags",
     "rerun": "rerun",
     "pinocchio": "pinocchio",
 }

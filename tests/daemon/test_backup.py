@@ -1,4 +1,4 @@
-"""`bodyschema backup` and `bodyschema restore`."""
+"""`bodyschema backup` and `bodyschema backup --restore`."""
 
 from __future__ import annotations
 
@@ -194,7 +194,7 @@ def test_a_sampler_that_writes_the_store_is_not_disturbed(config, backed_up) -> 
 
 def put_back_in_another_process(file: Path, config: Config) -> None:
     """Restore in another process: the lock belongs to a process, so this one's own would not block it."""
-    done = warm.run("-m", "bodyschema", "restore", file, "--robot", config.file, "--force")
+    done = warm.run("-m", "bodyschema", "backup", file, "--restore", "--robot", config.file, "--force")
     if done.returncode:
         raise StoreError(done.stderr)
 
@@ -409,7 +409,7 @@ def test_a_backup_leaves_out_changed_pairs(config, file, elsewhere, capsys) -> N
         connection.execute("UPDATE pairs SET q = '[0.5,0.5]' WHERE seq IN (3, 4)")
         connection.commit()
     before = config.store_file.read_bytes()
-    for words in (["backup", file, "--robot", config.file], ["restore", file, "--robot", elsewhere]):
+    for words in (["backup", file, "--robot", config.file], ["backup", file, "--restore", "--robot", elsewhere]):
         command_line(words[0])(list(map(str, words)), exit_on_error=False, result_action="return_value")
     shown = capsys.readouterr().out
     assert f"{file}: arm, 18 pairs to number 20" in shown
@@ -548,8 +548,8 @@ def test_a_urdf_in_another_folder_is_kept_and_its_place_is_told(config, file, el
     config.robot.tree.file.rename(urdf)
     config.file.write_text(config.file.read_text().replace('"arm.urdf"', '"../models/arm.urdf"'))
     write_backup(Config.load(config.file, {}), file, utc=UTC, version="0")
-    command_line("restore")(
-        ["restore", str(file), "--robot", str(elsewhere)], exit_on_error=False, result_action="return_value"
+    command_line("backup")(
+        ["backup", str(file), "--restore", "--robot", str(elsewhere)], exit_on_error=False, result_action="return_value"
     )
     kept = elsewhere.parent / "elsewhere" / "arm.urdf"
     assert kept.read_text() == URDF
@@ -557,7 +557,7 @@ def test_a_urdf_in_another_folder_is_kept_and_its_place_is_told(config, file, el
 
 
 def test_the_commands_go_there_and_back(config, file, elsewhere, capsys) -> None:
-    for words in (["backup", file, "--robot", config.file], ["restore", file, "--robot", elsewhere]):
+    for words in (["backup", file, "--robot", config.file], ["backup", file, "--restore", "--robot", elsewhere]):
         command_line(words[0])(list(map(str, words)), exit_on_error=False, result_action="return_value")
     shown = capsys.readouterr().out
     assert f"{file}: arm, 20 pairs to number 20, no checkpoint yet" in shown

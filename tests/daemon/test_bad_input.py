@@ -29,7 +29,7 @@ from bodyschema.interfaces.errors import BusError, RequestError
 
 LIMIT_S = 500.0
 DAEMON = ("-m", "bodyschema")
-PROCESSES = ("sampler", "learner", "run")
+PROCESSES = ("run",)
 KEYS = Keys("arm")
 RECORDING = "waist,shoulder,x,y,z\n" + "".join(f"{0.03 * k},0.1,0.3,0.0{k},0.5\n" for k in range(1, 9))
 # Root may write wherever it likes; without this capability it is as everybody.
@@ -97,13 +97,25 @@ def fix(file: Path, right: str, wrong: str) -> None:
 @pytest.mark.parametrize(
     ("command", "right", "wrong", "line", "said"),
     [
-        ("sampler", '"arm.urdf"', '"leg.urdf"', None, "cannot read the URDF: No such file or directory. Fix [robot]"),
-        ("learner", '"arm.urdf"', '"leg.urdf"', None, "cannot read the URDF: No such file or directory. Fix [robot]"),
-        ("sampler", '"waist", ', '"wrist", ', 4, "there is no joint 'wrist' in arm.urdf. Did you mean 'waist'?"),
+        (
+            "run sampler",
+            '"arm.urdf"',
+            '"leg.urdf"',
+            None,
+            "cannot read the URDF: No such file or directory. Fix [robot]",
+        ),
+        (
+            "run learner",
+            '"arm.urdf"',
+            '"leg.urdf"',
+            None,
+            "cannot read the URDF: No such file or directory. Fix [robot]",
+        ),
+        ("run sampler", '"waist", ', '"wrist", ', 4, "there is no joint 'wrist' in arm.urdf. Did you mean 'waist'?"),
         ("run", '"waist", ', '"wrist", ', 4, "there is no joint 'wrist' in arm.urdf. Did you mean 'waist'?"),
-        ("learner", '"hand"', '"hnd"', 5, "there is no link 'hnd' in arm.urdf. Did you mean 'hand'?"),
-        ("sampler", "state_dir", "statedir", 12, "unknown key 'statedir' in [daemon]. Did you mean 'state_dir'?"),
-        ("learner", "state_dir", "statedir", 12, "unknown key 'statedir' in [daemon]. Did you mean 'state_dir'?"),
+        ("run learner", '"hand"', '"hnd"', 5, "there is no link 'hnd' in arm.urdf. Did you mean 'hand'?"),
+        ("run sampler", "state_dir", "statedir", 12, "unknown key 'statedir' in [daemon]. Did you mean 'state_dir'?"),
+        ("run learner", "state_dir", "statedir", 12, "unknown key 'statedir' in [daemon]. Did you mean 'state_dir'?"),
         ("replay", '"arm.urdf"', '"leg.urdf"', None, "cannot read the URDF: No such file or directory. Fix [robot]"),
         ("predict", '"waist", ', '"wrist", ', 4, "there is no joint 'wrist' in arm.urdf. Did you mean 'waist'?"),
         ("status", "state_dir", "statedir", 12, "unknown key 'statedir' in [daemon]. Did you mean 'state_dir'?"),
@@ -111,12 +123,12 @@ def fix(file: Path, right: str, wrong: str) -> None:
 )
 def test_nothing_starts_with_a_wrong_description(robot, command, right, wrong, line, said) -> None:
     fix(robot, right, wrong)
-    message = refused(command, *(["walk.csv"] if command == "replay" else []), cwd=robot.parent)
+    message = refused(*command.split(), *(["walk.csv"] if command == "replay" else []), cwd=robot.parent)
     assert message.startswith("leg.urdf: " if line is None else f"robot.toml, line {line}: ")
     assert said in message
 
 
-@pytest.mark.parametrize("command", ["config check", "learner", "run", "replay walk.csv"])
+@pytest.mark.parametrize("command", ["config", "run learner", "run", "replay walk.csv"])
 def test_more_joints_than_can_be_learnt_are_refused_with_the_limit_and_what_learns_them(tmp_path, command) -> None:
     write_long_arm(tmp_path, joints=13)
     message = refused(*command.split(), cwd=tmp_path)
@@ -127,12 +139,15 @@ def test_more_joints_than_can_be_learnt_are_refused_with_the_limit_and_what_lear
 
 def test_twelve_joints_are_in_order(tmp_path) -> None:
     write_long_arm(tmp_path, joints=12)
-    done = run_here("config", "check", cwd=tmp_path)
+    done = run_here("config", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_a_folder_for_robot_toml_is_refused(robot) -> None:
-    assert refused("sampler", "--robot", ".", cwd=robot.parent) == ".: a folder, not a file. Name the robot.toml in it"
+    assert (
+        refused("run", "sampler", "--robot", ".", cwd=robot.parent)
+        == ".: a folder, not a file. Name the robot.toml in it"
+    )
 
 
 @pytest.mark.parametrize(
@@ -163,7 +178,7 @@ def test_a_recording_that_is_not_there_is_refused(robot) -> None:
 
 def test_a_sampler_of_an_unreadable_recording_leaves_no_store(robot) -> None:
     fix(robot.parent / "walk.csv", "0.03,", "0.03x,")
-    assert "walk.csv, line 2, column waist: '0.03x' is not a number" in refused("sampler", cwd=robot.parent)
+    assert "walk.csv, line 2, column waist: '0.03x' is not a number" in refused("run", "sampler", cwd=robot.parent)
 
 
 # --- joint angles at the command line
@@ -195,7 +210,7 @@ def test_a_letter_among_the_joint_angles_is_named(robot) -> None:
 def test_a_port_in_use_is_named_and_leaves_no_trace(robot, process) -> None:
     endpoint = getattr(Config.load(robot, {}).tables.zenoh, process)
     with ZenohSession(listen=endpoint):
-        said = refused(process, cwd=robot.parent)
+        said = refused("run", process, cwd=robot.parent)
     assert said == (
         f"the port of {endpoint} is in use. Stop the other bodyschema, "
         "or give another endpoint in the table [zenoh] of robot.toml"
@@ -212,7 +227,7 @@ def test_a_port_in_use_is_named_and_leaves_no_trace(robot, process) -> None:
 def test_a_folder_that_cannot_be_written_ends_the_sampler(robot, state_dir, said) -> None:
     folder = robot.parent / state_dir
     (robot.parent / "locked").mkdir(mode=0o555)
-    done = run("sampler", "--state-dir", folder, cwd=robot.parent, by=("-c", WITHOUT_ROOTS_RIGHTS))
+    done = run("run", "sampler", "--state-dir", folder, cwd=robot.parent, by=("-c", WITHOUT_ROOTS_RIGHTS))
     assert done.returncode == 1
     assert said.format(folder if "new" in state_dir else folder / "pairs.sqlite") in done.stderr
     assert list((robot.parent / "locked").iterdir()) == []
@@ -226,7 +241,7 @@ def process_running(config: Config, process: str, by: tuple[str, ...] = DAEMON) 
     """Run a process and stop it when the context ends."""
     up = threading.Event()
     with tempfile.TemporaryFile() as log, ZenohSession(connect=getattr(config.tables.zenoh, process)) as bus:
-        words = (*by, process, "--robot", config.file)
+        words = (*by, "run", process, "--robot", config.file)
         child = (
             warm.Child(*words, stderr=log) if by == DAEMON else subprocess.Popen([sys.executable, *words], stderr=log)
         )
@@ -271,7 +286,7 @@ def test_a_prediction_before_any_pair_is_refused_where_the_camera_stands_anywher
     said = refused("predict", "--", "0.1", "-0.2", cwd=lonely_learner.file.parent)
     assert said == (
         "there is no model yet: robot.toml says [camera] pose_known = false, so positions have no frame until about "
-        "10 pairs have come (0 so far). Start the sampler with `bodyschema sampler` and guide the arm"
+        "10 pairs have come (0 so far). Start the sampler with `bodyschema run sampler` and guide the arm"
     )
 
 
@@ -307,8 +322,8 @@ def test_a_learner_without_a_sampler_says_where_it_looks_and_how_to_start_one(lo
     status = learner_status(lonely_learner)
     assert (status.state, status.sampler_alive) == ("waiting", False)
     assert status.health[0] == (
-        f"no sampler on {lonely_learner.tables.zenoh.sampler}, so no new pairs; start it with `bodyschema sampler`. "
-        "Predictions go on"
+        f"no sampler on {lonely_learner.tables.zenoh.sampler}, so no new pairs; start it with `bodyschema run "
+        "sampler`. Predictions go on"
     )
 
 
@@ -316,7 +331,7 @@ def test_the_status_of_a_learner_alone_names_the_command_that_starts_a_sampler(l
     done = run_here("status", cwd=lonely_learner.file.parent)
     text = " ".join(done.stdout.split())
     assert done.returncode == 0
-    assert f"sampler does not answer on {lonely_learner.tables.zenoh.sampler}. Start it with `bodyschema s" in text
+    assert f"sampler does not answer on {lonely_learner.tables.zenoh.sampler}. Start it with `bodyschema run s" in text
 
 
 def test_a_command_of_the_sampler_is_refused_by_the_learner(lonely_learner) -> None:

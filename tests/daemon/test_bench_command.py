@@ -42,6 +42,7 @@ def test_the_written_file_is_the_users_with_the_port_of_the_bench(config, folder
     assert written.state_dir != config.state_dir
 
 
+@pytest.mark.usefixtures("patient_host")
 @EACH
 def test_the_driver_reads_the_bench_by_the_written_file(file, folder) -> None:
     config = Config.load(folder / file, {})
@@ -65,7 +66,7 @@ def test_a_bench_leaves_nothing_behind(file, folder) -> None:
     ("file", "what", "command"),
     [
         ("servos.toml", "4 servos", "scan"),
-        ("feetech.toml", "4 servos", "joints"),
+        ("feetech.toml", "4 servos", "watch joints"),
         ("encoders.toml", "4 encoders", "doctor"),
     ],
 )

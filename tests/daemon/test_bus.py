@@ -98,12 +98,12 @@ def test_a_subscriber_with_a_bug_goes_on_receiving(server, asking, quick: bool) 
 
 
 def test_where_nobody_answers_the_process_to_start_is_named(asking) -> None:
-    with pytest.raises(BusError, match=r"Is the sampler running\? Start it with `bodyschema sampler`"):
+    with pytest.raises(BusError, match=r"Is the sampler running\? Start it with `bodyschema run sampler`"):
         asking.ask_one(KEY)
 
 
 def test_the_learners_keys_name_the_learner(asking) -> None:
-    with pytest.raises(BusError, match="Start it with `bodyschema learner`"):
+    with pytest.raises(BusError, match="Start it with `bodyschema run learner`"):
         asking.ask_one("bodyschema/arm/predict")
 
 

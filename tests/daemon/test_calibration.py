@@ -151,7 +151,7 @@ def said(arm: Planted, **changed) -> str:
 
 
 def test_zeros_that_nothing_shows_are_said_to_be_left_as_drawn() -> None:
-    assert "Kept at nominal: base_yaw, wrist_roll. Nothing that was measured tells their zeros" in said(planted(1))
+    assert "Kept at nominal: base_yaw, wrist_roll. The measurements cannot tell" in said(planted(1))
 
 
 def test_a_joint_that_hardly_moved_is_named() -> None:
@@ -352,7 +352,7 @@ def retooled(seed: int, at: int, move_m: float, *, walk: bool = False) -> Plante
 
 @pytest.mark.parametrize(
     ("at", "walk"),
-    [(20, False), (50, True), *(pytest.param(at, False, marks=pytest.mark.soak) for at in (50, 82))],
+    [(20, False), *(pytest.param(*case, marks=pytest.mark.soak) for case in ((50, True), (50, False), (82, False)))],
 )
 def test_the_row_from_which_on_there_is_another_tool_is_found(at: int, walk: bool) -> None:
     report = report_on(retooled(5, at, 0.05, walk=walk))
@@ -360,7 +360,7 @@ def test_the_row_from_which_on_there_is_another_tool_is_found(at: int, walk: boo
     assert report.other_tool_mm == pytest.approx(50.0, rel=0.35)
 
 
-@pytest.mark.parametrize("seed", [0, 3, *(pytest.param(seed, marks=pytest.mark.soak) for seed in (1, 2))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in (1, 2, 3))])
 def test_one_tool_is_not_taken_for_two(seed: int) -> None:
     assert report_on(planted(seed, pairs=24 + 30 * seed, outliers=2 * seed)).other_tool_from is None
 

@@ -7,7 +7,7 @@ import logging
 import msgspec
 import pytest
 
-from bodyschema.daemon.learner.changes import Changes
+from bodyschema.daemon.learner.findings import Changes
 from bodyschema.learning.changes.record import ChangeRecord, KindOfChange
 
 JOINTS = ("waist", "shoulder", "elbow")

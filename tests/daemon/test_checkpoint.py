@@ -15,11 +15,11 @@ from bodyschema.daemon.learner.checkpoint import (
     LARGEST_BYTES,
     CheckpointError,
     generations,
+    go_on,
     read_checkpoint,
     set_aside,
     write_checkpoint,
 )
-from bodyschema.daemon.learner.resume import go_on
 from bodyschema.learning.state import LearningState
 
 UTC = "2026-11-21T12:00:00.000+00:00"

@@ -12,10 +12,11 @@ import warm
 from cyclopts import CycloptsError
 from small_arm import URDF, write_small_arm
 
-from bodyschema.cli.main import COMMANDS, app, command_line, present_names
+from bodyschema.cli.commands.options import print_json
+from bodyschema.cli.main import COMMANDS, RENAMED, app, command_line, present_names
 from bodyschema.cli.terminal.screen import two_digits
 from bodyschema.daemon.config import Config
-from bodyschema.interfaces.errors import BusError, ConfigError
+from bodyschema.interfaces.errors import BusError, ConfigError, RequestError
 
 LIMIT_S = 500.0
 
@@ -51,7 +52,9 @@ def test_help_names_every_command(tmp_path) -> None:
     assert [name for name in COMMANDS if f" {name} " not in text] == []
 
 
-@pytest.mark.parametrize("command", [*COMMANDS, "init", "config check", "config show", "install udev", "robot new"])
+@pytest.mark.parametrize(
+    "command", [*COMMANDS, "calibrate cameras", "calibrate latency", "marker print", "marker learn"]
+)
 def test_each_command_says_what_it_needs_and_what_is_next(command, capsys) -> None:
     # As in a process of its own: a summary given to the same page before would be shown in its place.
     sys.modules.pop(f"bodyschema.cli.commands.{command.split()[0]}", None)
@@ -67,7 +70,7 @@ def test_help_fits_a_terminal_of_80_columns(tmp_path) -> None:
 
 
 def test_a_mistake_of_the_user_is_one_line_and_exit_code_1(tmp_path) -> None:
-    done = run("sampler", cwd=tmp_path)
+    done = run("run", "sampler", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr == "bodyschema: robot.toml: there is no such file. `bodyschema init` writes one\n"
 
@@ -75,7 +78,7 @@ def test_a_mistake_of_the_user_is_one_line_and_exit_code_1(tmp_path) -> None:
 def test_robot_toml_may_be_named_in_the_environment(tmp_path, robot) -> None:
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
-    done = run("config", "check", cwd=elsewhere, environment={"BODYSCHEMA_ROBOT": str(robot)})
+    done = run("config", cwd=elsewhere, environment={"BODYSCHEMA_ROBOT": str(robot)})
     assert done.returncode == 0, done.stderr
 
 
@@ -86,7 +89,7 @@ def test_the_example_that_init_writes_is_in_order_once_the_urdf_fits(tmp_path, c
     called("init", "--robot", tmp_path / "robot.toml")
     urdf = URDF.replace("waist", "joint_1").replace("shoulder", "joint_2").replace('"base"', '"base_link"')
     (tmp_path / "my_robot.urdf").write_text(urdf)
-    called("config", "check", "--robot", tmp_path / "robot.toml")
+    called("config", "--robot", tmp_path / "robot.toml")
     assert "is in order: robot my_robot, 2 joints" in capsys.readouterr().out
 
 
@@ -149,14 +152,38 @@ def test_init_refuses_a_link_that_the_urdf_has_not(tmp_path) -> None:
         called("init", "--robot", tmp_path / "new.toml", "--urdf", tmp_path / "arm.urdf", "--marker-link", "hnad")
 
 
+@pytest.mark.parametrize("present", RENAMED.values(), ids=" ".join)
+def test_what_an_earlier_name_became_is_a_command(present, capsys) -> None:
+    command_line(present[0])([*present, "--help"], exit_on_error=False, result_action="return_value")
+    page = capsys.readouterr().out
+    assert f"Usage: bodyschema {present[0]}" in page
+    assert all(word in page for word in present)
+
+
+def test_every_output_for_programs_has_a_schema(capsys) -> None:
+    print_json({"pairs": 3})
+    assert json.loads(capsys.readouterr().out) == {"schema": 1, "pairs": 3}
+    print_json({"schema": 2, "pairs": 3})
+    assert json.loads(capsys.readouterr().out)["schema"] == 2
+
+
+def test_options_that_belong_to_another_process_are_refused(robot) -> None:
+    with pytest.raises(RequestError, match="--sim does not go with `bodyschema run learner`"):
+        called("run", "learner", "--sim", "--robot", robot)
+    with pytest.raises(RequestError, match="--compare"):
+        called("fleet", "a.csv", "--compare")
+
+
 def test_the_earlier_names_answer_with_the_present_one(capsys) -> None:
+    assert present_names(["servos", "set", "id=3"]) == ["servos", "id=3"]
+    assert present_names(["fleet", "a.csv"]) == ["fleet", "a.csv"]
     assert present_names(["robot", "new", "--urdf", "a"]) == ["init", "--from", "scan", "--urdf", "a"]
     assert present_names(["config", "init", "--sim"]) == ["init", "--sim"]
     assert "bodyschema config init is now: bodyschema init\n" in capsys.readouterr().err
 
 
 def test_check_says_what_was_understood(robot, capsys) -> None:
-    called("config", "check", "--robot", robot)
+    called("config", "--robot", robot)
     text = capsys.readouterr().out
     assert "waist: -171.9° to 171.9°" in text
     assert "stereo calibration not described" in text
@@ -164,9 +191,9 @@ def test_check_says_what_was_understood(robot, capsys) -> None:
 
 def test_show_prints_the_settings_in_force(tmp_path, robot, capsys, monkeypatch) -> None:
     monkeypatch.setenv("BODYSCHEMA_DAEMON_MAX_STEP_DEG", "8")
-    called("config", "show", "--robot", robot)
+    called("config", "--json", "--robot", robot)
     shown = json.loads(capsys.readouterr().out)
-    assert shown["daemon"]["max_step_deg"] == 8.0
+    assert (shown["schema"], shown["daemon"]["max_step_deg"]) == (1, 8.0)
     assert shown["robot"]["marker_xyz"] == [0.0, 0.0, 0.0]
 
 
@@ -194,7 +221,7 @@ def test_an_unknown_command_lists_the_known_ones(tmp_path, robot) -> None:
 
 
 def test_a_sampler_without_a_driver_says_so_and_leaves_no_store(tmp_path, robot) -> None:
-    done = run("sampler", "--robot", robot, cwd=tmp_path)
+    done = run("run", "sampler", "--robot", robot, cwd=tmp_path)
     assert (done.returncode, "no driver is configured" in done.stderr) == (1, True)
     assert not (tmp_path / "state").exists()
 

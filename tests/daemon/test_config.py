@@ -145,7 +145,7 @@ def test_one_camera_alone_has_a_calibration_without_a_baseline(tmp_path) -> None
 @pytest.mark.parametrize(
     ("tables", "said"),
     [
-        (ONE_EYE, r"vision\.radius_m is missing: one camera alone tells the depth from the marker's size"),
+        (ONE_EYE, r"vision\.radius_m is missing: one camera alone takes the depth from the marker's size"),
         (f'{ONE_EYE}[vision]\nmarker = "tag"\n', r"vision\.tag\.side_m is missing.*black square"),
         (
             f'{ONE_EYE}[vision]\nmarker = "cluster"\n[[vision.cluster.tags]]\nid = 1\n',

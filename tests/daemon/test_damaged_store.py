@@ -23,10 +23,9 @@ from bodyschema.interfaces.records import MarkerFix, frozen_array
 from bodyschema.recordings.files import from_store
 from bodyschema.recordings.store import schema as store_schema
 from bodyschema.recordings.store.damage import LEFT_FREE, Damage
-from bodyschema.recordings.store.log import commits
 from bodyschema.recordings.store.retention import Keep
 from bodyschema.recordings.store.rows import COLUMNS, checksum
-from bodyschema.recordings.store.store import PairReader, PairStore, Session, leave_out_damage
+from bodyschema.recordings.store.store import PairReader, PairStore, Session, commits, leave_out_damage
 
 JOINTS = ("waist", "shoulder")
 SESSION = Session(JOINTS, "2026-01-01T00:00:00+00:00", "[robot]", "<robot/>", "{}", "0", "host")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from bodyschema.cli.servos.servos_view import servos_table
+from bodyschema.cli.terminal.status_view import servos_table
 from bodyschema.daemon.sampler.devices import DeviceWatch, differences
 from bodyschema.daemon.transport.status import ServoStatus
 from bodyschema.interfaces.clock import SystemClock
@@ -76,7 +76,7 @@ def test_each_session_keeps_what_its_pairs_were_measured_with(file) -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"homing_offset_ticks": 100}, "homing_offset was 0, is 100.*servos set homing_offset=0 --joint elbow"),
+        ({"homing_offset_ticks": 100}, "homing_offset was 0, is 100.*servos homing_offset=0 --joint elbow"),
         ({"drive_mode": 1}, "drive_mode was 0, is 1"),
         ({"firmware": 47}, "the firmware of 'elbow' was 46, is 47"),
         ({"model": "XM540-W270"}, "another servo than the pairs before: XM430-W350 then, XM540-W270 now"),

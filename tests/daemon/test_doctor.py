@@ -18,7 +18,7 @@ from rich.console import Console
 
 from bodyschema.cli.hardware import doctor
 from bodyschema.cli.hardware.bench_run import BenchRun
-from bodyschema.cli.hardware.doctor_view import show
+from bodyschema.cli.hardware.doctor import show
 from bodyschema.cli.install.units import FOLDER
 from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config
@@ -125,7 +125,7 @@ def test_a_port_that_is_not_there_is_told_once(capsys) -> None:
 def test_the_running_sampler_tells_of_the_servos_itself(tmp_path, monkeypatch, capsys) -> None:
     with BenchRun(Config.load(EXAMPLE), tmp_path / "bus") as run:
         config = Config.load(run.robot_file)
-        holder = Holder(4711, "/usr/bin/python -m bodyschema sampler --robot robot.toml")
+        holder = Holder(4711, "/usr/bin/python -m bodyschema run sampler --robot robot.toml")
         monkeypatch.setattr(checks, "holders", lambda *_: [holder])
         with ZenohSession(listen=config.tables.zenoh.sampler) as bus:
             keys = Keys(config.robot.name)
@@ -178,7 +178,7 @@ def test_a_unit_that_starts_an_older_version_is_to_be_installed_again(tmp_path, 
 def test_a_unit_of_this_version_is_not_told_of(tmp_path) -> None:
     file = tmp_path / FOLDER / "bodyschema-sampler@.service"
     file.parent.mkdir(parents=True)
-    file.write_text("[Service]\nExecStart=/opt/arm/bin/python -P -m bodyschema sampler --robot robot.toml\n")
+    file.write_text("[Service]\nExecStart=/opt/arm/bin/python -P -m bodyschema run sampler --robot robot.toml\n")
     assert list(doctor.unit_checks(tmp_path)) == []
 
 

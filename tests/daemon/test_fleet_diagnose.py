@@ -54,9 +54,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def told(folder: Path) -> tuple[object, str, str]:
     few = ("--effects", "joint_scale,backlash")
-    return fleet(
-        "diagnose", "--from", folder, "--robot", DESK_ARM, "--out", folder / "out", *few, "--workers", "1", "--json"
-    )
+    return fleet("--from", folder, "--robot", DESK_ARM, "--out", folder / "out", *few, "--workers", "1", "--json")
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +99,7 @@ def test_progress_is_a_line_for_each_that_is_done(told: tuple[object, str, str])
 def test_a_scheduler_that_does_not_answer_is_told_with_its_address(folder: Path, endpoint: str) -> None:
     address = endpoint.replace("tcp/", "tcp://")
     with mock.patch("bodyschema.fleet.diagnosing.CONNECT_LIMIT_S", 0.5):
-        code, _, err = fleet("diagnose", folder / "left.csv", "--robot", DESK_ARM, "--scheduler", address)
+        code, _, err = fleet(folder / "left.csv", "--robot", DESK_ARM, "--scheduler", address)
     assert code == 1
     assert f"no Dask scheduler answers on {address}" in err
 

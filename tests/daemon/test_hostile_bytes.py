@@ -28,8 +28,7 @@ from bodyschema.cli.servos.log import LoggedWrite, ServoLog
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner import checkpoint
 from bodyschema.daemon.learner.answers import Answers
-from bodyschema.daemon.learner.checkpoint import CheckpointError
-from bodyschema.daemon.learner.resume import DOES_NOT_FIT
+from bodyschema.daemon.learner.checkpoint import DOES_NOT_FIT, CheckpointError
 from bodyschema.daemon.sampler.history import answer_pairs
 from bodyschema.daemon.transport import wire
 from bodyschema.daemon.transport.bus import Request

@@ -59,7 +59,7 @@ def test_port_and_rate_are_those_of_the_scan(four, tmp_path) -> None:
 def test_what_is_left_to_look_at_is_marked(four, tmp_path) -> None:
     new("--from", four, "--robot", tmp_path / "robot.toml", "--yes")
     text = (tmp_path / "robot.toml").read_text()
-    assert "# CHECK each with `bodyschema joints`" in text
+    assert "# CHECK each with `bodyschema watch joints`" in text
     assert text.count("# direction = -1") == 4
 
 

@@ -1,4 +1,4 @@
-"""`bodyschema joints`: an arm on the bench, moved joint by joint."""
+"""`bodyschema watch joints`: an arm on the bench, moved joint by joint."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import pytest
 from rich.console import Console
 
 from bodyschema.cli.hardware.bench_run import BenchRun
-from bodyschema.cli.hardware.joints_view import screen
-from bodyschema.cli.hardware.joints_watch import JointState, JointsWatch, Seen, SignCheck, Speeds, signs_in
+from bodyschema.cli.hardware.joints_watch import JointState, JointsWatch, Seen, SignCheck, Speeds, screen, signs_in
 from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.wiring import open_joints
@@ -113,13 +112,14 @@ def look_until(watch: JointsWatch, done) -> Seen:
     raise AssertionError("it was never seen")
 
 
+@pytest.mark.usefixtures("patient_host")
 @pytest.mark.parametrize(
     ("file", "ids"), [("servos.toml", [1, 2, 3, 4]), ("feetech.toml", [1, 2, 3, 4]), ("encoders.toml", [None] * 4)]
 )
 def test_once_gives_one_line_of_json(file, ids, tmp_path, capsys) -> None:
     with BenchRun(Config.load(EXAMPLE.with_name(file), {}), tmp_path / "bus") as run:
         app(
-            ["joints", "--robot", str(run.robot_file), "--once", "--json"],
+            ["watch", "joints", "--robot", str(run.robot_file), "--once", "--json"],
             exit_on_error=False,
             result_action="return_value",
         )
@@ -182,8 +182,9 @@ def test_an_angle_beyond_the_limits_is_told() -> None:
     assert "elbow was from +0° to +80°, its limits are -57° to +57°" in shown(high=1.4, within_limits=False)
 
 
+@pytest.mark.usefixtures("patient_host")
 def test_one_table_tells_what_is_wrong_with_any_servo(tmp_path, capsys) -> None:
     with BenchRun(Config.load(EXAMPLE), tmp_path / "bus", faults=["overload@wrist_roll"]) as run:
-        app(["joints", "--robot", str(run.robot_file), "--once", "--json"], result_action="return_value")
+        app(["watch", "joints", "--robot", str(run.robot_file), "--once", "--json"], result_action="return_value")
     (complaint,) = json.loads(capsys.readouterr().out)["health"]
     assert complaint.startswith("joint 'wrist_roll': it is overloaded")

@@ -59,7 +59,9 @@ def latency_by_speed(wiggle: Wiggle, chain: RigidChain) -> float:
     return float(minimize_scalar(mismatch, bounds=(best - STEP_S, best + STEP_S), method="bounded").x)
 
 
-@pytest.mark.parametrize("latency_s", [0.0, 0.033, 0.12])
+@pytest.mark.parametrize(
+    "latency_s", [0.033, *(pytest.param(latency_s, marks=pytest.mark.soak) for latency_s in (0.0, 0.12))]
+)
 def test_a_hidden_latency_is_found_to_two_milliseconds(latency_s) -> None:
     for seed in range(2):
         assert abs(latency_of(wiggle(seed, latency_s), ARM.chain).latency_s - latency_s) < 2e-3
@@ -123,7 +125,7 @@ def in_step(seed: int, latency_s: float) -> Wiggle:
 
 
 @pytest.mark.parametrize("seeds", [6, pytest.param(12, marks=pytest.mark.soak)])
-@pytest.mark.parametrize("latency_s", [0.0, 0.04])
+@pytest.mark.parametrize("latency_s", [pytest.param(0.0, marks=pytest.mark.soak), 0.04])
 def test_readings_in_step_with_the_images_do_not_draw_the_latency_between_two_readings(latency_s, seeds) -> None:
     """Check midpoints: a straight line between two readings has half their noise there and seems to fit best."""
     found = [latency_of(in_step(seed, latency_s), ARM.chain) for seed in range(seeds)]

@@ -147,18 +147,22 @@ def test_the_claimed_sigma_covers_two_thirds_of_the_coordinates_on_average() -> 
     assert 0.58 < np.mean(covered) < 0.78
 
 
-def test_the_claimed_sigma_grows_away_from_the_data() -> None:
-    scene = Scene.draw(1, 60)
-    learning = new_learning()
-    teach(learning, scene.pairs)
+@pytest.fixture(scope="module")
+def sixty() -> tuple[Scene, OnlineLearner]:
+    """Return an arm with sixty pairs, and a learner of them that tests only ask."""
+    scene, learning = Scene.draw(1, 60), new_learning()
+    teach(learning, scene.pairs, every=NOW_AND_THEN)
+    return scene, learning
+
+
+def test_the_claimed_sigma_grows_away_from_the_data(sixty) -> None:
+    scene, learning = sixty
     here, far = learning.snapshot.predict(scene.q), learning.snapshot.predict(scene.q + np.radians(70.0))
     assert here.sigma.mean() < 0.5 * far.sigma.mean()
 
 
-def test_where_data_was_is_in_support_and_far_away_is_not() -> None:
-    scene = Scene.draw(1, 60)
-    learning = new_learning()
-    teach(learning, scene.pairs)
+def test_where_data_was_is_in_support_and_far_away_is_not(sixty) -> None:
+    scene, learning = sixty
     assert learning.snapshot.predict(scene.q).in_support.all()
     assert not learning.snapshot.predict(scene.q + np.radians(70.0)).in_support.any()
 
@@ -177,7 +181,7 @@ def test_a_gross_outlier_is_counted_as_doubted_and_as_learnt() -> None:
     scene = Scene.draw(2, 100)
     learning = new_learning()
     wrong = make_pair(100, scene.q[99], scene.pairs[99].x + np.array([0.0, 1.0, 0.0]))
-    teach(learning, [*scene.pairs[:99], wrong])
+    teach(learning, [*scene.pairs[:99], wrong], every=NOW_AND_THEN)
     assert (learning.counters.doubted, learning.counters.pairs) == (1, 100)
 
 
@@ -237,7 +241,7 @@ def test_a_learner_restored_amid_a_tool_change_fits_the_tool_all_the_same() -> N
     assert Scene(changed, q, []).error_m(restored) < 0.025
 
 
-@pytest.mark.parametrize("end", ["restart", "lost solver"])
+@pytest.mark.parametrize("end", ["restart", pytest.param("lost solver", marks=pytest.mark.soak)])
 def test_what_was_learnt_from_pairs_that_are_no_longer_kept_is_not_forgotten(end: str) -> None:
     scene = Scene.draw(0, 240)
     settings = LearnerConfig(replay_capacity=60)
@@ -343,12 +347,12 @@ def test_replay_takes_as_many_steps_as_configured() -> None:
 def test_the_same_pairs_and_seed_give_the_same_model() -> None:
     scene = Scene.draw(0, 60)
     one, two = new_learning(), new_learning()
-    teach(one, scene.pairs)
-    teach(two, scene.pairs)
+    teach(one, scene.pairs, every=NOW_AND_THEN)
+    teach(two, scene.pairs, every=NOW_AND_THEN)
     assert one.snapshot.digest == two.snapshot.digest
 
 
-@settings(max_examples=6)
+@settings(max_examples=3)
 @given(
     seed=st.integers(0, 2**32 - 1),
     wild=st.dictionaries(st.integers(0, 23), st.floats(-900.0, 900.0), max_size=12),

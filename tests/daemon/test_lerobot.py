@@ -20,7 +20,7 @@ from bodyschema.daemon.wiring.wiring import open_joints
 from bodyschema.drivers.bench.pty_shell import PtyShell
 from bodyschema.drivers.dynamixel.bench.servo import Servo as DynamixelServo
 from bodyschema.drivers.dynamixel.models import BY_NAME as DYNAMIXEL
-from bodyschema.drivers.feetech.bench.chain import Chain
+from bodyschema.drivers.feetech.bench.arm import Chain
 from bodyschema.drivers.feetech.bench.servo import Servo
 from bodyschema.drivers.feetech.models import BY_NAME
 from bodyschema.interfaces.clock import SystemClock
@@ -42,6 +42,9 @@ READ_BY_LEROBOT = [
     ("dynamixel", "range_m100_100", 1, 1500, -42.54697286012526),
     ("feetech", "range_m100_100", 0, 3300, 100.0),
 ]
+
+# The emulated arms are on real ports.
+pytestmark = pytest.mark.usefixtures("patient_host")
 
 
 def config(*arguments: object) -> None:

@@ -267,7 +267,7 @@ def test_the_robots_own_cameras_are_calibrated_and_checked(robot, capsys) -> Non
     assert 'In [vision.cameras] write\ncalibration = "cameras.toml"' in said.out
     assert "Next: tilt the board's" in said.err
     assert len(list((robot.parent / "views").glob("left*.png"))) == rig.made.views + rig.made.left_out
-    called("calibrate", "check", "--robot", robot, "--json")
+    called("calibrate", "cameras", "--check", "--robot", robot, "--json")
     assert msgspec.json.decode(capsys.readouterr().out, type=CheckFile).holds
 
 

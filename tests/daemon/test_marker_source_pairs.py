@@ -17,13 +17,13 @@ import pytest
 from test_sampler import sampling, small_arm
 
 from bodyschema.daemon.sampler.sources import Sources
+from bodyschema.daemon.wiring.wiring import stream_of
 from bodyschema.drivers.markers.config import source_tables
 from bodyschema.drivers.markers.datagram import SCHEMA
-from bodyschema.drivers.markers.opened import stream_of
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.records import JointReading, frozen_array
 
-LIMIT_S = 120.0
+LIMIT_S = 400.0
 PAIRS = 12
 AHEAD_S = 999.0
 SIGMA_M = 2e-4

@@ -70,8 +70,24 @@ def clean_error_m(scene: Scene) -> float:
     return scene.error_m(learning)
 
 
-@pytest.mark.parametrize("spoil", [with_x(10.0), with_x(-900.0), with_q(1e5), with_cov(1e4 * np.eye(3))])
-@pytest.mark.parametrize("first", [0, TAUGHT])
+@pytest.mark.parametrize(
+    ("first", "spoil"),
+    [
+        (0, with_x(10.0)),
+        (TAUGHT, with_q(1e5)),
+        (TAUGHT, with_cov(1e4 * np.eye(3))),
+        *(
+            pytest.param(first, spoil, marks=pytest.mark.soak)
+            for first, spoil in (
+                (0, with_x(-900.0)),
+                (0, with_q(1e5)),
+                (0, with_cov(1e4 * np.eye(3))),
+                (TAUGHT, with_x(10.0)),
+                (TAUGHT, with_x(-900.0)),
+            )
+        ),
+    ],
+)
 def test_after_wild_pairs_that_could_be_true_a_walk_brings_the_learner_back(scene, clean_error_m, spoil, first) -> None:
     learning, pairs = new_learning(), list(scene.pairs)
     pairs[first : first + 2] = map(spoil, pairs[first : first + 2])

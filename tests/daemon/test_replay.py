@@ -229,6 +229,7 @@ def test_ending_the_replay_ends_its_two_processes(tmp_path: Path, robot: Path) -
 
 
 @pytest.mark.skipif(not REAL_DATA.is_dir(), reason=NO_REAL_DATA)
+@pytest.mark.soak
 def test_a_real_eye_in_hand_recording_is_learnt_in_a_frame_that_nobody_knew() -> None:
     folder = REAL_DATA / "panda_eyeinhand"
     ended = command_line(folder / "measured.csv", "--any-step", "--json", "--sigma-mm", 1, "--speed", 1)

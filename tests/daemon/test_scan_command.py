@@ -74,7 +74,7 @@ def test_a_missing_servo_is_named_with_its_joint(config, arm, port) -> None:
     [
         ({"model": "XL330-M288"}, "wrong model", 'set model = "XL330-M288"'),
         ({"model": "XL-320"}, "wrong model", "it is a XL-320, which no driver reads: put a XM540-W270 in its place"),
-        ({"model": None}, "not known", "it does not tell its model"),
+        ({"model": None}, "not known", "it does not report its model"),
         ({"baud": 57_600}, "another rate", "give the servo 1,000,000 bit/s, or set baud = 57600"),
         ({"port": "/dev/ttyUSB9"}, "another port", 'set port = "/dev/ttyUSB9"'),
         ({"is_double": True}, "double", "give the other another ID"),

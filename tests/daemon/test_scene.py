@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodyschema.cli.demo.scene import prepare
-from bodyschema.cli.demo.tags import CUBE_M
+from bodyschema.cli.demo.scene import CUBE_M, prepare
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.wiring import open_sources
 from bodyschema.interfaces.errors import ConfigError

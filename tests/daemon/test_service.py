@@ -159,7 +159,7 @@ def test_a_systemd_that_is_gone_is_logged_once_and_ends_nothing(tmp_path, caplog
     notifier.ready()
     notifier.feed_watchdog()
     assert [record.getMessage() for record in caplog.records] == [
-        "systemd cannot be told READY: No such file or directory"
+        "cannot notify systemd of READY: No such file or directory"
     ]
 
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from bodyschema.cli.servos.log import FILE, LoggedWrite, ServoLog
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.bench import Motion, bench_robot_file, open_bench
 from bodyschema.drivers.bench.dry_run import DryRun
-from bodyschema.interfaces.errors import BodyschemaError, ConfigError, SourceError
+from bodyschema.interfaces.errors import BodyschemaError, ConfigError, RequestError, SourceError
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "desk_arm" / "servos.toml"
 ELBOW = ("--joint", "elbow_pitch")
@@ -59,14 +58,14 @@ def bench(tmp_path: Path, patient_host: None) -> Iterator[Bench]:
 
 
 def test_a_dry_run_shows_the_table_and_writes_nothing(bench, capsys) -> None:
-    assert bench("set", "return_delay=0", *ELBOW, "--dry-run") == 0
+    assert bench("return_delay=0", *ELBOW, "--dry-run") == 0
     assert "elbow_pitch   3  return_delay (9)  250 (500 µs)  →  0 (0 µs)" in capsys.readouterr().out
     assert (bench.elbow("return_delay"), bench.elbow("torque")) == (250, 1)
     assert not bench.robot.with_name("bus.state").exists()
 
 
 def test_what_was_written_is_what_the_sdk_reads(bench) -> None:
-    assert bench("set", "return_delay=0", "operating_mode=current", *ELBOW, "--yes") == 0
+    assert bench("return_delay=0", "operating_mode=current", *ELBOW, "--yes") == 0
     port = sdk.PortHandler(str(bench.robot.with_name("bus")))
     port.setBaudRate(1_000_000)
     found = [sdk.PacketHandler(2.0).read1ByteTxRx(port, 3, address)[0] for address in (9, 11, 64)]
@@ -75,46 +74,46 @@ def test_what_was_written_is_what_the_sdk_reads(bench) -> None:
 
 
 def test_each_write_is_logged_before_and_after(bench) -> None:
-    bench("set", "return_delay=0", *ELBOW, "--yes")
+    bench("return_delay=0", *ELBOW, "--yes")
     assert [(line.old, line.new, line.state) for line in bench.log] == [(250, 0, "begun"), (250, 0, "written")]
 
 
 def test_undo_takes_back_one_command_after_the_other(bench) -> None:
-    bench("set", "return_delay=0", *ELBOW, "--yes")
-    bench("set", "id=9", *ELBOW, "--yes")
-    assert bench("undo", "--yes") == 0
+    bench("return_delay=0", *ELBOW, "--yes")
+    bench("id=9", *ELBOW, "--yes")
+    assert bench("--undo", "--yes") == 0
     assert (bench.elbow("id"), bench.elbow("return_delay")) == (3, 0)
-    assert bench("undo", "--yes") == 0
+    assert bench("--undo", "--yes") == 0
     assert bench.elbow("return_delay") == 250
     with pytest.raises(ConfigError, match="nothing to take back"):
-        bench("undo", "--yes")
+        bench("--undo", "--yes")
 
 
 def test_undo_leaves_alone_what_somebody_else_changed(bench, capsys) -> None:
-    bench("set", "return_delay=0", *ELBOW, "--yes")
+    bench("return_delay=0", *ELBOW, "--yes")
     bench.dry_run.arm.servo("elbow_pitch")["return_delay"] = 7
-    assert bench("undo", "--yes") == 0
+    assert bench("--undo", "--yes") == 0
     assert bench.elbow("return_delay") == 7
     assert "left alone: elbow_pitch (ID 3): return_delay is 7" in capsys.readouterr().out
 
 
 def test_a_rate_is_changed_and_taken_back(bench) -> None:
-    assert bench("set", "baud=57600", "--joint", "base_yaw", "--yes") == 0
+    assert bench("baud=57600", "--joint", "base_yaw", "--yes") == 0
     assert bench.dry_run.arm.servo("base_yaw").baud == 57_600
-    assert bench("show", "--port", str(bench.robot.with_name("bus")), "--id", "1", "--baud", "57600") == 0
-    assert bench("undo", "--yes") == 0
+    assert bench("--port", str(bench.robot.with_name("bus")), "--id", "1", "--baud", "57600") == 0
+    assert bench("--undo", "--yes") == 0
     assert bench.dry_run.arm.servo("base_yaw").baud == 1_000_000
 
 
 def test_zero_tells_the_ticks_of_here_and_writes_nothing(bench, capsys) -> None:
-    assert bench("zero", *ELBOW) == 0
+    assert bench("--zero", *ELBOW) == 0
     ticks = 2048 - round(0.2 * 4096 / (2 * 3.141592653589793))  # it counts against the joint
     assert f"elbow_pitch  zero_ticks = {ticks}" in capsys.readouterr().out
     assert bench.elbow("homing_offset") == 0
 
 
 def test_zero_in_the_servo_makes_here_the_zero(bench) -> None:
-    assert bench("zero", "--in-servo", *ELBOW, "--yes") == 0
+    assert bench("--zero", "--in-servo", *ELBOW, "--yes") == 0
     assert bench.dry_run.arm.servo("elbow_pitch").position(0.0) == 2048
 
 
@@ -128,34 +127,38 @@ def test_zero_in_the_servo_makes_here_the_zero(bench) -> None:
         (("position=1", *ELBOW), "has no setting 'position'"),
         (("return_delay=255", *ELBOW), "from 0 to 254"),
         (("baud=12345", *ELBOW), "Give one of 9600, 57600"),
-        (("return_delay=0",), "which servos"),
-        ((*ELBOW,), "nothing to set"),
+        (("return_delay=0",), "no servos are named"),
         (("return_delay", *ELBOW), "Write NAME=VALUE"),
         (("return_delay=0", "--joint", "elbow"), "Did you mean 'elbow_pitch'"),
     ],
 )
 def test_what_cannot_be_is_refused_and_nothing_is_written(bench, words, said) -> None:
     with pytest.raises(BodyschemaError, match=said):
-        bench("set", *words, "--yes")
+        bench(*words, "--yes")
     assert bench.elbow("torque") == 1
 
 
 def test_a_servo_that_does_not_answer_is_named(bench) -> None:
     bench.dry_run.arm.chains["arm"].servos.pop(2)
     with pytest.raises(SourceError, match=r"'elbow_pitch' \(ID 3, XM430-W350\).*no answer"):
-        bench("set", "return_delay=0", *ELBOW, "--yes")
+        bench("return_delay=0", *ELBOW, "--yes")
 
 
 def test_a_log_whose_last_line_a_crash_cut_off_is_read(bench) -> None:
-    bench("set", "return_delay=0", *ELBOW, "--yes")
+    bench("return_delay=0", *ELBOW, "--yes")
     log = ServoLog(bench.robot.with_name("bus.state"))
     with log.file.open("ab") as stream:
         stream.write(b'{"utc":"2026')
     assert [entry.new for entry in log.to_undo()] == [0]
 
 
-def test_the_page_names_the_commands() -> None:
-    told = subprocess.run(
-        [sys.executable, "-m", "bodyschema", "servos", "--help"], check=True, capture_output=True, text=True
-    ).stdout
-    assert all(name in told for name in ("show", "set", "zero", "undo"))
+def test_settings_are_printed_as_json_too(bench, capsys) -> None:
+    assert bench("--json", *ELBOW) == 0
+    (servo,) = json.loads(capsys.readouterr().out)["servos"]
+    assert (servo["joint"], servo["settings"]["return_delay"]["value"]) == ("elbow_pitch", 250)
+
+
+@pytest.mark.parametrize("words", [("id=9", "--undo"), ("--zero", "--undo", *ELBOW), ("--in-servo",)])
+def test_two_requests_at_once_are_refused(bench, words) -> None:
+    with pytest.raises(RequestError):
+        bench(*words)

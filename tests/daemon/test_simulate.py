@@ -117,7 +117,7 @@ def test_a_file_that_is_there_is_kept(tmp_path) -> None:
 
 
 def test_config_check_names_the_effects(tmp_path, capsys) -> None:
-    called("config", "check", "--robot", write_small_arm(tmp_path, EFFECT))
+    called("config", "--robot", write_small_arm(tmp_path, EFFECT))
     assert "effect joint_offset at waist: offset_rad = 0.05" in capsys.readouterr().out
 
 
@@ -125,7 +125,7 @@ def test_config_check_names_the_effects(tmp_path, capsys) -> None:
 def test_a_spring_without_a_load_is_said_to_change_nothing(tmp_path, capsys, hold, why) -> None:
     file = write_small_arm(tmp_path, '[[effects]]\neffect = "joint_compliance"\nwhere = "waist"\n' + SPRING)
     file.write_text(file.read_text().replace("[camera]", f'hold = "{hold}"\n[camera]'))
-    called("config", "check", "--robot", file)
+    called("config", "--robot", file)
     assert why in capsys.readouterr().out
 
 

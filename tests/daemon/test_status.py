@@ -106,7 +106,7 @@ def test_a_change_that_was_rolled_back_is_none_in_force(config) -> None:
 
 def test_a_process_that_does_not_answer_is_named_with_the_command_that_starts_it(config) -> None:
     text = " ".join(shown(Seen(SAMPLER, None), config).split())
-    assert f"learner does not answer on {config.tables.zenoh.learner}. Start it with `bodyschema learner`" in text
+    assert f"learner does not answer on {config.tables.zenoh.learner}. Start it with `bodyschema run learner`" in text
 
 
 def test_json_has_both_processes_and_null_for_who_is_not_there() -> None:

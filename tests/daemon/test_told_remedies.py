@@ -8,7 +8,7 @@ import sys
 import pytest
 from rich.console import Console
 
-from bodyschema.cli.hardware.doctor_view import show
+from bodyschema.cli.hardware.doctor import show
 from bodyschema.daemon.service.logs import PlainFormatter
 from bodyschema.daemon.service.remedies import WITH_ROBOT, as_typed, given_robot, printable
 from bodyschema.daemon.wiring.servos import Check
@@ -63,15 +63,14 @@ def test_each_of_these_commands_takes_it(command, capsys) -> None:
     from bodyschema.cli.main import command_line
 
     words = command.split()
-    pages = {"servos": ["servos", "show"]}.get(command, words)
-    command_line(words[0])([*pages, "--help"], exit_on_error=False, result_action="return_value")
+    command_line(words[0])([*words, "--help"], exit_on_error=False, result_action="return_value")
     assert "--robot" in capsys.readouterr().out
 
 
 def test_doctor_and_the_log_say_it(monkeypatch, capsys) -> None:
     monkeypatch.setattr(sys, "argv", ["bodyschema", *GIVEN])
-    show(Console(width=80), [Check("servos", "wrong", "none answers", "bodyschema joints    # live")])
-    assert "bodyschema joints --robot arm/left.toml    # live" in capsys.readouterr().out
+    show(Console(width=80), [Check("servos", "wrong", "none answers", "bodyschema watch joints    # live")])
+    assert "bodyschema watch joints --robot arm/left.toml    # live" in capsys.readouterr().out
     record = logging.LogRecord("x", logging.INFO, "", 0, "see `bodyschema status`", None, None)
     assert PlainFormatter("%(message)s").format(record) == "see `bodyschema status --robot arm/left.toml`"
 

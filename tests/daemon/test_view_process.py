@@ -53,7 +53,7 @@ def test_a_port_that_is_taken_is_no_matter_for_whoever_is_shown(robot: Path, cap
     assert "the page had ended with exit code 1" in caplog.text
 
 
-@pytest.mark.parametrize("command", [["view"], ["learner", "--view"], ["run", "--view"]])
+@pytest.mark.parametrize("command", [["view"], ["run", "learner", "--view"], ["run", "--view"]])
 def test_without_the_extra_the_error_names_it(robot: Path, command: list[str], monkeypatch) -> None:
     monkeypatch.setitem(extras.MODULES, "view", ("no_such_library",))
     with pytest.raises(ConfigError, match=r"bodyschema\[view\]"):

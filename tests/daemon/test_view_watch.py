@@ -236,5 +236,5 @@ def _answered(watch: Watch) -> bool:
 
 
 def test_without_a_sampler_nobody_has_the_pairs(watch) -> None:
-    with pytest.raises(BusError, match="bodyschema sampler"):
+    with pytest.raises(BusError, match="bodyschema run sampler"):
         watch.history(10)

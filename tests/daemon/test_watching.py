@@ -167,18 +167,18 @@ def test_a_misspelt_key_is_named_with_its_line(tmp_path) -> None:
 
 
 def test_config_check_says_where_images_come_from(tmp_path, capsys) -> None:
-    run("config", "check", "--robot", str(write_robot(tmp_path, IMAGES.format(speed=1.0))))
+    run("config", "--robot", str(write_robot(tmp_path, IMAGES.format(speed=1.0))))
     assert "images l_*.png and r_*.png, at 1 times their speed" in capsys.readouterr().out
 
 
 def test_config_check_names_a_damaged_calibration(tmp_path, capsys) -> None:
     calibrated = IMAGES.format(speed=1.0).replace("[vision", '[vision.cameras]\ncalibration = "c.toml"\n[vision', 1)
     file = write_robot(tmp_path, calibrated)
-    run("config", "check", "--robot", str(file))
+    run("config", "--robot", str(file))
     assert "calibrated by c.toml, which is not there yet" in capsys.readouterr().out
     (tmp_path / "c.toml").write_text('format = "bodyschema stereo rig 1"\n[left', encoding="utf-8")
     with pytest.raises(ConfigError, match=r"c.toml: not TOML: .* calibrate again"):
-        app(["config", "check", "--robot", str(file)], exit_on_error=False, result_action="return_value")
+        app(["config", "--robot", str(file)], exit_on_error=False, result_action="return_value")
     assert "is in order" not in capsys.readouterr().out
 
 
@@ -210,7 +210,7 @@ def test_two_cameras_that_are_plugged_in_are_the_eyes_of_a_new_robot() -> None:
 
 
 def test_without_cameras_the_tables_are_an_example_that_does_nothing() -> None:
-    lines = robot_toml(EXAMPLE).split("docs/cameras.md tells the rest.\n")[1].splitlines()
+    lines = robot_toml(EXAMPLE).split("docs/cameras.md has the rest.\n")[1].splitlines()
     assert all(line.startswith("#") for line in lines)
     assert json.dumps("/dev/v4l/by-id/usb-LEFT-video-index0") in "\n".join(lines)
 

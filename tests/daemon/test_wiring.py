@@ -168,7 +168,7 @@ def test_servos_in_robot_toml_are_the_joint_source(tmp_path) -> None:
 
 
 def test_servos_without_a_camera_make_no_pairs(tmp_path) -> None:
-    with pytest.raises(ConfigError, match="nothing tells where the marker is"):
+    with pytest.raises(ConfigError, match="nothing measures the marker"):
         enter(load(tmp_path, SERVOS), sim=False)
 
 

@@ -116,7 +116,7 @@ def learner(tmp_path_factory, free_endpoint) -> Iterator[Config]:
     robot = write_small_arm(folder, zenoh + '[daemon]\nstate_dir = "state"\n')
     config, up = Config.load(robot, {}), threading.Event()
     with (folder / "log").open("wb") as log, ZenohSession(connect=config.tables.zenoh.learner) as bus:
-        process = warm.Child("-m", "bodyschema", "learner", "--robot", robot, stderr=log)
+        process = warm.Child("-m", "bodyschema", "run", "learner", "--robot", robot, stderr=log)
         try:
             bus.watch(KEYS.alive("learner"), lambda _: up.set())
             assert up.wait(LIMIT_S), (folder / "log").read_text()

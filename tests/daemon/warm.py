@@ -164,7 +164,8 @@ def _settle(request: tuple[list[str], str, dict[str, str]], files: list[int]) ->
     os.dup2(files[2], 2)
     os.closerange(3, max(map(int, os.listdir("/proc/self/fd"))) + 1)
     # Those of the server know whether its own files can seek, not whether these can.
-    sys.stdout, sys.stderr = (os.fdopen(number, "w", closefd=False) for number in (1, 2))
+    sys.stdout = sys.__stdout__ = os.fdopen(1, "w", closefd=False)
+    sys.stderr = sys.__stderr__ = os.fdopen(2, "w", 1, errors="backslashreplace", closefd=False)
     os.chdir(folder)
     os.environ.clear()
     os.environ.update(environment)
@@ -198,5 +199,6 @@ if __name__ == "__main__":
     code = _run(_serve(socket.socket(fileno=int(sys.argv[1]))))
     threading._shutdown()
     atexit._run_exitfuncs()
-    sys.stdout.flush()
+    for stream in (sys.stderr, sys.stdout):
+        stream.flush()
     os._exit(code)  # taking all modules apart costs more than all the rest

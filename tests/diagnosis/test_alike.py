@@ -7,7 +7,7 @@ from planted_cases import ELBOW, SHOULDER, desk_arm, start_of, walk
 from bodyschema.diagnosis.alike import alike
 from bodyschema.diagnosis.hypotheses import Hypotheses
 from bodyschema.diagnosis.result import Alike, Errors
-from bodyschema.diagnosis.words import beside_geometry
+from bodyschema.diagnosis.text import beside_geometry
 from bodyschema.effects import Effect
 
 HELD = {'"torque_free"': '"held"'}

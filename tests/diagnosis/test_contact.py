@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 from planted_cases import INTERVAL_S, SHOULDER, desk_arm, measured, motion_of, seen, walk
 
 from bodyschema.diagnosis.alignment import aligned
-from bodyschema.diagnosis.contact import before_contact, before_rest, between_flanks
+from bodyschema.diagnosis.contact import doubtful
 from bodyschema.diagnosis.fit import Fit
 from bodyschema.diagnosis.observations import Observations
 from bodyschema.effects import Effect, Motion, Simulation
@@ -38,40 +37,35 @@ def in_runs(robot: RobotDescription, *effects: Effect) -> Fit:
 
 
 def test_a_joint_that_settles_is_at_rest_when_it_has_forgotten_what_was_before_the_run(robot) -> None:
-    lacking = before_rest(in_runs(robot, Effect.at(robot, "settling", SHOULDER, values=[0.3, 0.3])))
+    lacking = doubtful(in_runs(robot, Effect.at(robot, "settling", SHOULDER, values=[0.3, 0.3])))
     rows = np.flatnonzero(lacking[:RUN])
     # 0.3 and 0.09 of it are more than a twentieth, 0.027 is not; the first row is never trusted in a walk.
     np.testing.assert_array_equal(rows, [1, 2])
 
 
 def test_a_joint_that_remembers_nothing_is_at_rest_at_once(robot) -> None:
-    assert not before_rest(in_runs(robot, Effect.at(robot, "settling", SHOULDER, values=[0.3, 0.0]))).any()
+    assert not doubtful(in_runs(robot, Effect.at(robot, "settling", SHOULDER, values=[0.3, 0.0]))).any()
 
 
 def test_a_run_that_begins_in_mid_move_makes_no_outliers_beyond_the_rows_before_rest(robot) -> None:
     fit = in_runs(robot, Effect.at(robot, "settling", SHOULDER, values=[0.5, 0.3]))
-    again = aligned(fit.observations.without(before_rest(fit)), Simulation(robot)).with_causes(fit.causes)
+    again = aligned(fit.observations.without(doubtful(fit)), Simulation(robot)).with_causes(fit.causes)
     assert fit.noise.share > 0.02
     assert again.noise.share < 0.005
 
 
 def test_a_play_is_known_once_the_run_has_crossed_it(robot) -> None:
-    fit = in_runs(robot)
-    q = np.tile(np.median(fit.observations.motion.q, axis=0), (6, 1))
+    q = np.tile(np.median(walk(robot, 3).q, axis=0), (6, 1))
     q[:, robot.joints.index(SHOULDER)] += [0.0, 0.01, 0.02, 0.03, 0.02, 0.01]
     play = Effect.at(robot, "backlash", SHOULDER, values=[0.025])
-    crossing = dataclasses.replace(fit.observations, motion=motion_of(q), x=np.zeros((6, 3)))
-    there = dataclasses.replace(fit, observations=crossing, simulation=Simulation(robot, (play,)), nuisances=0)
-    np.testing.assert_array_equal(before_contact(there), [True, True, True, False, False, False])
+    run = Simulation(robot, (play,)).run(motion_of(q))
+    np.testing.assert_array_equal(play.kind.unknown_state(run, play), [True, True, True, False, False, False])
 
 
 def test_a_flank_is_known_where_friction_does_not_matter(robot) -> None:
     torque = np.array([10.0, 3.0, -0.4, -0.8, -3.0, -10.0])  # friction of 1 N m lets go at -1
     play = Effect.at(robot, "gravity_backlash", SHOULDER, values=[0.01, 1.0])
     k = robot.joints.index(SHOULDER)
-    loaded = SimpleNamespace(
-        observations=SimpleNamespace(motion=torque),
-        simulation=Simulation(robot, (play,)),
-        run=SimpleNamespace(torques=np.outer(torque, np.arange(len(robot.joints)) == k)),
-    )
-    np.testing.assert_array_equal(between_flanks(loaded), [False, False, False, True, False, False])
+    torques = np.outer(torque, np.arange(len(robot.joints)) == k)
+    run = SimpleNamespace(simulation=Simulation(robot, (play,)), torques=torques)
+    np.testing.assert_array_equal(play.kind.unknown_state(run, play), [False, False, False, True, False, False])

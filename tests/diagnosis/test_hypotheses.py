@@ -10,7 +10,7 @@ from planted_cases import ELBOW, SHOULDER, desk_arm, motion_of, observed, survey
 
 from bodyschema.diagnosis.hypotheses import Hypotheses
 from bodyschema.diagnosis.observations import Observations
-from bodyschema.effects import KINDS, Motion, Simulation
+from bodyschema.effects import EFFECT_TYPES, Motion, Simulation
 from bodyschema.robot.description import RobotDescription
 
 STEREO = """focal_px = 600.0                # from the stereo calibration
@@ -47,7 +47,7 @@ def test_a_recording_without_times_is_not_tested_for_latency_and_drift() -> None
     robot = desk_arm()
     timed, untimed = walk(robot, 1), dataclasses.replace(walk(robot, 1), t=None)
     assert names(asked_of(robot, timed)) - names(asked_of(robot, untimed)) == {
-        k.name for k in KINDS.values() if k.needs_times
+        k.name for k in EFFECT_TYPES.values() if k.needs_times
     }
     assert any("no times" in sentence for sentence in asked_of(robot, untimed).limitations)
     assert not any("no times" in sentence for sentence in asked_of(robot, timed).limitations)
@@ -65,7 +65,9 @@ def test_a_joint_that_never_moved_is_no_place_and_no_source_of_anything() -> Non
 
 def test_a_camera_without_stereo_calibration_is_not_tested_for_its_lenses() -> None:
     found = asked_of(desk_arm({STEREO: ""}))
-    assert names(asked_of(desk_arm())) - names(found) == {kind.name for kind in KINDS.values() if kind.needs_stereo}
+    assert names(asked_of(desk_arm())) - names(found) == {
+        kind.name for kind in EFFECT_TYPES.values() if kind.needs_stereo
+    }
     assert any("no stereo calibration" in sentence for sentence in found.limitations)
 
 
@@ -82,10 +84,10 @@ def test_every_effect_is_tested_at_every_joint_once() -> None:
     assert len(set(keys)) == len(keys)
     d = len(robot.joints)
     for name in names(found):
-        kind = KINDS[name]
+        kind = EFFECT_TYPES[name]
         places = 1 if not kind.at_joint else d * (d - 1) if kind.takes_source else d
         assert sum(key[0] == name for key in keys) == places
-    assert names(found) == {kind.name for kind in KINDS.values() if not kind.needs_weight}
+    assert names(found) == {kind.name for kind in EFFECT_TYPES.values() if not kind.needs_weight}
 
 
 def test_only_what_is_asked_for_is_tested() -> None:

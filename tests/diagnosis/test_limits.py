@@ -47,7 +47,7 @@ def test_a_play_that_runs_hardly_cross_is_told_with_what_to_record() -> None:
     short = Motion(way.q, way.t, np.arange(len(way.q)) // 4)
     truth = Effect.at(robot, "backlash", SHOULDER, values=[0.12])
     found = diagnose(seen(robot, short, (truth,), 1), Simulation(robot), only=("backlash",))
-    (told,) = [line for line in conclusion(found).limitations if "side of its play" in line]
+    (told,) = [line for line in conclusion(found).limitations if "side of its backlash" in line]
     assert SHOULDER in told
     assert "Record longer runs" in told
 

@@ -11,7 +11,6 @@ import pytest
 from walked import DESK_ARM
 
 from bodyschema.diagnosis.numbers import number, numbers_of, percent, telling
-from bodyschema.diagnosis.remedies import remedies
 from bodyschema.diagnosis.result import (
     Cause,
     DiagnosisFile,
@@ -22,7 +21,7 @@ from bodyschema.diagnosis.result import (
     Pairs,
     Unexplained,
 )
-from bodyschema.diagnosis.words import finding
+from bodyschema.diagnosis.text import finding, remedies
 from bodyschema.effects import Effect, Motion, Simulation
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription

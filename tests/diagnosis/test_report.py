@@ -15,14 +15,14 @@ from walked import DESK_ARM, walked
 from bodyschema.diagnosis.conclusion import conclusion
 from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
 from bodyschema.diagnosis.observations import ticks
-from bodyschema.diagnosis.remedies import remedies
-from bodyschema.diagnosis.report import About, page
-from bodyschema.diagnosis.report.evidence import evidence_panels
+from bodyschema.diagnosis.presenters.registry import presenter_of
+from bodyschema.diagnosis.report.page import About, page
 from bodyschema.diagnosis.report.plot import round_up
 from bodyschema.diagnosis.report.plot import ticks as axis_ticks
 from bodyschema.diagnosis.report.residuals import Residuals, binned, structure
 from bodyschema.diagnosis.result import DiagnosisFile, Interval
-from bodyschema.effects import KINDS, Effect, Simulation
+from bodyschema.diagnosis.text import remedies
+from bodyschema.effects import EFFECT_TYPES, Effect, Simulation
 from bodyschema.robot.description import RobotDescription
 
 ABOUT = About("<pairs> & more.csv", "desk", "1.2.3")
@@ -161,7 +161,7 @@ def test_a_recording_in_which_nothing_is_found_has_a_report_without_causes(robot
 
 PLACES = [
     (kind.name, 1 if kind.at_joint else None, 2 if kind.takes_source else None)
-    for kind in KINDS.values()
+    for kind in EFFECT_TYPES.values()
 ]  # fmt: skip
 
 
@@ -175,9 +175,9 @@ def test_every_effect_has_a_plot_and_a_remedy_of_its_own(robot, planted, file, n
         values[-1] = 50.0
     effect = effect.with_values(values)
     fit = planted.extended.with_causes([effect])
-    panels = evidence_panels(Residuals(dataclasses.replace(planted, extended=fit)), fit.causes[0])
-    assert "<path" in panels[0].svg
-    assert "nan" not in panels[0].svg
+    panel = presenter_of(name).panel(Residuals(dataclasses.replace(planted, extended=fit)), fit.causes[0])
+    assert "<path" in panel.svg
+    assert "nan" not in panel.svg
     parameters = {p.name: Interval(v, (v, v)) for p, v in zip(effect.parameters, effect.values.tolist(), strict=True)}
     extra = {"amplitude_rad": Interval(0.1, (0.1, 0.1)), "phase_rad": Interval(0.2, (0.2, 0.2))}
     known = next(cause for cause in file.causes if cause.effect == "joint_scale")

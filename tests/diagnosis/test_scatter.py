@@ -18,6 +18,7 @@ from bodyschema.diagnosis.scatter import instruments
 from bodyschema.diagnosis.search import Search
 from bodyschema.diagnosis.worth import NAMED, nats
 from bodyschema.effects import Effect, Motion, Simulation
+from bodyschema.effects.catalogue.settling import Settling
 from bodyschema.robot.description import RobotDescription
 
 ROWS, SIGMA_M, SCATTER_RAD = 1200, 5e-5, np.radians(0.04)
@@ -90,7 +91,7 @@ def test_a_play_of_several_times_the_scatter_is_clearly_seen_beside_it(robot, se
     assert chance(fit_of(robot, seed, play), play, beside=True) < CLEARLY
 
 
-@pytest.mark.parametrize("name", ["backlash", "settling"])
+@pytest.mark.parametrize("name", [pytest.param("backlash", marks=pytest.mark.soak), "settling"])
 def test_of_memories_that_no_joint_has_one_in_a_hundred_is_as_improbable_as_one_in_a_hundred(robot, name) -> None:
     """More than 4 of 80 p-values below 0.01 occur by chance in 1 of 700 such tests."""
     chances = []
@@ -134,9 +135,13 @@ def test_a_play_that_only_the_scatter_speaks_for_is_not_said_to_be_sure(robot, s
     assert standing.probability < 0.9
 
 
+class LagOfAnotherPackage(Settling):
+    name = "lag_of_another_package"
+
+
 def test_what_another_package_says_a_joint_remembers_is_asked_for_in_the_same_way(robot) -> None:
     lag = remembers(robot, "settling")
-    other = dataclasses.replace(lag, kind=dataclasses.replace(lag.kind, name="lag_of_another_package"))
+    other = dataclasses.replace(lag, kind=LagOfAnotherPackage())
     fit = fit_of(robot, 0)
     np.testing.assert_array_equal(instruments(fit, other), instruments(fit, lag))
 

@@ -91,7 +91,8 @@ def test_a_small_one_is_no_sure_cause(robot, seed) -> None:
     assert all(cause.probability < 0.9 for cause in file.causes)
 
 
-@pytest.mark.parametrize("where", [SHOULDER, pytest.param(ELBOW, marks=pytest.mark.soak)])
+@pytest.mark.soak
+@pytest.mark.parametrize("where", [SHOULDER, ELBOW])
 def test_a_joint_that_gives_is_named(robot, where) -> None:
     truth = Effect.at(robot, "joint_compliance", where, values=[0.03])
     (cause,) = found(seen(robot, walk(robot, 1), (truth,), 1), robot).causes

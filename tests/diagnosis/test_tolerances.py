@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -82,6 +83,21 @@ def test_a_bent_link_is_named_where_it_is_larger_than_tolerance(robot: RobotDesc
     bent = Effect.at(robot, "link_geometry", ELBOW, values=[4e-3, 0.0, 5e-3, 0.0, 0.02, 0.01])
     file = found_in(robot, 3, bent)
     assert [(cause.effect, cause.where) for cause in file.causes] == [("link_geometry", ELBOW)]
+
+
+def test_an_interval_allows_for_other_sizes_of_the_tolerances(robot: RobotDescription, monkeypatch) -> None:
+    rng = np.random.default_rng([7, 4])
+    q = rng.uniform(0.7 * robot.lower, 0.7 * robot.upper, (ROWS, len(robot.joints)))
+    offset = Effect.at(robot, "joint_offset", ELBOW, values=[0.04])
+    x = Simulation(robot, (offset,), None, made(robot, rng)).positions(motion_of(q))
+    recording = measured(robot, motion_of(q), x + NOISE_M * rng.normal(size=x.shape))
+    start = aligned(Observations.of(recording, Simulation(robot)), Simulation(robot))
+    # Smaller than they are.
+    fit = start.with_causes([offset]).tolerating(Scales(0.5, 0.5, 0.5))
+    (place,) = fit.places(fit.causes[0])
+    integrated = fit.covariance[place, place]
+    monkeypatch.setattr("bodyschema.diagnosis.fit._NODES", np.zeros(1))
+    assert integrated > 1.2 * replace(fit).covariance[place, place]
 
 
 def test_a_background_is_in_the_extended_simulation_and_comes_back(robot: RobotDescription, tmp_path: Path) -> None:

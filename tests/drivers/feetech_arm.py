@@ -8,8 +8,7 @@ from typing import Literal
 from servo_arm import Path, ServoArm
 
 from bodyschema.drivers.bench.virtual_port import VirtualPort
-from bodyschema.drivers.feetech.bench.chain import Chain
-from bodyschema.drivers.feetech.bench.frames import Code, Instruction, instructions_in
+from bodyschema.drivers.feetech.bench.arm import Chain, Code, Instruction, instructions_in
 from bodyschema.drivers.feetech.bench.servo import Servo
 from bodyschema.drivers.feetech.config import BusConfig, FeetechConfig, ServoConfig
 from bodyschema.drivers.feetech.joints import FeetechJoints

@@ -16,8 +16,7 @@ from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE, Servo
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from bodyschema.drivers.dynamixel.joints import DynamixelJoints
 from bodyschema.drivers.dynamixel.models import BY_NAME
-from bodyschema.drivers.dynamixel.powered_config import FloatingJoint, ZeroForceConfig
-from bodyschema.drivers.dynamixel.torque_constants import torque_constant
+from bodyschema.drivers.dynamixel.powered_config import FloatingJoint, ZeroForceConfig, torque_constant
 from bodyschema.drivers.dynamixel.zero_force import ZeroForce
 
 MODEL = "XM430-W350"

@@ -11,8 +11,8 @@ from bodyschema.daemon.sampler.gaze_loop import GazeLoop, HandModel
 from bodyschema.daemon.wiring.wiring import demonstration_model
 from bodyschema.drivers.bench.faults import Planned
 from bodyschema.drivers.bench.virtual_port import VirtualClock
+from bodyschema.drivers.dynamixel.bench.arm import DrivenShaft
 from bodyschema.drivers.dynamixel.bench.chain import Chain
-from bodyschema.drivers.dynamixel.bench.driven_shaft import DrivenShaft
 from bodyschema.drivers.dynamixel.bench.servo import Servo
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from bodyschema.drivers.dynamixel.gaze import Gaze

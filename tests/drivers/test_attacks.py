@@ -12,20 +12,20 @@ from bench_arm import Arm
 from feetech_arm import FeetechArm
 from servo_arm import TICK
 
+from bodyschema.daemon.wiring.servos import SCANNERS
 from bodyschema.drivers.bench.device import Device, OnlyAnswers, Reply
 from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
-from bodyschema.drivers.dynamixel.bench import faults
+from bodyschema.drivers.dynamixel.bench.arm import swapped
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.servo import Servo
 from bodyschema.drivers.dynamixel.bus import Bus
 from bodyschema.drivers.dynamixel.joints import DYNAMIXEL
 from bodyschema.drivers.dynamixel.models import BY_NAME
-from bodyschema.drivers.feetech.bench.chain import Chain as FeetechChain
+from bodyschema.drivers.feetech.bench.arm import Chain as FeetechChain
 from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
 from bodyschema.drivers.feetech.joints import Bus as FeetechBus
 from bodyschema.drivers.feetech.models import BY_NAME as FEETECH_MODELS
 from bodyschema.drivers.scan import scan_port
-from bodyschema.drivers.scanners import SCANNERS
 from bodyschema.drivers.servos.workbench import Workbench
 from bodyschema.interfaces.errors import SourceLost
 
@@ -93,7 +93,7 @@ def test_answers_to_others_at_the_opening_are_waited_out(make) -> None:
     arm = make()
 
     def of_another(_data: bytes, replies: list[Reply], _t: float) -> list[Reply]:
-        return [faults.swapped(reply, Random(3)) for reply in replies]
+        return [swapped(reply, Random(3)) for reply in replies]
 
     arm.port.device = Wire(arm.chain, of_another)
     with pytest.raises(SourceLost, match="another servo's answer"):

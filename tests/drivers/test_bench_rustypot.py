@@ -12,7 +12,7 @@ from bodyschema.drivers.bench.pty_shell import PtyShell
 from bodyschema.drivers.dynamixel.bench.chain import Chain as DynamixelChain
 from bodyschema.drivers.dynamixel.bench.servo import Servo as DynamixelServo
 from bodyschema.drivers.dynamixel.models import BY_NAME as DYNAMIXEL
-from bodyschema.drivers.feetech.bench.chain import Chain as FeetechChain
+from bodyschema.drivers.feetech.bench.arm import Chain as FeetechChain
 from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
 from bodyschema.drivers.feetech.models import BY_NAME as FEETECH
 

@@ -97,7 +97,7 @@ def test_who_has_the_port_is_told_with_the_command_that_ends_it(machine) -> None
 
 
 def test_the_running_sampler_may_have_the_port(machine) -> None:
-    machine.process(4711, "bodyschema sampler", machine.port)
+    machine.process(4711, "bodyschema run sampler", machine.port)
     (check,) = port_checks("arm", str(machine.by_id), machine.root, ours=[4711])
     assert (check.state, check.said.endswith("the running sampler has it open")) == ("ok", True)
 
@@ -180,7 +180,7 @@ def test_an_alert_is_wrong_and_says_what_to_do(make, tmp_path, joint) -> None:
 @EACH
 def test_slow_answers_are_told_with_the_register(make, tmp_path) -> None:
     check = Told(make, tmp_path, delay_s=500e-6).of("servos")[1]
-    assert (check.state, check.fix) == ("warning", "bodyschema servos set return_delay=0 --bus arm")
+    assert (check.state, check.fix) == ("warning", "bodyschema servos return_delay=0 --bus arm")
 
 
 @EACH

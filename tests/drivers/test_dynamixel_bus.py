@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from bodyschema.drivers.bench.virtual_port import VirtualClock
 from bodyschema.drivers.dynamixel.bench.frames import status_packet
 from bodyschema.drivers.dynamixel.bus import Answer, Bus, Trouble, sync_request
-from bodyschema.drivers.dynamixel.channel import Channel
+from bodyschema.drivers.dynamixel.joints import Channel
 from bodyschema.drivers.dynamixel.models import BY_NAME
 from bodyschema.drivers.dynamixel.packets import Status
 from bodyschema.drivers.servos.handshake import FittedServo

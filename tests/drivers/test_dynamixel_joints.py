@@ -14,8 +14,8 @@ from servo_arm import TICK, swing
 
 from bodyschema.drivers.bench.faults import corrupt, garbage, half, late, mute, wrong_checksum
 from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
+from bodyschema.drivers.dynamixel.bench.arm import storm, swapped
 from bodyschema.drivers.dynamixel.bench.chain import Chain
-from bodyschema.drivers.dynamixel.bench.faults import storm, swapped
 from bodyschema.drivers.dynamixel.bench.servo import Servo
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from bodyschema.drivers.dynamixel.joints import DynamixelJoints
@@ -212,8 +212,15 @@ def test_fast_sync_read_is_used_where_all_know_it(knows, fast) -> None:
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=range(len(FAULTS)))
-@pytest.mark.parametrize("models", [("XM430-W350",) * 3, MIXED])
-@pytest.mark.parametrize("fast", ["auto", "never"])
+@pytest.mark.parametrize(
+    ("models", "fast"),
+    [
+        (("XM430-W350",) * 3, "auto"),
+        (MIXED, "never"),
+        pytest.param(("XM430-W350",) * 3, "never", marks=pytest.mark.soak),
+        pytest.param(MIXED, "auto", marks=pytest.mark.soak),
+    ],
+)
 def test_a_fault_costs_a_reading_and_nothing_else(fault, models, fast) -> None:
     with (arm := Arm(models, fast=fast)).joints:
         read(arm, 10)
@@ -304,7 +311,9 @@ def turning(t: float) -> float:
     return 4.0 * max(t - 100.0, 0.0)
 
 
-@pytest.mark.parametrize("model", ["XM430-W350", "MX-28", "PH42-020-S300"])
+@pytest.mark.parametrize(
+    "model", ["MX-28", *(pytest.param(model, marks=pytest.mark.soak) for model in ("XM430-W350", "PH42-020-S300"))]
+)
 def test_positions_go_on_across_turns(model) -> None:
     with (arm := Arm((model,), [turning])).joints:
         for reading in read(arm, 1500):
@@ -351,8 +360,15 @@ def test_limits_within_a_turn_tell_the_turn() -> None:
 # --- times, rates, storms
 
 
-@pytest.mark.parametrize("fast", ["auto", "never"])
-@pytest.mark.parametrize("delay_s", [0.0, 500e-6])
+@pytest.mark.parametrize(
+    ("fast", "delay_s"),
+    [
+        ("auto", 0.0),
+        ("never", 500e-6),
+        pytest.param("auto", 500e-6, marks=pytest.mark.soak),
+        pytest.param("never", 0.0, marks=pytest.mark.soak),
+    ],
+)
 def test_times_are_those_of_the_sampling_to_half_a_millisecond(fast, delay_s) -> None:
     with (arm := Arm(("XM430-W350",) * 6, latency_s=2e-3, delay_s=delay_s, fast=fast)).joints:
         off = [abs(reading.t - arm.sampled()) for reading in (read(arm)[0] for _ in range(1000))]
@@ -376,8 +392,15 @@ def test_six_servos_are_read_two_hundred_times_a_second() -> None:
         assert 500 / (arm.clock.now() - begin) >= 200
 
 
-@pytest.mark.parametrize("models", [("XM430-W350",) * 6, MIXED])
-@pytest.mark.parametrize("fast", ["auto", "never"])
+@pytest.mark.parametrize(
+    ("models", "fast"),
+    [
+        (("XM430-W350",) * 6, "auto"),
+        (MIXED, "never"),
+        pytest.param(("XM430-W350",) * 6, "never", marks=pytest.mark.soak),
+        pytest.param(MIXED, "auto", marks=pytest.mark.soak),
+    ],
+)
 def test_in_a_storm_of_faults_no_wrong_reading_is_believed(models, fast) -> None:
     arm = Arm(models, fast=fast, seed=5)
     with arm.joints:

@@ -23,7 +23,7 @@ LIMIT_S = 300.0
 
 
 @pytest.fixture
-def shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, patient_host: None):
     # Emulator and driver share this process: on a busy machine the emulator itself may be silent for a while.
     monkeypatch.setattr("bodyschema.drivers.servos.joints.LOST_AFTER_S", LIMIT_S)
     servos = [Servo(BY_NAME["XM430-W350"], id, swing(id), return_delay_s=0, booted_s=id * 0.1234) for id in SIX]

@@ -10,11 +10,9 @@ from hypothesis import strategies as st
 from test_dynamixel_bus import TalkingPort
 
 from bodyschema.drivers.bench.virtual_port import VirtualClock
-from bodyschema.drivers.feetech.bench.chain import Chain
-from bodyschema.drivers.feetech.bench.frames import Code, instructions_in, status_packet
+from bodyschema.drivers.feetech.bench.arm import Chain, Code, instructions_in, status_packet
 from bodyschema.drivers.feetech.bench.servo import CALIBRATE, Servo
-from bodyschema.drivers.feetech.channel import Channel
-from bodyschema.drivers.feetech.joints import PACKETS, Bus
+from bodyschema.drivers.feetech.joints import PACKETS, Bus, Channel
 from bodyschema.drivers.feetech.models import BY_NAME, MODELS
 from bodyschema.drivers.servos.bus import Answer, Request
 from bodyschema.drivers.servos.handshake import FittedServo

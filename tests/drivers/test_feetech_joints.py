@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from servo_arm import TICK, swing
 
 from bodyschema.drivers.bench.faults import corrupt, garbage, half, late, mute, wrong_checksum
-from bodyschema.drivers.feetech.bench.faults import storm, swapped
+from bodyschema.drivers.feetech.bench.arm import storm, swapped
 from bodyschema.drivers.feetech.bench.servo import Servo
 from bodyschema.drivers.feetech.models import BY_NAME
 from bodyschema.drivers.servos.channel import Punctuality

@@ -12,7 +12,7 @@ import pytest
 from gazing_robot import HEAD, GazingRobot
 
 from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode
-from bodyschema.drivers.dynamixel.bench.driven_shaft import DrivenShaft
+from bodyschema.drivers.dynamixel.bench.arm import DrivenShaft
 from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.robot.description import RobotDescription
@@ -74,8 +74,8 @@ def test_the_head_turns_no_faster_than_allowed() -> None:
 def test_the_head_stays_within_its_limits() -> None:
     with (robot := GazingRobot(limits_deg={"neck_pitch": (15.0, 22.0), "neck_yaw": (-5.0, 5.0)})).joints:
         robot.switch_on()
-        robot.run(2.0)
-        for _ in range(60):
+        robot.run(1.0)
+        for _ in range(30):
             robot.run(0.1)
             yaw, pitch = np.degrees(robot.q()[:2])
             assert -5.2 <= yaw <= 5.2
@@ -151,7 +151,7 @@ def test_a_model_that_is_not_good_is_not_taken(truth, sigma, support) -> None:
 def test_another_mode_is_refused_with_the_command_that_changes_it() -> None:
     robot = GazingRobot()
     robot.chain.servo(2)["operating_mode"] = CURRENT_MODE
-    with robot.joints, pytest.raises(RequestError, match="bodyschema servos set operating_mode=3 --joint neck_pitch"):
+    with robot.joints, pytest.raises(RequestError, match="bodyschema servos operating_mode=3 --joint neck_pitch"):
         robot.switch_on()
     assert torque(robot) == [0] * 7
 

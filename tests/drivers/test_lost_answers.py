@@ -22,7 +22,7 @@ from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.servo import Servo
 from bodyschema.drivers.dynamixel.bus import Bus
 from bodyschema.drivers.dynamixel.models import BY_NAME
-from bodyschema.drivers.feetech.bench.chain import Chain as FeetechChain
+from bodyschema.drivers.feetech.bench.arm import Chain as FeetechChain
 from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
 from bodyschema.drivers.feetech.joints import Bus as FeetechBus
 from bodyschema.drivers.feetech.models import BY_NAME as FEETECH_MODELS

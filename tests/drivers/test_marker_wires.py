@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from sent_markers import table
 
+from bodyschema.daemon.wiring.wiring import stream_of
 from bodyschema.drivers.markers.bench.natnet_server import NatnetServer
 from bodyschema.drivers.markers.checks import stream_checks
 from bodyschema.drivers.markers.datagram import SCHEMA
 from bodyschema.drivers.markers.natnet import packets
-from bodyschema.drivers.markers.opened import stream_of
 from bodyschema.drivers.markers.report import Unusable
 from bodyschema.drivers.markers.stream import MarkerStream
 from bodyschema.drivers.ros2 import rmw
@@ -29,7 +29,7 @@ from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.records import MarkerFix
 
-LIMIT_S = 60.0
+LIMIT_S = 400.0
 AT = (0.1, 0.2, 0.3)
 LEVEL = (0.0, 0.0, 0.0, 1.0)
 EVERY_S = 0.004

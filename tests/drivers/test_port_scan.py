@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from bodyschema.daemon.wiring.servos import SCANNERS
 from bodyschema.drivers.bench.device import Faults, OnlyAnswers, Reply, no_faults
 from bodyschema.drivers.bench.pty_shell import PtyShell
 from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
@@ -17,13 +18,12 @@ from bodyschema.drivers.dynamixel.bench.frames import Code, Error, instructions_
 from bodyschema.drivers.dynamixel.bench.servo import Servo
 from bodyschema.drivers.dynamixel.models import BY_NAME
 from bodyschema.drivers.dynamixel.scan import LIKELY_FIRST
-from bodyschema.drivers.feetech.bench.chain import Chain as FeetechChain
+from bodyschema.drivers.feetech.bench.arm import Chain as FeetechChain
 from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
+from bodyschema.drivers.feetech.joints import FeetechPackets
 from bodyschema.drivers.feetech.models import BAUDS as FEETECH_BAUDS
 from bodyschema.drivers.feetech.models import BY_NAME as FEETECH
-from bodyschema.drivers.feetech.packets import FeetechPackets
 from bodyschema.drivers.scan import FoundServo, ScannedBus, scan_port, serial_ports
-from bodyschema.drivers.scanners import SCANNERS
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import SourceError
 
@@ -92,8 +92,15 @@ def test_a_servo_is_found_at_every_rate(model, baud) -> None:
     assert [(s.id, s.baud, s.model) for s in told] == [(7, baud, model), (8, baud, model)]
 
 
-@pytest.mark.parametrize("model", FEETECH)
-@pytest.mark.parametrize("baud", FEETECH_BAUDS)
+@pytest.mark.parametrize(
+    ("model", "baud"),
+    [
+        # Each model and each rate once; every model at every rate in soak.
+        pytest.param(model, baud, marks=() if k == j % len(FEETECH) else pytest.mark.soak)
+        for k, model in enumerate(FEETECH)
+        for j, baud in enumerate(FEETECH_BAUDS)
+    ],
+)
 def test_a_feetech_servo_is_found_at_every_rate(model, baud) -> None:
     told = found(feetech(model, 9, baud), feetech(model, 10, baud))  # 9 is a byte of an STS3215's number, too
     assert [(s.id, s.baud, s.model, s.protocol) for s in told] == [(id, baud, model, "Feetech") for id in (9, 10)]

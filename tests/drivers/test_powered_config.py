@@ -10,7 +10,7 @@ import pytest
 
 from bodyschema.drivers.config import DriversConfig
 from bodyschema.drivers.dynamixel.models import BY_NAME, MODELS
-from bodyschema.drivers.dynamixel.torque_constants import TORQUE_AT_CURRENT, torque_constant
+from bodyschema.drivers.dynamixel.powered_config import TORQUE_AT_CURRENT, torque_constant
 from bodyschema.interfaces.errors import ConfigError
 
 SERVOS = """

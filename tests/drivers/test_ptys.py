@@ -21,7 +21,7 @@ from bodyschema.drivers.dynamixel.config import BusConfig as DynamixelBus
 from bodyschema.drivers.dynamixel.config import DynamixelConfig
 from bodyschema.drivers.dynamixel.joints import DynamixelJoints
 from bodyschema.drivers.dynamixel.models import BY_NAME as DYNAMIXEL
-from bodyschema.drivers.feetech.bench.chain import Chain
+from bodyschema.drivers.feetech.bench.arm import Chain
 from bodyschema.drivers.feetech.bench.servo import Servo
 from bodyschema.drivers.feetech.config import BusConfig, FeetechConfig, ServoConfig
 from bodyschema.drivers.feetech.joints import FeetechJoints
@@ -79,6 +79,7 @@ def wait_for_reading(source: Any) -> JointReading:
     raise AssertionError("no reading came")
 
 
+@pytest.mark.usefixtures("patient_host")
 @EACH
 def test_readings_are_right_with_wire_time(make: Make, tmp_path, monkeypatch) -> None:
     # Emulator and driver share this process: on a busy machine the emulator itself may be silent for a while.

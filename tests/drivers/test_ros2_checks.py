@@ -30,7 +30,7 @@ def test_a_robot_that_is_well_has_its_rate_told() -> None:
 def test_a_joint_that_is_not_told_is_wrong_and_the_remedy_is_its_name() -> None:
     told = checks_of(Robot(), ("elbow", "pan", "wrist"))
     assert told["joint states"].state == "wrong"
-    assert "says nothing about wrist" in told["joint states"].said
+    assert "does not name wrist" in told["joint states"].said
     assert told["joint states"].fix == "Say in [drivers.ros2] names what ROS calls each joint"
 
 

@@ -100,7 +100,7 @@ def test_of_joints_of_several_nodes_the_least_sure_time_counts() -> None:
         assert robot.read(3.0)[-1].t_sigma < 0.5 * slow
 
 
-@pytest.mark.parametrize("drift", [-1e-4, 1e-4, 2e-3])
+@pytest.mark.parametrize("drift", [-1e-4, *(pytest.param(drift, marks=pytest.mark.soak) for drift in (1e-4, 2e-3))])
 def test_a_clock_of_another_rate_is_followed(drift) -> None:
     rng = Random(4)
     robot = Robot([said("a", *PATHS, rate_hz=10.0, drift=drift)], delay=lambda: rng.uniform(0.0, 1e-3))

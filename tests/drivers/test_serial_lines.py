@@ -203,8 +203,8 @@ def steep_arm(**settings) -> BoardArm:
     return BoardArm(STEEP, ticks=16384, limits=[(-1e9, 1e9)], **settings)
 
 
-@pytest.mark.parametrize("drift", [0.0, 1e-4, -0.01])
-@pytest.mark.parametrize("latency_s", [0.0, 4e-3, 16e-3])
+@pytest.mark.parametrize("drift", [0.0, pytest.param(1e-4, marks=pytest.mark.soak), -0.01])
+@pytest.mark.parametrize("latency_s", [0.0, pytest.param(4e-3, marks=pytest.mark.soak), 16e-3])
 def test_the_time_sigma_holds_from_the_first_reading(drift, latency_s) -> None:
     with (arm := steep_arm(latency_s=latency_s, drift=drift)).joints:
         readings = arm.read(2000)

@@ -16,7 +16,7 @@ from bodyschema.drivers.dynamixel.joints import DYNAMIXEL
 from bodyschema.drivers.dynamixel.models import BY_NAME as DYNAMIXELS
 from bodyschema.drivers.dynamixel.models import MODELS
 from bodyschema.drivers.dynamixel.settings import settings_of
-from bodyschema.drivers.feetech.bench.chain import Chain as FeetechChain
+from bodyschema.drivers.feetech.bench.arm import Chain as FeetechChain
 from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
 from bodyschema.drivers.feetech.joints import FEETECH
 from bodyschema.drivers.feetech.models import BY_NAME as FEETECHS

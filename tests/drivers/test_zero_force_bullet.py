@@ -11,13 +11,13 @@ import pytest
 from test_zero_force_process import write_robot
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.wiring.powered import open_drives
+from bodyschema.daemon.wiring.wiring import open_drives
 from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE, Servo
 from bodyschema.drivers.dynamixel.joints import DynamixelJoints
 from bodyschema.drivers.dynamixel.models import BY_NAME
-from bodyschema.drivers.dynamixel.torque_constants import torque_constant
+from bodyschema.drivers.dynamixel.powered_config import torque_constant
 
 pybullet = pytest.importorskip("pybullet")
 

@@ -89,10 +89,10 @@ def bench(tmp_path: Path) -> Iterator[DryRun]:
 
 
 class Floating:
-    """A running `bodyschema joints --zero-force`."""
+    """A running `bodyschema watch joints --zero-force`."""
 
     def __init__(self, folder: Path) -> None:
-        words = ["joints", "--json", "--zero-force", "--robot", "robot.toml"]
+        words = ["watch", "joints", "--json", "--zero-force", "--robot", "robot.toml"]
         ours, its = os.pipe()
         self._said, self._errors = os.fdopen(ours), tempfile.TemporaryFile("w+")  # noqa: SIM115
         with os.fdopen(its, "w") as out:
@@ -176,7 +176,7 @@ def test_a_fault_of_a_servo_ends_it(bench, floating) -> None:
 def test_another_mode_is_refused_with_the_command(tmp_path) -> None:
     with bench_of(write_robot(tmp_path), POSITION_MODE) as bench, Floating(tmp_path) as floating:
         assert floating.ended() == 1
-        assert "bodyschema servos set operating_mode=0 --joint shoulder" in " ".join(floating.errors().split())
+        assert "bodyschema servos operating_mode=0 --joint shoulder" in " ".join(floating.errors().split())
         assert torque(bench) == [0, 0]
 
 

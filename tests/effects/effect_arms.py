@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyschema.effects import KINDS, Effect, Motion
+from bodyschema.effects import EFFECT_TYPES, Effect, Motion
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 
@@ -89,7 +89,7 @@ def walk(seed: int = 0, rows: int = 120) -> Motion:
 def everywhere(robot: RobotDescription) -> list[tuple[str, str | None, str | None]]:
     """Return every effect at every possible joint; a coupling from one other joint each."""
     found: list[tuple[str, str | None, str | None]] = []
-    for kind in KINDS.values():
+    for kind in EFFECT_TYPES.values():
         for k, joint in enumerate(robot.joints if kind.at_joint else (None,)):
             if kind.turns_only and joint == SLIDE:
                 continue

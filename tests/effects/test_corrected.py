@@ -7,7 +7,6 @@ import pytest
 from effect_arms import ALL, SLIDE, arm, everywhere, sized, walk
 
 from bodyschema.effects import Effect, Simulation, corrected_file, write_corrected
-from bodyschema.effects.simulation import RIGID
 from bodyschema.robot.calibrated_files import CAMERA_LINK, MARKER_LINK
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.urdf import UrdfTree, chain_between
@@ -37,7 +36,7 @@ def seen(robot: RobotDescription, file) -> np.ndarray:
 def test_it_is_the_simulation_with_the_geometric_effects_alone(robot, tmp_path) -> None:
     effects = [sized(robot, where, 2.0, k) for k, where in enumerate(everywhere(robot))]
     simulation = Simulation(robot, tuple(effects))
-    wanted = Simulation(robot, tuple(effect for effect in effects if effect.name in RIGID)).positions(walk())
+    wanted = Simulation(robot, tuple(effect for effect in effects if effect.kind.rigid)).positions(walk())
     file = write_corrected(simulation, tmp_path / "out", HEADING)
     np.testing.assert_allclose(seen(robot, file), wanted, rtol=0.0, atol=1e-9)
 
@@ -52,7 +51,7 @@ def test_effects_at_one_place_add_up(robot, tmp_path, where) -> None:
 
 def test_the_rigid_chain_is_the_simulation_with_the_geometric_effects_alone(robot) -> None:
     effects = tuple(sized(robot, where, 2.0, k) for k, where in enumerate(everywhere(robot)))
-    wanted = Simulation(robot, tuple(effect for effect in effects if effect.name in RIGID)).positions(walk())
+    wanted = Simulation(robot, tuple(effect for effect in effects if effect.kind.rigid)).positions(walk())
     chain = Simulation(robot, effects).rigid_chain
     np.testing.assert_allclose(chain.positions(walk().q), wanted, rtol=0.0, atol=1e-9)
 

@@ -8,7 +8,7 @@ from effect_arms import arm, everywhere, sized, walk
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bodyschema.effects import KINDS, Simulation
+from bodyschema.effects import EFFECT_TYPES, Simulation
 
 # Of the largest derivative. That a spring's deflection changes its own load is left out.
 EXACT, AT_A_KNOT, TO_FIRST_ORDER = 1e-5, 1e-3, 0.02
@@ -34,7 +34,7 @@ def robot(tmp_path_factory):
     return arm(tmp_path_factory.mktemp("arm"))
 
 
-PLACES = st.sampled_from([kind.name for kind in KINDS.values()])
+PLACES = st.sampled_from([kind.name for kind in EFFECT_TYPES.values()])
 KNOWN = settings(max_examples=60)
 
 
@@ -89,7 +89,7 @@ def test_columns_are_the_derivatives_of_an_effect_among_others(robot, data, shar
     check_columns(robot, others, sized(robot, drawn(data, robot), share, seed))
 
 
-@pytest.mark.parametrize("kind", list(KINDS))
+@pytest.mark.parametrize("kind", list(EFFECT_TYPES))
 def test_with_nominal_amounts_nothing_changes(robot, kind) -> None:
     nominal = Simulation(robot).positions(MOTION)
     for place in everywhere(robot):
@@ -98,7 +98,7 @@ def test_with_nominal_amounts_nothing_changes(robot, kind) -> None:
             np.testing.assert_allclose(same, nominal, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", list(KINDS))
+@pytest.mark.parametrize("kind", list(EFFECT_TYPES))
 def test_half_the_usual_size_moves_positions(robot, kind) -> None:
     for place in everywhere(robot):
         if place[0] == kind and place != ("joint_compliance", "neck_yaw", None):  # whose axis is vertical

@@ -8,12 +8,12 @@ from effect_arms import arm, everywhere, sized, walk
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bodyschema.effects import Effect, LiveEncoders, Motion, Simulation
-from bodyschema.effects.encoder import ENCODER_EFFECTS, played
+from bodyschema.effects import EFFECT_TYPES, Effect, LiveEncoders, Motion, Simulation
+from bodyschema.effects.catalogue.backlash import played
 
 PATHS = st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=60).map(np.array)
 WIDTHS = st.floats(1e-4, 0.5)
-EACH = [effect.name for effect in ENCODER_EFFECTS]
+EACH = [name for name, effect in EFFECT_TYPES.items() if effect.encoder is not None]
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from effect_arms import arm, walk
 
-from bodyschema.effects import KINDS, Simulation, Unexplained, load_simulation
+from bodyschema.effects import EFFECT_TYPES, Simulation, Unexplained, load_simulation
 from bodyschema.recordings.recording import Recording
 from kbmaps import JointBasis, RigidChain
 
@@ -24,20 +24,20 @@ def block(language: str) -> str:
 
 
 def test_the_page_has_a_row_for_every_effect_of_the_table() -> None:
-    assert set(ROWS) == set(KINDS)
+    assert set(ROWS) == set(EFFECT_TYPES)
 
 
-@pytest.mark.parametrize("name", list(KINDS))
+@pytest.mark.parametrize("name", list(EFFECT_TYPES))
 def test_the_row_of_an_effect_names_its_numbers(name: str) -> None:
     numbers = set(re.findall(r"`([a-z0-9]+(?:_\w+)?)`", ROWS[name].split(" | ")[0]))
-    names = [parameter.name for parameter in KINDS[name].turning]
+    names = [parameter.name for parameter in EFFECT_TYPES[name].turning]
     if " … " in ROWS[name]:
         names = [names[0], "rz_rad", *names[6:]]
     assert numbers - {"compliance_m_per_N", "width_m", "hold_N"} == set(names)
 
 
 def test_the_page_counts_what_the_change_log_says() -> None:
-    assert len(KINDS) == 22
+    assert len(EFFECT_TYPES) == 22
 
 
 def test_the_page_s_extended_toml_can_be_read(tmp_path) -> None:

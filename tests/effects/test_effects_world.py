@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from effect_arms import arm, everywhere, sized, walk
 
-from bodyschema.effects import KINDS, Motion, Simulation
+from bodyschema.effects import EFFECT_TYPES, Motion, Simulation
 from bodyschema.sim_backend import ErrorConfig, SimConfig
 from bodyschema.sim_backend.posed import PERIOD_S, PosedWorld
-from bodyschema.sim_backend.truth import GEOMETRY
 
 CLOSE_M = 1e-6
 NO_ERRORS = ErrorConfig(
@@ -44,7 +43,7 @@ def rows(postures) -> Motion:
     return Motion(postures, PERIOD_S * np.arange(1.0, len(postures) + 1), np.zeros(len(postures), dtype=np.int64))
 
 
-@pytest.mark.parametrize("name", [name for name in KINDS if name != "camera_latency"])
+@pytest.mark.parametrize("name", [name for name in EFFECT_TYPES if name != "camera_latency"])
 def test_an_effect_at_any_joint_shows_in_the_world(robot, name, monkeypatch) -> None:
     postures = walk(2).q[:20]
     for place in everywhere(robot):
@@ -72,7 +71,7 @@ class Wave:
 def test_the_true_chain_has_geometric_effects_and_drawn_errors_in_it(robot, monkeypatch) -> None:
     monkeypatch.setattr("bodyschema.sim_backend.posed.RenderProcess", NoRenderer)
     postures = walk(5).q[:20]
-    places = [place for place in everywhere(robot) if place[0] in GEOMETRY]
+    places = [place for place in everywhere(robot) if EFFECT_TYPES[place[0]].rigid]
     simulation = Simulation(robot, tuple(sized(robot, place, 1.0, k) for k, place in enumerate(places)))
     with PosedWorld(robot, SimConfig(seed=7), postures, simulation) as world:
         x = np.array([world.scene(number).x_seen for number in range(len(postures))])

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from effect_arms import arm, everywhere, sized, walk
 
-from bodyschema.effects import KINDS, Effect, LiveEncoders, Motion, Simulation
+from bodyschema.effects import EFFECT_TYPES, Effect, LiveEncoders, Motion, Simulation
 from bodyschema.effects.exports import write_correction
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 
 READERS = Path(__file__).resolve().parents[2] / "examples" / "correction"
 NOT_OF_THE_ARM = {"camera_scale", "camera_focal", "lens_distortion", "camera_latency", "thermal_drift"}
-NAMES = tuple(name for name in KINDS if name not in NOT_OF_THE_ARM)
+NAMES = tuple(name for name in EFFECT_TYPES if name not in NOT_OF_THE_ARM)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,8 @@ import pytest
 from effect_arms import arm, everywhere, sized, walk
 from public_arms import ARMS, public_arm, readings
 
-from bodyschema.effects import KINDS, Effect, Kind, Motion, Parameter, Simulation
+from bodyschema.effects import EFFECT_TYPES, Effect, Motion, Parameter, Simulation
+from bodyschema.effects.encoder import EncoderEffect
 from bodyschema.effects.exports import replayed, write_correction, write_mjcf
 from bodyschema.interfaces.errors import RobotError
 from bodyschema.interfaces.records import FloatArray
@@ -132,7 +133,7 @@ def test_a_payload_loads_the_springs(tmp_path: Path) -> None:
     assert farthest(Simulation(robot, (spring,)).positions(motion), wanted) > 10.0 * CLOSE_M
 
 
-@pytest.mark.parametrize("name", list(KINDS))
+@pytest.mark.parametrize("name", list(EFFECT_TYPES))
 def test_what_mjcf_cannot_hold_is_listed(name: str, tmp_path: Path) -> None:
     robot, file = arm(tmp_path), tmp_path / "model.xml"
     where = next(where for where in everywhere(robot) if where[0] == name and where[1] != "rail")
@@ -163,11 +164,20 @@ def test_meshes_are_kept_and_missing_ones_are_listed(tmp_path: Path) -> None:
     assert (model.nmesh, model.ngeom > 5) == (0, True)
 
 
+class NewEffect(EncoderEffect):
+    name = "new_effect"
+
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        return (Parameter("size_rad", 0.1),)
+
+    def columns(self, motion, place, values):
+        return np.square(motion.q[:, [place.joint]])
+
+
 @pytest.mark.parametrize(("write", "name"), [(write_mjcf, "model.xml"), (write_correction, "correction.json")])
 def test_effects_that_are_not_known_are_listed(write, name: str, tmp_path: Path) -> None:
-    size = (Parameter("size_rad", 0.1),)
     robot = arm(tmp_path)
-    new = Effect(Kind("new_effect", "encoder", True, size, size), "elbow", None, np.array([0.1]))
+    new = Effect(NewEffect(), "elbow", None, np.array([0.1]))
     [told] = write(Simulation(robot, (new,)), tmp_path / name, "made by a test")
     assert told.startswith("not in the file: new_effect at elbow")
 

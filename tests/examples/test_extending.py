@@ -136,7 +136,8 @@ def test_the_effect_is_found_where_it_is_hidden_and_told_in_its_words(packages: 
     travelled = (q[:, 2] + np.radians(150.0)) / np.radians(300.0)
     turned[:, 2] += np.radians(300.0) * 0.12 * travelled**2 * (1.0 - travelled)
     x = robot.chain.positions(turned) + 5e-4 * rng.normal(size=(len(q), 3))
-    Recording(robot.joints, q, x).write_csv(robot_toml.parent / "measured.csv")
+    stated = np.tile(np.square(5e-4) * np.eye(3), (len(q), 1, 1))
+    Recording(robot.joints, q, x, cov=stated).write_csv(robot_toml.parent / "measured.csv")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(packages), str(ROOT)])}
     command = [sys.executable, "-m", "bodyschema", "diagnose", "measured.csv", "--json"]
     run = subprocess.run(

@@ -153,7 +153,9 @@ def test_outliers_from_the_first_pair_on_cost_no_more_than_their_share_of_the_pa
     assert np.mean(spoilt) < 1.1 * np.mean(clean)
 
 
-@pytest.mark.parametrize("noise", [1e-6, 1e-5, 1e-4, 1e-2])
+@pytest.mark.parametrize(
+    "noise", [1e-6, 1e-2, *(pytest.param(noise, marks=pytest.mark.soak) for noise in (1e-5, 1e-4))]
+)
 def test_the_noise_it_starts_from_does_not_matter_after_thirty_pairs(noise):
     rng = np.random.default_rng(11)
     arm = rough_arm(rng)

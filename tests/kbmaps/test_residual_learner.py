@@ -172,7 +172,7 @@ def test_twenty_joints_with_eccentric_encoders_are_learnt_beyond_the_rigid_chain
     assert mean_distance(learner.predict(test), truth) < 0.5 * mean_distance(learner.rigid.predict(test), truth)
 
 
-@pytest.mark.parametrize("told", [None, SIGMA])
+@pytest.mark.parametrize("told", [None, pytest.param(SIGMA, marks=pytest.mark.soak)])
 def test_sigma_covers_two_thirds_and_nineteen_twentieths_of_a_bent_arm(told):
     ratios = []
     for seed in range(8):

@@ -21,7 +21,7 @@ from kbmaps import (
     SettingError,
     ShapeError,
 )
-from kbmaps.residual.correlation import innovations, most_probable
+from kbmaps.residual.fit import innovations, most_probable
 
 SIGMA = 0.003
 DOWN = np.array([0.2, -0.3, -0.9])

@@ -10,7 +10,7 @@ import numpy as np
 
 from bodyschema.daemon.config import Config
 from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
-from bodyschema.drivers.feetech.bench.chain import Chain
+from bodyschema.drivers.feetech.bench.arm import Chain
 from bodyschema.drivers.feetech.bench.servo import Servo
 from bodyschema.drivers.feetech.joints import FeetechJoints
 from bodyschema.drivers.feetech.models import BY_NAME

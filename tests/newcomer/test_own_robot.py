@@ -112,13 +112,13 @@ def test_init_writes_what_the_page_says_and_guesses_what_the_example_has(desk) -
 
 
 def test_check_prints_what_the_page_says(desk) -> None:
-    assert typed("bodyschema config check", desk).stdout == output_of("bodyschema config check")
+    assert typed("bodyschema config", desk).stdout == output_of("bodyschema config")
 
 
 def test_check_names_a_joint_that_was_forgotten(desk) -> None:
     text = (desk / "robot.toml").read_text(encoding="utf-8")
     (desk / "robot.toml").write_text(text.replace('"base_yaw", ', ""), encoding="utf-8")
-    assert "base_yaw: on the way, but not in joints: stands still at 0" in typed("bodyschema config check", desk).stdout
+    assert "base_yaw: on the way, but not in joints: stands still at 0" in typed("bodyschema config", desk).stdout
 
 
 @pytest.mark.parametrize(("right", "wrong", "message"), [*table("instead of"), *MORE_MISTAKES])
@@ -184,6 +184,7 @@ def guided_recording(robot: RobotDescription, rows: int) -> str:
     return "\n".join([",".join([*robot.joints, "x", "y", "z"]), *lines, ""])
 
 
+@pytest.mark.soak
 def test_a_recording_of_one_s_own_is_replayed_as_on_the_page(desk) -> None:
     recording = guided_recording(RobotDescription.load(desk / "robot.toml"), 60)
     (desk / "guided.csv").write_text(recording, encoding="utf-8")

@@ -48,6 +48,7 @@ def test_every_command_in_the_readme_is_understood(command: str) -> None:
     command_line(words[0]).parse_args(words, exit_on_error=False, print_error=False)
 
 
+@pytest.mark.usefixtures("patient_host")
 def test_the_commands_for_a_real_arm_go_through_on_a_bench(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Run the README's commands on an emulated arm: the port and one baud rate are given, and there are no prompts."""
     with BenchRun(Config.load(ROOT / "examples" / "desk_arm" / "servos.toml", {}), tmp_path / "bus") as run:
@@ -58,7 +59,7 @@ def test_the_commands_for_a_real_arm_go_through_on_a_bench(tmp_path: Path, capsy
             ["init", "--urdf", urdf, "--from", "scan", *port, "--robot", robot, "--yes"],
             ["scan", *port, "--robot", robot],
             ["doctor", "--robot", str(run.robot_file)],
-            ["joints", "--robot", robot, "--once"],
+            ["watch", "joints", "--robot", robot, "--once"],
         ):
             command_line(words[0])(words, exit_on_error=False, result_action="return_value")
     shown = capsys.readouterr().out

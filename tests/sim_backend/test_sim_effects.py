@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_sim_truth import NO_ERRORS
 
-from bodyschema.effects import KINDS, Effect, Motion, Simulation
+from bodyschema.effects import EFFECT_TYPES, Effect, Motion, Simulation
 from bodyschema.interfaces.records import MarkerFix
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.toml_file import read_toml
@@ -94,7 +94,7 @@ def extended(*cases) -> Simulation:
     return Simulation(robot, tuple(Effect.at(robot, *case) for case in cases))
 
 
-def guided(simulation: Simulation, config: SimConfig = CONFIG, seconds: float = 1.5) -> tuple[Motion, np.ndarray]:
+def guided(simulation: Simulation, config: SimConfig = CONFIG, seconds: float = 1.0) -> tuple[Motion, np.ndarray]:
     """Return readings at every step from the start, and an ideal tracker's positions; NaN between frames."""
     robot = simulation.robot
     assert robot.calibration is not None
@@ -117,7 +117,7 @@ def frames(motion: Motion) -> Motion:
 
 
 def test_every_effect_of_the_table_is_tried() -> None:
-    assert {case[0] for case in EFFECTS} == set(KINDS)
+    assert {case[0] for case in EFFECTS} == set(EFFECT_TYPES)
 
 
 @pytest.mark.parametrize("cases", groups(), ids=lambda cases: "-".join(map(named, cases)))

@@ -5,9 +5,9 @@ import pytest
 from guided_run import guide, learning, shipped, shipped_run, step_degrees
 
 from bodyschema.sim_backend import SimConfig, true_chain
-from bodyschema.sim_backend.arm import TorqueFreeArm
 from bodyschema.sim_backend.bullet import Body
 from bodyschema.sim_backend.config import CameraConfig, SimTag
+from bodyschema.sim_backend.physics import TorqueFreeArm
 from bodyschema.sim_backend.physics_urdf import physics_urdf
 from bodyschema.sim_backend.roles import JointRoles
 from bodyschema.sim_backend.truth import TrueRobot
@@ -103,7 +103,10 @@ def test_a_single_tag_is_turned_to_the_eyes_in_nine_frames_of_ten(seed):
 @pytest.mark.parametrize(
     "joints",
     [
-        ("neck_yaw", "neck_pitch", "shoulder_flexion", "upperarm_rotation", "elbow_flexion"),
+        pytest.param(
+            ("neck_yaw", "neck_pitch", "shoulder_flexion", "upperarm_rotation", "elbow_flexion"),
+            marks=pytest.mark.soak,
+        ),
         pytest.param(
             ("neck_yaw", "neck_pitch", "shoulder_flexion", "shoulder_abduction", "upperarm_rotation", "elbow_flexion"),
             marks=pytest.mark.soak,
@@ -112,7 +115,9 @@ def test_a_single_tag_is_turned_to_the_eyes_in_nine_frames_of_ten(seed):
             "neck_yaw", "neck_roll", "neck_pitch", "shoulder_flexion", "shoulder_abduction", "upperarm_rotation",
             "elbow_flexion", "forearm_rotation", "wrist_flexion", "wrist_abduction",
         ),
-        ("shoulder_flexion", "shoulder_abduction", "upperarm_rotation", "elbow_flexion"),
+        pytest.param(
+            ("shoulder_flexion", "shoulder_abduction", "upperarm_rotation", "elbow_flexion"), marks=pytest.mark.soak
+        ),
     ],
     ids=len,
 )  # fmt: skip

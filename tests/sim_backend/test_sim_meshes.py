@@ -262,7 +262,7 @@ def test_a_malformed_mesh_becomes_a_rod(tmp_path, name) -> None:
 def test_missing_meshes_become_rods_and_are_named(tmp_path, name) -> None:
     shapes, said, bullet = shapes_of(robot_of(tmp_path, mesh(name)))
     assert [kind for kind, _, _ in shapes] == [bullet.GEOM_CYLINDER]
-    assert said.startswith(f"missing meshes: {name or 'one without a file name'}. The simulation goes on")
+    assert said.startswith(f"missing meshes: {name or 'one without a file name'}. The simulation continues without")
 
 
 def test_no_rod_leads_to_a_tool(tmp_path) -> None:

@@ -23,6 +23,13 @@ def world():
         yield world
 
 
+@pytest.fixture(scope="module")
+def running():
+    """Yield an open world that tests share; its time goes on from test to test."""
+    with SimWorld(shipped(), SimConfig(seed=2)) as world, world.joints, world.camera:
+        yield world
+
+
 def frames(world, count):
     return [world.camera.read(WAIT_S) for _ in range(count)]
 
@@ -46,9 +53,9 @@ def triangulated(calibration, frame):
     return np.append((left - calibration.principal_point_px) * z / calibration.focal_px, z)
 
 
-def test_the_sources_are_what_the_sampler_expects(world):
-    assert isinstance(world.joints, JointSource)
-    assert isinstance(world.camera, StereoCamera)
+def test_the_sources_are_what_the_sampler_expects(running):
+    assert isinstance(running.joints, JointSource)
+    assert isinstance(running.camera, StereoCamera)
 
 
 def test_the_same_seed_gives_the_same_readings_and_frames_bit_by_bit():
@@ -66,30 +73,21 @@ def test_the_same_seed_gives_the_same_readings_and_frames_bit_by_bit():
         np.testing.assert_array_equal(first.right, second.right)
 
 
-def test_readings_come_at_their_rate(world):
-    times = [world.joints.read(WAIT_S).t for _ in range(8)]
-    np.testing.assert_allclose(times, np.arange(1, 9) / 120, atol=1e-12)
-
-
-def test_frames_come_at_their_rate(world):
-    np.testing.assert_allclose([frame.t for frame in frames(world, 5)], np.arange(1, 6) / 30, atol=1e-12)
-
-
-def test_two_threads_get_all_readings_and_frames_in_strict_order(world):
+def test_two_threads_get_all_readings_and_frames_in_order_at_their_rates(world):
     times, seen = [], []
 
     def read_joints():
-        while not times or times[-1] < 1.0:
+        while not times or times[-1] < 0.4:
             reading = world.joints.read(WAIT_S)
             times.append(reading.t)
 
     reader = threading.Thread(target=read_joints)
     reader.start()
-    while not seen or seen[-1] < 1.0:
+    while not seen or seen[-1] < 0.4:
         seen.append(world.camera.read(WAIT_S).t)
     reader.join(WAIT_S)
-    np.testing.assert_allclose(times, np.arange(1, 121) / 120, atol=1e-12)
-    np.testing.assert_allclose(seen, np.arange(1, 31) / 30, atol=1e-12)
+    np.testing.assert_allclose(times, np.arange(1, 49) / 120, atol=1e-12)
+    np.testing.assert_allclose(seen, np.arange(1, 13) / 30, atol=1e-12)
 
 
 def test_encoders_do_not_run_more_than_two_frames_ahead_of_the_camera(world):
@@ -112,12 +110,12 @@ def test_joints_alone_run_on_when_no_camera_is_open():
         assert readings_until(world, 0.5)[-1].t == pytest.approx(0.5)
 
 
-def test_the_triangulated_ball_is_where_the_true_chain_puts_it(world):
+def test_the_triangulated_ball_is_where_the_true_chain_puts_it(running):
     misses = []
-    for frame in frames(world, 12):
-        reading = readings_until(world, frame.t)[-1]
+    for frame in frames(running, 12):
+        reading = readings_until(running, frame.t)[-1]
         assert reading.t == pytest.approx(frame.t)
-        misses.append(triangulated(world.camera.calibration, frame) - world.true_chain().positions(reading.q))
+        misses.append(triangulated(running.camera.calibration, frame) - running.true_chain().positions(reading.q))
     # A crude threshold centroid: a third of a pixel, and 2 mm of encoder ticks and noise; depth is the worst.
     assert np.abs(misses)[:, :2].max() < 2e-3
     assert np.abs(misses)[:, 2].max() < 10e-3
@@ -145,15 +143,17 @@ def test_a_planned_tool_change_happens_at_its_time():
         assert (before, world.stats.tool_changes) == (0, 1)
 
 
-def test_the_clock_shows_simulated_time(world):
-    opened = datetime.fromisoformat(world.clock.utc())
-    readings_until(world, 0.05)
-    assert world.clock.now() == pytest.approx(0.05)
-    assert (datetime.fromisoformat(world.clock.utc()) - opened).total_seconds() == pytest.approx(0.05, abs=2e-3)
+def test_the_clock_shows_simulated_time():
+    with SimWorld(shipped(), SimConfig()) as world, world.joints:
+        opened = datetime.fromisoformat(world.clock.utc())
+        readings_until(world, 0.05)
+        assert world.clock.now() == pytest.approx(0.05)
+        assert (datetime.fromisoformat(world.clock.utc()) - opened).total_seconds() == pytest.approx(0.05, abs=2e-3)
 
 
-def test_frames_cannot_be_changed_by_their_readers(world):
-    frame = world.camera.read(WAIT_S)
+def test_frames_cannot_be_changed_by_their_readers(running):
+    frame = running.camera.read(WAIT_S)
+    readings_until(running, frame.t)
     with pytest.raises(ValueError, match="read-only"):
         frame.left[0, 0, 0] = 1
 
@@ -182,23 +182,12 @@ def test_a_reader_that_waits_is_told_when_the_world_closes():
     reader.join(WAIT_S)
 
 
-def test_a_dead_renderer_is_a_lost_source(world):
+def test_a_dead_renderer_is_a_lost_source_until_the_camera_is_opened_again(world):
     world.renderer_process.kill()
     with pytest.raises(SourceLost, match="renderer"):
         frames(world, 10)
-
-
-def test_a_camera_that_is_opened_again_after_its_renderer_died_gives_frames(world):
-    world.renderer_process.kill()
-    with pytest.raises(SourceLost):
-        frames(world, 10)
     with world.camera:
         assert None not in frames(world, 3)
-
-
-def test_the_ball_is_red_in_both_images(world):
-    frame = frames(world, 1)[0]
-    assert min(red_pixels(frame.left), red_pixels(frame.right)) > 200
 
 
 def test_a_robot_with_one_eye_is_rendered_with_one_image_that_shows_the_marker():

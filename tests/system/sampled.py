@@ -52,10 +52,17 @@ def eyes_at(config: Config, x: FloatArray) -> tuple[np.ndarray, np.ndarray]:
     for eye in range(2):
         seen = limb(x - [eye * calibration.baseline_m, 0.0, 0.0], config.tables.vision.radius_m)
         outline_px = calibration.focal_px * seen[:, :2] / seen[:, 2:] + calibration.principal_point_px
-        image = np.full((2 * height, 2 * width, 3), 128, np.uint8)
-        corners = np.round(16 * (2 * outline_px + 0.5)).astype(np.int32)
-        cv2.fillPoly(image, [corners], (30, 30, 220), cv2.LINE_AA, 4)
-        eyes.append(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
+        image = np.full((height, width, 3), 128, np.uint8)
+        # Only the ball's surroundings are drawn at twice the size and averaged.
+        left, top = np.clip(np.floor(outline_px.min(axis=0)).astype(int) - 2, 0, (width, height))
+        right, bottom = np.clip(np.ceil(outline_px.max(axis=0)).astype(int) + 3, 0, (width, height))
+        if left < right and top < bottom:
+            part = np.full((2 * (bottom - top), 2 * (right - left), 3), 128, np.uint8)
+            corners = np.round(16 * (2 * (outline_px - [left, top]) + 0.5)).astype(np.int32)
+            cv2.fillPoly(part, [corners], (30, 30, 220), cv2.LINE_AA, 4)
+            size = int(right - left), int(bottom - top)
+            image[top:bottom, left:right] = cv2.resize(part, size, interpolation=cv2.INTER_AREA)
+        eyes.append(image)
     return eyes[0], eyes[1]
 
 
@@ -70,7 +77,7 @@ def on_the_bench(config: Config, folder: Path, angle: Callable[[float], FloatArr
 
 
 class SamplerProcess:
-    """A running `bodyschema sampler`."""
+    """A running `bodyschema run sampler`."""
 
     def __init__(
         self, config: Config, bus: ZenohSession, process: subprocess.Popen[bytes] | warm.Child, log: Path
@@ -104,7 +111,7 @@ class SamplerProcess:
 @contextlib.contextmanager
 def sampling(config: Config, environment: dict[str, str] | None = None) -> Iterator[SamplerProcess]:
     """Run a sampler process."""
-    words = ["-m", "bodyschema", "sampler", "--robot", config.file]
+    words = ["-m", "bodyschema", "run", "sampler", "--robot", config.file]
     log = config.file.with_suffix(".log")
     with log.open("w") as errors:
         if environment:  # the environment applies to new processes

@@ -142,7 +142,7 @@ with ZenohSession(connect=sys.argv[1]) as bus:
 
 @pytest.mark.parametrize("stopped", [pytest.param(False, marks=pytest.mark.soak), True], ids=["slow", "stopped"])
 def test_a_subscriber_that_takes_nothing_delays_nobody_else(tmp_path, free_endpoint, stopped) -> None:
-    config = write_robot(tmp_path, free_endpoint, pairs_per_s=200.0)
+    config = write_robot(tmp_path, free_endpoint)
     with running(config, "sampler"), running(config, "learner"):
         learner_with(config, SOME)
         command = [sys.executable, "-c", SUBSCRIBER, config.tables.zenoh.sampler, KEYS.pair]

@@ -1,4 +1,4 @@
-"""`bodyschema sampler` with emulated servos and cameras below OpenCV, or images in a folder."""
+"""`bodyschema run sampler` with emulated servos and cameras below OpenCV, or images in a folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`bodyschema sampler` with gaze: an emulated head of two servos, which carries cameras below OpenCV."""
+"""`bodyschema run sampler` with gaze: an emulated head of two servos, which carries cameras below OpenCV."""
 
 from __future__ import annotations
 
@@ -20,6 +20,9 @@ from bodyschema.drivers.bench.dry_run import DryRun
 from bodyschema.interfaces.records import FloatArray, Pair
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.pointing import Pointing
+
+# In real time, which a busy machine has too little of; in virtual time, gaze is in drivers/test_gaze.py.
+pytestmark = pytest.mark.soak
 
 HEAD = [0, 1]
 DIRECTIONS = [1, -1, 1, 1, 1, 1, 1]  # of the servos
@@ -223,7 +226,6 @@ def with_the_head_still(episode: Episode, q: FloatArray) -> FloatArray:
     return q
 
 
-@pytest.mark.soak  # on a busy machine the head turns late; in virtual time it is in drivers/test_gaze.py
 def test_the_hand_stays_in_both_images_where_it_would_have_left_them(episode) -> None:
     q = episode.gazing.q
     lost, without = (1.0 - in_view(episode.robot, poses).mean() for poses in (q, with_the_head_still(episode, q)))

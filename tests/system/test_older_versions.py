@@ -92,9 +92,9 @@ def test_an_unreadable_older_row_is_left_out(older: Config) -> None:
 KILLED_WHILE_MIGRATING = """
 import os, signal, sys
 from pathlib import Path
-from bodyschema.daemon import store_schema
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler.session import session_of
+from bodyschema.recordings.store import schema as store_schema
 from bodyschema.recordings.store.store import PairStore
 from bodyschema.interfaces.clock import SystemClock
 left = int(sys.argv[2])

@@ -88,7 +88,7 @@ def started(
     config: Config, systemd: Systemd, process: str, *wrapper: object
 ) -> contextlib.AbstractContextManager[warm.Child]:
     """Run a process under `systemd`, with its log beside robot.toml."""
-    return running(systemd, log_of(config), *(wrapper or ("-m", "bodyschema")), process, "--robot", config.file)
+    return running(systemd, log_of(config), *(wrapper or ("-m", "bodyschema")), "run", process, "--robot", config.file)
 
 
 @contextlib.contextmanager

@@ -93,9 +93,9 @@ def desk(network: Network, tmp_path_factory) -> Iterator[dict[str, Any]]:
     (folders["robot"] / "recording.csv").write_text("t,waist,shoulder,x,y,z\n" + rows)
 
     with ExitStack() as stack:
-        for host, process in (("hub", "router"), ("robot", "sampler"), ("learner", "learner")):
+        for host, process in (("hub", ["router"]), ("robot", ["run", "sampler"]), ("learner", ["run", "learner"])):
             log = stack.enter_context((folders[host] / "log").open("wb"))
-            command = [*network.on(host), sys.executable, "-m", "bodyschema", process]
+            command = [*network.on(host), sys.executable, "-m", "bodyschema", *process]
             running = stack.enter_context(subprocess.Popen(command, cwd=folders[host], stderr=log))
             stack.callback(running.terminate)
         command = [*network.on("desk"), sys.executable, str(DESK), f"tls/{HOSTS['hub']}:7450", str(PAIRS)]

@@ -205,7 +205,7 @@ def test_a_learner_that_is_silent_is_named_and_the_page_goes_on_when_it_is_back(
     learner = child_of("learner", robot_file)
     os.kill(learner, signal.SIGSTOP)
     try:
-        says(page, "#notices", "The learner has not answered since .*bodyschema learner")
+        says(page, "#notices", "The learner has not answered since .*bodyschema run learner")
         says(page, "#pill-learner", "gone")
         expect(page.locator("#tool")).to_be_disabled()
     finally:

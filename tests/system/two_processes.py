@@ -96,7 +96,7 @@ def running(
         prefix: words before the command.
     """
     wrapper, notes = Path(__file__).with_name("killed_at.py"), journal or config.file.with_name("journal")
-    words = [wrapper, *fate, notes, process, "--robot", config.file]
+    words = [wrapper, *fate, notes, "run", process, "--robot", config.file]
     with (config.file.parent / f"{process}.log").open("ab") as log:
         if environment or prefix:  # the environment applies to new processes
             command, variables = [*prefix, sys.executable, *words], {**os.environ, **(environment or {})}

@@ -45,6 +45,11 @@ class Look:
         moved_m: motion of the ball while the shutter is open, (x, y, z) [m]; it is at its place half-way.
         distortion: lens distortion that rectification left over: radial, relative at the image's corner.
         wall: an even grey behind the ball instead of clutter.
+        light_slope: uneven light: relative change over 100 px to the right and down.
+        tone: exponent of the camera's tone curve; 1 is linear, 1/2.2 about sRGB.
+        bayer: one colour per pixel, interpolated, as on a sensor behind a colour mosaic.
+        denoise: noise that the camera's bilateral filter takes away (1-sigma) [grey levels]; 0 for none.
+        sharpen: strength of the camera's unsharp mask, whose radius is 1 px: halos along edges.
     """
 
     ball_rgb: tuple[float, float, float] = (0.85, 0.08, 0.08)
@@ -62,6 +67,11 @@ class Look:
     moved_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     distortion: float = 0.0
     wall: float | None = None
+    light_slope: tuple[float, float] = (0.0, 0.0)
+    tone: float = 1.0
+    bayer: bool = False
+    denoise: float = 0.0
+    sharpen: float = 0.0
 
 
 def backdrop(rng: np.random.Generator, size_px: tuple[int, int], wall: float | None) -> FloatArray:
@@ -178,13 +188,17 @@ def _neighbourhood(
 
 
 def take(picture: FloatArray, look: Look, rng: np.random.Generator) -> ImageArray:
-    """Expose a picture: lens blur, exposure, shot and sensor noise, eight bits, JPEG; BGR."""
+    """Expose a picture: uneven light, lens blur, shot and sensor noise, the camera's processing, JPEG; BGR."""
     grey_levels = 255.0 * look.exposure * picture[..., ::-1]
+    if any(look.light_slope):
+        rows, columns = (np.arange(size) - 0.5 * size for size in picture.shape[:2])
+        slope_u, slope_v = look.light_slope
+        grey_levels = grey_levels * (1.0 + 0.01 * (slope_u * columns + slope_v * rows[:, None]))[..., None]
     if look.blur_px > 0:
         grey_levels = cv2.GaussianBlur(grey_levels, (0, 0), look.blur_px)
     sigma = np.sqrt(look.noise_sd**2 + look.shot * grey_levels) if look.shot else look.noise_sd
     noise = rng.standard_normal(grey_levels.shape, dtype=np.float32) * sigma
-    image = np.clip(np.rint(grey_levels + noise), 0, 255).astype(np.uint8)
+    image = processed(grey_levels + noise, look)
     if look.jpeg is None:
         return image
     settings = [
@@ -194,6 +208,23 @@ def take(picture: FloatArray, look: Look, rng: np.random.Generator) -> ImageArra
         cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420,
     ]
     return np.asarray(cv2.imdecode(cv2.imencode(".jpg", image, settings)[1], cv2.IMREAD_COLOR), dtype=np.uint8)
+
+
+def processed(grey_levels: FloatArray, look: Look) -> ImageArray:
+    """Return a sensor's linear levels (height, width, 3) as its camera gives them, in eight bits."""
+    curved = 255.0 * np.clip(grey_levels / 255.0, 0.0, 1.0) ** look.tone
+    image = np.rint(curved).astype(np.uint8)
+    if look.bayer:
+        mosaic = image[..., 1].copy()
+        mosaic[::2, ::2], mosaic[1::2, 1::2] = image[::2, ::2, 0], image[1::2, 1::2, 2]
+        image = np.asarray(cv2.cvtColor(mosaic, cv2.COLOR_BayerRGGB2BGR), np.uint8)
+    if look.denoise:
+        image = np.asarray(cv2.bilateralFilter(image, 5, 3.0 * look.denoise, 1.5), np.uint8)
+    if look.sharpen:
+        levels = image.astype(np.float32)
+        halo = look.sharpen * (levels - cv2.GaussianBlur(levels, (0, 0), 1.0))
+        image = np.clip(np.rint(levels + halo), 0, 255).astype(np.uint8)
+    return image
 
 
 def random_light(rng: np.random.Generator, look: Look) -> Look:

@@ -34,6 +34,7 @@ class Sheet:
         rotation, x: pose of the tag's middle (x right, y up, z out of the paper) in the left optical frame, [m].
         side_m: side of the black square.
         margin: width of the white margin, in squares of the pattern.
+        curl: curvature of the paper across its width, towards the camera [1/m].
     """
 
     id: int
@@ -42,6 +43,7 @@ class Sheet:
     side_m: float
     margin: float = 1.0
     dictionary: int = cv2.aruco.DICT_APRILTAG_36h11
+    curl: float = 0.0
 
     @property
     def half_m(self) -> float:
@@ -128,9 +130,13 @@ def _cover(
     normal = thing.rotation[:, 2]
     facing = rays @ normal
     x = thing.x - eye
+    curl = thing.curl if isinstance(thing, Sheet) else 0.0
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = (x @ normal) / facing
         on_plane = (rays * depth[..., None] - x) @ thing.rotation
+        for _ in range(3 if curl else 0):  # the parabola meets each ray after three steps, to a micrometre
+            depth = (x @ normal + 0.5 * curl * on_plane[..., 0] ** 2) / facing
+            on_plane = (rays * depth[..., None] - x) @ thing.rotation
     across, up = on_plane[..., 0], on_plane[..., 1]
     hit = (facing < 0.0) & (depth > 0.0) & (depth < nearest) & (np.maximum(abs(across), abs(up)) < thing.half_m)
     light = np.array(look.light) / np.linalg.norm(look.light)

@@ -180,6 +180,29 @@ def test_another_number_of_squares_is_named(columns, rows) -> None:
     assert f"the board has {columns}x{rows} squares, not 8x6" in found.text
 
 
+def small(printed: Printed) -> ImageArray:
+    """Return an image of half the size, which is quicker to search."""
+    return np.asarray(cv2.resize(shown(Taken(), printed)[0], (320, 240), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def test_a_mirrored_board_is_named() -> None:
+    found = fault(np.ascontiguousarray(small(Printed())[:, ::-1]))
+    assert (found.why, "the board is mirrored" in found.text) == ("mirrored", True)
+
+
+@pytest.mark.parametrize(
+    ("board", "said"),
+    [
+        (BOARD, "a plain chessboard of 8x5 squares. Give --pattern chessboard --squares 8x5"),
+        (Board(7, 4, 0.025, pattern="chessboard"), "the board has 8x5 squares, not 7x4. Give --squares 8x5"),
+        (Board(9, 6, 0.025, pattern="chessboard"), "8x5 squares of a chessboard, not 9x6. All of it has to be in view"),
+    ],
+    ids=["markers wanted", "a smaller one wanted", "a larger one wanted"],
+)
+def test_a_plain_chessboard_of_other_squares_is_named(board, said) -> None:
+    assert said in fault(small(Printed(8, 5, 0.025, dictionary=None)), board).text
+
+
 def test_an_image_without_a_board_says_so() -> None:
     noise = np.random.default_rng(0).integers(60, 190, (240, 320, 3), dtype=np.uint8)
     assert fault(noise).why == "not_found"

@@ -21,7 +21,8 @@ from bodyschema.vision.calibration.guidance import Coverage
 from bodyschema.vision.calibration.images import ImagePair
 from bodyschema.vision.calibration.influence import covariance
 from bodyschema.vision.calibration.view import View
-from bodyschema.vision.rig import CalibrationError
+from bodyschema.vision.lens import Lens
+from bodyschema.vision.rig import CalibrationError, lenses_of
 
 ASKED = Asked(SIZE, ("A1", "B2"), "2026-01-01T00:00:00Z", scale_sigma=0.0)
 PINHOLE = replace(ASKED, model="pinhole")
@@ -104,6 +105,39 @@ def test_the_lens_model_is_chosen_that_foretells_views_better(fisheye) -> None:
     rig = webcams(rng, fisheye=fisheye)
     found = calibrate(corner_views(rig, rng), BOARD, ASKED)
     assert found.rig.model == ("fisheye" if fisheye else "pinhole")
+
+
+def test_a_model_that_folds_the_image_over_is_refused(planted, monkeypatch) -> None:
+    monkeypatch.setattr(Lens, "is_one_to_one", lambda lens, _: False)
+    with pytest.raises(CalibrationError, match="the pinhole model folds over within the image"):
+        fit(planted[1][:9], BOARD.corners_m, SIZE, "pinhole")
+
+
+def test_a_model_that_is_refused_leaves_the_others(planted, monkeypatch) -> None:
+    def only_fisheye(views, corners_m, size_px, model, eyes) -> Fitted:
+        if model != "fisheye":
+            raise CalibrationError("it folds over")
+        return fit(views, corners_m, size_px, model, eyes)
+
+    monkeypatch.setattr("bodyschema.vision.calibration.calibrate.fit", only_fisheye)
+    told: list[str] = []
+    found = calibrate(planted[1][:10], BOARD, ASKED, told.append)
+    assert list(found.rivals_px) == ["fisheye"]
+    assert "pinhole lenses do not fit: it folds over" in told
+
+
+def test_a_lens_that_far_views_let_fold_over_is_kept_from_it(planted) -> None:
+    rig, rng = planted[0], np.random.default_rng(1)
+    photographer = Photographer(rig, Printed(), Taken(), rng)
+    far = []
+    for k in range(12):
+        R = Rotation.from_euler("xyz", rng.uniform(-0.6, 0.6, 3)).as_matrix()
+        place = np.array([0.03 + rng.uniform(-0.05, 0.05), rng.uniform(-0.05, 0.05), 1.0])
+        far.append(view_of(str(k), photographer, (R, place - R @ [0.12, 0.09, 0.0]), rng, 0.1))
+    bundle = fit(far, BOARD.corners_m, SIZE, "pinhole").bundle
+    assert bundle.prior.any()  # without it, the fit folds over in the image's corners
+    assert all(lens.is_one_to_one(SIZE) for lens in lenses_of("pinhole", bundle.vector))
+    assert np.linalg.norm(bundle.vector[-3:]) == pytest.approx(rig.baseline_m, rel=0.02)
 
 
 def test_the_held_out_error_is_that_of_new_views(planted) -> None:

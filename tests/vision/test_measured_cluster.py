@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from tag_renderer import Sheet, photograph
 
 from bodyschema.cli.main import app
-from bodyschema.daemon.wiring.clusters import ClusterFile, Wanted, _require_tags, figures, said, sides_of
+from bodyschema.daemon.wiring.markers import ClusterFile, Wanted, _require_tags, figures, said, sides_of
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
@@ -225,7 +225,7 @@ def test_rendered_images_of_a_cluster_become_its_tables(tmp_path, capsys) -> Non
         frame = photograph(sheets, EYES, Look(wall=0.4, samples=2), rng)
         cv2.imwrite(str(tmp_path / f"left{k}.png"), frame.left)
         cv2.imwrite(str(tmp_path / f"right{k}.png"), frame.right)
-    words = ["marker", "cluster", str(tmp_path), "--side-mm", "40", "--calibration", str(tmp_path / "cameras.toml")]
+    words = ["marker", "learn", str(tmp_path), "--side-mm", "40", "--calibration", str(tmp_path / "cameras.toml")]
     app([*words, "--json"], exit_on_error=False, result_action="return_value")
     found = msgspec.json.decode(capsys.readouterr().out, type=ClusterFile)
     R, x = places[3]

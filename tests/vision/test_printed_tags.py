@@ -94,7 +94,15 @@ def test_a_cube_that_was_printed_cut_out_and_folded_is_found_as_its_tables_say(r
     assert Rotation.from_matrix(rotation.T @ Rotation.from_quat(fix.R).as_matrix()).magnitude() < np.radians(0.4)
 
 
-@pytest.mark.parametrize(("columns", "rows", "fold_deg"), [(1, 1, 0.0), (3, 2, 0.0), (3, 1, 40.0), (4, 1, 90.0)])
+@pytest.mark.parametrize(
+    ("columns", "rows", "fold_deg"),
+    [
+        (1, 1, 0.0),
+        pytest.param(3, 2, 0.0, marks=pytest.mark.soak),
+        (3, 1, 40.0),
+        pytest.param(4, 1, 90.0, marks=pytest.mark.soak),
+    ],
+)
 def test_a_plate_that_was_printed_is_found_as_its_tables_say(columns, rows, fold_deg) -> None:
     shape, x, rotation = plate(columns, rows, fold_deg), np.array([-0.05, -0.02, 0.40]), facing(0, 12, 0)
     page = shape_page(shape, ids_of(shape), APRILTAG, SIDE_MM, "A4")

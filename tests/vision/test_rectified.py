@@ -128,3 +128,17 @@ def test_too_little_of_the_board_is_said(calibrated) -> None:
     rig, view = calibrated
     with pytest.raises(CalibrationError, match="both eyes see 0 corners"):
         check(rig, replace(view, right=None), BOARD)
+
+
+def test_cameras_without_a_common_view_are_named_by_their_angle() -> None:
+    rig = known_rig(webcams(np.random.default_rng(6)))
+    apart = replace(rig, rotation_rad=np.array([0.0, np.radians(70.0), 0.0]))
+    with pytest.raises(CalibrationError, match=r"share almost no view: their lines of sight are 70° apart"):
+        _ = Rectification(apart).calibration
+
+
+def test_a_lens_that_folds_over_is_named() -> None:
+    rig = known_rig(webcams(np.random.default_rng(6)))
+    folded = replace(rig, left=replace(rig.left, distortion=(-1.2, 0.0, 0.0, 0.0, 0.0)))
+    with pytest.raises(CalibrationError, match="the pinhole lens model folds over within the image"):
+        _ = Rectification(folded).calibration

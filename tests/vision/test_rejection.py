@@ -55,7 +55,7 @@ def test_a_square_of_the_ball_s_hue_is_no_ball(side_px):
         images.append(take(picture, Look(blur_px=0.9, noise_sd=1.5), rng))
     radius_m = 0.06 * side_px / 2 / 40.0  # a ball of this size would fit the depth
     found = StereoTracker(SMALL, VisionConfig(radius_m=radius_m)).track(StereoFrame(0.0, *images))
-    assert reason(found) is Reason.OCCLUDED
+    assert reason(found) is Reason.NOT_ROUND
 
 
 def test_no_ball_is_no_marker():

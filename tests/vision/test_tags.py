@@ -18,6 +18,7 @@ from bodyschema.vision.config import VisionConfig
 from bodyschema.vision.pose import PoseEstimator, Sighting, mirrored
 from bodyschema.vision.tag_body import TAG_CORNERS, TagBody
 from bodyschema.vision.tag_config import ClusterConfig, PlacedTag, TagConfig
+from bodyschema.vision.tag_edge import PIXEL_CUMULANT, blurred_step
 from bodyschema.vision.tag_image import TagImage, measure_tag
 from bodyschema.vision.tag_tracker import TagTracker
 from bodyschema.vision.tracker import StereoTracker
@@ -121,6 +122,40 @@ def test_what_blur_brings_from_the_modules_beyond_pulls_no_edge(blur_px) -> None
     tag = measure_tag(cv2.cvtColor(frame.left, cv2.COLOR_BGR2GRAY), 0, true + 0.4, CONFIG)
     assert isinstance(tag, TagImage)
     assert np.abs(tag.corners_px - true).max() < 0.06
+
+
+PHOTOGRAPHED = {
+    "a lamp at one side": replace(WALL, light_slope=(0.5, -0.3), ambient=0.25),
+    "halos": replace(WALL, sharpen=1.5),
+    "phone": replace(WALL, sharpen=1.0, bayer=True, denoise=4.0, jpeg=75),
+    "tone curve": replace(WALL, tone=1 / 2.2),
+}
+
+
+def corners_in_the_left_eye(rotation: FloatArray) -> FloatArray:
+    corners = MIDDLE + SIDE_M * TAG_CORNERS @ rotation.T
+    return SMALL.focal_px * corners[:, :2] / corners[:, 2:] + SMALL.principal_point_px
+
+
+def measured(thing: Sheet, look: Look = WALL) -> TagImage | Reason:
+    grey = np.asarray(cv2.cvtColor(seen(thing, look=look).left, cv2.COLOR_BGR2GRAY), np.uint8)
+    return measure_tag(grey, 0, corners_in_the_left_eye(thing.rotation) + 0.4, CONFIG)
+
+
+@pytest.mark.parametrize("look", PHOTOGRAPHED.values(), ids=PHOTOGRAPHED)
+def test_no_camera_moves_a_corner_far(look) -> None:
+    rotation = tilted([1.0, 1.0, 0.3], 12.0)
+    tag = measured(sheet(rotation=rotation), look)
+    assert isinstance(tag, TagImage)
+    # A tone curve makes all that is black narrower, by a third of the lens blur.
+    assert np.abs(tag.corners_px - corners_in_the_left_eye(rotation)).max() < (0.1 if look.tone == 1.0 else 0.35)
+
+
+def test_a_curled_sheet_is_measured_with_less_certainty() -> None:
+    flat, curled = measured(sheet()), measured(replace(sheet(), curl=6.0, rotation=tilted([1.0, 0.0, 0.0], 40.0)))
+    assert isinstance(flat, TagImage)
+    assert isinstance(curled, TagImage)
+    assert np.trace(curled.cov_px) > 2.0 * np.trace(flat.cov_px)
 
 
 def test_a_followed_tag_is_found_after_a_step_and_after_a_jump() -> None:
@@ -259,3 +294,18 @@ def test_exact_pixels_give_the_exact_pose_from_a_rough_one() -> None:
 def test_the_mirrored_pose_of_a_mirrored_pose_is_the_first() -> None:
     rotation = Rotation.random(rng=np.random.default_rng(4)).as_matrix()
     assert mirrored(mirrored(rotation, MIDDLE), MIDDLE) == pytest.approx(rotation, abs=1e-12)
+
+
+def test_light_beyond_an_edge_is_that_of_square_pixels() -> None:
+    shift = (np.arange(400) + 0.5) / 400.0
+    places = np.linspace(-2.0, 2.0, 81)
+    whole = np.floor(places[:, None] - shift)
+    part = places[:, None] - shift - whole
+    # Pixels whose centres are at whole numbers plus the shift see this share of a step at 0.
+    left, right = (np.clip(0.5 + shift + whole + more, 0.0, 1.0) for more in (0.0, 1.0))
+    seen = (left * (1.0 - part) + right * part).mean(axis=1)
+    blur_px = 0.5  # of a pixel and the interpolation
+    assert np.abs(blurred_step(places / blur_px, PIXEL_CUMULANT / blur_px**4) - seen).max() < 0.003
+    tail = places <= -0.85
+    gauss, ours = (float(np.sum(blurred_step(places[tail] / blur_px, c) - seen[tail])) for c in (0.0, -0.4))
+    assert abs(ours) < 0.2 * abs(gauss)

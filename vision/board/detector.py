@@ -19,12 +19,15 @@ from .sharpness import blur_px
 from .squares import squares_seen
 
 IntArray = NDArray[np.int64]
-Why = Literal["dark", "over_exposed", "blurred", "other_dictionary", "other_pattern", "other_squares", "not_found"]
+Why = Literal[
+    "dark", "over_exposed", "blurred", "mirrored", "other_dictionary", "other_pattern", "other_squares", "not_found"
+]
 # Reasons that mean that another board is in view.
-OTHER_BOARD: tuple[Why, ...] = ("other_dictionary", "other_pattern", "other_squares")
+OTHER_BOARD: tuple[Why, ...] = ("mirrored", "other_dictionary", "other_pattern", "other_squares")
 
 _LEAST_CORNERS = 6
 _LEAST_MARKERS = 3
+_SMALLEST_GRID = (4, 3)  # corners of an unknown chessboard: smaller ones are found in any texture
 # Corner accuracy is a small share of the edge width; with more blur that share is too large.
 _MOST_BLUR_PX = 2.5
 _FAMILIES = ("4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "APRILTAG_36h11", "ARUCO_ORIGINAL")
@@ -104,6 +107,9 @@ class BoardDetector:
         return Corners(*found) if len(found[0]) >= _LEAST_CORNERS else self._nothing(grey, len(markers))
 
     def _nothing(self, grey: ImageArray, markers: int) -> NotFound:
+        mirrored = _markers(np.ascontiguousarray(grey[:, ::-1]), self.board.dictionary_name)
+        if len(mirrored) >= max(_LEAST_MARKERS, markers + 1):
+            return NotFound("mirrored", "the board is mirrored: print it again as it is, or mirror the images back")
         if markers:
             return NotFound("not_found", f"too little of the board: {markers} of its markers. Bring it into view")
         other = self._other_dictionary(grey, self.board.dictionary_name)
@@ -111,7 +117,12 @@ class BoardDetector:
             wanted = self.board.dictionary_name
             text = f"the markers are {other}, not {wanted}. Give --dictionary {other}, or take the right board"
             return NotFound("other_dictionary", text)
-        return NotFound("not_found", "no board. Bring it into view, larger, and not mirrored or in glare")
+        squares = _plain_squares(grey)
+        if squares is not None:
+            seen = "x".join(map(str, squares))
+            text = f"a plain chessboard of {seen} squares. Give --pattern chessboard --squares {seen}"
+            return NotFound("other_pattern", text)
+        return NotFound("not_found", "no board. Bring it into view, larger, and not in glare")
 
     def _plain(self, grey: ImageArray) -> Corners | NotFound:
         size = (self.board.columns - 1, self.board.rows - 1)
@@ -121,10 +132,21 @@ class BoardDetector:
             if markers is not None:
                 remedy = f"Leave out --pattern, and give --dictionary {markers}"
                 return NotFound("other_pattern", f"the board has {markers} markers in its squares. {remedy}")
-            text = f"no chessboard of {self.board.columns}x{self.board.rows} squares. All of it has to be in view"
-            return NotFound("not_found", text)
+            return self._no_chessboard(grey)
         corners = _in_order(grey, np.reshape(px, (size[1], size[0], 2)).astype(np.float64), self.board)
         return Corners(np.arange(len(self.board.corners_m)), corners.reshape(-1, 2))
+
+    def _no_chessboard(self, grey: ImageArray) -> NotFound:
+        wanted = self.board.columns, self.board.rows
+        name = "x".join(map(str, wanted))
+        squares = _plain_squares(grey)
+        if squares is None:
+            return NotFound("not_found", f"no chessboard of {name} squares. All of it has to be in view")
+        seen = "x".join(map(str, squares))
+        if squares[0] <= max(wanted) and squares[1] <= min(wanted):
+            return NotFound("not_found", f"{seen} squares of a chessboard, not {name}. All of it has to be in view")
+        text = f"the board has {seen} squares, not {name}. Give --squares {seen}, or take the right board"
+        return NotFound("other_squares", text)
 
     def _other_dictionary(self, grey: ImageArray, wanted: str | None) -> str | None:
         """Return the family of other markers in the image, if there are any.
@@ -148,6 +170,15 @@ def _markers(grey: ImageArray, family: str) -> list[int]:
     detector: Any = cv2.aruco.ArucoDetector(dictionary(family))
     numbers: Sequence[int] | None = detector.detectMarkers(grey)[1]
     return [] if numbers is None else np.ravel(numbers).tolist()
+
+
+def _plain_squares(grey: ImageArray) -> tuple[int, int] | None:
+    """Return the squares, the more first, of the chessboard in an image, or of as much of one as is in view."""
+    found, _, grid = cv2.findChessboardCornersSBWithMeta(grey, _SMALLEST_GRID, cv2.CALIB_CB_LARGER)
+    if not found:
+        return None
+    rows, columns = sorted(each + 1 for each in np.shape(grid)[:2])
+    return columns, rows
 
 
 def _in_order(grey: ImageArray, grid: FloatArray, board: Board) -> FloatArray:

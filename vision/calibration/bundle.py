@@ -16,7 +16,7 @@ from bodyschema.vision.rig import CalibrationError, lens_of_one, split
 from .view import EYES, Eye, View
 
 _ITERATIONS = 60
-_CONVERGED = 1e-9  # smallest relative decrease of the sum of squares for another step
+_CONVERGED = 1e-7  # smallest relative decrease of the sum of squares for another step: thousandths of a sigma
 _FIRST_DAMPING = 1e-4
 _MOST_DAMPING = 1e12
 _POSE = 6
@@ -34,6 +34,7 @@ class Bundle:
         residuals: per view, measured minus predicted, shape (corners, 2) [px], the left eye's before the right one's.
         weights: per view and corner, shape (corners,), of `corner_weights`; 0 for rejected corners.
         normal: the normal matrix of `vector` with the poses eliminated, for residuals of 1 px.
+        prior: precision of each parameter about 0 before the views, in the same units, shape (p,); 0: none.
     """
 
     model: Model
@@ -42,6 +43,7 @@ class Bundle:
     residuals: tuple[FloatArray, ...]
     weights: tuple[FloatArray, ...]
     normal: FloatArray
+    prior: FloatArray
 
     @property
     def kept(self) -> tuple[FloatArray, ...]:
@@ -70,6 +72,7 @@ def solve(
     vector: FloatArray,
     poses: FloatArray,
     weights: Sequence[FloatArray] | None = None,
+    prior: FloatArray | None = None,
 ) -> Bundle:
     """Solve the least-squares problem from a start by the Levenberg-Marquardt method.
 
@@ -77,18 +80,20 @@ def solve(
         corners_m: the board's corners, shape (n, 3) [m].
         vector, poses: the start, as `Bundle` has them.
         weights: as `Bundle` has them; None: all corners count alike.
+        prior: as `Bundle` has it; None: none.
 
     Raises:
         CalibrationError: the views do not determine the parameters.
     """
     damping = _FIRST_DAMPING
     weighed = tuple(np.ones(view.corner_count) for view in views) if weights is None else tuple(weights)
-    linear = _linearised(views, corners_m, model, vector, poses, weighed)
+    prior = np.zeros(len(vector)) if prior is None else prior
+    linear = _linearised(views, corners_m, model, vector, poses, weighed, prior)
     for _ in range(_ITERATIONS):
         while damping < _MOST_DAMPING:
             step = linear.step(damping)
             if step is not None:
-                stepped = _linearised(views, corners_m, model, vector + step[0], poses + step[1], weighed)
+                stepped = _linearised(views, corners_m, model, vector + step[0], poses + step[1], weighed, prior)
                 if stepped.squares <= linear.squares:
                     break
             damping *= 10.0
@@ -101,7 +106,7 @@ def solve(
             break
     if not np.isfinite(linear.squares):
         raise CalibrationError("the views do not determine the lenses. Take more views, tilted and all over the image")
-    return Bundle(model, vector, poses, tuple(linear.residuals), weighed, linear.reduced(0.0)[0])
+    return Bundle(model, vector, poses, tuple(linear.residuals), weighed, linear.reduced(0.0)[0], prior)
 
 
 def view_residuals(
@@ -192,10 +197,11 @@ class _Linear:
     pose_normals: FloatArray
     pose_gradients: FloatArray
     mixed: FloatArray
+    penalty: float
 
     @cached_property
     def squares(self) -> float:
-        return _weighted(self.residuals, self.weights)
+        return self.penalty + _weighted(self.residuals, self.weights)
 
     def reduced(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return normal matrix and gradient of the rig with the poses eliminated, and the poses' normal matrices."""
@@ -230,10 +236,19 @@ def _linearised(
     vector: FloatArray,
     poses: FloatArray,
     weights: Sequence[FloatArray],
+    prior: FloatArray | None = None,
 ) -> _Linear:
     p, m = len(vector), len(views)
+    known = np.zeros(p) if prior is None else prior
     linear = _Linear(
-        [], weights, np.zeros((p, p)), np.zeros(p), np.zeros((m, 6, 6)), np.zeros((m, 6)), np.zeros((m, p, 6))
+        [],
+        weights,
+        np.diag(known),
+        -known * vector,
+        np.zeros((m, 6, 6)),
+        np.zeros((m, 6)),
+        np.zeros((m, p, 6)),
+        float(known @ vector**2),
     )
     for k, (view, pose) in enumerate(zip(views, poses, strict=True)):
         residual, J, K = seen_with_slopes(view, corners_m, model, vector, pose)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -11,8 +12,8 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.vision.board import Board
-from bodyschema.vision.lens import Model
-from bodyschema.vision.rig import CalibrationError, Made, OneEyeRig, Rig, StereoRig, lens_of_one, split
+from bodyschema.vision.lens import DISTORTION_NAMES, Model
+from bodyschema.vision.rig import CalibrationError, Made, OneEyeRig, Rig, StereoRig, lenses_of, split
 
 from .bundle import Bundle, solve
 from .guidance import Coverage
@@ -23,12 +24,17 @@ from .start import start
 from .view import EYES, ONE_EYE, Eye, View
 from .weights import corner_weights
 
-ModelChoice = Literal["auto", "pinhole", "fisheye"]
+ModelChoice = Literal["auto", "pinhole", "fisheye", "rational"]
 
 _OUTLIER_SPREADS = 8.0
 _OUTLIER_RATIO = 3.0
 _MOST_LEFT_OUT = 0.35
 _REWEIGHTED = 3
+# Power of the distance from the axis in the last term of the distortion, and the 1-sigma of that term at the image's
+# corner where it would fold the image over: a lens of a webcam has 0.01.
+_STEEPEST_POWER: dict[Model, int] = {"pinhole": 6, "fisheye": 8, "rational": 6}
+_STEEPEST_TERM = 0.02
+_NUMBERS = re.compile(r"-?\d+(\.\d+)?")
 
 
 @dataclass(frozen=True)
@@ -38,7 +44,7 @@ class Asked:
     Attributes:
         image_size_px, serials: of the eyes.
         date: ISO 8601 in UTC.
-        model: lens model; `auto` takes fisheye if it predicts held-out views better.
+        model: lens model; `auto` takes the simplest that fits, or one that predicts held-out views clearly better.
         scale_sigma: relative 1-sigma of the board's size.
         baseline_m: baseline measured by hand, for a check [m].
     """
@@ -82,7 +88,7 @@ class Calibrated:
     Attributes:
         rig: the calibration.
         fitted: the selected model.
-        rivals_px: held-out error of each candidate model [px].
+        rivals_px: held-out error of each candidate model that fits the cameras [px].
         coverage: image coverage of the views.
     """
 
@@ -104,7 +110,7 @@ def calibrate(
     coverage = Coverage.of(views, board, asked.image_size_px, asked.eyes)
     if reasons := lacking(coverage):
         raise CalibrationError(together(reasons))
-    models: tuple[Model, ...] = ("pinhole", "fisheye") if asked.model == "auto" else (asked.model,)
+    models: tuple[Model, ...] = tuple(DISTORTION_NAMES) if asked.model == "auto" else (asked.model,)
     fits = _fits(views, board, asked, models, tell)
     model = _chosen(fits)
     rig = _rig(fits[model], board, asked)
@@ -128,18 +134,26 @@ def _fits(
     models: Sequence[Model],
     tell: Callable[[str], None],
 ) -> dict[Model, Fitted]:
-    """Fit each model and return those that fit; raise the first model's CalibrationError if none does."""
+    """Fit each model and return those that fit; raise CalibrationError if none does."""
     fits: dict[Model, Fitted] = {}
-    refusals: list[CalibrationError] = []
+    refusals: dict[Model, CalibrationError] = {}
     for model in models:
+        if model == "rational" and fits and _chosen(fits) == "pinhole":
+            continue  # it differs from pinhole at wide angles, where fisheye is better too
         tell(f"fitting {model} lenses to {len(views)} views")
         try:
             fits[model] = fit(views, board.corners_m, asked.image_size_px, model, asked.eyes)
         except CalibrationError as error:
-            refusals.append(error)
-    if not fits:
-        raise refusals[0]
-    return fits
+            if len(models) > 1:
+                tell(f"{model} lenses do not fit: {error}")
+            refusals[model] = error
+    if fits:
+        return fits
+    first, *others = refusals.values()
+    # A model that does not suit the lenses may misplace the eyes: one cause is sure only if all models say the same.
+    if len({_NUMBERS.sub("", str(each)) for each in (first, *others)}) == 1:
+        raise first
+    raise CalibrationError(together([f"{model} lenses: {error}" for model, error in refusals.items()]))
 
 
 def fit(
@@ -152,8 +166,30 @@ def fit(
     """Fit one lens model; views that do not fit the others are left out, the worst first.
 
     Raises:
-        CalibrationError: the eyes are misplaced, the views do not determine the lenses, or too many are outliers.
+        CalibrationError: the eyes are misplaced, the views do not determine the lenses, the model folds the image
+            over, or too many views are outliers.
     """
+    try:
+        fitted = _fit(views, corners_m, image_size_px, model, eyes)
+    except np.linalg.LinAlgError as error:
+        raise CalibrationError(
+            f"the views do not determine {model} lenses. Take more views, tilted and all over the image"
+        ) from error
+    if _is_one_to_one(fitted.bundle, image_size_px):
+        return fitted
+    raise CalibrationError(
+        f"the {model} model folds over within the image: it would show two directions at one point. Show the board in "
+        "the image's corners, or take another lens model"
+    )
+
+
+def _fit(
+    views: Sequence[View],
+    corners_m: FloatArray,
+    image_size_px: tuple[int, int],
+    model: Model,
+    eyes: tuple[Eye, ...],
+) -> Fitted:
     kept = list(views)
     left_out: list[LeftOut] = []
     vector, poses = start(kept, corners_m, image_size_px, model, eyes)
@@ -172,24 +208,48 @@ def fit(
             )
         vector, poses = bundle.vector, np.delete(bundle.poses, worst, axis=0)
     _require_places(model, bundle.vector)
+    if not _is_one_to_one(bundle, image_size_px):
+        bundle = _stiffened(kept, corners_m, bundle, image_size_px)
     return Fitted(tuple(kept), tuple(left_out), bundle, held_out(kept, corners_m, bundle))
+
+
+def _is_one_to_one(bundle: Bundle, image_size_px: tuple[int, int]) -> bool:
+    return all(lens.is_one_to_one(image_size_px) for lens in lenses_of(bundle.model, bundle.vector))
+
+
+def _stiffened(views: Sequence[View], corners_m: FloatArray, bundle: Bundle, image_size_px: tuple[int, int]) -> Bundle:
+    """Refit a lens that folds over, with a prior that keeps the steepest term of its polynomial small.
+
+    A narrow lens hardly shows that term, and it may fold the image over where the board never was.
+    """
+    count = 4 + len(DISTORTION_NAMES[bundle.model])
+    prior, vector = np.zeros(len(bundle.vector)), bundle.vector.copy()
+    for number, lens in enumerate(lenses_of(bundle.model, bundle.vector)):
+        # The last coefficient is of the largest power.
+        corner = 0.5 * np.linalg.norm(np.array(image_size_px) / np.array(lens.focal_px))
+        last = (number + 1) * count - 1
+        prior[last] = (bundle.sigma_px * corner ** _STEEPEST_POWER[bundle.model] / _STEEPEST_TERM) ** 2
+        vector[last] = 0.0
+    stiff = solve(views, corners_m, bundle.model, vector, bundle.poses, bundle.weights, prior)
+    return _weighed(views, corners_m, stiff)
 
 
 def _weighed(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> Bundle:
     """Refit with weights that follow the accuracy of each image's corners."""
     for _ in range(_REWEIGHTED):
         weights = corner_weights(views, corners_m, bundle)
-        bundle = solve(views, corners_m, bundle.model, bundle.vector, bundle.poses, weights)
+        bundle = solve(views, corners_m, bundle.model, bundle.vector, bundle.poses, weights, bundle.prior)
     return bundle
 
 
 def _chosen(fits: dict[Model, Fitted]) -> Model:
-    """Select pinhole, unless fisheye predicts the views shared by both fits better."""
-    if len(fits) == 1:
-        return next(iter(fits))
-    shared = {view.name for view in fits["pinhole"].views} & {view.name for view in fits["fisheye"].views}
-    pinhole, fisheye = (_of(fits[model], shared) for model in ("pinhole", "fisheye"))
-    return "fisheye" if fisheye.is_better_than(pinhole) else "pinhole"
+    """Select the simplest model, unless a later one predicts the views shared by both fits clearly better."""
+    best, *others = fits
+    for model in others:
+        shared = {view.name for view in fits[best].views} & {view.name for view in fits[model].views}
+        if _of(fits[model], shared).is_better_than(_of(fits[best], shared)):
+            best = model
+    return best
 
 
 def _of(fitted: Fitted, names: set[str]) -> HeldOut:
@@ -207,7 +267,7 @@ def _outlier(rms_px: FloatArray) -> int | None:
 
 
 def _require_places(model: Model, vector: FloatArray) -> None:
-    if lens_of_one(model, vector) is not None:
+    if len(lenses_of(model, vector)) == 1:
         return
     _, _, rotation, translation = split(model, vector)
     reason = misplaced(np.asarray(cv2.Rodrigues(rotation)[0], dtype=np.float64), translation)
@@ -227,9 +287,9 @@ def _rig(fitted: Fitted, board: Board, asked: Asked) -> Rig:
         held_out_px=fitted.held_out.rms_px,
         scale_sigma=asked.scale_sigma,
     )
-    alone = lens_of_one(bundle.model, bundle.vector)
-    if alone is not None:
-        return OneEyeRig(alone, asked.image_size_px, (asked.serials[0],), unsure_by, made)
+    lenses = lenses_of(bundle.model, bundle.vector)
+    if len(lenses) == 1:
+        return OneEyeRig(lenses[0], asked.image_size_px, (asked.serials[0],), unsure_by, made)
     left, right, rotation, translation = split(bundle.model, bundle.vector)
     # An error of the board's size scales all lengths, and nothing else.
     unsure_by[-3:, -3:] += asked.scale_sigma**2 * np.outer(translation, translation)

@@ -56,7 +56,9 @@ def held_out(views: Sequence[View], corners_m: FloatArray, whole: Bundle) -> Hel
     for group in range(groups.max() + 1):
         kept = np.flatnonzero(groups != group).tolist()
         weights = [whole.weights[k] for k in kept]
-        part = solve([views[k] for k in kept], corners_m, whole.model, whole.vector, whole.poses[kept], weights)
+        part = solve(
+            [views[k] for k in kept], corners_m, whole.model, whole.vector, whole.poses[kept], weights, whole.prior
+        )
         for k in np.flatnonzero(groups == group).tolist():
             own = whole.weights[k]
             left = view_residuals(views[k], corners_m, whole.model, part.vector, whole.poses[k], own)

@@ -52,7 +52,7 @@ def covariance(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> 
     Each corner's own residuals stand for its variance (HC3 of MacKinnon & White 1985), so that corners with much noise
     and much influence, such as those at a fisheye's border, are weighted correctly.
     """
-    middle = np.zeros_like(bundle.normal)
+    middle = np.diag(bundle.prior) * bundle.sigma_px**2
     for each in influences(views, corners_m, bundle):
         pulls = each.scores * (each.residual / each.free[:, None]).reshape(-1, 1)
         pulls = pulls.reshape(len(each.free), 2, -1).sum(axis=1)

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.vision.rig import Rig, StereoRig
+from bodyschema.vision.rectified import Rectification
+from bodyschema.vision.rig import CalibrationError, Rig, StereoRig
 
 from .guidance import Coverage, cell_name
 from .view import image_of
@@ -95,6 +96,10 @@ def unsure(rig: Rig) -> list[str]:
             reasons.append(
                 f"the {whose}principal point is known to {centre:.1f} px only. Take tilted views near corners"
             )
+    try:
+        _ = Rectification(rig).calibration
+    except CalibrationError as error:
+        reasons.append(str(error))
     if not isinstance(rig, StereoRig):
         return reasons
     share = rig.baseline_sigma_m / rig.baseline_m

@@ -70,23 +70,25 @@ def _lens(seen: Sequence[Corners], corners_m: FloatArray, size_px: tuple[int, in
         return min(
             (_fisheye(usable, corners_m, size_px, share) for share in _FISHEYE_FOCALS), key=lambda each: each[1]
         )[0]
+    count = len(DISTORTION_NAMES[model])
     try:
         _, matrix, distortion, _, _ = cv2.calibrateCamera(
             [corners_m[each.numbers].astype(np.float32) for each in usable],
             [each.px.astype(np.float32) for each in usable],
             size_px,
             np.eye(3),
-            np.zeros(5),
+            np.zeros(count),
+            flags=cv2.CALIB_RATIONAL_MODEL if model == "rational" else 0,
         )
     except cv2.error as error:
         raise CalibrationError(
             f"the {eye} eye's views do not determine its lens. Tilt the board in some of them, by 20° and more"
         ) from error
     return Lens(
-        "pinhole",
+        model,
         (float(matrix[0, 0]), float(matrix[1, 1])),
         (float(matrix[0, 2]), float(matrix[1, 2])),
-        tuple(np.ravel(distortion)[: len(DISTORTION_NAMES["pinhole"])].tolist()),
+        tuple(np.ravel(distortion)[:count].tolist()),
     )
 
 

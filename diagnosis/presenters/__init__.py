@@ -1,0 +1,1 @@
+"""Present each effect: one file each, with its sentences and its plot, found by `registry`."""

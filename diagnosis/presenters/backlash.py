@@ -1,0 +1,57 @@
+"""Present play in a drive."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bodyschema.diagnosis.report.panels import Panel
+from bodyschema.diagnosis.report.plot import Plot, span
+from bodyschema.diagnosis.report.residuals import POINTS, Residuals, binned
+from bodyschema.effects import Effect
+
+from .plots import CUT, attributed
+from .presenter import Found, Presenter, Workshop
+
+
+class Backlash(Presenter):
+    """Present play in a drive."""
+
+    effect = "backlash"
+
+    def finding(self, found: Found) -> str:
+        return f"{found.at} has {found.size('width')} of play"
+
+    def remedy(self, workshop: Workshop, found: Found) -> str:
+        play = workshop.amount(found, "width").replace("+", "")
+        return (
+            f"Tighten or preload the gear of {found.where}. Until then come to each pose from the same side, by more "
+            f"than {play}."
+        )
+
+    def panel(self, residuals: Residuals, effect: Effect) -> Panel:
+        """Plot both directions of motion separately."""
+        k = residuals.run.simulation.place(effect).joint
+        partial, _ = attributed(residuals, effect)
+        rows, x, y = residuals.telling(k), residuals.angles(k), residuals.as_angle(k, partial)
+        half = 0.5 * residuals.unit(k)[0] * float(effect.values[0])
+        plot = Plot(
+            f"{effect.where} [{residuals.unit(k)[1]}]",
+            f"{effect.where}: true less read [{residuals.unit(k)[1]}]",
+            span(x[rows]),
+            span(y[rows], cut=CUT),
+        )
+        marks = []
+        ends = np.array(plot.x)
+        for way, look in ((1, "up"), (-1, "down")):
+            moving = rows[residuals.direction[rows, k] == way]
+            if not len(moving):
+                continue
+            some, bins = residuals.some(POINTS // 2, moving), binned(x[moving], y[moving])
+            marks.append(plot.dots(x[some], y[some], f"pale {look}"))
+            marks.append(plot.line(ends, np.full(2, -way * half), f"fit {look}"))
+            marks.append(plot.bars(bins.x, bins.y, bins.half, look))
+        title = (
+            f"How far {effect.where} is from its reading, moving up (blue) and down (orange); "
+            "lines: half the play each way"
+        )
+        return Panel(title, plot.svg(*marks))

@@ -1,0 +1,27 @@
+"""Present a wrong focal length."""
+
+from __future__ import annotations
+
+from bodyschema.diagnosis.report.panels import Panel
+from bodyschema.diagnosis.report.residuals import Residuals
+from bodyschema.effects import Effect
+
+from .plots import by_distance
+from .presenter import Found, Presenter, Workshop
+
+
+class CameraFocal(Presenter):
+    """Present a wrong focal length."""
+
+    effect = "camera_focal"
+
+    def finding(self, found: Found) -> str:
+        return f"the focal length is {100 * found.numbers['focal_error']:+.3g} % off: depth is scaled"
+
+    def remedy(self, workshop: Workshop, found: Found) -> str:
+        assert workshop.robot.calibration is not None
+        focal = workshop.robot.calibration.focal_px * (1.0 + found.numbers["focal_error"])
+        return f"Calibrate the cameras again; or set focal_px = {focal:.6g} in robot.toml."
+
+    def panel(self, residuals: Residuals, effect: Effect) -> Panel:
+        return by_distance(residuals, effect)

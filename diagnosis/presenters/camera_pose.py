@@ -1,0 +1,17 @@
+"""Present a camera that stands elsewhere."""
+
+from __future__ import annotations
+
+from .presenter import Found, Presenter, Workshop, pose, toml_pose
+
+
+class CameraPose(Presenter):
+    """Present a camera that stands elsewhere."""
+
+    effect = "camera_pose"
+
+    def finding(self, found: Found) -> str:
+        return f"the {found.seen_by} stands {found.moved} off"
+
+    def remedy(self, workshop: Workshop, found: Found) -> str:
+        return f"In [camera] of robot.toml: {toml_pose(workshop.robot.camera.pose @ pose(found.numbers))}."

@@ -1,0 +1,38 @@
+"""Present a wrong scale of what is measured."""
+
+from __future__ import annotations
+
+from bodyschema.diagnosis.report.panels import Panel
+from bodyschema.diagnosis.report.residuals import Residuals
+from bodyschema.effects import Effect
+
+from .plots import by_distance
+from .presenter import Found, Presenter, Workshop
+
+
+class CameraScale(Presenter):
+    """Present a wrong scale of what is measured."""
+
+    effect = "camera_scale"
+
+    def finding(self, found: Found) -> str:
+        error = f"{100 * found.numbers['scale_error']:+.3g} %"
+        return f"all that is measured is {error} too large: the baseline is wrong"
+
+    def remedy(self, workshop: Workshop, found: Found) -> str:
+        factor, calibration = 1.0 + found.numbers["scale_error"], workshop.robot.calibration
+        if calibration is None:
+            return (
+                f"Divide what is measured by {factor:.5f}: the instrument's scale is off, or all links of the URDF are."
+            )
+        if not calibration.is_stereo:
+            return (
+                f"Measure the marker again: its side_m (or radius_m) in robot.toml seems to be {factor:.5f} times what "
+                "it is."
+            )
+        return (
+            f"Calibrate the stereo pair again; or set baseline_m = {calibration.baseline_m / factor:.6g} in robot.toml."
+        )
+
+    def panel(self, residuals: Residuals, effect: Effect) -> Panel:
+        return by_distance(residuals, effect)

@@ -1,0 +1,33 @@
+"""Present friction behind an elastic drive."""
+
+from __future__ import annotations
+
+from bodyschema.diagnosis.report.panels import Panel
+from bodyschema.diagnosis.report.residuals import Residuals
+from bodyschema.effects import Effect
+
+from .plots import over_quantity, remembered
+from .presenter import Found, Presenter, Workshop
+
+
+class Hysteresis(Presenter):
+    """Present friction behind an elastic drive."""
+
+    effect = "hysteresis"
+
+    def finding(self, found: Found) -> str:
+        lag, length = found.size("lag"), found.size("length")
+        return f"{found.at} lags by {lag} behind its reading, against the way it went, and turns round over {length}"
+
+    def remedy(self, workshop: Workshop, found: Found) -> str:
+        way = workshop.amount(found, "length").replace("+", "")
+        return (
+            f"Look for friction behind the drive of {found.where}: bearing, seal, cable, brake. Until then come to "
+            f"each pose from the same side, by several times {way}."
+        )
+
+    def panel(self, residuals: Residuals, effect: Effect) -> Panel:
+        """Plot over the strain of the friction."""
+        correction = remembered(residuals, effect)
+        strained = -correction / max(float(effect.values[0]), 1e-12)
+        return over_quantity(residuals, effect, strained, f"direction of the last moves of {effect.where}", correction)

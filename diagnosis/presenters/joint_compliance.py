@@ -1,0 +1,37 @@
+"""Present a joint that yields under the weight."""
+
+from __future__ import annotations
+
+from bodyschema.diagnosis.report.panels import Panel
+from bodyschema.diagnosis.report.residuals import Residuals
+from bodyschema.effects import Effect
+
+from .plots import load, over_quantity
+from .presenter import DEG, Found, Presenter, Workshop
+
+
+class JointCompliance(Presenter):
+    """Present a joint that yields under the weight."""
+
+    effect = "joint_compliance"
+
+    def finding(self, found: Found) -> str:
+        numbers = found.numbers
+        if "compliance_rad_per_Nm" in numbers:
+            return f"{found.at} gives by {numbers['compliance_rad_per_Nm'] * DEG:.2g}°/N·m under the arm's weight"
+        return f"{found.at} gives by {1e3 * numbers['compliance_m_per_N']:.2g} mm/N under the arm's weight"
+
+    def remedy(self, workshop: Workshop, found: Found) -> str:
+        sag = ""
+        if workshop.torques is not None:
+            compliance = next(v for name, v in found.numbers.items() if name.startswith("compliance"))
+            most = workshop.torques[workshop.joint(found)] * compliance
+            sag = f" (up to {1e3 * most:.2g} mm here)" if workshop.slides(found) else f" (up to {most * DEG:.2g}° here)"
+        return (
+            f"Check what bears the weight at {found.where}: screws, gear, belt, the gain of its position loop{sag}. A "
+            "spring that stays belongs into the simulation, as in extended.toml."
+        )
+
+    def panel(self, residuals: Residuals, effect: Effect) -> Panel:
+        torque, label = load(residuals, effect)
+        return over_quantity(residuals, effect, torque, label, effect.values[0] * torque)

@@ -1,0 +1,29 @@
+"""Present a joint that moves with another."""
+
+from __future__ import annotations
+
+from bodyschema.diagnosis.report.panels import Panel
+from bodyschema.diagnosis.report.residuals import Residuals
+from bodyschema.effects import Effect
+
+from .plots import over_reading
+from .presenter import Found, Presenter, Workshop
+
+
+class JointCoupling(Presenter):
+    """Present a joint that moves with another."""
+
+    effect = "joint_coupling"
+
+    def finding(self, found: Found) -> str:
+        return f"{found.at} moves by {100 * found.numbers['ratio']:+.3g} % of joint {found.source}'s angle"
+
+    def remedy(self, workshop: Workshop, found: Found) -> str:
+        ratio = f"{found.numbers['ratio']:+.5f}"
+        return (
+            f"In the driver, add {ratio} times the reading of {found.source} to that of {found.where}: "
+            f"a tendon or a differential carries {found.source}'s motion on."
+        )
+
+    def panel(self, residuals: Residuals, effect: Effect) -> Panel:
+        return over_reading(residuals, effect)

@@ -1,0 +1,29 @@
+"""Present an encoder that sits off its axis."""
+
+from __future__ import annotations
+
+from bodyschema.diagnosis.report.panels import Panel
+from bodyschema.diagnosis.report.residuals import Residuals
+from bodyschema.effects import Effect
+
+from .plots import over_reading
+from .presenter import DEG, Found, Presenter, Workshop, with_sign
+
+
+class JointEccentricity(Presenter):
+    """Present an encoder that sits off its axis."""
+
+    effect = "joint_eccentricity"
+
+    def finding(self, found: Found) -> str:
+        return f"the encoder of {found.at} sits off its axis: ±{found.numbers['amplitude_rad'] * DEG:.2g}° once a turn"
+
+    def remedy(self, workshop: Workshop, found: Found) -> str:
+        amplitude, phase = (found.numbers[name] * DEG for name in ("amplitude_rad", "phase_rad"))
+        return (
+            f"Centre the encoder's magnet of {found.where} on the axis. Until then add "
+            f"{amplitude:.3g}°·sin(q {with_sign(phase)}°) to its reading q."
+        )
+
+    def panel(self, residuals: Residuals, effect: Effect) -> Panel:
+        return over_reading(residuals, effect)

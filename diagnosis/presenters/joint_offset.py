@@ -1,0 +1,31 @@
+"""Present a wrong joint zero."""
+
+from __future__ import annotations
+
+from bodyschema.diagnosis.report.panels import Panel
+from bodyschema.diagnosis.report.residuals import Residuals
+from bodyschema.effects import Effect
+
+from .plots import over_reading
+from .presenter import Found, Presenter, Workshop
+
+_TURN_ORIGIN = "turn the origin of joint {} by as much about"
+
+
+class JointOffset(Presenter):
+    """Present a wrong joint zero."""
+
+    effect = "joint_offset"
+
+    def finding(self, found: Found) -> str:
+        return f"the zero of {found.at} is off by {found.signed('offset')}"
+
+    def remedy(self, workshop: Workshop, found: Found) -> str:
+        move = "move the origin of joint {} by as much along" if workshop.slides(found) else _TURN_ORIGIN
+        return (
+            f"Add {workshop.amount(found, 'offset')} to what the encoder of {found.where} reads, in its homing "
+            f"offset or in the driver. Or in the URDF: {move.format(found.where)} its axis{workshop.in_urdf}."
+        )
+
+    def panel(self, residuals: Residuals, effect: Effect) -> Panel:
+        return over_reading(residuals, effect)

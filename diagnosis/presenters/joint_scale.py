@@ -1,0 +1,37 @@
+"""Present a wrong gear ratio."""
+
+from __future__ import annotations
+
+from bodyschema.diagnosis.report.panels import Panel
+from bodyschema.diagnosis.report.residuals import Residuals
+from bodyschema.effects import Effect
+
+from .plots import over_reading
+from .presenter import Found, Presenter, Workshop
+
+# A scale error below this reverses the joint's direction.
+_BACKWARDS = -1.0
+
+
+class JointScale(Presenter):
+    """Present a wrong gear ratio."""
+
+    effect = "joint_scale"
+
+    def finding(self, found: Found) -> str:
+        error = found.numbers["scale_error"]
+        if error < _BACKWARDS:
+            return f"{found.at} counts the other way than its encoder says"
+        return f"{found.at} turns {100 * abs(error):.3g} % {'more' if error > 0.0 else 'less'} than its encoder says"
+
+    def remedy(self, workshop: Workshop, found: Found) -> str:
+        error = found.numbers["scale_error"]
+        if error < _BACKWARDS:
+            return f"Give the readings of {found.where} the other sign, in driver and recordings, and diagnose again."
+        return (
+            f"Multiply what the encoder of {found.where} reads by {1.0 + error:.5f}: check its gear "
+            "ratio and its counts per turn."
+        )
+
+    def panel(self, residuals: Residuals, effect: Effect) -> Panel:
+        return over_reading(residuals, effect)

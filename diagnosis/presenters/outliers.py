@@ -1,0 +1,36 @@
+"""Present fixes that are not the marker."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bodyschema.diagnosis.report.panels import Panel
+from bodyschema.diagnosis.report.plot import Plot, span
+from bodyschema.diagnosis.report.residuals import POINTS, Residuals
+
+from .presenter import Found, Presenter, Workshop
+
+
+class Outliers(Presenter):
+    """Present fixes that are not the marker."""
+
+    effect = "outliers"
+
+    def finding(self, found: Found) -> str:
+        return f"{100 * found.numbers['share']:.2g} % of the fixes are not the marker"
+
+    def remedy(self, workshop: Workshop, found: Found) -> str:
+        return (
+            f"Look at the images of the {100 * found.numbers['share']:.2g} % of fixes that are not the marker: cover "
+            "what else looks like it, and keep people out of the view. They were left out here."
+        )
+
+
+def outlier_panel(residuals: Residuals) -> Panel:
+    """Plot outliers beside the other fixes, over time."""
+    length = 1e3 * np.linalg.norm(residuals.after, axis=1)
+    away = np.flatnonzero(~residuals.diagnosis.markers)
+    plot = Plot(residuals.clock_label, "error [mm]", span(residuals.clock), (0.0, 1.05 * float(length.max())))
+    parts = [(residuals.some(POINTS), "pale after"), (residuals.some(POINTS, away), "away")]
+    marks = [plot.dots(residuals.clock[rows], length[rows], look) for rows, look in parts]
+    return Panel("Fixes that are not the marker, beside those that are", plot.svg(*marks))

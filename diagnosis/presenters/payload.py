@@ -1,0 +1,24 @@
+"""Present a mass that the URDF lacks."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .presenter import Found, Presenter, Workshop, listed
+
+
+class Payload(Presenter):
+    """Present a mass that the URDF lacks."""
+
+    effect = "payload"
+
+    def finding(self, found: Found) -> str:
+        return f"the hand carries {found.numbers['mass_kg']:.2g} kg that the URDF does not have"
+
+    def remedy(self, workshop: Workshop, found: Found) -> str:
+        mass = found.numbers["mass_kg"]
+        centre = [found.numbers[f"{axis}_kgm"] / max(mass, 1e-9) for axis in "xyz"]
+        return (
+            f"Weigh what the hand carries and give the link {workshop.robot.robot.marker_link} of the URDF an inertial "
+            f"with its mass: {mass:.2g} kg here, with its centre at {listed(np.round(centre, 3))} m. Or take it off."
+        )

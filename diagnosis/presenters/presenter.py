@@ -1,0 +1,212 @@
+"""Define how an effect is presented: as a finding, with a remedy, and with a plot of the evidence."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from bodyschema.diagnosis.report.panels import Panel
+from bodyschema.diagnosis.report.residuals import Residuals
+from bodyschema.diagnosis.result import Cause
+from bodyschema.effects import Effect, corrected_file
+from bodyschema.effects.effect_type import EffectType
+from bodyschema.effects.poses import transforms
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.rpy import rpy_of
+
+from .plots import measured_against_predicted
+
+DEG = math.degrees(1.0)
+# Ticks that divide a turn to within this share are counted per turn.
+_WHOLE_TURN = 0.01
+
+
+@dataclass(frozen=True)
+class Found:
+    """A cause with its numbers.
+
+    Attributes:
+        where, source: the joint it acts on, and the joint that causes it; None where there is none.
+        numbers: of shifts and turns, only those given count.
+        seen_by: the kind of measuring device, as in `DiagnosisFile`.
+        timed: True if the recording has times; otherwise a moment is a row number.
+    """
+
+    where: str | None
+    source: str | None
+    numbers: Mapping[str, float]
+    seen_by: str = "camera"
+    timed: bool = True
+
+    @classmethod
+    def of(cls, cause: Cause) -> Found:
+        """Return a cause with all of its numbers."""
+        return cls(cause.where, cause.source, {name: interval.value for name, interval in cause.parameters.items()})
+
+    @property
+    def at(self) -> str:
+        """The joint, with the word."""
+        return f"joint {self.where}"
+
+    @property
+    def shift(self) -> str:
+        """Length of its shift."""
+        return f"{1e3 * self._size('x_m', 'y_m', 'z_m'):.3g} mm"
+
+    @property
+    def turn(self) -> str:
+        """Angle of its turn."""
+        return f"{self._size('rx_rad', 'ry_rad', 'rz_rad') * DEG:.2g}°"
+
+    @property
+    def shifts(self) -> list[str]:
+        """Axes of its shift."""
+        return [axis for axis in "xyz" if f"{axis}_m" in self.numbers]
+
+    @property
+    def turns(self) -> list[str]:
+        """Axes of its turn."""
+        return [axis for axis in "xyz" if f"r{axis}_rad" in self.numbers]
+
+    @property
+    def moved(self) -> str:
+        """Its shift and its turn."""
+        return " and ".join(said for said, axes in ((self.shift, self.shifts), (self.turn, self.turns)) if axes)
+
+    @property
+    def when(self) -> str:
+        """Its moment, with a preposition; empty where it is not given."""
+        if "t0" not in self.numbers:
+            return ""
+        return f" at {'t =' if self.timed else 'row'} {self.numbers['t0']:.1f}"
+
+    def size(self, base: str) -> str:
+        """Return the size of a number that is an angle, or a length at a prismatic joint."""
+        return self.signed(base).lstrip("+")
+
+    def signed(self, base: str) -> str:
+        """Return such a number with its sign."""
+        if f"{base}_rad" in self.numbers:
+            return f"{self.numbers[f'{base}_rad'] * DEG:+.3g}°"
+        return f"{self.numbers[f'{base}_m'] * 1e3:+.3g} mm"
+
+    def _size(self, *names: str) -> float:
+        return float(np.linalg.norm([self.numbers[n] for n in names if n in self.numbers]))
+
+
+@dataclass(frozen=True)
+class Workshop:
+    """What is known of the robot to which a remedy is applied.
+
+    Attributes:
+        robot: the robot as described.
+        steps: encoder step of each joint (d,) [rad, m]; 0 where it is unknown.
+        torques: the largest torque of gravity on each joint (d,) [N·m, N]; None where masses are unknown.
+        causes: all causes, by effect.
+    """
+
+    robot: RobotDescription
+    steps: FloatArray
+    torques: FloatArray | None
+    causes: Mapping[str, Cause] = field(default_factory=dict)
+
+    @property
+    def in_urdf(self) -> str:
+        """Hint at the corrected URDF."""
+        return f" (--out writes {corrected_file(self.robot)}, which has it)"
+
+    def joint(self, found: Found) -> int:
+        """Return the index in q of the joint at which a cause is."""
+        return self.robot.joints.index(found.where or "")
+
+    def slides(self, found: Found) -> bool:
+        """Return True for a cause at a prismatic joint."""
+        return bool(self.robot.chain.prismatic[self.joint(found)])
+
+    def amount(self, found: Found, base: str) -> str:
+        """Return a number of a cause that is an angle or a length, with its ticks where they are known."""
+        name = f"{base}_m" if self.slides(found) else f"{base}_rad"
+        return f"{found.signed(base)}{self._ticks(found, found.numbers[name])}"
+
+    def _ticks(self, found: Found, amount: float) -> str:
+        step = float(self.steps[self.joint(found)])
+        if step <= 0.0:
+            return ""
+        count = round(amount / step)
+        per_turn = 2.0 * math.pi / step
+        of = ""
+        if not self.slides(found) and abs(per_turn - round(per_turn)) < _WHOLE_TURN * per_turn:
+            of = f" of {round(per_turn)} a turn"
+        return f" ({count:+d} tick{'' if abs(count) == 1 else 's'}{of})"
+
+    def pose_of(self, effect: str) -> FloatArray:
+        """Return the pose (4, 4) of another cause, the identity where it was not found."""
+        cause = self.causes.get(effect)
+        return np.eye(4) if cause is None else pose(Found.of(cause).numbers)
+
+
+class Presenter(ABC):
+    """Sentences and a plot for one effect.
+
+    Attributes:
+        effect: name of the effect.
+    """
+
+    effect: ClassVar[str]
+
+    @abstractmethod
+    def finding(self, found: Found) -> str:
+        """Return a cause as a clause: what is wrong, where, by how much."""
+
+    @abstractmethod
+    def remedy(self, workshop: Workshop, found: Found) -> str:
+        """Return what to do about a cause."""
+
+    def panel(self, residuals: Residuals, effect: Effect) -> Panel:
+        """Plot the evidence for a cause."""
+        return measured_against_predicted(residuals, effect)
+
+
+class PlainPresenter(Presenter):
+    """Presenter of an effect without one of its own, as of another package."""
+
+    def __init__(self, kind: EffectType) -> None:
+        self._kind = kind
+
+    def finding(self, found: Found) -> str:
+        return self._kind.finding("" if found.where is None else found.at, found.numbers)
+
+    def remedy(self, workshop: Workshop, found: Found) -> str:
+        return self._kind.remedy("" if found.where is None else found.at)
+
+
+def pose(numbers: Mapping[str, float]) -> FloatArray:
+    """Return the pose (4, 4) of a shift and a turn; numbers that are not given are 0."""
+    names = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
+    return transforms(np.array([[numbers.get(name, 0.0) for name in names]]))[0]
+
+
+def listed(values: FloatArray) -> str:
+    """Return numbers as a list of robot.toml."""
+    return f"[{', '.join(short(value, 5) for value in values.tolist())}]"
+
+
+def toml_pose(T: FloatArray) -> str:
+    """Return a pose (4, 4) as lines of robot.toml."""
+    return f"xyz = {listed(T[:3, 3])}, rpy = {listed(rpy_of(T[:3, :3]))}"
+
+
+def short(value: float, digits: int) -> str:
+    """Return a number without trailing zeros."""
+    return f"{round(value, digits) + 0.0:.{digits}f}".rstrip("0").rstrip(".")
+
+
+def with_sign(value: float) -> str:
+    """Return a number to add to another, with its sign apart."""
+    return f"{'-' if value < 0 else '+'} {abs(value):.3g}"

@@ -1,0 +1,27 @@
+"""Find the presenter of each effect."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pkgutil import iter_modules
+
+from bodyschema.diagnosis import presenters
+from bodyschema.effects import EFFECT_TYPES
+
+from .presenter import PlainPresenter, Presenter
+
+
+def presenter_of(effect: str) -> Presenter:
+    """Return the presenter of an effect; a plain one for an effect that has none of its own."""
+    return PRESENTERS.get(effect) or PlainPresenter(EFFECT_TYPES[effect])
+
+
+def built_in() -> dict[str, Presenter]:
+    """Return one of each class of this folder, by the name of its effect."""
+    modules = [import_module(f"{presenters.__name__}.{found.name}") for found in iter_modules(presenters.__path__)]
+    members = [member for module in modules for member in vars(module).values()]
+    classes = [m for m in members if isinstance(m, type) and issubclass(m, Presenter) and hasattr(m, "effect")]
+    return {member.effect: member() for member in classes}
+
+
+PRESENTERS: dict[str, Presenter] = built_in()

@@ -1,0 +1,20 @@
+"""Present a marker that sits elsewhere on the hand."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .presenter import Found, Presenter, Workshop, listed, pose
+
+
+class ToolOffset(Presenter):
+    """Present a marker that sits elsewhere on the hand."""
+
+    effect = "tool_offset"
+
+    def finding(self, found: Found) -> str:
+        return f"the marker sits {found.shift} beside its place on the hand"
+
+    def remedy(self, workshop: Workshop, found: Found) -> str:
+        marker = listed(np.array(workshop.robot.robot.marker_xyz) + pose(found.numbers)[:3, 3])
+        return f"In robot.toml: marker_xyz = {marker}, or put the marker back to where it was."

@@ -1,0 +1,32 @@
+"""Present a marker that slipped on the hand."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bodyschema.diagnosis.report.panels import Panel
+from bodyschema.diagnosis.report.residuals import Residuals
+from bodyschema.effects import Effect
+
+from .plots import over_time_since
+from .presenter import Found, Presenter, Workshop, listed, pose
+
+
+class ToolSlip(Presenter):
+    """Present a marker that slipped on the hand."""
+
+    effect = "tool_slip"
+
+    def finding(self, found: Found) -> str:
+        return f"the marker slipped by {found.shift}{found.when}"
+
+    def remedy(self, workshop: Workshop, found: Found) -> str:
+        robot = workshop.robot.robot
+        if not robot.marker_known:
+            return "Fasten the marker: it slipped on the hand."
+        shift = pose(found.numbers)[:3, 3] + workshop.pose_of("tool_offset")[:3, 3]
+        marker = listed(np.array(robot.marker_xyz) + shift)
+        return f"Fasten the marker: it slipped on the hand. What was measured since needs marker_xyz = {marker}."
+
+    def panel(self, residuals: Residuals, effect: Effect) -> Panel:
+        return over_time_since(residuals, effect)

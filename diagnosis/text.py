@@ -1,0 +1,252 @@
+"""Say in words that a mechanic understands what was found, what to do about it, and what to measure next."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bodyschema.effects import Effect
+from bodyschema.effects.unexplained import PLACE
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.robot.description import RobotDescription
+
+from .diagnosis import Diagnosis
+from .nameless import Nameless
+from .numbers import named, rival_named, told_values
+from .presenters.presenter import Found, Workshop
+from .presenters.registry import presenter_of
+from .result import Alike, Cause, DiagnosisFile, Errors, Gain, Interval, Tolerances, Unexplained, Verdict
+from .rivals import Rival, Standing, apart_on, whole_range, widened
+from .search import describe
+
+# Tolerances that leave at most this share of the error are mentioned.
+_BY_TOLERANCES = 0.95
+# An interval with a larger ratio of its ends is given by its upper end.
+_UNTOLD = 10.0
+# A headline names this many causes and counts the others, to fit two lines.
+_TOLD = 2
+# A less probable cause leaves the verdict open, and is to be confirmed first.
+SURE = 0.9
+# Smallest Δχ² between two causes at which a motion is worth advising.
+_TELLS = 25.0
+# Measurements that reveal an unnamed cause.
+_WATCH = {
+    "joint": "compare its reading with an angle that is measured otherwise",
+    "body": "press on it, or record with a second marker on what carries it",
+    "place": "calibrate the cameras again, where they stand to each other too",
+}
+
+
+def finding(
+    name: str,
+    where: str | None,
+    source: str | None,
+    numbers: dict[str, float],
+    seen_by: str = "camera",
+    *,
+    timed: bool = True,
+) -> str:
+    """Return one cause as a clause: what is wrong, where, by how much.
+
+    Args:
+        numbers: only the shifts and turns given count.
+        seen_by: the kind of measuring device, as in `DiagnosisFile`.
+    """
+    return presenter_of(name).finding(Found(where, source, numbers, seen_by, timed))
+
+
+def remedies(
+    diagnosis: DiagnosisFile, robot: RobotDescription, steps: FloatArray, torques: FloatArray | None
+) -> list[str]:
+    """Return advice on each cause, the one that explains most first.
+
+    Args:
+        steps: encoder step of each joint (d,) [rad, m]; 0 where it is unknown.
+        torques: the largest torque of gravity on each joint (d,) [N·m, N]; None where masses are unknown.
+    """
+    workshop = Workshop(robot, steps, torques, {cause.effect: cause for cause in diagnosis.causes})
+    causes = sorted(diagnosis.causes, key=lambda cause: -cause.share_of_gain_percent)
+    told = [presenter_of(cause.effect).remedy(workshop, Found.of(cause)) for cause in causes]
+    return [_if_sure(cause, remedy) for cause, remedy in zip(causes, told, strict=True)]
+
+
+def _if_sure(cause: Cause, remedy: str) -> str:
+    """Return the remedy, preceded by what to confirm before any change."""
+    open_ones = [rival for rival in cause.rivals if rival.by == "this_motion"]
+    if cause.probability >= SURE or not open_ones:
+        return remedy
+    rivals = " or ".join(rival_named(rival) for rival in open_ones[:2])
+    return (
+        f"If it is {named(cause.effect, cause.where, cause.source)} and not {rivals}: {remedy[0].lower()}{remedy[1:]}"
+    )
+
+
+def sentence(
+    verdict: Verdict,
+    causes: Sequence[Cause],
+    rms: Errors,
+    gain: Gain,
+    named_mm: float | None = None,
+    tolerated_mm: float | None = None,
+    seen_by: str = "camera",
+    *,
+    timed: bool = True,
+) -> str:
+    """Return the verdict in one or two short sentences.
+
+    Args:
+        named_mm: RMS with the causes alone [mm], where there is also a smooth model of unnamed causes.
+        tolerated_mm: RMS with small errors everywhere and no cause [mm], where such errors show.
+        seen_by: the kind of measuring device, as in `DiagnosisFile`.
+    """
+    figures = f"{rms.aligned:.3g} → {rms.extended:.3g} mm on held-out data"
+    if verdict == "nothing_found" and rms.extended < _BY_TOLERANCES * rms.aligned:
+        return f"No cause stands out: small errors everywhere explain {_share(gain)} ({figures})"
+    if verdict == "nothing_found":
+        return f"The simulation is right to within the noise: nothing found in {rms.aligned:.3g} mm of error"
+    if not causes:
+        told = "What is measured differs from the simulation in a way that none of the known effects explains"
+        return told if named_mm is None else f"{told}; a smooth model of it explains {_share(gain)} ({figures})"
+    largest = sorted(causes, key=lambda cause: -cause.share_of_gain_percent)
+    told = [finding(c.effect, c.where, c.source, told_values(c), seen_by, timed=timed) for c in largest[:_TOLD]]
+    head = told[0][0].upper() + told[0][1:]
+    if more := len(largest) - len(told):
+        head += f"; {', '.join(told[1:])}; {more} smaller cause{'s' * (more > 1)}"
+    elif len(told) > 1:
+        head += f", and {told[1]}"
+    if gain.held_out_percent <= 0.0:
+        return f"{head}: this explains the pairs that were fitted and no others ({figures})"
+    if named_mm is not None:
+        figures += f", {named_mm:.3g} mm without the smooth model of the rest"
+    elif tolerated_mm is not None and tolerated_mm < _BY_TOLERANCES * rms.aligned:
+        figures += f", {tolerated_mm:.3g} mm with tolerances alone"
+    return f"{head}. RMS error {figures}{_open(verdict, causes)}"
+
+
+def _open(verdict: Verdict, causes: Sequence[Cause]) -> str:
+    """Return the part of a verdict's sentence on what remains open."""
+    if verdict == "unexplained":
+        return ". Part of the error remains unexplained"
+    unsure = [cause for cause in causes if is_unsure(cause)]
+    if verdict != "undecided" or not unsure:
+        return ""
+    named = [f"{c.effect}{'' if c.where is None else f' at {c.where}'}" for c in unsure]
+    return f". Not sure: {', '.join(named)}; other causes explain as much"
+
+
+def is_unsure(cause: Cause) -> bool:
+    """Return True for a cause with a rival that is not much less probable."""
+    return cause.probability < SURE and bool(cause.rivals)
+
+
+def _share(gain: Gain) -> str:
+    explained = round(gain.held_out_percent)
+    return f"{explained} % of the error" if explained > 0 else "less than 1 % of the error"
+
+
+def made_to(tolerances: Tolerances) -> str:
+    """Return one sentence on the manufacturing tolerances of an arm; upper bounds where they do not show."""
+
+    def told(size: Interval, unit: str, sign: str = "") -> str:
+        low, high = size.ci95
+        if high > _UNTOLD * low:
+            return f"{sign}{high:.1g}{unit} or better"
+        return f"about {sign}{size.value:.1g}{unit}"
+
+    length, angle = told(tolerances.length_mm, " mm"), told(tolerances.angle_deg, "°")
+    drives = told(tolerances.drive_deg, "°", "±")
+    return f"The arm is made to {length} and {angle}; its drives run true to {drives}."
+
+
+def beside_geometry(rms: Errors, alike: Sequence[Alike]) -> list[str]:
+    """Return sentences on what the best geometry explains and which effects are confounded; empty if there are none."""
+    if rms.geometry is None or not alike:
+        return []
+    told = [
+        f"The best geometry, with every link, zero, the tool and the camera free, brings {rms.aligned:.3g} mm to "
+        f"{rms.geometry:.3g} mm. What is left can be described in more than one way:"
+    ]
+    for pair in alike:
+        told.append(
+            f"{pair.effect} and {pair.other} at {pair.where} share a direction: alone they explain "
+            f"{pair.explains_percent:.0f} % and {pair.other_explains_percent:.0f} % of what is left, and "
+            f"{pair.shared_percent:.0f} % of the smaller part is the same (Δχ² = {pair.delta_chi2:.0f} for the first)."
+        )
+    return told
+
+
+def modelled(left: Unexplained) -> str:
+    """Return one or two sentences on the smooth model in extended.toml; empty if no structure is left."""
+    told = []
+    if left.model_joints:
+        over = "the marker's place" if left.model_joints == PLACE else f"the readings of {', '.join(left.model_joints)}"
+        told.append(f"extended.toml has a smooth model of it over {over}, as good as the recording is dense.")
+    elif left.what:
+        why = "" if left.not_in_model else ": none is right on pairs that it was not fitted to. More pairs may tell one"
+        told.append(f"extended.toml has no model of it{why}.")
+    if left.not_in_model:
+        told.append(
+            f"What changes with time is in no such model: {'; '.join(left.not_in_model)}. Another recording will "
+            "differ by it again."
+        )
+    return " ".join(told)
+
+
+def evidence(standing: Standing) -> str:
+    """Return the evidence for a cause in one sentence."""
+    text = (
+        f"Without it the fit is worse by Δχ² = {standing.gain:.0f} for {standing.dof} number{'s' * (standing.dof > 1)}"
+    )
+    if not standing.rivals:
+        return f"{text}; nothing else comes near."
+    rival = standing.rivals[0]
+    return f"{text}; the nearest rival: {rival.described} ({100 * rival.probability:.0f} %)."
+
+
+def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
+    """Return sentences of advice: motions that would separate confounded causes, and steps against unnamed causes."""
+    told = []
+    for cause, standing in zip(diagnosis.causes, diagnosis.standings, strict=True):
+        for rival in standing.rivals:
+            if not rival.is_same_anywhere:
+                told.append(_motion(diagnosis, cause, rival))
+            elif not rival.is_one:
+                told.append(
+                    f"{rival.described} can do all that {describe(cause)} does, and more: "
+                    "a longer recording of the same kind would show whether it does."
+                )
+            elif rival.effect is not None:
+                told.append(f"No motion tells {describe(cause)} from {rival.described}: fix whichever is easier.")
+            if isinstance(rival.instead, Nameless):
+                told.append(f"Watch whether {rival.described}: {_WATCH[rival.instead.kind]}.")
+    if diagnosis.left.rattle is not None:
+        told.append(f"Fasten the marker: {diagnosis.left.rattle.what}.")
+    if what := diagnosis.left.nameless:
+        joints = [diagnosis.extended.simulation.robot.joints[k] for k in diagnosis.left.joints]
+        where = f" Look at {', '.join(joints)} first." if joints else ""
+        told.append(f"None of the known effects fits {'; '.join(what)}.{where}{_of_the_model(diagnosis)}")
+    return tuple(dict.fromkeys(told))
+
+
+def _of_the_model(diagnosis: Diagnosis) -> str:
+    stored = diagnosis.left.model is not None and diagnosis.left.model.stored is not None
+    return " The extended simulation is right about it only where the recording has been." if stored else ""
+
+
+def _motion(diagnosis: Diagnosis, cause: Effect, rival: Rival) -> str:
+    """Return advice on the joint that, moved through its whole range, best separates two causes."""
+    robot, fit = diagnosis.extended.simulation.robot, diagnosis.extended
+    pair = f"{describe(cause)} from {rival.described}"
+    apart = [apart_on(fit, rival.instead, widened(fit, [k])) for k in range(len(robot.joints))]
+    best = int(np.argmax(apart))
+    if apart[best] >= _TELLS:
+        low, high = whole_range(fit, best)
+        unit, scale = ("mm", 1e3) if robot.chain.prismatic[best] else ("°", 180.0 / np.pi)
+        span = f"{low * scale:.0f}{unit} to {high * scale:.0f}{unit}"
+        return f"To tell {pair}, move joint {robot.joints[best]} through its whole range ({span}) in another recording."
+    poses = f"To tell {pair}, record poses over the whole range of all joints, with stops and at different speeds"
+    if rival.anywhere >= _TELLS:
+        return f"{poses}."
+    pairs = len(fit.observations) * _TELLS / rival.anywhere
+    return f"{poses}: about {float(f'{pairs:.1g}'):,.0f} of them, since the effect is small beside the noise."

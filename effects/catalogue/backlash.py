@@ -1,0 +1,139 @@
+"""Play between the encoder and its joint, with friction that keeps the joint in place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyschema.effects.encoder import EncoderEffect, Place
+from bodyschema.effects.joint_errors import JointErrors
+from bodyschema.effects.motion import Motion
+from bodyschema.effects.parameter import Parameter
+from bodyschema.interfaces.records import FloatArray, frozen_array
+
+if TYPE_CHECKING:
+    from bodyschema.effects.effect import Effect
+    from bodyschema.effects.simulation import Simulated
+
+# Step of the numerical derivative by the width [rad, m].
+_WIDTH_STEP = 1e-6
+_PLAYS_KEPT = 256
+# Widths tried [rad, m].
+WIDTHS = np.geomspace(2e-4, 0.15, 14)
+
+
+class Backlash(EncoderEffect):
+    """Backlash between encoder and joint: the joint rests until the reading has crossed its width."""
+
+    name = "backlash"
+    rank = 6
+    remembers = True
+    by_direction = True
+    is_linear = False
+    search = "width"
+
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        return (
+            Parameter("width_m", 0.002, never_negative=True)
+            if prismatic
+            else Parameter("width_rad", 0.01, never_negative=True),
+        )
+
+    def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        wider = self.correction(motion, place, values + _WIDTH_STEP)
+        return ((wider - self.correction(motion, place, values)) / _WIDTH_STEP)[:, None]
+
+    def correction(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        return _played(motion, place.joint, abs(float(values[0]))) * np.sign(values[0])
+
+    def live(self, place: Place, values: FloatArray, row_readings: int) -> _LivePlay:
+        return _LivePlay(place, float(values[0]))
+
+    def trial_shapes(self, motion: Motion) -> FloatArray:
+        return WIDTHS
+
+    def unknown_state(self, run: Simulated, effect: Effect) -> NDArray[np.bool_]:
+        """Return rows (n,) before the joint first crosses its backlash in a run."""
+        return run.motion.before_travel(run.simulation.place(effect).joint, float(effect.values[0]))
+
+    def correction_values(self, effect: Effect) -> list[float]:
+        return effect.values.tolist()
+
+    def add_to(self, joint: JointErrors, effect: Effect) -> str | None:
+        if joint.play or effect.values[0] < 0.0:
+            return "a joint has one backlash there"
+        joint.play = float(effect.values[0])
+        return None
+
+
+class Play:
+    """A backlash of a width [rad, m], driven reading by reading; its output moves once the input has crossed it."""
+
+    def __init__(self, width: float) -> None:
+        self._half = 0.5 * width
+        self._output: float | None = None
+
+    def begin(self, reading: float, leading: float) -> None:
+        """Start with the input at `reading`, leading by half the width in the direction of `leading`; 0: centred."""
+        self._output = reading - self._half * float(np.sign(leading))
+
+    def follow(self, reading: float) -> float:
+        """Return the output for the next reading."""
+        return self.followed([reading])[0]
+
+    def followed(self, readings: Sequence[float]) -> list[float]:
+        """Return the outputs for the next readings."""
+        half, outputs = self._half, []
+        output = readings[0] if self._output is None else self._output
+        for reading in readings:
+            if output < reading - half:
+                output = reading - half
+            elif output > reading + half:
+                output = reading + half
+            outputs.append(output)
+        self._output = output
+        return outputs
+
+
+def played(q: FloatArray, width: float) -> FloatArray:
+    """Return output minus input (n,) of a backlash of `width` driven by q (n,), leading in its first direction.
+
+    Between two runs it is driven straight from the last reading of one to the first of the next: the side at the end of
+        the run is known, and a long move ends on its own side.
+    """
+    moves = np.diff(q)
+    leading = moves[np.flatnonzero(moves)[:1]]
+    play = Play(width)
+    play.begin(float(q[0]), float(leading[0]) if len(leading) else 0.0)
+    return np.array(play.followed(q.tolist())) - q
+
+
+@lru_cache(maxsize=_PLAYS_KEPT)
+def _played(motion: Motion, joint: int, width: float) -> FloatArray:
+    """Return `played` of one joint; cached, since a search repeats the same widths."""
+    return frozen_array(played(motion.q[:, joint], width))
+
+
+class _LivePlay:
+    """A backlash at a joint; the first move determines its initial side, until then it is centred."""
+
+    def __init__(self, place: Place, width: float) -> None:
+        self._joint = place.joint
+        self._sign = float(np.sign(width))
+        self._play = Play(abs(width))
+        self._first: float | None = None
+        self._moved = False
+
+    def at(self, motion: Motion, move: float) -> float:
+        """Return output minus input [rad, m] at the next reading."""
+        reading = float(motion.q[0, self._joint])
+        if self._first is None:
+            self._first = reading
+        if not self._moved and reading != self._first:
+            self._moved = True
+            self._play.begin(self._first, reading - self._first)
+        return self._sign * (self._play.follow(reading) - reading)

@@ -1,0 +1,42 @@
+"""Images whose time stamps are late."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bodyschema.effects.effect_type import TimeEffect
+from bodyschema.effects.parameter import Parameter
+from bodyschema.interfaces.records import FloatArray
+
+if TYPE_CHECKING:
+    from bodyschema.effects.effect import Effect
+    from bodyschema.effects.simulation import Simulated
+
+# Step of the numerical derivative [s].
+_STEP_S = 1e-5
+
+
+class CameraLatency(TimeEffect):
+    """Delay of the images' time stamps against the encoders."""
+
+    name = "camera_latency"
+    rank = 0
+    moves_joints = True
+
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        return (Parameter("latency_s", 0.02),)
+
+    @property
+    def depends_on_path(self) -> bool:
+        return True
+
+    def delay_s(self, values: FloatArray) -> float:
+        return float(values[0])
+
+    def jacobian(self, run: Simulated, effect: Effect) -> FloatArray:
+        # Include the encoder errors: they too are those of the earlier moment.
+        simulation, latency = run.simulation, run.simulation.latency_s
+        later, sooner = (simulation.unloaded(run.motion.earlier(latency + s)) for s in (_STEP_S, -_STEP_S))
+        return np.einsum("nij,nj->ni", run.by_joint, (later - sooner) / (2.0 * _STEP_S))[:, :, None]

@@ -1,0 +1,35 @@
+"""A camera that stands elsewhere."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from bodyschema.effects.effect_type import CameraEffect
+from bodyschema.effects.parameter import Parameter, shifts, turns
+from bodyschema.effects.poses import moved_by_observer, transforms
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.robot.description import RobotDescription
+
+if TYPE_CHECKING:
+    from bodyschema.effects.effect import Effect
+    from bodyschema.effects.simulation import Simulated
+
+
+class CameraPose(CameraEffect):
+    """Pose of the camera in the frame that the description gives it."""
+
+    name = "camera_pose"
+    rank = 0
+    rigid = True
+
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        return (*shifts(0.01), *turns(0.02))
+
+    def is_free(self, robot: RobotDescription) -> bool:
+        return not robot.camera.pose_known
+
+    def pose(self, values: FloatArray) -> FloatArray:
+        return transforms(values[None])[0]
+
+    def jacobian(self, run: Simulated, effect: Effect) -> FloatArray:
+        return run.optical(run.since_moved(moved_by_observer(effect.values, run.x_placed)))

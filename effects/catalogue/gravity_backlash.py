@@ -1,0 +1,76 @@
+"""Play in a joint that hangs on the flank to which the weight pulls it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyschema.effects.effect_type import StructureEffect
+from bodyschema.effects.flank import flanks
+from bodyschema.effects.joint_errors import JointErrors
+from bodyschema.effects.moments import with_moment
+from bodyschema.effects.motion import Motion
+from bodyschema.effects.parameter import Parameter
+from bodyschema.interfaces.records import FloatArray
+
+if TYPE_CHECKING:
+    from bodyschema.effects.effect import Effect
+    from bodyschema.effects.simulation import Simulated
+
+# Uncertainty factor of the friction, and the smallest relative load that counts.
+_FRICTION_WITHIN, _UPRIGHT = 2.0, 0.02
+# Frictions tried, as shares of the largest load.
+_HOLDS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35)
+
+
+class GravityBacklash(StructureEffect):
+    """Backlash under load: angle += width/2 · side.
+
+    The side is the sign of gravity's torque, and changes only when that exceeds `hold` in the other direction.
+    """
+
+    name = "gravity_backlash"
+    rank = 1
+    at_joint = True
+    needs_weight = True
+    moves_joints = True
+    search = "load"
+    has_slack = True
+
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        if prismatic:
+            return (Parameter("width_m", 0.002, never_negative=True), Parameter("hold_N", 0.0, None))
+        return (Parameter("width_rad", 0.01, never_negative=True), Parameter("hold_Nm", 0.0, None))
+
+    def slack(self, torque: FloatArray, values: FloatArray, side: float) -> tuple[FloatArray, float]:
+        sides = flanks(torque, float(values[1]), side)
+        return 0.5 * values[0] * sides, float(sides[-1])
+
+    def jacobian(self, run: Simulated, effect: Effect) -> FloatArray:
+        k = run.simulation.place(effect).joint
+        if not run.simulation.bears_weight:
+            return np.zeros((len(run.q), 3, 2))
+        side = flanks(run.torques[:, k], float(effect.values[1]))
+        return with_moment(run.by_joint[:, :, [k]] * 0.5 * side[:, None, None])
+
+    def trial_shapes(self, motion: Motion) -> FloatArray:
+        """Return shares of the largest load."""
+        return np.array(_HOLDS)
+
+    def unknown_state(self, run: Simulated, effect: Effect) -> NDArray[np.bool_]:
+        """Return rows (n,) at which the side depends on the size of the friction."""
+        torque, hold = run.torques[:, run.simulation.place(effect).joint], float(effect.values[1])
+        less, more = hold / _FRICTION_WITHIN, hold * _FRICTION_WITHIN + _UPRIGHT * float(np.abs(torque).max())
+        return flanks(torque, less) != flanks(torque, more)
+
+    def correction_values(self, effect: Effect) -> list[float]:
+        return effect.values.tolist()
+
+    def add_to(self, joint: JointErrors, effect: Effect) -> str | None:
+        width, hold = effect.values.tolist()
+        if joint.loose or width < 0.0:
+            return "a joint has one backlash under gravity there"
+        joint.loose = width, max(hold, 0.0)
+        return None

@@ -1,0 +1,127 @@
+"""Friction behind an elastic drive."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyschema.effects.encoder import EncoderEffect, Place, carried_on
+from bodyschema.effects.motion import Motion
+from bodyschema.effects.parameter import Parameter
+from bodyschema.interfaces.records import FloatArray, frozen_array
+
+from .backlash import WIDTHS
+
+if TYPE_CHECKING:
+    from bodyschema.effects.effect import Effect
+    from bodyschema.effects.simulation import Simulated
+
+_LAGS_KEPT = 256
+# Lengths tried [rad, m].
+_LENGTHS = np.geomspace(5e-4, 0.3, 14)
+# After this many lengths, only the last direction determines the strain.
+_STRAINED = 3.0
+
+
+class Hysteresis(EncoderEffect):
+    """Friction behind an elastic drive: the joint lags behind the reading, against the last direction (Dahl 1968).
+
+    true angle = reading - lag · z, where z moves towards the direction of motion over `length`:
+    dz = (sign(dq) - z) · |dq| / length.
+    """
+
+    name = "hysteresis"
+    rank = 8
+    remembers = True
+    by_direction = True
+    search = "shape"
+    # A backlash, with one shape parameter more that must pay for itself.
+    refines = True
+    further_trials = len(WIDTHS)
+    no_counterpart = "friction whose lag depends on the way is not in a rigid-body simulator"
+
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        unit, lag, length = ("m", 0.001, 0.005) if prismatic else ("rad", 0.005, 0.03)
+        return (
+            Parameter(f"lag_{unit}", lag, never_negative=True),
+            Parameter(f"length_{unit}", length, None, smooth=True, positive=True),
+        )
+
+    def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        strained = _strained(motion, place.joint, float(values[1]))
+        return np.stack([-strained, np.zeros_like(strained)], axis=1)
+
+    def live(self, place: Place, values: FloatArray, row_readings: int) -> _LiveHysteresis:
+        return _LiveHysteresis(place, values)
+
+    def trial_shapes(self, motion: Motion) -> FloatArray:
+        return _LENGTHS
+
+    def correction_values(self, effect: Effect) -> list[float]:
+        return effect.values.tolist()
+
+    def unknown_state(self, run: Simulated, effect: Effect) -> NDArray[np.bool_]:
+        """Return rows (n,) before the joint has gone far enough one way in a run."""
+        return run.motion.before_travel(run.simulation.place(effect).joint, _STRAINED * float(effect.values[1]))
+
+
+class Bristle:
+    """Friction strain from -1 to 1, driven reading by reading.
+
+    Args:
+        length: travel [rad, m] over which it reverses.
+    """
+
+    def __init__(self, length: float) -> None:
+        self._length = length
+        self._last: float | None = None
+        self.strained = 0.0
+
+    def begin(self, reading: float, leading: float) -> None:
+        """Start at `reading`, reached in the direction of `leading`; 0 for no direction."""
+        self._last, self.strained = reading, float(np.sign(leading))
+
+    def follow(self, reading: float) -> float:
+        """Return the strain at the next reading."""
+        move = 0.0 if self._last is None else reading - self._last
+        kept = float(np.exp(-abs(move) / self._length))
+        self._last, self.strained = reading, float(np.sign(move)) * (1.0 - kept) + kept * self.strained
+        return self.strained
+
+
+@lru_cache(maxsize=_LAGS_KEPT)
+def _strained(motion: Motion, joint: int, length: float) -> FloatArray:
+    """Return the strain of a joint's friction (n,), from -1 to 1; it begins in the direction of the first move.
+
+    Between two runs it is driven straight, as a backlash is.
+    """
+    moves = np.diff(motion.q[:, joint], prepend=motion.q[0, joint])
+    leading = moves[np.flatnonzero(moves)[:1]]
+    kept = np.exp(-np.abs(moves) / length)
+    strained = np.sign(moves) * (1.0 - kept)
+    strained[0], kept[0] = float(np.sign(leading[0])) if len(leading) else 0.0, 0.0
+    return frozen_array(carried_on(strained, kept))
+
+
+class _LiveHysteresis:
+    """Friction behind an elastic drive; the first move determines its initial strain."""
+
+    def __init__(self, place: Place, values: FloatArray) -> None:
+        self._joint = place.joint
+        self._lag, length = values.tolist()
+        self._bristle = Bristle(length)
+        self._first: float | None = None
+        self._moved = False
+
+    def at(self, motion: Motion, move: float) -> float:
+        """Return minus the lag of the joint [rad, m] at the next reading."""
+        reading = float(motion.q[0, self._joint])
+        if self._first is None:
+            self._first = reading
+        if not self._moved and reading != self._first:
+            self._moved = True
+            self._bristle.begin(self._first, reading - self._first)
+        return -self._lag * self._bristle.follow(reading)

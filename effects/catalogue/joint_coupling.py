@@ -1,0 +1,35 @@
+"""A joint that moves with another."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from bodyschema.effects.encoder import EncoderEffect, Place
+from bodyschema.effects.joint_errors import JointErrors
+from bodyschema.effects.motion import Motion
+from bodyschema.effects.parameter import Parameter
+from bodyschema.interfaces.records import FloatArray
+
+if TYPE_CHECKING:
+    from bodyschema.effects.effect import Effect
+
+
+class JointCoupling(EncoderEffect):
+    """Coupling of a joint to another: true angle = reading + ratio · (reading of the other)."""
+
+    name = "joint_coupling"
+    rank = 4
+    takes_source = True
+
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        return (Parameter("ratio", 0.02),)
+
+    def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        assert place.source is not None
+        return motion.q[:, [place.source]]
+
+    def correction_values(self, effect: Effect) -> list[float]:
+        return effect.values.tolist()
+
+    def add_to(self, joint: JointErrors, effect: Effect) -> None:
+        joint.add_ratio(str(effect.source), float(effect.values[0]))

@@ -1,0 +1,54 @@
+"""An encoder magnet or disc off the axis of its joint."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bodyschema.effects.encoder import EncoderEffect, Place
+from bodyschema.effects.joint_errors import JointErrors
+from bodyschema.effects.motion import Motion
+from bodyschema.effects.parameter import Parameter
+from bodyschema.interfaces.records import FloatArray
+
+if TYPE_CHECKING:
+    from bodyschema.effects.effect import Effect
+
+# Upper limit of a magnet's eccentricity as a share of its radius; beyond it the encoder cannot be read.
+_FARTHEST_OFF = 0.95
+
+
+class JointEccentricity(EncoderEffect):
+    """Encoder magnet off the axis by (sine, -cosine) of its radius.
+
+    The field has the direction of (cos θ, sin θ) + e, so true angle = reading + asin(sine · sin + cosine · cos).
+    """
+
+    name = "joint_eccentricity"
+    rank = 2
+    turns_only = True
+    of_drive = True
+
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        return (Parameter("sine_rad", 0.02), Parameter("cosine_rad", 0.02))
+
+    def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        ring = self._ring(motion, place)
+        return ring / np.sqrt(1.0 - np.square(self._sine(ring, values)))[:, None]
+
+    def correction(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        return np.arcsin(self._sine(self._ring(motion, place), values))
+
+    def correction_values(self, effect: Effect) -> list[float]:
+        return effect.values.tolist()
+
+    def add_to(self, joint: JointErrors, effect: Effect) -> None:
+        joint.add_wave(self.name, effect.values, 1.0)
+
+    def _ring(self, motion: Motion, place: Place) -> FloatArray:
+        q = motion.q[:, place.joint]
+        return np.stack([np.sin(q), np.cos(q)], axis=1)
+
+    def _sine(self, ring: FloatArray, values: FloatArray) -> FloatArray:
+        return np.clip(ring @ values, -_FARTHEST_OFF, _FARTHEST_OFF)

@@ -1,0 +1,38 @@
+"""A joint whose zero is wrong."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bodyschema.effects.encoder import EncoderEffect, Place
+from bodyschema.effects.joint_errors import JointErrors
+from bodyschema.effects.motion import Motion
+from bodyschema.effects.parameter import Parameter
+from bodyschema.interfaces.records import FloatArray
+
+if TYPE_CHECKING:
+    from bodyschema.effects.effect import Effect
+
+
+class JointOffset(EncoderEffect):
+    """Constant joint offset: true angle = reading + offset."""
+
+    name = "joint_offset"
+    rank = 0
+    rigid = True
+    is_zero = True
+    absorbed_by = ("link_geometry",)
+
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        return (Parameter("offset_m", 0.005) if prismatic else Parameter("offset_rad", 0.05),)
+
+    def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        return np.ones((len(motion), 1))
+
+    def correction_values(self, effect: Effect) -> list[float]:
+        return effect.values.tolist()
+
+    def add_to(self, joint: JointErrors, effect: Effect) -> None:
+        joint.offset += float(effect.values[0])

@@ -1,0 +1,61 @@
+"""A periodic error of a drive, finer than a turn."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bodyschema.effects.encoder import EncoderEffect, Place
+from bodyschema.effects.joint_errors import JointErrors
+from bodyschema.effects.motion import Motion
+from bodyschema.effects.parameter import Parameter
+from bodyschema.interfaces.records import FloatArray
+
+if TYPE_CHECKING:
+    from bodyschema.effects.effect import Effect
+    from bodyschema.effects.simulation import Simulated
+
+# Largest step of the phase over the joint's range [rad].
+_OF_A_PEAK = 0.5
+# At once per turn it would be an eccentricity.
+_FEWEST_CYCLES = 1.5
+
+
+class JointRipple(EncoderEffect):
+    """Periodic error of gear teeth, strain wave or pole pairs; its period is a fraction of a turn, or a length."""
+
+    name = "joint_ripple"
+    rank = 3
+    of_drive = True
+    search = "cycles"
+
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        if prismatic:
+            cycles = Parameter("cycles_per_m", 100.0, None, smooth=True, positive=True)
+            return (Parameter("sine_m", 0.001), Parameter("cosine_m", 0.001), cycles)
+        cycles = Parameter("cycles_per_turn", 8.0, None, smooth=True, positive=True)
+        return (Parameter("sine_rad", 0.01), Parameter("cosine_rad", 0.01), cycles)
+
+    @property
+    def most_at_one_place(self) -> int:
+        # Teeth, strain wave, pole pairs and a screw have periods of their own.
+        return 4
+
+    def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        phase = motion.q[:, place.joint] * values[2] * (2.0 * np.pi if place.prismatic else 1.0)
+        return np.stack([np.sin(phase), np.cos(phase), np.zeros_like(phase)], axis=1)
+
+    def shape_step(self, run: Simulated, effect: Effect, k: int) -> float:
+        return _OF_A_PEAK / max(float(np.ptp(run.readings.q[:, run.simulation.place(effect).joint])), 1e-6)
+
+    def bounded(self, effect: Effect, k: int, value: float, motion: Motion) -> float:
+        return super().bounded(effect, k, value if effect.prismatic else max(value, _FEWEST_CYCLES), motion)
+
+    def correction_values(self, effect: Effect) -> list[float]:
+        sine, cosine, cycles = effect.values.tolist()
+        # The format has radians per unit of the reading.
+        return [sine, cosine, cycles * (2.0 * np.pi if effect.prismatic else 1.0)]
+
+    def add_to(self, joint: JointErrors, effect: Effect) -> None:
+        joint.add_wave(self.name, effect.values, float(effect.values[2]) * (2.0 * np.pi if effect.prismatic else 1.0))

@@ -1,0 +1,33 @@
+"""A joint with a wrong gear ratio."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from bodyschema.effects.encoder import EncoderEffect, Place
+from bodyschema.effects.joint_errors import JointErrors
+from bodyschema.effects.motion import Motion
+from bodyschema.effects.parameter import Parameter
+from bodyschema.interfaces.records import FloatArray
+
+if TYPE_CHECKING:
+    from bodyschema.effects.effect import Effect
+
+
+class JointScale(EncoderEffect):
+    """Wrong gear ratio or counts per turn: true angle = reading · (1 + scale_error)."""
+
+    name = "joint_scale"
+    rank = 1
+
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        return (Parameter("scale_error", 0.01),)
+
+    def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
+        return motion.q[:, [place.joint]]
+
+    def correction_values(self, effect: Effect) -> list[float]:
+        return effect.values.tolist()
+
+    def add_to(self, joint: JointErrors, effect: Effect) -> None:
+        joint.add_ratio(str(effect.where), float(effect.values[0]))

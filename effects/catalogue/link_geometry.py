@@ -1,0 +1,44 @@
+"""A link whose length, shift or axis differs from the URDF."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from bodyschema.effects.effect_type import StructureEffect
+from bodyschema.effects.parameter import Parameter, shifts, turns
+from bodyschema.effects.poses import moved_and_turned, rotation, transforms
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.robot.urdf import inverse
+
+if TYPE_CHECKING:
+    from bodyschema.effects.effect import Effect
+    from bodyschema.effects.simulation import Simulated
+
+
+class LinkGeometry(StructureEffect):
+    """A joint's frame on its parent link, moved by a shift and a rotation vector in the nominal frame."""
+
+    name = "link_geometry"
+    rank = 3
+    at_joint = True
+    rigid = True
+    in_parts = True
+
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        return (*shifts(0.005), *turns(0.02))
+
+    def frame(self, values: FloatArray) -> FloatArray:
+        return transforms(values[None])[0]
+
+    def jacobian(self, run: Simulated, effect: Effect) -> FloatArray:
+        k = run.simulation.place(effect).joint
+        turn, by_turn = rotation(effect.values)
+        if run.simulation.upward[k]:
+            # Frame after the joint's own motion, in which the link above begins.
+            frame = run.frames[:, k + 1] @ inverse(run.chain.fixed[k + 1])
+            axes = -frame[:, :3, :3] @ turn.T
+        else:
+            frame = run.frames[:, k]
+            axes = frame[:, :3, :3] @ turn.T
+        lever = run.x_true - frame[:, :3, 3]
+        return run.seen(moved_and_turned(axes, axes @ by_turn, lever))

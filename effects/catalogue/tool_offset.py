@@ -1,0 +1,34 @@
+"""A marker that sits elsewhere on the hand."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from bodyschema.effects.effect_type import ToolEffect
+from bodyschema.effects.parameter import Parameter, shifts
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.robot.description import RobotDescription
+
+if TYPE_CHECKING:
+    from bodyschema.effects.effect import Effect
+    from bodyschema.effects.simulation import Simulated
+
+
+class ToolOffset(ToolEffect):
+    """A displacement of the marker in its link, as by another tool."""
+
+    name = "tool_offset"
+    rank = 0
+    rigid = True
+
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        return shifts(0.01)
+
+    def is_free(self, robot: RobotDescription) -> bool:
+        return not robot.robot.marker_known
+
+    def shift(self, values: FloatArray) -> FloatArray:
+        return values
+
+    def jacobian(self, run: Simulated, effect: Effect) -> FloatArray:
+        return run.by_marker

@@ -1,0 +1,293 @@
+"""Define what an effect is: its parameters, where it can sit, what it does to a run, how it is searched and exported.
+
+Each effect is one class in one file of `catalogue`, a subclass of the class of its stage.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from functools import cached_property
+from typing import TYPE_CHECKING, ClassVar, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyschema.interfaces.camera import StereoCalibration
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.urdf import PointMass
+
+from .joint_errors import JointErrors
+from .motion import Motion
+from .optics import Optics
+from .parameter import Parameter
+
+if TYPE_CHECKING:
+    from .effect import Effect
+    from .encoder import EncoderEffect
+    from .gravity import GravityLoad
+    from .simulation import Simulated
+
+Stage = Literal["encoder", "structure", "tool", "camera", "time"]
+STAGES: tuple[Stage, ...] = get_args(Stage)
+# How the last parameter is searched: not at all, as a moment, a number of cycles, a width that is also the amount, one
+# of `trial_shapes`, or a load of those shares of the largest one.
+ShapeSearch = Literal["none", "moment", "cycles", "width", "shape", "load"]
+# Largest step of a period or a time constant, as a share of it; largest change in one step.
+_SHAPE_STEP, _SHAPE_CHANGE = 0.3, 2.0
+# Two moments at one place are told apart; further ones are a drift.
+_MOST_MOMENTS = 2
+# Step of numerical derivatives by a camera's parameters.
+_STEP = 1e-6
+
+
+class EffectType(ABC):
+    """One way in which reality may differ from the simulation.
+
+    Attributes:
+        name: as in `diagnosis.json`.
+        stage: the stage of the simulation at which it acts.
+        rank: its place in lists among the effects of its stage; of equal rank, by name.
+        at_joint: True if it acts at a joint.
+        takes_source: True if another joint causes it.
+        turns_only: True if only a revolute joint can have it.
+        needs_times: True if it needs times, not only an order.
+        needs_stereo: True if it needs the stereo calibration.
+        needs_weight: True if it needs joints that bear the arm's weight, and its masses.
+        in_parts: True if only some of its amounts may differ from nominal, as where a link is too long but straight.
+        rigid: True if a rigid chain can hold it.
+        is_spring: True if its joint yields in proportion to its load.
+        is_load: True if it is a mass that the URDF does not state.
+        moves_joints: True if the true joint angles differ from the readings.
+        is_zero: True for the zero of a joint, which is often wrong at several joints.
+        of_drive: True for a periodic error, of which every drive has a little.
+        absorbed_by: names of the effects that can stand for it.
+        stays_as: name of its permanent form, for an effect that begins at a moment.
+        drifts: True if it grows with time.
+        remembers: True if it depends on earlier readings.
+        by_direction: True if only the direction of the moves counts for it, and not their size.
+        is_linear: True if it is proportional to its amounts.
+        search: how its last parameter is searched.
+        refines: True if to first order it looks like a simpler effect, in whose place it is tried.
+        further_trials: factor on the number of shapes tried, for one that has a shape more than a simpler effect.
+        no_counterpart: reason why a model of the arm does not hold it.
+    """
+
+    name: ClassVar[str]
+    stage: ClassVar[Stage]
+    rank: ClassVar[int] = 100
+    at_joint: ClassVar[bool] = False
+    takes_source: ClassVar[bool] = False
+    turns_only: ClassVar[bool] = False
+    needs_times: ClassVar[bool] = False
+    needs_stereo: ClassVar[bool] = False
+    needs_weight: ClassVar[bool] = False
+    in_parts: ClassVar[bool] = False
+    rigid: ClassVar[bool] = False
+    is_spring: ClassVar[bool] = False
+    is_load: ClassVar[bool] = False
+    moves_joints: ClassVar[bool] = False
+    is_zero: ClassVar[bool] = False
+    of_drive: ClassVar[bool] = False
+    absorbed_by: ClassVar[tuple[str, ...]] = ()
+    stays_as: ClassVar[str | None] = None
+    drifts: ClassVar[bool] = False
+    remembers: ClassVar[bool] = False
+    by_direction: ClassVar[bool] = False
+    is_linear: ClassVar[bool] = True
+    search: ClassVar[ShapeSearch] = "none"
+    refines: ClassVar[bool] = False
+    further_trials: ClassVar[int] = 1
+    no_counterpart: ClassVar[str] = "this effect has no counterpart there"
+
+    @abstractmethod
+    def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
+        """Return its parameters at a revolute or prismatic joint; equal where it acts at no joint."""
+
+    @abstractmethod
+    def jacobian(self, run: Simulated, effect: Effect) -> FloatArray:
+        """Return derivatives (n, 3, p) of the measurements by the effect's values; zeros for those not amounts."""
+
+    @cached_property
+    def turning(self) -> tuple[Parameter, ...]:
+        """Parameters at a revolute joint, or at none."""
+        return self.parameters(False)
+
+    @cached_property
+    def sliding(self) -> tuple[Parameter, ...]:
+        """Parameters at a prismatic joint."""
+        return self.parameters(True)
+
+    @cached_property
+    def begins(self) -> bool:
+        """True if it begins at a moment, its last parameter `t0`."""
+        return "t0" in [parameter.name for parameter in self.turning]
+
+    @property
+    def encoder(self) -> EncoderEffect | None:
+        """The effect, if it is one of the first stage."""
+        return None
+
+    @property
+    def depends_on_path(self) -> bool:
+        """True if it depends on the path between two readings, which was not observed."""
+        return self.remembers
+
+    @property
+    def changes_with_time(self) -> bool:
+        """True if it makes the same pose measure differently later, as correlated noise does."""
+        return self.begins or self.drifts
+
+    @property
+    def is_transient(self) -> bool:
+        """True if it is gone once the arm is at rest and warm."""
+        return self.depends_on_path or self.drifts
+
+    @property
+    def is_periodic(self) -> bool:
+        """True if its last parameter is a number of cycles per turn or metre."""
+        return self.search == "cycles"
+
+    @property
+    def most_at_one_place(self) -> int:
+        """Maximum of effects of this type at one place."""
+        return _MOST_MOMENTS if self.begins else 1
+
+    def is_free(self, robot: RobotDescription) -> bool:
+        """Return True if robot.toml does not know what it changes: it is fitted first, and never a finding."""
+        return False
+
+    def trial_shapes(self, motion: Motion) -> FloatArray:
+        """Return the values (m,) of its last parameter that are tried, in increasing order."""
+        raise NotImplementedError(f"{self.name} has no shape to search")
+
+    def growth(self, motion: Motion, shape: float) -> FloatArray:
+        """Return the share of its amounts (n,) that has developed, for a drift whose last parameter is `shape`."""
+        raise NotImplementedError(f"{self.name} does not grow")
+
+    def shape_step(self, run: Simulated, effect: Effect, k: int) -> float:
+        """Return the largest step of value k, a smooth shape, for which its derivative is still valid."""
+        return _SHAPE_STEP * float(effect.values[k])
+
+    def bounded(self, effect: Effect, k: int, value: float, motion: Motion) -> float:
+        """Limit value k, a smooth shape, to its valid range and to one step from the present one."""
+        return float(np.clip(value, effect.values[k] / _SHAPE_CHANGE, _SHAPE_CHANGE * effect.values[k]))
+
+    def unknown_state(self, run: Simulated, effect: Effect) -> NDArray[np.bool_]:
+        """Return rows (n,) at which its state is not known well enough, as before the first contact of a backlash."""
+        return np.zeros(len(run.motion), dtype=np.bool_)
+
+    def correction_values(self, effect: Effect) -> list[float] | None:
+        """Return its values for the readings' corrections in correction.json; None if the format has no such entry."""
+        return None
+
+    def add_to(self, joint: JointErrors, effect: Effect) -> str | None:
+        """Add it to the errors of its joint for a rigid-body simulator; return the reason if it cannot be added."""
+        return self.no_counterpart
+
+    def finding(self, at: str, numbers: Mapping[str, float]) -> str:
+        """Describe it in a clause, where `diagnosis.presenters` has no sentence. `at` names the joint, if any."""
+        amounts = ", ".join(f"{name} = {value:.3g}" for name, value in numbers.items())
+        return f"{at or 'the arm'} has {self.name.replace('_', ' ')} ({amounts})"
+
+    def remedy(self, at: str) -> str:
+        """Return a remedy, where `diagnosis.presenters` has none."""
+        return f"See what could cause it{f' at {at}' if at else ''}; extended.toml takes it into account"
+
+
+class StructureEffect(EffectType):
+    """An effect on the links' poses: a moved joint frame, or a joint that yields under the arm's weight.
+
+    Attributes:
+        has_slack: True if `slack` gives a deflection.
+    """
+
+    stage = "structure"
+    has_slack: ClassVar[bool] = False
+
+    def frame(self, values: FloatArray) -> FloatArray | None:
+        """Return the pose (4, 4) of its joint's frame in the nominal frame; None if it does not move it."""
+        return None
+
+    def compliance(self, values: FloatArray) -> float:
+        """Return the deflection of its joint per load [rad/(N·m), m/N]."""
+        return 0.0
+
+    def slack(self, torque: FloatArray, values: FloatArray, side: float) -> tuple[FloatArray, float]:
+        """Return the further deflection of its joint (n,) [rad, m] under a torque (n,), and its side at the last row.
+
+        Args:
+            side: before the first row: 1 or -1; 0 if unknown.
+        """
+        return np.zeros_like(torque), side
+
+    def load(self, robot: RobotDescription, values: FloatArray) -> GravityLoad | None:
+        """Return the load of a mass that the URDF does not state; None without one."""
+        return None
+
+    def point_mass(self, values: FloatArray) -> PointMass | None:
+        """Return this mass, its centre in the marker's link; None without one."""
+        return None
+
+
+class ToolEffect(EffectType):
+    """An effect on the marker's place in its link, from its moment on if it has one."""
+
+    stage = "tool"
+
+    @abstractmethod
+    def shift(self, values: FloatArray) -> FloatArray:
+        """Return the marker's displacement (3,) [m] in its link."""
+
+
+class CameraEffect(EffectType):
+    """An effect on the camera's pose, or on the positions that it reports.
+
+    One that is none of these overrides `reported` and sets `alters_report`; its derivative is then taken numerically.
+    """
+
+    stage = "camera"
+    no_counterpart = "an error of the measurement, not of the arm"
+    alters_report: ClassVar[bool] = False
+
+    def pose(self, values: FloatArray) -> FloatArray | None:
+        """Return the camera's pose (4, 4) in its frame before, from its moment on if it has one; None if unmoved."""
+        return None
+
+    def optics(self, values: FloatArray) -> Optics | None:
+        """Return the differences of the lenses from the calibration; None without any."""
+        return None
+
+    def reported(
+        self, x: FloatArray, motion: Motion, values: FloatArray, calibration: StereoCalibration | None
+    ) -> FloatArray:
+        """Return the points that are reported (n, 3) [m] in the place of those otherwise reported x (n, 3) [m]."""
+        return x
+
+    def jacobian(self, run: Simulated, effect: Effect) -> FloatArray:
+        """Return derivatives (n, 3, p) of the measurements by the effect's values, by central differences."""
+        columns = np.zeros((len(run.motion), 3, len(effect.values)))
+        for k in effect.all_amounts:
+            step = np.zeros(len(effect.values))
+            step[k] = _STEP
+            ends = (run.simulation.having(effect.with_values(effect.values + s * step)) for s in (1.0, -1.0))
+            more, less = (simulation.reported(run.x_camera, run.motion) for simulation in ends)
+            columns[:, :, k] = (more - less) / (2.0 * _STEP)
+        return columns
+
+
+class TimeEffect(EffectType):
+    """An effect of time: a delay of the images, or a drift of what is measured."""
+
+    stage = "time"
+    needs_times = True
+    no_counterpart = "it depends on time"
+
+    def delay_s(self, values: FloatArray) -> float:
+        """Return the delay of the images' time stamps [s]."""
+        return 0.0
+
+    def drift(self, motion: Motion, values: FloatArray) -> FloatArray | None:
+        """Return the shift (n, 3) [m] that is added to what is measured; None without one."""
+        return None

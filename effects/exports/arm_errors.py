@@ -1,0 +1,103 @@
+"""Sort the effects of a simulation by joint, and tell which a rigid-body simulator cannot hold."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Self
+
+from bodyschema.effects.effect import Effect
+from bodyschema.effects.effect_type import StructureEffect
+from bodyschema.effects.joint_errors import JointErrors
+from bodyschema.effects.simulation import Simulation
+from bodyschema.robot.urdf import PointMass
+
+BORNE_BY_HAND = 'with hold = "torque_free" the guiding hand bore the weight'
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """An effect that a format cannot hold, with the reason."""
+
+    effect: Effect
+    why: str
+
+
+def sentences(left_out: Iterable[LeftOut]) -> list[str]:
+    """Return one sentence for each kind of effect that is left out."""
+    places: dict[tuple[str, str], list[str]] = {}
+    for each in left_out:
+        effect = each.effect
+        source = "" if effect.source is None else f" from {effect.source}"
+        places.setdefault((effect.name, each.why), []).append(f"{effect.where}{source}" if effect.where else "")
+    told = []
+    for (name, why), at in places.items():
+        count = f"{len(at)} " if len(at) > 1 else ""
+        told.append(f"not in the file: {count}{name}{' at ' if at[0] else ''}{', '.join(dict.fromkeys(at))}: {why}")
+    return told
+
+
+def numbers(effect: Effect) -> str:
+    """Return the values of an effect with their names, in readable form."""
+    return ", ".join(f"{p.name} = {value:.4g}" for p, value in zip(effect.parameters, effect.values, strict=True))
+
+
+@dataclass(frozen=True)
+class ArmErrors:
+    """Effects of a simulation after its moments have passed, sorted by joint.
+
+    Attributes:
+        joints: errors of every joint of the robot.
+        payloads: masses on the marker's link that the URDF does not state, their centres in its frame [m].
+        left_out: effects that a rigid-body simulator cannot hold.
+        notes: sentences on effects that are held in another form than found.
+    """
+
+    simulation: Simulation
+    joints: dict[str, JointErrors]
+    payloads: tuple[PointMass, ...]
+    left_out: tuple[LeftOut, ...]
+    notes: tuple[str, ...]
+
+    @classmethod
+    def of(cls, simulation: Simulation) -> Self:
+        """Sort the effects of a simulation."""
+        stayed = simulation.after_moments
+        joints = {joint: JointErrors() for joint in simulation.robot.joints}
+        payloads: list[PointMass] = []
+        left_out: list[LeftOut] = []
+        for effect in stayed.all_effects:
+            if effect.kind.rigid and not effect.kind.is_zero:
+                continue
+            if effect.kind.needs_weight and not simulation.bears_weight:
+                why = BORNE_BY_HAND
+            elif isinstance(effect.kind, StructureEffect) and (mass := effect.kind.point_mass(effect.values)):
+                payloads.append(mass)
+                why = None
+            elif effect.where is None:
+                why = effect.kind.no_counterpart
+            else:
+                why = effect.kind.add_to(joints[effect.where], effect)
+            if why is not None:
+                left_out.append(LeftOut(effect, why))
+        return cls(stayed, joints, tuple(payloads), tuple(left_out), tuple(moment_notes(simulation)))
+
+    def told(self) -> list[str]:
+        """Return sentences on effects that are not in the file, or in another form."""
+        told = sentences(self.left_out)
+        return [*told, *residual_note(self.simulation), *self.notes]
+
+
+def residual_note(simulation: Simulation) -> list[str]:
+    """Return a sentence on the unexplained part, if there is one."""
+    if simulation.residual is None:
+        return []
+    return ["not in the file: [unexplained]: a learnt map of the readings has no counterpart there"]
+
+
+def moment_notes(simulation: Simulation) -> Iterator[str]:
+    """Yield a sentence on each effect that began at a moment."""
+    for effect in simulation.all_effects:
+        if effect.kind.begins:
+            at = "" if effect.where is None else f" at {effect.where}"
+            yield f"{effect.name}{at}: the file has the arm as it is after t0 = {effect.value('t0'):g}"

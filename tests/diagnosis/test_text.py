@@ -1,0 +1,86 @@
+"""Causes in words, and what to do about them."""
+
+from __future__ import annotations
+
+from bodyschema.diagnosis.result import Cause, Errors, Gain, Indistinguishable, Interval, Tolerances
+from bodyschema.diagnosis.text import finding, made_to, sentence
+
+SHIFT = {"x_m": 0.001, "y_m": 0.0, "z_m": 0.0}
+TURN = {"rx_rad": 0.0, "ry_rad": 0.01, "rz_rad": 0.0}
+
+
+def _link(untold_m: float) -> Cause:
+    """Return a link whose shift in x and turns are identified, and whose other shifts are not."""
+    told = {name: Interval(value, (value - 1e-4, value + 1e-4)) for name, value in (SHIFT | TURN).items()}
+    untold = {name: Interval(0.05, (0.05 - untold_m, 0.05 + untold_m)) for name in ("y_m", "z_m")}
+    return Cause("link_geometry", "elbow", None, told | untold, 1.0, 100.0, 80.0, 100.0, (), (), "")
+
+
+def test_a_link_that_only_turns_is_off_by_an_angle_alone():
+    assert finding("link_geometry", "elbow", None, TURN) == "the link before joint elbow is off by 0.57°"
+
+
+def test_a_link_that_is_off_in_some_directions_has_them_named():
+    said = finding("link_geometry", "elbow", None, {"x_m": 0.003, "z_m": 0.004, "ry_rad": 0.01})
+    assert said == "the link before joint elbow is off by 5 mm in x and z and 0.57° about y"
+
+
+def test_a_shift_that_the_recording_does_not_tell_is_in_no_sentence():
+    errors = Errors(5.0, 5.0, 1.0, 1.0, 0.9)
+    assert "1 mm in x and 0.57°" in sentence("explained", [_link(1.0)], errors, Gain(80.0, (75.0, 85.0)))
+
+
+def test_a_gain_on_fitted_pairs_alone_is_called_none():
+    errors = Errors(5.0, 3.6, 1.8, 3.9, 0.7)
+    said = sentence("unexplained", [_link(1.0)], errors, Gain(-9.0, (-20.0, 2.0)))
+    assert "no others" in said
+    assert "-9" not in said
+
+
+def test_the_sentence_tells_what_the_smooth_model_adds():
+    errors = Errors(10.0, 10.0, 5.0, 2.0, 1.9)
+    said = sentence("unexplained", [_link(1.0)], errors, Gain(80.0, (75.0, 85.0)), named_mm=6.0)
+    assert "10 → 2 mm on held-out data, 6 mm without the smooth model" in said
+
+
+def _zero(joint: str, probability: float = 1.0, share: float = 10.0) -> Cause:
+    rival = Indistinguishable("link_geometry", joint, None, "this_motion", 1.0 - probability)
+    rivals = (rival,) if probability < 1.0 else ()
+    numbers = {"offset_rad": Interval(0.02, (0.019, 0.021))}
+    return Cause("joint_offset", joint, None, numbers, probability, share, share, 100.0, (), rivals, "")
+
+
+def test_the_headline_of_many_causes_fits_two_lines():
+    causes = [_zero(f"joint_{k}", share=10.0 + k) for k in range(6)]
+    said = sentence("explained", causes, Errors(5.0, 5.0, 1.0, 1.0, 0.9), Gain(80.0, (75.0, 85.0)), tolerated_mm=3.0)
+    assert "joint_5" in said
+    assert "4 smaller causes" in said
+    assert len(said) < 2 * 96
+
+
+def test_an_undecided_headline_names_what_is_unsure():
+    causes = [_zero("elbow", 0.6), _zero("wrist")]
+    said = sentence("undecided", causes, Errors(5.0, 5.0, 1.0, 1.0, 0.9), Gain(80.0, (75.0, 85.0)))
+    assert said.endswith("Not sure: joint_offset at elbow; other causes explain as much")
+
+
+def test_an_instrument_is_not_called_a_camera():
+    assert finding("camera_moved", None, None, SHIFT, "instrument") == "the instrument moved by 1 mm"
+
+
+def test_a_slides_ripple_is_told_where_its_pitch_is_unsure():
+    numbers = {
+        "amplitude_m": Interval(2e-4, (1e-4, 3e-4)),
+        "phase_rad": Interval(0.0, (-9.0, 9.0)),
+        "cycles_per_m": Interval(10.0, (-90.0, 110.0)),
+    }
+    cause = Cause("joint_ripple", "lift", None, numbers, 1.0, 100.0, 80.0, 100.0, (), (), "")
+    said = sentence("explained", [cause], Errors(5.0, 5.0, 1.0, 1.0, 0.9), Gain(80.0, (75.0, 85.0)))
+    assert "joint lift has a ripple of ±0.2 mm, 10 times a metre" in said.lower()
+
+
+def test_tolerances_that_do_not_show_are_told_by_what_they_are_at_most():
+    size, none = Interval(0.3, (0.2, 0.4)), Interval(0.01, (0.0, 0.02))
+    assert made_to(Tolerances(size, none, none)) == (
+        "The arm is made to about 0.3 mm and 0.02° or better; its drives run true to ±0.02° or better."
+    )

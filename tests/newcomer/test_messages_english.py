@@ -1,0 +1,68 @@
+"""Messages for people use plain words: a list of what they avoid."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+ROOMS = (
+    *("calibration", "cli", "daemon", "dashboard", "drivers", "fleet", "interfaces"),
+    *("kbmaps", "learning", "recordings", "robot", "sim_backend"),
+)
+INSTEAD = {
+    r"anew": "again",
+    r"mend(s|ed|ing)?": "fix, correct",
+    r"nobody": "no one, no program",
+    r"somebody|whoever": "a program, the user",
+    r"is told|are told|was told|be told": "is reported",
+    r"tells (why|which|whether|of|how)|does not tell|cannot tell": "shows, reports",
+    r"as drawn|is none": "nominal; is invalid",
+    r"the judge|judged": "the evaluation",
+}
+WORDS = re.compile(rf"\b({'|'.join(INSTEAD)})\b", re.IGNORECASE)
+# The views of a diagnosis quote its sentences.
+OF_DIAGNOSIS = re.compile(r"diagnosis_(run|view)\.py$")
+
+
+def _docstrings(tree: ast.Module) -> set[int]:
+    found = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    commands = (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"))
+    return found - {id(node.body[0].value) for node in commands if isinstance(node.body[0], ast.Expr)}
+
+
+def avoided(source: str, *, with_docstrings: bool) -> Iterator[str]:
+    """Yield the avoided words in the messages of a module; docstrings are what `--help` prints of a command."""
+    tree = ast.parse(source)
+    skipped = _docstrings(tree)
+    if not with_docstrings:
+        skipped = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        if (
+            isinstance(node, ast.Constant)
+            and isinstance(node.value, str)
+            and " " in node.value
+            and id(node) not in skipped
+        ):
+            yield from (f"line {node.lineno}: {found[0]}" for found in WORDS.finditer(node.value))
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_messages_avoid_the_words_of_the_list(room: str) -> None:
+    files = [file for file in (ROOT / room).rglob("*.py") if not OF_DIAGNOSIS.search(file.name)]
+    found = {
+        str(file.relative_to(ROOT)): words
+        for file in files
+        if (words := list(avoided(file.read_text("utf-8"), with_docstrings="commands" in file.parts)))
+    }
+    assert found == {}
+
+
+def test_an_avoided_word_is_found() -> None:
+    assert list(avoided('raise Error(f"{port} is opened anew")', with_docstrings=False)) == ["line 1: anew"]
+    assert list(avoided('"""Nobody reads this."""', with_docstrings=False)) == []
+    assert list(avoided('def run():\n    """Whoever runs."""', with_docstrings=True)) == ["line 2: Whoever"]
