@@ -29,12 +29,16 @@ class KernelBuildHook(BuildHookInterface):
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         """Compile the kernels, or report why not and leave the wheel pure Python."""
-        mend_links(Path(self.root, PACKAGE))
+        # The maths has a pyproject.toml of its own, in its folder.
+        root, place = Path(self.root), LIBRARY
+        if (root / PACKAGE).is_dir():
+            mend_links(root / PACKAGE)
+        else:
+            root, place = root.parent, Path(LIBRARY).name
         if os.environ.get("BODYSCHEMA_PURE", "") not in ("", "0"):
             return
-        root = Path(self.root)
-        library = root / LIBRARY if version == "editable" else Path(self._scratch()) / Path(LIBRARY).name
-        complaint = compile_kernels(root, library)
+        library = Path(self.root, place) if version == "editable" else Path(self._scratch()) / Path(LIBRARY).name
+        complaint = compile_kernels(root / SOURCES, library)
         if complaint:
             self.app.display_warning(
                 "kbmaps: no compiled kernels, its NumPy path is used instead (slower, otherwise the same). "
@@ -47,7 +51,7 @@ class KernelBuildHook(BuildHookInterface):
         build_data["pure_python"] = False
         build_data["tag"] = f"{ABI_TAG}-{platform}"
         if version != "editable":
-            build_data["force_include"][str(library)] = LIBRARY
+            build_data["force_include"][str(library)] = place
 
     def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:  # noqa: ARG002
         """Remove the temporary files of the wheel build."""
@@ -75,12 +79,12 @@ def mend_links(folder: Path) -> None:
         file.symlink_to(target)
 
 
-def compile_kernels(root: Path, library: Path) -> str:
+def compile_kernels(folder: Path, library: Path) -> str:
     """Compile the sources into the library; return what went wrong, or nothing."""
     library.unlink(missing_ok=True)
     compiler = shlex.split(os.environ.get("CC") or sysconfig.get_config_var("CC") or "cc")
     include = sysconfig.get_path("include")
-    sources = sorted(str(path) for path in (root / SOURCES).glob("*.c"))
+    sources = sorted(str(path) for path in folder.glob("*.c"))
     flags = [*FLAGS, *shlex.split(os.environ.get("CFLAGS", "")), f"-I{include}"]
     command = [*compiler, *flags, *sources, "-o", str(library), "-lm"]
     try:

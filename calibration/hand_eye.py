@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Self
 
@@ -12,10 +13,9 @@ from scipy.spatial.transform import Rotation
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.interfaces.whole_files import write_whole
-from bodyschema.robot.rpy import rotation_of
 
 LAUNCH = "hand_eye.launch.py"
-_STEP = 1e-6  # of the numerical derivative by roll, pitch and yaw [rad]
+_STEP = 1e-6  # of the numerical derivative of a pose [m, rad]
 _PUBLISHER = "static_transform_publisher"
 
 
@@ -63,17 +63,18 @@ def in_shell_lines(pose: HandEye) -> str:
     return " \\\n".join([command, *("   " + "".join(f" --{option}" for option in row) for row in rows)])
 
 
-def covariance_of_turns(rpy: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return the covariance (6, 6) of place and turns about the parent's axes.
+def pose_covariance(pose: Callable[[FloatArray], FloatArray], values: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return the covariance (6, 6) of a pose's place [m] and turns about the parent's axes [rad].
 
     Args:
-        rpy: roll, pitch, yaw (3,) [rad].
-        covariance: (6, 6) of x, y, z, roll, pitch, yaw.
+        pose: the pose (4, 4) for values such as `values` (p,).
+        covariance: of the values, shape (p, p).
     """
-    jacobian, here = np.eye(6), rotation_of(rpy)
-    for k in range(3):
-        moved = rotation_of(rpy + _STEP * np.eye(3)[k]) @ here.T
-        jacobian[3:, 3 + k] = Rotation.from_matrix(moved).as_rotvec() / _STEP
+    here, jacobian = pose(values), np.empty((6, len(values)))
+    for k in range(len(values)):
+        moved = pose(values + _STEP * np.eye(len(values))[k])
+        jacobian[:3, k] = (moved[:3, 3] - here[:3, 3]) / _STEP
+        jacobian[3:, k] = Rotation.from_matrix(moved[:3, :3] @ here[:3, :3].T).as_rotvec() / _STEP
     return jacobian @ covariance @ jacobian.T
 
 

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from bodyschema.calibration.chain_figures import ChainFigures
-from bodyschema.calibration.hand_eye import HandEye, covariance_of_turns
+from bodyschema.calibration.hand_eye import HandEye, pose_covariance
 from bodyschema.calibration.plausibility.check import Plausibility
 from bodyschema.calibration.rigid_chain import Calibration, Trusted
 from bodyschema.calibration.tool_jump import tool_jump
@@ -17,6 +17,7 @@ from bodyschema.learning.solvers.tolerance_selection import WORKMANSHIP
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.calibrated_files import CAMERA_LINK
 from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.rpy import pose_of
 
 # A joint that moved less is named [rad, m].
 STILL_RAD, STILL_M = math.radians(10.0), 0.02
@@ -191,7 +192,7 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def _hand_eye(robot: RobotDescription, figures: ChainFigures, frame: str) -> HandEye:
-    covariance = covariance_of_turns(figures.values[3:6], figures.covariance[:6, :6])
+    covariance = pose_covariance(lambda v: pose_of(v[:3], v[3:]), figures.values[:6], figures.covariance[:6, :6])
     return HandEye.of(robot.camera.parent_link, frame, figures.geometry.T_parent_camera, covariance)
 
 

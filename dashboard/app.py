@@ -86,7 +86,7 @@ class PageCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Command of a button of the page; reset and torque are not available."""
 
     process: Process
-    command: Literal["pause", "resume", "tool_changed"]
+    command: Literal["pause", "resume", "tool_changed", "rollback"]
 
 
 class Commands(Protocol):
@@ -95,6 +95,18 @@ class Commands(Protocol):
     def command(self, process: Process, name: CommandName) -> str:
         """Return the process's reply; BusError if it does not answer, RequestError if it refuses."""
         ...
+
+
+class Pictures(Protocol):
+    """Gives pictures of the cameras."""
+
+    def picture(self) -> bytes:
+        """Return the newest one as JPEG; BusError if no sampler with cameras answers, RequestError before the first."""
+        ...
+
+
+class Processes(Commands, Pictures, Protocol):
+    """Both processes, as far as the page needs them."""
 
 
 class Diagnosing(Protocol):
@@ -113,7 +125,7 @@ class Diagnosing(Protocol):
         ...
 
 
-def application(hub: Hub, commands: Commands, diagnoses: Diagnosing) -> Starlette:
+def application(hub: Hub, processes: Processes, diagnoses: Diagnosing) -> Starlette:
     """Return the page's application on the documents of `hub`."""
 
     async def index(_: Request) -> Response:
@@ -132,8 +144,14 @@ def application(hub: Hub, commands: Commands, diagnoses: Diagnosing) -> Starlett
 
     async def command(request: Request) -> Response:
         asked = decode(await _body(request), PageCommand)
-        message = await run_in_threadpool(commands.command, asked.process, asked.command)
+        message = await run_in_threadpool(processes.command, asked.process, asked.command)
         return Response(encode(CommandReply(asked.command, message)), media_type=_JSON)
+
+    async def picture(_: Request) -> Response:
+        try:
+            return Response(await run_in_threadpool(processes.picture), media_type="image/jpeg")
+        except (BusError, RequestError):  # the page hides its panel
+            return Response(status_code=204)
 
     async def diagnose(_: Request) -> Response:
         return JSONResponse({"number": await run_in_threadpool(diagnoses.start)}, status_code=202)
@@ -153,6 +171,7 @@ def application(hub: Hub, commands: Commands, diagnoses: Diagnosing) -> Starlett
         Route("/api/state", state),
         Route("/api/events", events),
         Route("/api/command", _explained(command), methods=["POST"]),
+        Route("/api/picture", picture),
         Route("/api/diagnosis", _explained(diagnose), methods=["POST"]),
         Route("/api/diagnosis", _explained(stop_diagnosing), methods=["DELETE"]),
         Route("/report", report),

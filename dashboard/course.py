@@ -23,7 +23,7 @@ class Series:
         t: float,
         *,
         error_m: float | None,
-        claimed_m: float | None,
+        expected_m: float | None,
         pairs_per_s: float | None,
         predict_s: float | None,
     ) -> None:
@@ -32,7 +32,7 @@ class Series:
         self._offered += 1
         if not is_kept:
             return
-        self._rows.append((t, error_m, claimed_m, pairs_per_s, predict_s))
+        self._rows.append((t, error_m, expected_m, pairs_per_s, predict_s))
         if len(self._rows) > LARGEST_SERIES:
             self._stride *= 2
             self._rows = self._rows[::2]

@@ -42,14 +42,14 @@ class SeriesDocument(msgspec.Struct, frozen=True):
     Attributes:
         t: UTC [s since 1970].
         error_m: error on new pairs of the answering model [m], measurement noise included; null while there is none.
-        claimed_m: distance to the truth that the learner predicts in its support [m].
+        expected_m: error that the learner expects on new pairs in its support, measurement noise included [m].
         pairs_per_s: accepted pairs.
         predict_s: round-trip time of one prediction [s]; null without an answer.
     """
 
     t: list[float]
     error_m: list[float | None]
-    claimed_m: list[float | None]
+    expected_m: list[float | None]
     pairs_per_s: list[float | None]
     predict_s: list[float | None]
 
@@ -133,6 +133,52 @@ class CloudDocument(msgspec.Struct, frozen=True):
     segment: list[int]
     median_m: float | None
     p95_m: float | None
+
+
+class OutlookDocument(msgspec.Struct, frozen=True):
+    """Expected gain of further pairs. All errors are those expected on new pairs, measurement noise included [m].
+
+    Attributes:
+        sentence: advice in words.
+        pairs: number of pairs that the forecast rests on.
+        now_m: where the arm has been, after these pairs.
+        further_pairs: numbers of further pairs.
+        like_so_far_m: after each number of further pairs, moving as so far.
+        best_motion: the motion that would reduce the error most, in words.
+        best_motion_m: after each number of further pairs of that motion.
+    """
+
+    sentence: str
+    pairs: int
+    now_m: float
+    further_pairs: list[int]
+    like_so_far_m: list[float]
+    best_motion: str
+    best_motion_m: list[float]
+
+
+class ArmDocument(msgspec.Struct, frozen=True):
+    """The arm at its newest pair, in the root link's frame [m].
+
+    Attributes:
+        pair: sequence number of the pair.
+        links: lines from joint to joint, and to the marker.
+        joints: places of the joints that move.
+        camera: origin of the measurement frame, and its axes x, y, z.
+        measured: the marker as it was measured.
+        predicted: the marker by the answering model; null without one.
+        apart_m: distance of both. The pair may be learnt already.
+        placed: true if the camera's pose is known.
+    """
+
+    pair: int
+    links: list[list[list[float]]]
+    joints: list[list[float]]
+    camera: list[list[float]]
+    measured: list[float]
+    predicted: list[float] | None
+    apart_m: float | None
+    placed: bool
 
 
 class DiagnosisDocument(msgspec.Struct, frozen=True):

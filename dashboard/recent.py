@@ -36,6 +36,10 @@ class RecentPairs:
         """Newest pair."""
         return self._pairs[-1] if self._pairs else None
 
+    def at(self, seq: int) -> Pair | None:
+        """Return the pair with this sequence number; None if it is not among them."""
+        return next((pair for pair in reversed(self._pairs) if pair.seq == seq), None)
+
     def add(self, pairs: Iterable[Pair]) -> None:
         """Append pairs."""
         self._pairs.extend(pairs)

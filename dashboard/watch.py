@@ -11,7 +11,6 @@ from types import TracebackType
 from typing import Any, Generic, Self, TypeVar
 
 from bodyschema.cli.recordings.recorder import History
-from bodyschema.cli.terminal.findings_view import outlook_sentence
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.command_names import CommandName
@@ -21,8 +20,10 @@ from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import CommandReply, CommandRequest, JointsRequest, PredictReply, decode, encode
 from bodyschema.dashboard.course import Course, Series
 from bodyschema.dashboard.documents import Process, ProcessDocument, RobotDocument
+from bodyschema.dashboard.expected import expected_error_m, expected_outlook
 from bodyschema.dashboard.hub import Hub
 from bodyschema.dashboard.recent import KEPT, RecentPairs, cloud
+from bodyschema.dashboard.scene import arm
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import BusError, RecordingError, RequestError
 from bodyschema.interfaces.protocols import Clock
@@ -90,6 +91,7 @@ log = logging.getLogger(__name__)
 EVERY_S = 1.0
 CLOUD_EVERY_S = 2.0
 PREDICT_LIMIT_S = 2.0
+PICTURE_EVERY_S = 0.5
 # Longer than a tool change or switching torque on takes.
 COMMAND_LIMIT_S = 10.0
 
@@ -110,6 +112,9 @@ class Watch:
         self._recent = RecentPairs()
         self._history: History | None = None
         self._store: str | None = None
+        self._predicted: tuple[int, PredictReply] | None = None
+        self._picture: tuple[float, bytes] | None = None
+        self._picturing = threading.Lock()
         self._cloud_of: tuple[str, int] | None = None
         self._cloud_at = -CLOUD_EVERY_S
         self._stopping = threading.Event()
@@ -143,6 +148,20 @@ class Watch:
         payload = encode(CommandRequest(name))
         reply = self._sessions[process].ask_one(self._keys.command(process), payload, timeout_s=COMMAND_LIMIT_S)
         return decode(reply, CommandReply).message
+
+    def picture(self) -> bytes:
+        """Return the sampler's newest camera picture with detections, as JPEG; at most one request each half second.
+
+        Raises:
+            BusError: the sampler does not answer, or has no cameras.
+            RequestError: no frame has come yet.
+        """
+        with self._picturing:
+            now = self._clock.now()
+            if self._picture is None or now - self._picture[0] > PICTURE_EVERY_S:
+                jpeg = self._sessions["sampler"].ask_one(self._keys.picture, timeout_s=PREDICT_LIMIT_S)
+                self._picture = now, jpeg
+            return self._picture[1]
 
     def history(self, newest: int) -> History:
         """Return the sampler's newest pairs, `newest` of them, to be read page by page.
@@ -183,21 +202,31 @@ class Watch:
         status = self._learner.status if self._learner.answers else None
         if status is not None:
             self._course.note(status, time.time())
-            outlook = status.outlook
-            self._hub.put("outlook", None if outlook is None else outlook_sentence(outlook))
+            self._hub.put("outlook", expected_outlook(status))
         self._hub.put("course", self._course.document)
         self._note_figures(status)
         if self._sampler.answers:
             self._catch_up()
         if status is not None:
             self._renew_cloud(status)
+        self._show_arm(status)
+
+    def _show_arm(self, learner: LearnerStatus | None) -> None:
+        newest = self._recent.newest
+        if newest is None:
+            return
+        # The prediction was asked for before newer pairs came.
+        seq, reply = self._predicted or (newest.seq, None)
+        pair = self._recent.at(seq) or newest
+        reply = reply if pair.seq == seq and learner is not None else None
+        self._hub.put("arm", arm(self._config.robot, pair, None if learner is None else learner.calibration, reply))
 
     def _note_figures(self, learner: LearnerStatus | None) -> None:
         sampler = self._sampler.status if self._sampler.answers else None
         self._series.add(
             time.time(),
             error_m=None if learner is None else learner.prequential_m.get(learner.answering),
-            claimed_m=None if learner is None else learner.claimed_error_m,
+            expected_m=None if learner is None else expected_error_m(learner, learner.claimed_error_m),
             pairs_per_s=None if sampler is None else sampler.pairs_per_s,
             predict_s=None if learner is None else self._predict_time(),
         )
@@ -209,10 +238,12 @@ class Watch:
         q = (0.5 * (robot.lower + robot.upper) if newest is None else newest.q).tolist()
         begin = time.perf_counter()
         try:
-            self._predict([q])
+            reply = self._predict([q])
         except (BusError, RequestError):
             return None
-        return time.perf_counter() - begin
+        took_s = time.perf_counter() - begin
+        self._predicted = None if newest is None else (newest.seq, reply)
+        return took_s
 
     def _predict(self, q: list[list[float]]) -> PredictReply:
         payload = encode(JointsRequest([*q]))
@@ -226,6 +257,7 @@ class Watch:
         restarted = self._history is not None and status.pairs < self._history.next_seq - 1
         if self._history is None or status.store != self._store or restarted:
             self._history, self._store, self._recent = self.history(KEPT), status.store, RecentPairs()
+            self._predicted = None
         had = len(self._recent), self._recent.newest
         while page := self._history.page():
             self._recent.add(page)

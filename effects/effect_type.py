@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.urdf import PointMass
 
 from .joint_errors import JointErrors
 from .motion import Motion
@@ -57,6 +58,7 @@ class EffectType(ABC):
         in_parts: True if only some of its amounts may differ from nominal, as where a link is too long but straight.
         rigid: True if a rigid chain can hold it.
         is_spring: True if its joint yields in proportion to its load.
+        is_load: True if it is a mass that the URDF does not state.
         moves_joints: True if the true joint angles differ from the readings.
         is_zero: True for the zero of a joint, which is often wrong at several joints.
         of_drive: True for a periodic error, of which every drive has a little.
@@ -84,6 +86,7 @@ class EffectType(ABC):
     in_parts: ClassVar[bool] = False
     rigid: ClassVar[bool] = False
     is_spring: ClassVar[bool] = False
+    is_load: ClassVar[bool] = False
     moves_joints: ClassVar[bool] = False
     is_zero: ClassVar[bool] = False
     of_drive: ClassVar[bool] = False
@@ -221,6 +224,10 @@ class StructureEffect(EffectType):
 
     def load(self, robot: RobotDescription, values: FloatArray) -> GravityLoad | None:
         """Return the load of a mass that the URDF does not state; None without one."""
+        return None
+
+    def point_mass(self, values: FloatArray) -> PointMass | None:
+        """Return this mass, its centre in the marker's link; None without one."""
         return None
 
 

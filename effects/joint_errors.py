@@ -35,6 +35,7 @@ class JointErrors:
         ratios: share of each joint's reading that is added, by the joint; the joint's own is its scale error.
         waves: periodic errors.
         play: width of the backlash [rad, m].
+        loose: width [rad, m] of the backlash under gravity, and the friction [N·m, N] that holds it on its side.
         compliance: [rad/(N·m), m/N].
     """
 
@@ -42,6 +43,7 @@ class JointErrors:
     ratios: dict[str, float] = field(default_factory=dict)
     waves: list[Wave] = field(default_factory=list)
     play: float = 0.0
+    loose: tuple[float, float] | None = None
     compliance: float = 0.0
 
     def add_ratio(self, source: str, ratio: float) -> None:

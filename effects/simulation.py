@@ -259,10 +259,11 @@ class Simulation:
 
     def torques(self, q: FloatArray) -> FloatArray:
         """Return torques of gravity about the joints (n, d) [N·m, N], with payloads, at q (n, d)."""
-        return sum((load.torques(q) for load in self._payloads), self.gravity.torques(q))
+        return sum((load.torques(q) for load in self.payloads), self.gravity.torques(q))
 
     @cached_property
-    def _payloads(self) -> list[GravityLoad]:
+    def payloads(self) -> list[GravityLoad]:
+        """Loads of masses that the URDF does not state."""
         loads = [kind.load(self.robot, effect.values) for effect, kind in self._of(StructureEffect)]
         return [load for load in loads if load is not None]
 

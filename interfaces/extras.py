@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
+import sys
 from importlib.util import find_spec
+from pathlib import Path
 
 from bodyschema.interfaces.errors import ConfigError
 
@@ -16,6 +19,8 @@ MODULES = {
     "bags": ("rosbags",),
     "realsense": ("pyrealsense2",),
 }
+# Packages without wheels for some machines are no extras: installing all of them has to work everywhere.
+_ALONE = {"realsense": "pyrealsense2"}
 
 
 def require_extra(extra: str, what: str) -> None:
@@ -34,6 +39,22 @@ def missing_module(error: ModuleNotFoundError) -> ConfigError | None:
 def missing(module: str, extra: str, what: str) -> ConfigError:
     """Return the error for `what`, which needs `module`."""
     name = "OpenCV" if module == "cv2" else module
-    return ConfigError(
-        f"{what} needs {name}, which is not installed", remedy=f"Type: pip install 'bodyschema[{extra}]'"
-    )
+    if module == "pybullet" and (remedy := no_pybullet()):
+        return ConfigError(f"{what} needs pybullet", remedy=remedy)
+    return ConfigError(f"{what} needs {name}, which is not installed", remedy=f"Type: {install_command(extra)}")
+
+
+def install_command(extra: str) -> str:
+    """Return the command that adds an extra to this installation; it needs no published bodyschema."""
+    pip, here = shutil.which("pip"), Path(sys.executable).absolute().parent
+    own = pip is not None and Path(pip).absolute().parent == here
+    what = _ALONE.get(extra, f"'bodyschema[{extra}]'")
+    return f"{'pip' if own else f'{sys.executable} -m pip'} install {what}"
+
+
+def no_pybullet() -> str:
+    """Return what to do where pybullet has no wheel for this Python; empty where it has one."""
+    if sys.version_info < (3, 12):
+        return ""
+    found = f"{sys.version_info.major}.{sys.version_info.minor}"
+    return f"The simulator needs Python 3.11: pybullet has no wheel for {found}. All else works with {found}"

@@ -67,6 +67,8 @@ if TYPE_CHECKING:
     from kbmaps.trains.settings import TensorSettings
     from kbmaps.trains.train import TensorTrain
 
+__version__ = "0.1.0"
+
 __all__ = [
     "NLMS",
     "SUPPORT_LIMIT",

@@ -1,10 +1,11 @@
-"""The joints of a LeRobotDataset (Parquet, layouts 2.1 and 3.0), with marker positions from elsewhere.
+"""The joints of a LeRobotDataset (Parquet, layouts 2.1 and 3.0), and where its videos are.
 
 Needs the extra `export`. Times are those of the dataset, which start at 0 in each episode.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ import msgspec
 import numpy as np
 
 from bodyschema.interfaces.errors import RecordingError
+from bodyschema.interfaces.extras import install_command
 from bodyschema.robot.lerobot import Calibrations, JointServo, Unit
 from bodyschema.robot.limited import MOST_MEMORY_BYTES, bounded_memory, opened, read_at_most
 
@@ -45,8 +47,23 @@ class LeRobotUnits:
     unit: Unit | None = None
 
 
+@dataclass(frozen=True)
+class VideoPart:
+    """The part of a video file that shows one episode.
+
+    Attributes:
+        begin_s, end_s: from the first frame of the file.
+    """
+
+    file: Path
+    episode: int
+    begin_s: float = 0.0
+    end_s: float = math.inf
+
+
 class _Feature(msgspec.Struct, frozen=True):
     names: list[str] | dict[str, list[str]] | None = None
+    dtype: str = ""
 
 
 class _Info(msgspec.Struct, frozen=True):
@@ -89,6 +106,61 @@ def read_lerobot_dataset(source: Path, units: LeRobotUnits, marker: MarkerTrack)
     return joined(joints, JointTrack(t, q, episode.astype(np.int64)), marker, source)
 
 
+def video_parts(source: Path, camera: str) -> list[VideoPart]:
+    """Return where each episode is in the videos of `camera`, such as `observation.images.front`.
+
+    Raises:
+        RecordingError: the dataset has no such camera, or cannot be read.
+    """
+    info = _info(source)
+    cameras = [name for name, feature in info.features.items() if feature.dtype == "video"]
+    if camera not in cameras:
+        raise RecordingError(
+            f"the dataset has no video {camera}", file=source / INFO, remedy=f"It has {', '.join(cameras) or 'none'}"
+        )
+    videos = source / "videos"
+    if info.codebase_version.startswith("v2.1"):
+        files = sorted(videos.glob(f"chunk-*/{camera}/episode_*.mp4"))
+        parts = [VideoPart(file, int(file.stem.removeprefix("episode_"))) for file in files]
+    else:
+        keys = [f"videos/{camera}/{key}" for key in ("chunk_index", "file_index", "from_timestamp", "to_timestamp")]
+        parts = [
+            VideoPart(
+                videos / camera / f"chunk-{int(chunk):03d}" / f"file-{int(number):03d}.mp4", int(episode), begin, end
+            )
+            for episode, chunk, number, begin, end in _table(source / "meta" / "episodes", ["episode_index", *keys])
+        ]
+    if not parts:
+        raise RecordingError(f"there are no files of {camera}", file=videos, remedy="Download the dataset whole")
+    return parts
+
+
+def _table(folder: Path, columns: Sequence[str]) -> list[tuple[float, ...]]:
+    """Return the rows of these columns of all Parquet files in a folder."""
+    pyarrow, rows = _pyarrow(folder), list[tuple[float, ...]]()
+    for file in sorted(folder.rglob("*.parquet")):
+        try:
+            with bounded_memory(MOST_MEMORY_BYTES), opened(file, MOST_BYTES) as stream:
+                table = pyarrow.parquet.ParquetFile(stream).read(columns=list(columns))
+            numbers = np.column_stack([table.column(name).to_numpy().astype(np.float64) for name in columns])
+            if not np.isfinite(numbers).all():
+                raise ValueError("a number is missing or not finite")
+        except (pyarrow.ArrowException, KeyError, ValueError, TypeError, OSError) as error:
+            raise RecordingError(f"is no list of episodes: {error}", file=file) from error
+        rows += [tuple(row) for row in numbers.tolist()]
+    return rows
+
+
+def _pyarrow(source: Path) -> Any:
+    try:
+        import pyarrow.parquet
+    except ImportError as error:
+        raise RecordingError(
+            "a LeRobotDataset needs the extra `export`", file=source, remedy=f"Type: {install_command('export')}"
+        ) from error
+    return pyarrow
+
+
 def _info(source: Path) -> _Info:
     file = source / INFO
     try:
@@ -123,13 +195,7 @@ def _motor_names(info: _Info, source: Path) -> list[str]:
 
 def _rows(source: Path, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return states (n, k), times (n,) [s] and episodes (n,) of all files, in their order."""
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError as error:
-        raise RecordingError(
-            "a LeRobotDataset needs the extra `export`", file=source, remedy="Type: pip install 'bodyschema[export]'"
-        ) from error
+    pyarrow = _pyarrow(source)
     files = sorted((source / "data").rglob("*.parquet"))
     if not files:
         raise RecordingError("the dataset has no data/**/*.parquet", file=source, remedy="Download it whole")

@@ -19,6 +19,7 @@ import msgspec
 import numpy as np
 
 from bodyschema.interfaces.errors import RecordingError
+from bodyschema.interfaces.extras import install_command
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.recordings.recording import Recording
 
@@ -129,6 +130,6 @@ def _writer_type(file: Path) -> Any:
         raise RecordingError(
             "MCAP needs the extra `export`",
             file=file,
-            remedy="Install it with `pip install 'bodyschema[export]'`, or use CSV",
+            remedy=f"Install it with `{install_command('export')}`, or use CSV",
         ) from error
     return Writer

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from bodyschema.interfaces.errors import RecordingError
+from bodyschema.interfaces.extras import install_command
 from bodyschema.robot.limited import MOST_MEMORY_BYTES, bounded_memory, opened
 
 from .columns import MOST_NUMBERS, Fault, Table, check_finite, check_header, check_width
@@ -119,7 +120,7 @@ def _modules(file: Path) -> tuple[Any, Any]:
         raise RecordingError(
             "Parquet needs the extra `export`",
             file=file,
-            remedy="Install it with `pip install 'bodyschema[export]'`, or use CSV",
+            remedy=f"Install it with `{install_command('export')}`, or use CSV",
         ) from error
     return pyarrow, pyarrow.parquet
 

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from bodyschema.interfaces.errors import RecordingError
+from bodyschema.interfaces.extras import install_command
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.recordings.recording import Recording
 
@@ -81,5 +82,5 @@ def _rerun(file: Path) -> Any:
         raise RecordingError(
             "Rerun files need the extra `rerun`",
             file=file,
-            remedy="Install it with `pip install 'bodyschema[rerun]'`, or use CSV",
+            remedy=f"Install it with `{install_command('rerun')}`, or use CSV",
         ) from error

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from bodyschema.interfaces.errors import RecordingError
+from bodyschema.interfaces.extras import install_command
 from bodyschema.robot.limited import MOST_MEMORY_BYTES, bounded_memory, check_regular, read_at_most
 from bodyschema.robot.suggest import did_you_mean
 
@@ -130,7 +131,7 @@ def _opened(source: Path) -> Iterator[_Bag]:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise RecordingError(
-            "reading a ROS bag needs the extra `bags`", file=source, remedy="Type: pip install 'bodyschema[bags]'"
+            "reading a ROS bag needs the extra `bags`", file=source, remedy=f"Type: {install_command('bags')}"
         ) from error
     if not source.exists():
         raise RecordingError("there is no such file", file=source, remedy="Name a bag that is there")

@@ -21,7 +21,7 @@ from bodyschema.interfaces.records import FloatArray, frozen_array
 from bodyschema.robot.toml_types import Positive
 from kbmaps import RigidChain
 
-from .rpy import rotation_of, rpy_of
+from .rpy import pose_of, rpy_of
 from .toml_file import convert, line_of, read_toml
 from .urdf import MOVING, UrdfJoint, UrdfTree, chain_between
 
@@ -86,10 +86,7 @@ class CameraSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def pose(self) -> FloatArray:
         """Pose of the left optical frame in the parent link, shape (4, 4)."""
-        T = np.eye(4)
-        T[:3, :3] = rotation_of(np.array(self.rpy))
-        T[:3, 3] = self.xyz
-        return T
+        return pose_of(np.array(self.xyz), np.array(self.rpy))
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from typing import Any, Self
 import numpy as np
 
 from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.extras import missing
 from bodyschema.interfaces.records import FloatArray
 
 from .geometry import cross_matrix
@@ -30,9 +31,7 @@ def load_pybullet() -> Any:
         with _quiet():
             return importlib.import_module("pybullet")
     except ImportError as error:
-        raise ConfigError(
-            "the simulation needs pybullet, which is not installed", remedy="pip install 'bodyschema[sim]'"
-        ) from error
+        raise missing("pybullet", "sim", "the simulation") from error
 
 
 class Body:

@@ -6,8 +6,13 @@ from dataclasses import replace
 from types import TracebackType
 from typing import Protocol, Self
 
+import cv2
+
 from bodyschema.interfaces.protocols import StereoCamera
-from bodyschema.interfaces.records import MarkerFix, MarkerMiss, StereoFrame
+from bodyschema.interfaces.records import ImageArray, MarkerFix, MarkerMiss, StereoFrame
+
+# Pictures for a page beside other panels: about 100 kB.
+_WIDEST_PX, _QUALITY = 1280, 80
 
 
 class MarkerTracker(Protocol):
@@ -24,11 +29,20 @@ class MarkerTracker(Protocol):
         ...
 
 
+class Draws(Protocol):
+    """Interface of what draws a tracker's result into its frame."""
+
+    def drawn(self, frame: StereoFrame, seen: MarkerFix | MarkerMiss) -> ImageArray:
+        """Return all images side by side, with annotations."""
+        ...
+
+
 class TrackedCamera:
     """A `MarkerSource`: opens and closes the camera, and tracks the marker in every frame."""
 
-    def __init__(self, camera: StereoCamera, tracker: MarkerTracker) -> None:
-        self._camera, self._tracker = camera, tracker
+    def __init__(self, camera: StereoCamera, tracker: MarkerTracker, annotator: Draws | None = None) -> None:
+        self._camera, self._tracker, self._annotator = camera, tracker, annotator
+        self._newest: tuple[StereoFrame, MarkerFix | MarkerMiss] | None = None
 
     def __enter__(self) -> Self:
         self._camera.__enter__()
@@ -39,6 +53,16 @@ class TrackedCamera:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._camera.__exit__(kind, error, trace)
+
+    def picture(self) -> bytes | None:
+        """Return the newest frame with its detections as JPEG, from any thread; None before the first."""
+        newest = self._newest
+        if newest is None or self._annotator is None:
+            return None
+        drawn = self._annotator.drawn(*newest)
+        scale = min(1.0, _WIDEST_PX / drawn.shape[1])
+        small = cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        return cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
 
     def read(self, timeout_s: float) -> MarkerFix | MarkerMiss | None:
         """Return the marker in the next frame, or the reason for a miss; None if no frame came within `timeout_s`
@@ -53,4 +77,5 @@ class TrackedCamera:
         if frame is None:
             return None
         seen = self._tracker.track(frame)
+        self._newest = frame, seen
         return replace(seen, t_sigma=frame.t_sigma) if isinstance(seen, MarkerFix) else seen

@@ -9,9 +9,12 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from bodyschema.calibration.hand_eye import HandEye, pose_covariance
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.records import FloatArray
 from bodyschema.interfaces.whole_files import write_whole
 from bodyschema.vision.board import Board
 from bodyschema.vision.board.board import Pattern
@@ -77,7 +80,7 @@ class UnusableImage(msgspec.Struct):
 class CamerasFile(msgspec.Struct):
     """Output of `bodyschema calibrate cameras --json`. Half widths are those of 95 % intervals.
 
-    One camera alone has no baseline.
+    One camera alone has no baseline. `right_camera` is the pose of the right optical frame in the left one.
     """
 
     model: str
@@ -97,6 +100,8 @@ class CamerasFile(msgspec.Struct):
     unusable: list[UnusableImage]
     missing: list[str]
     size_was_measured: bool
+    right_camera: HandEye | None
+    schema: int = 1
 
 
 class CheckFile(msgspec.Struct):
@@ -259,6 +264,7 @@ def figures(result: Calibrated, found: Gathered, *, size_was_measured: bool) -> 
         unusable=[UnusableImage(each.name, each.eye, each.fault.why, each.fault.text) for each in found.unusable],
         missing=result.coverage.missing(),
         size_was_measured=size_was_measured,
+        right_camera=None if pair is None else _right_camera(pair),
     )
 
 
@@ -306,6 +312,18 @@ def check_figures(found: Check) -> CheckFile:
         square_half_width_mm=1e3 * NORMAL_95 * found.square_sigma_m,
         nominal_mm=1e3 * found.nominal_m,
     )
+
+
+def _right_camera(rig: StereoRig) -> HandEye:
+    """Return the pose of the right optical frame in the left one, with its covariance."""
+
+    def pose(values: FloatArray) -> FloatArray:
+        R_right_left, t = Rotation.from_rotvec(values[:3]).as_matrix(), values[3:]
+        return np.vstack([np.column_stack([R_right_left.T, -R_right_left.T @ t]), [0.0, 0.0, 0.0, 1.0]])
+
+    values = np.concatenate([rig.rotation_rad, rig.translation_m])
+    covariance = pose_covariance(pose, values, rig.covariance[-6:, -6:])
+    return HandEye.of("left_camera_optical_frame", "right_camera_optical_frame", pose(values), covariance)
 
 
 def _position_half_widths_mm(rig: StereoRig) -> tuple[float, float, float]:

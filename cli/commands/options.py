@@ -51,6 +51,10 @@ class SourceOptions:
     markers: Annotated[
         Path | None, Parameter(help="Of a bag or a dataset: a file with the marker's positions (t, x, y, z).")
     ] = None
+    video: Annotated[
+        str | None,
+        Parameter(help="Of a dataset: track the marker in this camera's videos, such as observation.images.front."),
+    ] = None
     lerobot_unit: Annotated[
         Literal["degrees", "range_m100_100"] | None,
         Parameter(help="Of a dataset: the unit of its readings, where they do not show it."),
@@ -73,6 +77,7 @@ class SourceOptions:
             self.marker_topic,
             self.marker_frame,
             self.markers,
+            self.video,
             lerobot,
             self.lerobot_unit,
             1e-3 * self.marker_delay_ms,

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bodyschema.cli.hardware.lerobot_robot import joint_servos
+from bodyschema.cli.recordings.dataset_video import markers_in_video
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.servos import require_servos
 from bodyschema.interfaces.errors import RecordingError
@@ -25,6 +26,7 @@ class Taken:
 
     Attributes:
         joint_topic, marker_topic, marker_frame: of a bag; see `BagTopics`.
+        video: of a dataset: the camera in whose videos the marker is tracked.
         markers: a file with the marker's positions: t, x, y, z, and in `segment` the episode.
         lerobot: LeRobot's calibration of the arm that a dataset was recorded with.
         lerobot_unit: of a dataset's readings.
@@ -35,6 +37,7 @@ class Taken:
     marker_topic: str | None = None
     marker_frame: str | None = None
     markers: Path | None = None
+    video: str | None = None
     lerobot: Path | None = None
     lerobot_unit: Unit | None = None
     delay_s: float = 0.0
@@ -50,11 +53,14 @@ def opened(config: Config, source: Path, taken: Taken) -> Recording:
     marker = None if taken.markers is None else read_marker_track(taken.markers)
     joints = config.robot.joints
     if is_lerobot_dataset(source):
+        if marker is None and taken.video is not None:
+            marker = markers_in_video(config, source, taken.video)
         if marker is None:
             raise RecordingError(
                 "a LeRobotDataset has no marker positions",
                 file=source,
-                remedy="Give the marker's positions with --markers FILE.csv: t, x, y, z, and the episode as segment",
+                remedy="Name its camera with --video observation.images.NAME, or give the marker's positions with "
+                "--markers FILE.csv: t, x, y, z, and the episode as segment",
             )
         return read_lerobot_dataset(source, _units(config, source, taken), marker.earlier(taken.delay_s))
     if is_bag(source):

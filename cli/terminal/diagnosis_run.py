@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from bodyschema.calibration.hand_eye import HandEye
+from bodyschema.calibration.hand_eye import HandEye, pose_covariance
 from bodyschema.calibration.plausibility.check import plausibility, told_sigma
 from bodyschema.calibration.plausibility.limits import require_units
 from bodyschema.cli.recordings.recorder import History
@@ -28,8 +28,9 @@ from bodyschema.diagnosis.report.result import DiagnosisFile
 from bodyschema.diagnosis.report.text import modelled, remedies
 from bodyschema.diagnosis.search.hypotheses import STILL
 from bodyschema.effects import EFFECT_TYPES, write_corrected, write_extended
+from bodyschema.effects.effect_type import CameraEffect
 from bodyschema.interfaces.errors import BodyschemaError, RecordingError, RequestError
-from bodyschema.interfaces.records import Pair
+from bodyschema.interfaces.records import FloatArray, Pair
 from bodyschema.interfaces.whole_files import write_whole
 from bodyschema.learning.nominal import NominalModel
 from bodyschema.recordings import files as recordings
@@ -154,9 +155,22 @@ class Found:
 
     @property
     def hand_eye(self) -> HandEye:
-        """The camera's pose with what was found in it; how sure it is, `bodyschema calibrate` tells."""
-        placed = self.diagnosis.extended.simulation.placed
-        return HandEye.of(self.robot.camera.parent_link, CAMERA_LINK, placed.robot.camera.pose @ placed.camera_pose)
+        """The camera's pose with what was found in it. Without a fitted pose it has no covariance."""
+        fit, covariance = self.diagnosis.extended, None
+        effects = fit.simulation.effects
+        shifts = [effect for effect in effects if isinstance(effect.kind, CameraEffect) and effect.kind.rigid]
+        ends = np.cumsum([len(effect.values) for effect in shifts])
+
+        def pose(values: FloatArray) -> FloatArray:
+            parts = zip(shifts, np.split(values, ends), strict=False)
+            moved = fit.simulation.with_effects([effect.with_values(part) for effect, part in parts])
+            return self.robot.camera.pose @ moved.camera_pose
+
+        values = np.concatenate([np.empty(0), *(effect.values for effect in shifts)])
+        if shifts:
+            places = [place for effect in shifts for place in fit.places(effect)]
+            covariance = pose_covariance(pose, values, fit.covariance[np.ix_(places, places)])
+        return HandEye.of(self.robot.camera.parent_link, CAMERA_LINK, pose(values), covariance)
 
     @property
     def timed(self) -> bool:

@@ -96,6 +96,7 @@ class Sampler:
         self._bears = self._powered.get(ZERO_FORCE) if held else None
         self._cameras, self._seen_by = sources.cameras, sources.seen_by
         self._gaze = gaze_of(config.robot, sources, bus, self._wall)
+        self._picture = sources.picture
         self._simulation, self._source_clock = sources.simulation, sources.clock
         self._joints = ReconnectingSource(sources.joints, "the encoders", self._wall, forbidden=self._service.forbidden)
         self._encoders, self._devices = sources.joints, DeviceWatch(sources.joints, store, self._wall)
@@ -192,10 +193,18 @@ class Sampler:
         bus.answer(keys.pairs, lambda request: answer_pairs(self._store.reader, request))
         bus.answer(keys.status("sampler"), lambda request: encode(self.status(), request.encoding))
         bus.answer(keys.command("sampler"), self._obey)
+        if self._picture is not None:
+            bus.answer(keys.picture, lambda _: self._shown(), encoding="image/jpeg")
         if self._simulation is not None:
             world, clock = self._simulation, self._source_clock
             bus.answer(keys.simulation, lambda request: answer_simulation(world, clock, request))
         bus.token(keys.alive("sampler"))
+
+    def _shown(self) -> bytes:
+        picture = None if self._picture is None else self._picture()
+        if picture is None:
+            raise RequestError("no image has come yet")
+        return picture
 
     def _sample(self) -> None:
         while not self._stopping:

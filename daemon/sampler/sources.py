@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -11,6 +11,8 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.protocols import Clock, JointSource, MarkerSource, Source
 from bodyschema.interfaces.records import FloatArray
 from kbmaps import RigidChain
+
+Picture = Callable[[], bytes | None]
 
 
 class GroundTruth(Protocol):
@@ -116,6 +118,7 @@ class Sources:
         cameras: reports the health of the cameras or of other marker sources, if there are any.
         seen_by: name of the marker source in messages.
         calibration: the cameras' calibration, if it differs from [camera].
+        picture: returns the newest camera picture as JPEG, or None before the first; None without cameras.
         live: neither encoders nor cameras wait for the other; otherwise unread data is kept.
     """
 
@@ -128,6 +131,7 @@ class Sources:
     cameras: TellsHealth | None = None
     seen_by: str = THE_CAMERAS
     calibration: StereoCalibration | None = None
+    picture: Picture | None = None
     live: bool = False
 
 

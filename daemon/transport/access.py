@@ -35,7 +35,7 @@ class Names(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         viewer: asks for predictions, pairs, the model and states, and receives pairs and states.
-        operator: a viewer who may give commands, and change the simulated robot's tool.
+        operator: a viewer who may give commands, see the cameras' picture, and change the simulated robot's tool.
         sampler: the process of that name: publishes pairs, answers from its store.
         learner: the process of that name: receives pairs, answers predictions.
     """
@@ -78,11 +78,11 @@ def deeds(role: str, keys: Keys) -> dict[Deed, tuple[str, ...]]:
     if role == "viewer":
         return views
     if role == "operator":
-        return {**views, "asks": (*views["asks"], keys.command("*"), keys.simulation)}
+        return {**views, "asks": (*views["asks"], keys.command("*"), keys.picture, keys.simulation)}
     if role == "sampler":
         return {
             "says": (pair, states[0]),
-            "answers": (keys.pairs, states[0], keys.command("sampler"), keys.simulation, pair, cache),
+            "answers": (keys.pairs, states[0], keys.command("sampler"), keys.picture, keys.simulation, pair, cache),
             "asks": (keys.predict,),
             "shows": (alive[0], cache),
             "watches": (keys.alive("*"),),

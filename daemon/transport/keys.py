@@ -45,6 +45,11 @@ class Keys:
         return self._key("model")
 
     @property
+    def picture(self) -> str:
+        """The cameras' newest picture with detections, answered by a sampler with cameras."""
+        return self._key("picture")
+
+    @property
     def simulation(self) -> str:
         """The simulated world: its ground truth and its tool; only with --sim, and never used for learning."""
         return self._key("simulation")

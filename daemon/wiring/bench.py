@@ -26,6 +26,7 @@ from bodyschema.drivers.ros2.config import Ros2Config
 from bodyschema.drivers.serial_lines.config import SerialLinesConfig
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.extras import install_command, no_pybullet
 from bodyschema.interfaces.protocols import JointSource
 from bodyschema.interfaces.records import JointReading
 from bodyschema.robot.limited import read_at_most
@@ -91,7 +92,7 @@ def bench_motion(config: Config, tell: Callable[[float], None]) -> Motion:
 
 def _no_simulation(config: Config) -> str:
     if find_spec("pybullet") is None:
-        return "for a guided path: pip install 'bodyschema[sim]'"
+        return f"for a guided path: {no_pybullet() or install_command('sim')}"
     if config.robot.calibration is None:
         return "for a guided path describe the cameras in [camera]"
     return ""

@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
 
+import msgspec
+
 from bodyschema.daemon.config import Config
 from bodyschema.drivers.checks import Check, holders
 from bodyschema.interfaces.clock import SystemClock
@@ -28,6 +30,8 @@ from bodyschema.vision.cameras.watched import PlainEyes, WatchedCamera
 from bodyschema.vision.rectified import RectifiedCamera
 from bodyschema.vision.rig import OneEyeRig, Rig
 from bodyschema.vision.rig_file import read_rig
+from bodyschema.vision.tracked_camera import TrackedCamera
+from bodyschema.vision.trackers import tracker_of
 
 LOOK_S = 2.0  # `doctor` looks at the images
 READ_S = 0.5
@@ -101,6 +105,21 @@ def _of_files(rig: Rig, cameras: CamerasConfig) -> Rig:
     if names & set(rig.serials):
         return rig
     return replace(rig, serials=("",)) if isinstance(rig, OneEyeRig) else replace(rig, serials=("", ""))
+
+
+def tracked_video(config: Config, file: Path) -> TrackedCamera:
+    """Return a video of one camera with its tracker, not opened yet; lens and marker are those of robot.toml.
+
+    Raises:
+        ConfigError: there is no calibration of the camera, or the marker cannot be.
+    """
+    given = cameras_of(config)
+    videos = VideosConfig(left=str(file.absolute()), speed=0.0)
+    cameras = CamerasConfig(calibration=None if given is None else given.calibration, videos=videos)
+    vision = msgspec.structs.replace(config.tables.vision, cameras=cameras, further_cameras=())
+    seen = config.with_tables(msgspec.structs.replace(config.tables, vision=vision))
+    camera = camera_of(seen, open_eyes(seen, SystemClock()))
+    return TrackedCamera(camera, tracker_of(camera.calibration, vision))
 
 
 def require_usable(config: Config) -> None:

@@ -18,6 +18,7 @@ from bodyschema.daemon.sampler.sources import (
     Head,
     JoinedHealth,
     MarkerTopic,
+    Picture,
     Powered,
     Sources,
     StampedJoints,
@@ -57,7 +58,9 @@ if TYPE_CHECKING:
     from bodyschema.drivers.dynamixel.gaze import Gaze
     from bodyschema.drivers.dynamixel.zero_force import ZeroForce
     from bodyschema.drivers.ros2.joints import Ros2Joints
+    from bodyschema.interfaces.protocols import StereoCamera
     from bodyschema.vision.cameras.config import CamerasConfig
+    from bodyschema.vision.tracked_camera import TrackedCamera
 
 log = logging.getLogger(__name__)
 
@@ -219,7 +222,7 @@ def demonstration_model() -> Path:
 def _real(config: Config) -> Sources:
     clock = SystemClock()
     joints = open_joints(config, clock)
-    marker, health, calibration = _open_marker(config, clock)
+    marker, health, calibration, picture = _open_marker(config, clock)
     drives = joints.drives if isinstance(joints, ServoJoints) else ()
     return Sources(
         joints,
@@ -230,35 +233,38 @@ def _real(config: Config) -> Sources:
         cameras=health,
         seen_by=_seen_by(config),
         calibration=calibration,
+        picture=picture,
         live=True,
     )
 
 
-def _open_marker(config: Config, clock: Clock) -> tuple[MarkerSource, TellsHealth, StereoCalibration | None]:
-    """Return what sees the marker, not opened yet, what reports its health, and the cameras' calibration."""
+def _open_marker(
+    config: Config, clock: Clock
+) -> tuple[MarkerSource, TellsHealth, StereoCalibration | None, Picture | None]:
+    """Return what sees the marker, not opened yet, its health, and the calibration and picture of the cameras."""
     tables = config.tables.marker_source
     streams = [stream_of(table, clock) for table in tables]
     if config.tables.vision.cameras is None and len(streams) == 1:
-        return streams[0], streams[0], None
+        return streams[0], streams[0], None, None
     members = [Member(table.label, stream, table.pose) for table, stream in zip(tables, streams, strict=True)]
-    calibration = None
+    calibration = picture = None
     healths: list[TellsHealth] = [*streams]
     if config.tables.vision.cameras is not None:
-        cameras, eyes, calibration = _tracked_cameras(config, clock)
+        cameras, eyes, calibration, picture = _tracked_cameras(config, clock)
         further = config.tables.vision.further_cameras
         if not tables and not further:
-            return cameras, eyes, calibration
+            return cameras, eyes, calibration, picture
         members.insert(0, Member("cameras", cameras, np.eye(4)))
         healths.insert(0, eyes)
         for place, table in enumerate(further, 1):
-            others, health, _ = _tracked_cameras(_seen_through(config, table), clock)
+            others, health, _, _ = _tracked_cameras(_seen_through(config, table), clock)
             members.insert(place, Member(table.name, others, table.pose))
             healths.insert(place, health)
     for place, member in enumerate(members):
         member.source = reopening = ReconnectingSource(member.source, f"the positions by {member.name}", clock)
         healths[place] = JoinedHealth([reopening, healths[place]])
     fused = FusedMarkers(members, clock)
-    return fused, JoinedHealth([fused, *healths]), calibration
+    return fused, JoinedHealth([fused, *healths]), calibration, picture
 
 
 def _seen_through(config: Config, cameras: CamerasConfig) -> Config:
@@ -278,22 +284,30 @@ def _seen_by(config: Config) -> str:
     return f"the positions by {' and '.join(names)}"
 
 
-def _tracked_cameras(config: Config, clock: Clock) -> tuple[MarkerSource, TellsHealth, StereoCalibration]:
-    """Return the cameras of robot.toml with their tracker, not opened yet, their health and their calibration."""
+def _tracked_cameras(config: Config, clock: Clock) -> tuple[MarkerSource, TellsHealth, StereoCalibration, Picture]:
+    """Return the cameras of robot.toml with their tracker, not opened yet, their health, calibration and picture."""
     from bodyschema.vision.cameras.realsense import RealsenseCamera
     from bodyschema.vision.depth_check import DepthChecked
-    from bodyschema.vision.tracked_camera import TrackedCamera
-    from bodyschema.vision.trackers import tracker_of
 
     from .cameras import camera_of, open_eyes
 
     eyes = open_eyes(config, clock)
     camera, vision = camera_of(config, eyes), config.tables.vision
-    tracked = TrackedCamera(camera, tracker_of(camera.calibration, vision))
+    tracked = _tracked(camera, config)
     if eyes is not camera or not isinstance(eyes, RealsenseCamera):
-        return tracked, eyes, camera.calibration
+        return tracked, eyes, camera.calibration, tracked.picture
     checked = DepthChecked(tracked, eyes, vision.radius_m if vision.marker == "bright_ball" else 0.0)
-    return checked, JoinedHealth([eyes, checked]), camera.calibration
+    return checked, JoinedHealth([eyes, checked]), camera.calibration, tracked.picture
+
+
+def _tracked(camera: StereoCamera, config: Config) -> TrackedCamera:
+    """Return a camera with the tracker of robot.toml, not opened yet."""
+    from bodyschema.vision.cameras.annotate import Annotator
+    from bodyschema.vision.tracked_camera import TrackedCamera
+    from bodyschema.vision.trackers import tracker_of
+
+    vision = config.tables.vision
+    return TrackedCamera(camera, tracker_of(camera.calibration, vision), Annotator(camera.calibration, vision))
 
 
 def open_streams(config: Config, clock: Clock) -> list[MarkerStream]:
@@ -331,16 +345,14 @@ def _simulated(config: Config) -> Iterator[Sources]:
     require_simulation()
     from bodyschema.sim_backend import SimWorld
     from bodyschema.sim_backend.guided_path import exact_encoders
-    from bodyschema.vision.tracked_camera import TrackedCamera
-    from bodyschema.vision.trackers import tracker_of
 
     on_bench = config.tables.sim.servo_bench
     settings = simulation_settings(config)
     settings = exact_encoders(settings) if on_bench else settings
     with SimWorld(config.robot, settings, config.simulation) as world:
-        marker = TrackedCamera(world.camera, tracker_of(world.camera.calibration, config.tables.vision))
+        marker = _tracked(world.camera, config)
         joints = _through_bench(config, world.joints) if on_bench else world.joints
-        yield Sources(joints, marker, world.clock, world)
+        yield Sources(joints, marker, world.clock, world, picture=marker.picture)
 
 
 def _through_bench(config: Config, joints: JointSource) -> JointSource:
@@ -358,14 +370,11 @@ def open_postures(config: Config, count: int) -> Iterator[Sources]:
     require_simulation()
     from bodyschema.sim_backend.posed import PosedWorld
     from bodyschema.sim_backend.postures import visible_postures
-    from bodyschema.vision.tracked_camera import TrackedCamera
-    from bodyschema.vision.trackers import tracker_of
 
     settings = simulation_settings(config)
     postures = visible_postures(config.robot, settings, count, config.simulation)
     with PosedWorld(config.robot, settings, postures, config.simulation) as world:
-        marker = TrackedCamera(world.camera, tracker_of(world.camera.calibration, config.tables.vision))
-        yield Sources(world.joints, marker, world.clock)
+        yield Sources(world.joints, _tracked(world.camera, config), world.clock)
 
 
 def simulated_truth(config: Config) -> RigidChain:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from bodyschema.effects.effect_type import StructureEffect
 from bodyschema.effects.flank import flanks
+from bodyschema.effects.joint_errors import JointErrors
 from bodyschema.effects.moments import with_moment
 from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter
@@ -63,3 +64,13 @@ class GravityBacklash(StructureEffect):
         torque, hold = run.torques[:, run.simulation.place(effect).joint], float(effect.values[1])
         less, more = hold / _FRICTION_WITHIN, hold * _FRICTION_WITHIN + _UPRIGHT * float(np.abs(torque).max())
         return flanks(torque, less) != flanks(torque, more)
+
+    def correction_values(self, effect: Effect) -> list[float]:
+        return effect.values.tolist()
+
+    def add_to(self, joint: JointErrors, effect: Effect) -> str | None:
+        width, hold = effect.values.tolist()
+        if joint.loose or width < 0.0:
+            return "a joint has one backlash under gravity there"
+        joint.loose = width, max(hold, 0.0)
+        return None

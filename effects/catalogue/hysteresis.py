@@ -41,6 +41,7 @@ class Hysteresis(EncoderEffect):
     # A backlash, with one shape parameter more that must pay for itself.
     refines = True
     further_trials = len(WIDTHS)
+    no_counterpart = "friction whose lag depends on the way is not in a rigid-body simulator"
 
     def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
         unit, lag, length = ("m", 0.001, 0.005) if prismatic else ("rad", 0.005, 0.03)
@@ -58,6 +59,9 @@ class Hysteresis(EncoderEffect):
 
     def trial_shapes(self, motion: Motion) -> FloatArray:
         return _LENGTHS
+
+    def correction_values(self, effect: Effect) -> list[float]:
+        return effect.values.tolist()
 
     def unknown_state(self, run: Simulated, effect: Effect) -> NDArray[np.bool_]:
         """Return rows (n,) before the joint has gone far enough one way in a run."""

@@ -11,6 +11,7 @@ from bodyschema.effects.gravity import GravityLoad
 from bodyschema.effects.parameter import Parameter
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.urdf import PointMass
 
 if TYPE_CHECKING:
     from bodyschema.effects.effect import Effect
@@ -23,6 +24,8 @@ class Payload(StructureEffect):
     name = "payload"
     rank = 2
     needs_weight = True
+    is_load = True
+    no_counterpart = "without a mass there is no body for it"
 
     def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
         mass = Parameter("mass_kg", 1.0, never_negative=True)
@@ -30,6 +33,9 @@ class Payload(StructureEffect):
 
     def load(self, robot: RobotDescription, values: FloatArray) -> GravityLoad | None:
         return GravityLoad.of_payload(robot, float(values[0]), values[1:]) if values.any() else None
+
+    def point_mass(self, values: FloatArray) -> PointMass | None:
+        return PointMass(float(values[0]), values[1:] / values[0]) if values[0] > 0.0 else None
 
     def jacobian(self, run: Simulated, effect: Effect) -> FloatArray:
         simulation, springs = run.simulation, run.simulation.springs

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from typing import Self
 
 from bodyschema.effects.effect import Effect
+from bodyschema.effects.effect_type import StructureEffect
 from bodyschema.effects.joint_errors import JointErrors
 from bodyschema.effects.simulation import Simulation
+from bodyschema.robot.urdf import PointMass
 
 BORNE_BY_HAND = 'with hold = "torque_free" the guiding hand bore the weight'
 
@@ -46,12 +48,14 @@ class ArmErrors:
 
     Attributes:
         joints: errors of every joint of the robot.
+        payloads: masses on the marker's link that the URDF does not state, their centres in its frame [m].
         left_out: effects that a rigid-body simulator cannot hold.
         notes: sentences on effects that are held in another form than found.
     """
 
     simulation: Simulation
     joints: dict[str, JointErrors]
+    payloads: tuple[PointMass, ...]
     left_out: tuple[LeftOut, ...]
     notes: tuple[str, ...]
 
@@ -60,19 +64,23 @@ class ArmErrors:
         """Sort the effects of a simulation."""
         stayed = simulation.after_moments
         joints = {joint: JointErrors() for joint in simulation.robot.joints}
+        payloads: list[PointMass] = []
         left_out: list[LeftOut] = []
         for effect in stayed.all_effects:
             if effect.kind.rigid and not effect.kind.is_zero:
                 continue
-            if effect.kind.is_spring and not simulation.bears_weight:
+            if effect.kind.needs_weight and not simulation.bears_weight:
                 why = BORNE_BY_HAND
+            elif isinstance(effect.kind, StructureEffect) and (mass := effect.kind.point_mass(effect.values)):
+                payloads.append(mass)
+                why = None
             elif effect.where is None:
                 why = effect.kind.no_counterpart
             else:
                 why = effect.kind.add_to(joints[effect.where], effect)
             if why is not None:
                 left_out.append(LeftOut(effect, why))
-        return cls(stayed, joints, tuple(left_out), tuple(moment_notes(simulation)))
+        return cls(stayed, joints, tuple(payloads), tuple(left_out), tuple(moment_notes(simulation)))
 
     def told(self) -> list[str]:
         """Return sentences on effects that are not in the file, or in another form."""

@@ -27,14 +27,19 @@ def held_by_correction(simulation: Simulation) -> Simulation:
     """Return the simulation with only the effects that correction.json holds."""
     stayed = simulation.after_moments
     own, background = (
-        tuple(effect for effect in effects if _is_held(effect)) for effects in (stayed.effects, stayed.background)
+        tuple(effect for effect in effects if _why_not(stayed, effect) is None)
+        for effects in (stayed.effects, stayed.background)
     )
     return Simulation(simulation.robot, own, None, background)
 
 
-def _is_held(effect: Effect) -> bool:
+def _why_not(simulation: Simulation, effect: Effect) -> str | None:
+    """Return the reason why the format cannot hold an effect; None if it can."""
     kind = effect.kind
-    return kind.rigid or kind.is_spring or kind.correction_values(effect) is not None
+    if kind.needs_weight and not simulation.bears_weight:
+        return BORNE_BY_HAND
+    held = kind.rigid or kind.is_spring or kind.is_load or kind.correction_values(effect) is not None
+    return None if held else kind.no_counterpart
 
 
 def write_correction(simulation: Simulation, file: Path, heading: str) -> list[str]:
@@ -49,14 +54,10 @@ def write_correction(simulation: Simulation, file: Path, heading: str) -> list[s
     Raises:
         OSError: the file cannot be written.
     """
-    kept, left_out = held_by_correction(simulation), []
-    for effect in simulation.after_moments.all_effects:
-        if effect.kind.is_spring and not simulation.bears_weight:
-            left_out.append(LeftOut(effect, BORNE_BY_HAND))
-        elif not _is_held(effect):
-            left_out.append(LeftOut(effect, effect.kind.no_counterpart))
+    kept, stayed = held_by_correction(simulation), simulation.after_moments
+    reasons = [(effect, _why_not(stayed, effect)) for effect in stayed.all_effects]
+    left_out = [LeftOut(effect, why) for effect, why in reasons if why is not None]
     told = [*sentences(left_out), *residual_note(simulation), *moment_notes(simulation)]
-    springs = kept.springs if simulation.bears_weight else np.zeros(len(simulation.robot.joints))
     entries = [(effect, effect.kind.correction_values(effect)) for effect in kept.all_effects]
     contents = {
         "format": FORMAT,
@@ -66,21 +67,22 @@ def write_correction(simulation: Simulation, file: Path, heading: str) -> list[s
         "notes": told,
         "effects": [_entry(kept, effect, values) for effect, values in entries if values is not None],
         "gravity_m_s2": GRAVITY_M_S2,
-    } | _chain(kept, springs)
+    } | _chain(kept)
     file.write_text(json.dumps(contents, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     return told
 
 
 def _entry(simulation: Simulation, effect: Effect, values: list[float]) -> dict[str, Any]:
     place = simulation.place(effect)
-    # Settling and backlash have a state; it is unknown before the first reading.
+    # Some effects have a state; it is unknown before the first reading.
     entry = {"effect": effect.name, "joint": place.joint, "values": values, "state": []}
     return entry if place.source is None else entry | {"source": place.source}
 
 
-def _chain(simulation: Simulation, springs: FloatArray) -> dict[str, Any]:
+def _chain(simulation: Simulation) -> dict[str, Any]:
     """Return the joints, in the order of the readings, and the frames of camera and marker."""
     robot, gravity, geometry = simulation.robot, simulation.gravity, geometry_without_zeros(simulation)
+    loads = [load.bodies for load in (gravity, *simulation.payloads)]
     aligned: dict[int | None, FloatArray] = {None: np.eye(4)}
     for k, name in enumerate(robot.joints):
         aligned[k] = _onto_z(robot.tree.joint(name).axis)
@@ -95,9 +97,9 @@ def _chain(simulation: Simulation, springs: FloatArray) -> dict[str, Any]:
                 "slides": bool(robot.chain.prismatic[k]),
                 "parent": _numbered(body.carrier),
                 "pose": _numbers(inverse(aligned[body.carrier]) @ pose @ aligned[k]),
-                "compliance": float(springs[k]),
-                "mass_kg": float(body.mass_kg),
-                "moment_kg_m": (aligned[k][:3, :3].T @ body.moment).tolist(),
+                "compliance": float(simulation.springs[k]),
+                "mass_kg": float(sum(bodies[k].mass_kg for bodies in loads)),
+                "moment_kg_m": (aligned[k][:3, :3].T @ sum(bodies[k].moment for bodies in loads)).tolist(),
             }
         )
     T_link_marker = np.eye(4)

@@ -6,6 +6,8 @@
 | scale, coupling, periodic errors | a second joint about the same axis, tied to the readings that cause them |
 | backlash | a second joint with a range, and friction between the link and its parent |
 | compliance | a second joint with a stiffness |
+| backlash under gravity | a loose joint with a range, and the friction that was found |
+| payload | a body with its mass |
 """
 
 from __future__ import annotations
@@ -30,9 +32,11 @@ from .geometry import geometry_without_zeros
 from .link_parts import LinkParts, placed, rod, texts
 
 MARKER, MEASUREMENT = "marker", "measurement_frame"
+LOOSE = "_gravity_backlash"
 _STEP_S = 0.001
 # Inertia added to each joint [kg·m²], for joints about one axis in a row; a joint without load needs little.
 _ARMATURE, _IDLE_ARMATURE = 0.05, 1e-6
+_POINT_INERTIA = 1e-9
 # Rates [rad/s] of actuators and of unloaded springs: well below 1/_STEP_S, so that the integrator follows.
 _SERVO_RATE, _SPRING_RATE = 100.0, 60.0
 # Friction as a multiple of gravity's largest torque: backlash shows only if the weight does not close it.
@@ -178,6 +182,13 @@ class _Document:
                 held = self._robot.robot.held_at.get(joint.name, 0.0)
                 self._link(body, joint.child, standing(joint, False, held), None)
 
+    def _payloads(self, body: Any) -> None:
+        """Add the masses that the URDF lacks, as points."""
+        for count, payload in enumerate(self._errors.payloads):
+            held = self._add(body, "body", name=f"{self._robot.robot.marker_link}_payload_{count}")
+            centre, inertia = texts(payload.centre), texts(np.full(3, _POINT_INERTIA))
+            self._add(held, "inertial", pos=centre, mass=repr(payload.mass_kg), diaginertia=inertia)
+
     def _moves(self, joint: UrdfJoint) -> bool:
         """Return True if a joint moves in the file: joints held by robot.toml are fixed."""
         name, robot = joint.name, self._robot
@@ -186,6 +197,7 @@ class _Document:
     def _frames(self, body: Any, link: str) -> None:
         if link == self._robot.robot.marker_link:
             self._add(body, "site", name=MARKER, pos=texts(self._geometry.marker_xyz), size="0.01", rgba="1 0.4 0 1")
+            self._payloads(body)
         if link != self._robot.camera.parent_link:
             return
         T = self._geometry.T_parent_camera
@@ -236,6 +248,12 @@ class _Document:
             self._tie_error(name, joint, errors)
         if errors.play:
             self._play(body, joint, kind | heavy, errors.play)
+        if errors.loose:
+            width, friction = errors.loose
+            held = {f"{key}{of}": value for key, value in _STIFF.items() for of in ("limit", "friction")}
+            reach = texts(np.array([-0.5 * width, 0.5 * width]))
+            name = f"{joint.name}{LOOSE}"
+            self._joint(body, name, **kind, **held, range=reach, frictionloss=repr(friction), armature=f"{inertia:.4g}")
         if errors.compliance:
             stiffness = 1.0 / errors.compliance
             armature = stiffness / _SPRING_RATE**2
@@ -323,7 +341,7 @@ class _Document:
         """Return gravity's largest torque or force (d,) about each joint that is read, over its range."""
         lower, upper = np.maximum(self._robot.lower, -np.pi), np.minimum(self._robot.upper, np.pi)
         q = np.random.default_rng(0).uniform(lower, upper, (_POSTURES, len(lower)))
-        return np.abs(self.simulation.gravity.torques(q)).max(axis=0)
+        return np.abs(self.simulation.torques(q)).max(axis=0)
 
     def _inertia(self, joint: UrdfJoint) -> float:
         """Return the inertia about a joint, of point masses at zero [kg·m²]; for a prismatic joint the mass [kg]."""

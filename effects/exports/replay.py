@@ -12,7 +12,7 @@ from bodyschema.effects.motion import Motion
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
 
-from .mjcf import MARKER, MEASUREMENT
+from .mjcf import LOOSE, MARKER, MEASUREMENT
 
 # A spring's deflection changes its own load; each round adds the next order.
 _SPRING_ROUNDS = 5
@@ -73,6 +73,7 @@ class _Statics:
             if model.tendon_frictionloss[k] > 0.0
         ]
         self._springs = np.flatnonzero(model.jnt_stiffness > 0.0)
+        self._loose = [k for k in range(model.njnt) if model.joint(k).name.endswith(LOOSE)]
 
     def positions(self, readings: FloatArray) -> FloatArray:
         """Return positions at readings (n, d), in their order."""
@@ -80,9 +81,9 @@ class _Statics:
         qpos, springs = data.qpos, model.jnt_qposadr[self._springs]
         loads, stiffness = model.jnt_dofadr[self._springs], model.jnt_stiffness[self._springs]
         outputs = [self._first_output(read, loose, readings) for read, loose in self._plays]
-        found = np.empty((len(readings), 3))
+        found, sides = np.empty((len(readings), 3)), dict.fromkeys(self._loose, 0.0)
         for row, reading in enumerate(readings):
-            qpos[self._read] = reading
+            qpos[self._read], qpos[model.jnt_qposadr[self._loose]] = reading, 0.0
             for y, x, polynomial in self._ties:
                 qpos[y] = model.qpos0[y] + _polynomial(polynomial, qpos[x] - model.qpos0[x])
             mujoco.mj_kinematics(model, data)
@@ -98,6 +99,13 @@ class _Statics:
             for _ in range(_SPRING_ROUNDS if len(springs) else 0):
                 mujoco.mj_forward(model, data)
                 qpos[springs] = -data.qfrc_bias[loads] / stiffness
+            if self._loose:
+                mujoco.mj_forward(model, data)
+            for k in self._loose:
+                torque = -float(data.qfrc_bias[model.jnt_dofadr[k]])
+                if not sides[k] or abs(torque) > model.dof_frictionloss[model.jnt_dofadr[k]]:
+                    sides[k] = -1.0 if torque < 0.0 else 1.0
+                qpos[model.jnt_qposadr[k]] = sides[k] * model.jnt_range[k, 1]
             mujoco.mj_kinematics(model, data)
             seen = data.site(MEASUREMENT)
             found[row] = (data.site(MARKER).xpos - seen.xpos) @ seen.xmat.reshape(3, 3)

@@ -70,13 +70,14 @@ class Correction {
     if (file["format"].text != "bodyschema correction" || file["version"].number != 1)
       throw std::runtime_error("not a correction of version 1");
     static const char* kinds[] = {"joint_offset", "joint_scale", "joint_coupling", "joint_eccentricity",
-                                  "joint_ripple", "backlash", "settling"};
+                                  "joint_ripple", "backlash", "settling", "hysteresis", "gravity_backlash"};
     for (const Json& e : file["effects"].list) {
       const auto kind = std::find(std::begin(kinds), std::end(kinds), e["effect"].text);
       if (kind == std::end(kinds)) throw std::runtime_error("unknown effect " + e["effect"].text);
       const int source = e.table.count("source") ? int(e["source"].number) : 0;
       effects_.push_back({int(kind - kinds), int(e["joint"].number), source, e["values"].numbers<3>(),
                           e["state"].numbers<2>(), !e["state"].list.empty()});
+      loose_ = loose_ || effects_.back().kind == kLoose;
     }
     for (const Json& j : file["joints"].list) {
       joints_.push_back({int(j["parent"].number), j["slides"].number != 0, j["pose"].numbers<12>(),
@@ -103,7 +104,13 @@ class Correction {
     for (Effect& effect : effects_) angles[effect.joint] += error(effect, q, pace);
     for (size_t k = 0; k < joints_.size(); ++k) turn(k), sums_[k].unloaded = angles[k];
     place();
-    for (int round = 0; springs_ && round < 3; ++round) bend(), place();  // what gives moves its own load
+    for (int round = 0; springs_ && round < 3; ++round) {  // what gives moves its own load
+      weigh();
+      for (size_t k = 0; k < joints_.size(); ++k)
+        if (joints_[k].compliance != 0) angles[k] = sums_[k].unloaded + joints_[k].compliance * sums_[k].torque, turn(k);
+      place();
+    }
+    if (loose_) fall(), place();
     const Pose C = product(frames_[ends_[0].parent], ends_[0].pose);
     Pose back;
     for (int r = 0; r < 3; ++r) {
@@ -124,7 +131,7 @@ class Correction {
     double cosine = 1, sine = 0;  // of its angle
   };
   struct End { size_t parent; Pose pose; };
-  struct Sum { double mass, x, y, unloaded; };  // of what a joint carries: mass, and mass times its place
+  struct Sum { double mass, x, y, torque, unloaded; };  // of what a joint carries: mass, mass times its place, its load
 
   static double error(Effect& e, const std::vector<double>& q, double pace) {  // added to the reading of its joint
     const double reading = q[e.joint], a = e.values[0], b = e.values[1], c = e.values[2];
@@ -144,12 +151,21 @@ class Correction {
         }
         if (second != 0.0) first = std::clamp(first, reading - a / 2, reading + a / 2);
         return first - reading;
-      default:  // settling; the state: the last reading, and what was missing of it
+      case 6:  // settling; the state: the last reading, and what was missing of it
         if (!e.begun) e.state = {reading, 0.0};
         e.begun = true;
         second = pace < 0 ? 0.0 : a * (reading - first) + second * std::pow(b, pace);
         first = reading;
         return -second;
+      case 7: {  // hysteresis; the state: the last reading, and the strain from -1 to 1; 0 until it has moved
+        if (!e.begun) e.state = {reading, 0.0};
+        e.begun = true;
+        const double kept = std::exp(-std::abs(reading - first) / b), way = reading < first ? -1 : 1;
+        if (reading != first) second = second == 0.0 ? way : way * (1 - kept) + kept * second;
+        first = reading;
+        return -a * second;
+      }
+      default: return 0;  // a backlash under gravity follows the load, after the springs
     }
   }
 
@@ -169,7 +185,19 @@ class Correction {
     }
   }
 
-  void bend() {  // every joint that gives, by gravity's torque about it, or force along it
+  void fall() {  // every joint with a backlash under gravity; the state: the side on which it rests
+    weigh();
+    for (Effect& e : effects_) {
+      if (e.kind != kLoose) continue;
+      const double torque = sums_[e.joint].torque;
+      if (!e.begun || std::abs(torque) > e.values[1]) e.state[0] = torque < 0 ? -1 : 1;
+      e.begun = true;
+      angles[e.joint] += e.values[0] / 2 * e.state[0];
+      turn(e.joint);
+    }
+  }
+
+  void weigh() {  // gravity's torque about every joint, or force along it
     for (Sum& sum : sums_) sum.mass = sum.x = sum.y = 0.0;
     for (auto k = outwards_.rbegin(); k != outwards_.rend(); ++k) {
       const Joint& j = joints_[*k];
@@ -179,10 +207,7 @@ class Correction {
       own.x += j.mass * F[3] + F[0] * j.moment[0] + F[1] * j.moment[1] + F[2] * j.moment[2];
       own.y += j.mass * F[7] + F[4] * j.moment[0] + F[5] * j.moment[1] + F[6] * j.moment[2];
       const double arm = F[6] * (own.x - own.mass * F[3]) - F[2] * (own.y - own.mass * F[7]);
-      if (j.compliance != 0) {
-        angles[*k] = own.unloaded + j.compliance * gravity_ * (j.slides ? -own.mass * F[10] : arm);
-        turn(*k);
-      }
+      own.torque = gravity_ * (j.slides ? -own.mass * F[10] : arm);
       parent.mass += own.mass, parent.x += own.x, parent.y += own.y;
     }
   }
@@ -193,7 +218,8 @@ class Correction {
   std::vector<Pose> frames_;
   std::vector<Sum> sums_;
   End ends_[2];
-  bool springs_ = false;
+  static constexpr int kLoose = 8;  // the kind of a backlash under gravity
+  bool springs_ = false, loose_ = false;
   double gravity_;
 };
 

@@ -8,6 +8,7 @@ class Correction {
     if (this.format !== "bodyschema correction" || this.version !== 1) throw new Error("not a correction of version 1");
     this.root = this.joints.length;  // the frame of the root link, which has the number -1 in the file
     this.springs = this.joints.some((joint) => joint.compliance);
+    this.loose = this.effects.filter(({ effect }) => effect === "gravity_backlash");
   }
 
   // True joint angles, and the marker's pose (3 rows of 4) in the measurement frame, at the next readings.
@@ -19,6 +20,14 @@ class Correction {
     for (let round = 0; this.springs && round < 3; round++) {  // what gives moves its own load
       const torques = this.torques(frames);
       angles = unloaded.map((angle, k) => angle + this.joints[k].compliance * torques[k]);
+      frames = this.frames(angles);
+    }
+    if (this.loose.length) {
+      const torques = this.torques(frames);
+      for (const { joint, values: [width, hold], state } of this.loose) {  // the state: the side on which it rests
+        if (!state.length || Math.abs(torques[joint]) > hold) state[0] = torques[joint] < 0 ? -1 : 1;
+        angles[joint] += (width / 2) * state[0];
+      }
       frames = this.frames(angles);
     }
     const [camera, marker] = [this.camera, this.marker].map((end) => product(this.above(frames, end), end.pose));
@@ -49,6 +58,13 @@ class Correction {
         [state[0], state[1]] = [reading, pace === null ? 0 : a * (reading - last) + missing * b ** pace];
         return -state[1];
       }
+      case "hysteresis": {  // the state: the last reading, and the strain from -1 to 1; 0 until it has moved
+        const [last, strain] = state.length ? state : [reading, 0];
+        const way = Math.sign(reading - last), kept = Math.exp(-Math.abs(reading - last) / b);
+        [state[0], state[1]] = [reading, !way ? strain : !strain ? way : way * (1 - kept) + kept * strain];
+        return -a * state[1];
+      }
+      case "gravity_backlash": return 0;  // it follows the load, after the springs
       default: throw new Error(`unknown effect ${effect}`);
     }
   }

@@ -18,6 +18,7 @@ class Correction:
         self.effects, joints = file["effects"], file["joints"]
         self.chain = [(k, joints[k]["parent"], joints[k]["slides"], joints[k]["pose"]) for k in file["outwards"]]
         self.ends = [(file[end]["parent"], file[end]["pose"]) for end in ("camera", "marker")]
+        self.loose = [effect for effect in self.effects if effect["effect"] == "gravity_backlash"]
         self.springs = [(k, joint["compliance"]) for k, joint in enumerate(joints) if joint["compliance"]]
         self.masses = [(joint["mass_kg"], *joint["moment_kg_m"]) for joint in joints]
         self.gravity = file["gravity_m_s2"]
@@ -35,6 +36,14 @@ class Correction:
             torques, angles = self.torques(frames), list(unloaded)
             for k, compliance in self.springs:
                 angles[k] += compliance * torques[k]
+            frames = self.frames(angles)
+        if self.loose:
+            torques, angles = self.torques(frames), list(angles)
+            for effect in self.loose:  # the state: the side on which the joint rests
+                (width, hold), torque = effect["values"], torques[effect["joint"]]
+                if not effect["state"] or abs(torque) > hold:
+                    effect["state"][:] = [-1.0 if torque < 0.0 else 1.0]
+                angles[effect["joint"]] += 0.5 * width * effect["state"][0]
             frames = self.frames(angles)
         camera, marker = (product(frames[parent], pose) for parent, pose in self.ends)
         a, b, c, x, d, e, f, y, g, h, i, z = camera
@@ -66,6 +75,14 @@ class Correction:
             missing = 0.0 if pace is None else values[0] * (reading - last) + missing * values[1] ** pace
             state[:] = reading, missing
             return -missing
+        if kind == "hysteresis":  # the state: the last reading, and the strain from -1 to 1; 0 until it has moved
+            last, strain = state or (reading, 0.0)
+            kept, way = math.exp(-abs(reading - last) / values[1]), math.copysign(1.0, reading - last)
+            strain = strain if reading == last else way if strain == 0.0 else way * (1.0 - kept) + kept * strain
+            state[:] = reading, strain
+            return -values[0] * strain
+        if kind == "gravity_backlash":  # it follows the load, after the springs
+            return 0.0
         raise ValueError(f"unknown effect {kind}")
 
     def frames(self, angles):

@@ -13,7 +13,7 @@ import pytest
 from board_renderer import Photographer, Printed, Taken
 from shown_board import photographed
 
-from bodyschema.cli.cameras.calibration import CamerasFile, CheckFile
+from bodyschema.cli.cameras.calibration import NORMAL_95, CamerasFile, CheckFile
 from bodyschema.cli.main import app
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.interval import to_its_interval
@@ -186,6 +186,12 @@ def test_the_ruler_on_the_print_scales_the_baseline(folder, tmp_path, capsys) ->
     found = msgspec.json.decode(capsys.readouterr().out, type=CamerasFile)
     assert found.baseline_mm == pytest.approx(970 * read_rig(folder / "cameras.toml").baseline_m, rel=1e-6)
     assert (len(found.parameters), len(found.held_out_by_model_px)) == (24, 1)
+    assert found.right_camera is not None
+    place, covariance = np.array(found.right_camera.translation_m), np.array(found.right_camera.covariance)
+    assert 1e3 * np.linalg.norm(place) == pytest.approx(found.baseline_mm)
+    along = place / np.linalg.norm(place)
+    sigma_m = np.sqrt(along @ covariance.reshape(6, 6)[:3, :3] @ along)
+    assert 1e3 * NORMAL_95 * sigma_m == pytest.approx(found.baseline_half_width_mm, rel=1e-3)
 
 
 @pytest.mark.parametrize(

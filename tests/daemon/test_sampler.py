@@ -415,6 +415,16 @@ def test_nobody_tells_the_truth_where_there_is_no_simulation(ended) -> None:
         ended.ask_one(KEYS.simulation)
 
 
+def test_a_picture_is_given_once_a_frame_has_come(config) -> None:
+    pictures: list[bytes] = []
+    sources = replace(Walk(config.robot, 1).sources(), picture=lambda: pictures[-1] if pictures else None)
+    with running(config, sources) as bus:
+        with pytest.raises(RequestError, match="no image has come yet"):
+            bus.ask_one(KEYS.picture)
+        pictures.append(b"\xff\xd8jpeg")
+        assert bus.ask_one(KEYS.picture) == pictures[0]
+
+
 def test_silent_sources_are_reported(config, monkeypatch) -> None:
     monkeypatch.setattr("bodyschema.daemon.sampler.sampler.SILENT_AFTER_S", 0.0)
     held = threading.Event()

@@ -44,7 +44,7 @@ def pair(seq: int, segment: int = 1) -> Pair:
 def test_a_series_of_months_stays_small_and_covers_all_of_it() -> None:
     series = Series()
     for t in range(100_000):
-        series.add(float(t), error_m=0.001, claimed_m=None, pairs_per_s=10.0, predict_s=None)
+        series.add(float(t), error_m=0.001, expected_m=None, pairs_per_s=10.0, predict_s=None)
     t = series.document.t
     assert LARGEST_SERIES / 4 < len(t) <= LARGEST_SERIES
     assert t[0] < 1000 < 99_000 < t[-1]

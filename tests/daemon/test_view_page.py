@@ -18,7 +18,7 @@ from bodyschema.interfaces.errors import BusError, RequestError  # noqa: E402
 
 HERE = "http://127.0.0.1:8420"
 PAUSE = {"process": "sampler", "command": "pause"}
-ADDRESSES = ["/", "/api/state", "/api/events", "/report", "/static/style.css", "/static/js/main.js"]
+ADDRESSES = ["/", "/api/state", "/api/events", "/api/picture", "/report", "/static/style.css", "/static/js/main.js"]
 
 
 @dataclass
@@ -28,6 +28,12 @@ class Processes:
     told: list[tuple[str, ...]] = field(default_factory=list)
     error: Exception | None = None
     page: bytes | None = None
+    jpeg: bytes | None = None
+
+    def picture(self) -> bytes:
+        if self.jpeg is None:
+            raise BusError("nothing answers")
+        return self.jpeg
 
     def command(self, process: str, name: str) -> str:
         self._note(process, name)
@@ -79,6 +85,18 @@ def test_a_button_s_command_reaches_the_process_and_its_words_come_back(ask, pro
     answer = ask("POST", "/api/command", json=PAUSE)
     assert (answer.status_code, answer.json()["message"]) == (200, "no pairs are accepted until resume")
     assert processes.told == [("sampler", "pause")]
+
+
+def test_a_change_is_rolled_back_by_a_button(ask, processes) -> None:
+    assert ask("POST", "/api/command", json={"process": "learner", "command": "rollback"}).status_code == 200
+    assert processes.told == [("learner", "rollback")]
+
+
+def test_the_cameras_picture_is_served_where_there_is_one(ask, processes) -> None:
+    assert ask("GET", "/api/picture").status_code == 204
+    processes.jpeg = b"jpeg"
+    answer = ask("GET", "/api/picture")
+    assert (answer.content, answer.headers["content-type"]) == (b"jpeg", "image/jpeg")
 
 
 @pytest.mark.parametrize("address", ADDRESSES)
@@ -186,6 +204,7 @@ def test_the_page_may_load_from_here_alone(ask) -> None:
     policy = ask("GET", "/").headers["Content-Security-Policy"]
     assert policy.startswith("default-src 'none'; script-src 'self'")
     assert "unsafe" not in policy
+    assert "blob:" not in policy
     assert "frame-ancestors 'none'" in policy
 
 

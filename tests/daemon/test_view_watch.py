@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 from small_arm import write_small_arm
 from told_statuses import LEARNER, SAMPLER
@@ -30,6 +31,7 @@ from bodyschema.daemon.transport.wire import (
 from bodyschema.dashboard.hub import Hub
 from bodyschema.dashboard.watch import Watch
 from bodyschema.interfaces.errors import BusError, RequestError
+from bodyschema.robot.urdf import inverse
 
 LIMIT_S = 500.0
 KEYS = Keys("arm")
@@ -170,7 +172,53 @@ def test_a_state_that_is_not_understood_is_told_and_ends_nothing(config, hub, wa
 
 def test_where_to_move_next_is_told_in_words(config, hub, watch) -> None:
     with learner(config):
-        assert "moving shoulder over its range gains most" in until(lambda: document(hub, "outlook"))
+        outlook = until(lambda: document(hub, "outlook"))
+    assert "moving shoulder over its range gains most" in outlook["sentence"]
+
+
+def test_errors_have_the_noise_in_them(config, hub, watch) -> None:
+    with learner(config):
+        outlook = until(lambda: document(hub, "outlook"))
+        expected = until(lambda: [each for each in document(hub, "series")["expected_m"] if each])
+    # Mean distance of a measurement from the truth, by simulation.
+    noise_m = np.linalg.norm(np.random.default_rng(0).normal(0.0, 0.00126, (100_000, 3)), axis=1).mean()
+    assert expected[0] == pytest.approx(np.hypot(0.0066, noise_m), rel=1e-2)
+    assert outlook["now_m"] == pytest.approx(np.hypot(0.0006, noise_m), rel=1e-2)
+
+
+def test_the_arm_stands_at_the_newest_pair(config, hub, watch) -> None:
+    told = msgspec.structs.replace(LEARNER, calibration=None)
+    with sampler(config, 20), learner(config, told):
+        arm = until(lambda: (found := document(hub, "arm")) and found["predicted"] and found)
+    robot = config.robot
+    T = inverse(robot.camera.pose)
+    seen = [
+        T[:3, :3] @ np.array(point) + T[:3, 3] for point in (arm["links"][-1][1], arm["measured"], arm["predicted"])
+    ]
+    assert arm["pair"] == 20
+    np.testing.assert_allclose(seen[0], robot.chain.positions(np.array([[0.2, 0.0]]))[0], atol=1e-4)
+    np.testing.assert_allclose(seen[1:], [[0.5, 0.0, 0.003], [0.5, 0.0, 0.0]], atol=1e-4)
+    assert arm["apart_m"] == pytest.approx(0.003)
+
+
+def test_a_picture_is_asked_for_once_by_many_browsers(config, hub, watch) -> None:
+    asked: list[int] = []
+
+    def picture(_) -> bytes:
+        asked.append(1)
+        return b"jpeg"
+
+    with process(config.tables.zenoh.sampler, "sampler", SAMPLER, {KEYS.picture: picture}):
+        assert until(lambda: _pictured(watch)) == b"jpeg"
+        assert {watch.picture() for _ in range(5)} == {b"jpeg"}
+    assert len(asked) <= 2
+
+
+def _pictured(watch: Watch) -> bytes | None:
+    try:
+        return watch.picture()
+    except BusError:
+        return None
 
 
 def test_a_command_gets_the_process_own_words(config, watch) -> None:

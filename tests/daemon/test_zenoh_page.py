@@ -88,7 +88,7 @@ def test_the_page_s_commands_are_the_code_s() -> None:
 
 
 def test_the_page_has_every_key() -> None:
-    whole = [KEYS.pair, KEYS.pairs, KEYS.predict, KEYS.jacobian, KEYS.ik, KEYS.model, KEYS.simulation]
+    whole = [KEYS.pair, KEYS.pairs, KEYS.predict, KEYS.jacobian, KEYS.ik, KEYS.model, KEYS.picture, KEYS.simulation]
     whole += [key(process) for key in (KEYS.status, KEYS.command, KEYS.alive) for process in ("sampler", "learner")]
     assert {code(row[0]) for row in rows(section("Keys"))} == {key.removeprefix("bodyschema/arm/") for key in whole}
 

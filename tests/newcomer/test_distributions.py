@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 import tarfile
 import venv
 import zipfile
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -41,6 +43,11 @@ def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return build(ROOT, "sdist", tmp_path_factory.mktemp("sdist"))
 
 
+@pytest.fixture(scope="module")
+def maths(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build(ROOT / "kbmaps", "wheel", tmp_path_factory.mktemp("maths"))
+
+
 def tracked() -> set[str]:
     """Return the tracked files of the parts, under their names in a wheel."""
     links = [link for link in (ROOT / "bodyschema").iterdir() if link.is_symlink()]
@@ -60,6 +67,33 @@ def test_the_sdist_has_no_link_and_makes_the_same_wheel(sdist: Path, wheel: Path
         archive.extractall(tmp_path, filter="data")
     (source,) = tmp_path.iterdir()
     assert files_of(build(source, "wheel", tmp_path / "built")) == files_of(wheel)
+
+
+def test_the_maths_has_a_wheel_of_its_own_with_the_same_files(maths: Path, wheel: Path) -> None:
+    assert files_of(maths) - {"kbmaps/LICENSE"} == {name for name in files_of(wheel) if name.startswith("kbmaps/")}
+    with zipfile.ZipFile(maths) as archive:
+        (name,) = [name for name in archive.namelist() if name.endswith("/METADATA")]
+        told = archive.read(name).decode()
+    assert re.findall(r"^Requires-Dist: ([a-z]+)", told, re.MULTILINE) == ["numpy", "scipy"]
+    assert re.findall(r"^Version: (.*)", told, re.MULTILINE) == [version("bodyschema")]
+
+
+def test_the_wheel_of_the_maths_computes_alone(maths: Path) -> None:
+    code = "import sys, kbmaps; print(kbmaps.__file__, 'bodyschema' in sys.modules); kbmaps.KBMap"
+    environment = {**PURE, "PYTHONPATH": str(maths)}
+    command = [sys.executable, "-P", "-c", code]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=LIMIT_S)
+    assert done.stdout == f"{maths}/kbmaps/__init__.py False\n"
+
+
+def test_the_kernels_run_on_machines_of_2018() -> None:
+    """manylinux_2_28 promises glibc 2.28, and nothing beside the C library and its maths."""
+    library = ROOT / "kbmaps" / "_kernels.abi3.so"
+    if not library.exists():
+        pytest.skip("no compiled kernels; to run it: apt install gcc python3-dev, then make setup")
+    needed = {tuple(map(int, found)) for found in re.findall(rb"GLIBC_(\d+)\.(\d+)", library.read_bytes())}
+    assert max(needed) <= (2, 28)
+    assert set(re.findall(rb"lib\w+\.so[.\d]*", library.read_bytes())) <= {b"libc.so.6", b"libm.so.6"}
 
 
 def test_links_that_came_as_text_are_mended(tmp_path: Path) -> None:

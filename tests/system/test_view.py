@@ -152,7 +152,9 @@ def test_every_panel_shows_what_runs(page) -> None:
     says(page, "#pill-learner", "learning")
     says(page, "#tile-error", r"[\d.]+ mm")
     says(page, "#tile-predict", r"[\d.]+ ms")
-    says(page, "#outlook", "more pairs like these")
+    says(page, "#outlook", "(Enough data|More data)")
+    says(page, "#arm-text", r"Pair \d+: prediction and measurement are [\d.]+ mm apart")
+    says(page, "#calibration", "camera yaw")
     says(page, "#cloud-text", r"[\d,]+ pairs with this tool, all learnt already: median [\d.]+ mm")
     says(page, "#error-text", r"[\d.]+ mm after [\d,]+ pairs")
     says(page, "#latency-text", r"Median [\d.]+ ms")
@@ -183,6 +185,10 @@ def test_a_changed_tool_is_asked_for_twice_and_then_marked(page) -> None:
     page.click("text=Yes, the tool was changed")
     says(page, "#error-text", r"(tool|something) changed( \(told\))? after [\d,]+")
     says(page, "#versions", "after a change")
+    page.click("#rollback")
+    says(page, "#rollback-of", "The last change")
+    page.click("text=Yes, roll back")
+    says(page, "#notices", "learner: ")
 
 
 def test_a_diagnosis_is_begun_and_stopped_by_buttons(page) -> None:
@@ -214,7 +220,7 @@ def test_everything_is_reached_with_the_keyboard_alone(page) -> None:
     expect(page.locator("#pause")).to_be_enabled()
     expect(page.locator("#tool")).to_be_enabled()
     reached = []
-    for _ in range(14):
+    for _ in range(18):
         page.keyboard.press("Tab")
         reached.append(page.evaluate("document.activeElement.id || document.activeElement.name"))
     assert {"pause", "tool", "diagnose", "axis", "cloud", "cloud-reset"} <= set(reached)

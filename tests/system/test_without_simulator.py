@@ -13,6 +13,7 @@ from two_processes import running, status_when, write_robot
 
 from bodyschema.cli.main import COMMANDS
 from bodyschema.daemon.transport.status import LearnerStatus
+from bodyschema.interfaces.extras import install_command
 
 ROOT = Path(__file__).parents[2]
 # As if they were not installed, wherever they are.
@@ -59,7 +60,7 @@ def test_a_camera_command_names_the_extra(guarded: Path, tmp_path: Path) -> None
     done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
     assert (done.returncode, done.stderr) == (
         1,
-        "bodyschema: this needs OpenCV, which is not installed. Type: pip install 'bodyschema[cameras]'\n",
+        f"bodyschema: this needs OpenCV, which is not installed. Type: {install_command('cameras')}\n",
     )
 
 
@@ -82,4 +83,4 @@ def test_the_simulation_says_what_to_install(guarded: Path, tmp_path: Path) -> N
         text=True,
         check=False,
     )
-    assert (done.returncode, "pip install 'bodyschema[sim]'" in done.stderr) == (1, True)
+    assert (done.returncode, install_command("sim") in done.stderr) == (1, True)

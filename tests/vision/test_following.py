@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from ball_renderer import SMALL
@@ -7,6 +8,8 @@ from scenes import Ball, Slab, reason, sigmas_off, stage
 
 from bodyschema.interfaces.errors import SourceLost
 from bodyschema.interfaces.records import MarkerFix, Reason
+from bodyschema.vision.cameras.annotate import Annotator
+from bodyschema.vision.config import VisionConfig
 from bodyschema.vision.tracked_camera import TrackedCamera
 from bodyschema.vision.tracker import StereoTracker
 
@@ -190,6 +193,21 @@ def test_a_tracked_camera_answers_every_frame_with_its_time():
     assert found is not None
     assert lost is not None
     assert (found.t, lost.t) == (1.0, 1.1)
+
+
+def test_a_tracked_camera_shows_its_newest_frame_with_detections():
+    annotator = Annotator(SMALL, VisionConfig())
+    with TrackedCamera(Camera(stage(NEAR)), StereoTracker(SMALL), annotator) as source:
+        assert source.picture() is None
+        seen = source.read(0.1)
+        jpeg = source.picture()
+    assert seen is not None
+    assert jpeg is not None
+    picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    drawn = annotator.drawn(stage(NEAR), seen)
+    assert picture.shape == drawn.shape
+    assert np.abs(picture.astype(float) - drawn).mean() < 4.0
+    assert np.abs(np.hstack(stage(NEAR).images).astype(float) - drawn).mean() > 6.0
 
 
 def test_a_tracked_camera_has_nothing_while_no_frame_comes():

@@ -13,6 +13,7 @@ import pytest
 
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import SourceError, SourceLost
+from bodyschema.interfaces.extras import install_command
 from bodyschema.interfaces.records import MarkerFix, frozen_array
 from bodyschema.vision.cameras.config import CamerasConfig, RealsenseConfig
 from bodyschema.vision.cameras.realsense import RealsenseCamera, connected_device
@@ -178,7 +179,7 @@ def test_missing_sdk_is_a_missing_extra(monkeypatch) -> None:
         connected_device(None)
     told = missing_module(error.value)
     assert told is not None
-    assert told.remedy == "Type: pip install 'bodyschema[realsense]'"
+    assert told.remedy == f"Type: {install_command('realsense')}"
 
 
 class Fixed:

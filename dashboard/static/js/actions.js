@@ -1,6 +1,6 @@
 // The buttons: what they ask for, and when they can.
 import { byId, text } from "./dom.js";
-import { whole } from "./format.js";
+import { changed, whole } from "./format.js";
 import { tell } from "./notices.js";
 
 const VERDICTS = { explained: "Explained.", nothing_found: "Nothing found.", undecided: "Undecided.", unexplained: "Not all explained." };
@@ -10,11 +10,13 @@ export class Actions {
     this.changed = changed;
     this.state = {};
     byId("pause").addEventListener("click", () => this.command("sampler", this.paused() ? "resume" : "pause"));
-    byId("tool").addEventListener("click", () => byId("tool-dialog").showModal());
-    byId("tool-dialog").addEventListener("close", (event) => {
-      if (event.target.returnValue === "yes") this.command("learner", "tool_changed");
-      event.target.returnValue = "no";
-    });
+    for (const [id, command] of [["tool", "tool_changed"], ["rollback", "rollback"]]) {
+      byId(id).addEventListener("click", () => byId(`${id}-dialog`).showModal());
+      byId(`${id}-dialog`).addEventListener("close", (event) => {
+        if (event.target.returnValue === "yes") this.command("learner", command);
+        event.target.returnValue = "no";
+      });
+    }
     byId("diagnose").addEventListener("click", () => this.ask("POST", "api/diagnosis"));
     byId("diagnosis-stop").addEventListener("click", () => this.ask("DELETE", "api/diagnosis"));
   }
@@ -46,8 +48,10 @@ export class Actions {
   update(state, connected) {
     this.state = state;
     const { sampler, learner, diagnosis } = state;
+    const change = learner?.status?.last_change;
+    if (change) text("rollback-of", `The last change: ${changed({ kind: change.kind, told: !change.found })}, from pair ${change.first_seq} on. What was learnt since is dropped; the pairs stay stored.`);
     const running = ["copying", "running"].includes(diagnosis?.state);
-    const can = { pause: sampler?.answers && ["running", "paused"].includes(sampler.status.state), tool: learner?.answers, diagnose: sampler?.answers && !running };
+    const can = { pause: sampler?.answers && ["running", "paused"].includes(sampler.status.state), tool: learner?.answers, rollback: learner?.answers && change?.can_roll_back, diagnose: sampler?.answers && !running };
     for (const [id, possible] of Object.entries(can)) byId(id).disabled = !(connected && possible);
     text("pause", this.paused() ? "Resume" : "Pause");
     text("diagnose", running ? "Diagnosing…" : "Diagnose now");

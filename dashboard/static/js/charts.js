@@ -122,7 +122,7 @@ export class ErrorChart {
     const { learner, series } = this.state ?? {};
     const curve = learner?.status?.curve ?? [];
     if (this.over === "pairs") this.chart.show([curve.map((point) => point[0]), positive(curve.map((point) => point[1]))], "pairs");
-    else this.chart.show([series?.t ?? [], positive(series?.error_m ?? []), positive(series?.claimed_m ?? [])], "time");
+    else this.chart.show([series?.t ?? [], positive(series?.error_m ?? []), positive(series?.expected_m ?? [])], "time");
     if (!curve.length) return;
     const [[first, begin], [pairs, error]] = [curve[0], curve.at(-1)];
     const told = this.changes.length ? `; ${this.changes.map((change) => `${changed(change)} after ${whole(change.pairs)}`).join(", ")}` : "";
@@ -135,7 +135,7 @@ export class ErrorChart {
       { label: time ? "time" : "pairs", value: (_, shown) => (shown === null ? "–" : time ? clock(shown) : whole(shown)) },
       line("error on new pairs", "--line", mm),
     ];
-    if (time) series.push(line("claimed error", "--second", mm, { dash: [6, 4] }));
+    if (time) series.push(line("expected error", "--second", mm, { dash: [6, 4] }));
     return {
       series,
       scales: { x: { time }, y: { distr: 3 } },

@@ -7,10 +7,10 @@ const last = (values) => values?.findLast((value) => value !== null);
 export function tiles({ sampler, learner, series }) {
   const status = learner?.status;
   text("tile-error", mm(status?.prequential_m[status.answering]));
-  text("tile-claimed", mm(status?.claimed_error_m));
+  text("tile-expected", mm(series?.expected_m.at(-1)));
   text("tile-pairs", whole(status?.pairs ?? sampler?.status?.pairs));
-  text("tile-error-of", status?.prequential_pairs ? `${lastPairs(status)}, each predicted before it was learnt. Measurement noise${noise(status)} is in it` : "");
-  text("tile-claimed-of", status?.claimed_error_m ? "the learner's estimate of its distance to the truth where data is, without noise" : "");
+  text("tile-error-of", status?.prequential_pairs ? `${lastPairs(status)}, each predicted before it was learnt${noise(status)}` : "");
+  text("tile-expected-of", status?.claimed_error_m ? "the learner's estimate of the same, where data is" : "");
   const since = status && status.pairs_since_change < status.pairs ? [`${whole(status.pairs_since_change)} since the last change`] : [];
   const behind = status?.behind ? [`${whole(status.behind)} stored and not learnt yet`] : [];
   text("tile-pairs-of", [...since, ...behind].join(", "));
@@ -21,7 +21,7 @@ export function tiles({ sampler, learner, series }) {
 }
 
 const lastPairs = (status) => `last ${whole(status.prequential_pairs)} pairs`;
-const noise = (status) => (status.calibration ? ` (${mm(status.calibration.noise_m)} a coordinate)` : "");
+const noise = (status) => (status.calibration ? `; noise of the measurement: ${mm(status.calibration.noise_m)} a coordinate` : "");
 
 export function pills({ sampler, learner }) {
   for (const [name, process] of [["sampler", sampler], ["learner", learner]]) {
@@ -34,21 +34,49 @@ export function pills({ sampler, learner }) {
   }
 }
 
-export function outlook({ learner, outlook: sentence }) {
-  const found = learner?.status?.outlook;
-  text("outlook", found && sentence ? sentence : "Not known yet: the learner finds it some time after its first solution with the present tool.");
+export function outlook({ outlook: found }) {
+  text("outlook", found ? found.sentence : "Not known yet: the learner finds it some time after its first solution with the present tool.");
   const table = byId("forecast");
   table.hidden = !found;
   if (!found) return;
   const differs = found.best_motion_m.some((error, k) => error !== found.like_so_far_m[k]);
-  table.tHead.replaceChildren(row(element("th", {}, ""), ...[found.error_m === learner.status.claimed_error_m ? "now" : `after ${whole(found.pairs)} pairs`, ...found.further_pairs.map((pairs) => `+${pairs} pairs`)].map((name) => element("th", { scope: "col" }, name))));
-  const rows = [row("as so far", mm(found.error_m), ...found.like_so_far_m.map(mm))];
+  table.tHead.replaceChildren(row(element("th", {}, ""), ...[`after ${whole(found.pairs)} pairs`, ...found.further_pairs.map((pairs) => `+${pairs} pairs`)].map((name) => element("th", { scope: "col" }, name))));
+  const rows = [row("as so far", mm(found.now_m), ...found.like_so_far_m.map(mm))];
   if (differs) {
-    rows.push(row(found.best_motion, mm(found.error_m), ...found.best_motion_m.map(mm)));
+    rows.push(row(found.best_motion, mm(found.now_m), ...found.best_motion_m.map(mm)));
     rows[1].className = "best";
   }
   table.tBodies[0].replaceChildren(...rows);
 }
+
+// Nominal and learnt figures with their intervals; what no motion shows is said below.
+export function calibration({ learner, robot }) {
+  const found = learner?.status?.calibration;
+  byId("calibration").hidden = !found;
+  if (!found) {
+    text("calibration-text", "Not known yet: it comes with the first solution with the present tool.");
+    return;
+  }
+  const rows = [];
+  const figure = (name, unit, digits, factor, { drawn, learnt, half_width: half }) => rows.push(
+    row(name, ...[drawn, learnt].map((value) => `${signed(factor * value, digits)} ${unit}`), `${(factor * half).toFixed(digits)} ${unit}`),
+  );
+  const degree = 180 / Math.PI;
+  found.camera_xyz.forEach((each, k) => figure(`camera ${"xyz"[k]}`, "mm", 1, 1e3, each));
+  found.camera_rpy.forEach((each, k) => figure(`camera ${["roll", "pitch", "yaw"][k]}`, "°", 2, degree, each));
+  found.marker_xyz.forEach((each, k) => figure(`marker ${"xyz"[k]}`, "mm", 1, 1e3, each));
+  const hidden = [];
+  for (const [name, zero] of Object.entries(found.zeros)) {
+    const slides = robot?.slides.includes(name);
+    if (zero) figure(`offset ${name}`, slides ? "mm" : "°", 2, slides ? 1e3 : degree, { drawn: 0, learnt: zero.value, half_width: zero.half_width });
+    else hidden.push(name);
+  }
+  const kept = hidden.length ? ` Kept at nominal, because no motion shows the offset: ${hidden.join(", ")}.` : "";
+  text("calibration-text", `Of ${whole(found.pairs)} pairs: camera in ${found.camera_link}, marker in ${found.marker_link}, joint offsets to add to readings.${kept}`);
+  byId("calibration").tBodies[0].replaceChildren(...rows);
+}
+
+const signed = (value, digits) => `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(digits)}`;
 
 // The joints that the best motion names, unless it is no better than going on.
 function movedNext(found, joints) {
@@ -58,9 +86,9 @@ function movedNext(found, joints) {
   return new Set(some.length ? some : joints);
 }
 
-export function coverage({ sampler, learner, robot }) {
+export function coverage({ sampler, outlook: found, robot }) {
   const ranges = Object.entries(sampler?.status?.coverage ?? {});
-  const next = movedNext(learner?.status?.outlook, ranges.map(([name]) => name));
+  const next = movedNext(found, ranges.map(([name]) => name));
   const items = ranges.map(([name, range]) => {
     const slides = robot?.slides.includes(name);
     const width = range.upper_limit - range.lower_limit || 1;
@@ -118,7 +146,7 @@ export function models({ learner, course }) {
   }));
   const status = learner?.status;
   const errors = Object.entries(status?.prequential_m ?? {}).sort((a, b) => a[1] - b[1]);
-  text("models-of", errors.length ? `Error of each on the ${lastPairs(status)}, the same for all, predicted before they were learnt; measurement noise${noise(status)} included` : "");
+  text("models-of", errors.length ? `Error of each on the ${lastPairs(status)}, the same for all, predicted before they were learnt${noise(status)}` : "");
   const worst = Math.max(1e-12, ...errors.map(([, error]) => error));
   byId("models").hidden = !errors.length;
   byId("models").tBodies[0].replaceChildren(...errors.map(([name, error]) => {

@@ -1,0 +1,54 @@
+"""The camera's pose in diagnosis.json, with its covariance."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from bodyschema.cli.terminal.diagnosis_run import Found, Source
+from bodyschema.diagnosis.diagnosis import Diagnosis
+from bodyschema.diagnosis.fit import fitted
+from bodyschema.diagnosis.observations import Observations
+from bodyschema.effects import Effect, Motion, Simulation
+from bodyschema.recordings.recording import Recording
+from bodyschema.robot.description import RobotDescription
+
+DESK_ARM = Path(__file__).parents[2] / "examples" / "desk_arm" / "robot.toml"
+SHIFT = [0.02, -0.03, 0.01, 0.3, -0.2, 0.4]
+SIGMA_M = 1e-3
+
+
+def found(robot: RobotDescription, truth: Simulation | None, seed: int, effects: tuple[Effect, ...]) -> Found:
+    """Return what is left of a diagnosis whose only unknowns are `effects`."""
+    rng = np.random.default_rng(seed)
+    q = rng.uniform(robot.lower, robot.upper, (60, len(robot.joints)))
+    x = (truth or Simulation(robot)).positions(Motion(q, None, np.zeros(60, dtype=np.int64)))
+    recording = Recording(joints=robot.joints, q=q, x=x + SIGMA_M * rng.normal(size=x.shape))
+    nominal = Simulation(robot, effects)
+    fit = fitted(Observations.of(recording, nominal), nominal, len(effects))
+    return Found(cast(Diagnosis, SimpleNamespace(extended=fit)), Source(recording, "a test"), robot, ())
+
+
+def test_covariance_of_the_pose_covers_the_truth() -> None:
+    robot, squares = RobotDescription.load(DESK_ARM), []
+    truth = Simulation(robot, (Effect.at(robot, "camera_pose", values=SHIFT),))
+    true = robot.camera.pose @ truth.camera_pose
+    for seed in range(12):
+        pose = found(robot, truth, seed, (Effect.at(robot, "camera_pose"),)).hand_eye
+        T = np.array(pose.matrix)
+        turn = Rotation.from_matrix(T[:3, :3] @ true[:3, :3].T).as_rotvec()
+        off = np.concatenate([T[:3, 3] - true[:3, 3], turn])
+        squares.append(off @ np.linalg.solve(np.array(pose.covariance).reshape(6, 6), off))
+    # Chi-squared with 6 degrees of freedom: 6 ± 1 in the mean of twelve.
+    assert 3.0 < np.mean(squares) < 10.0
+
+
+def test_a_pose_that_was_not_fitted_has_no_covariance() -> None:
+    robot = RobotDescription.load(DESK_ARM)
+    pose = found(robot, None, 0, ()).hand_eye
+    assert pose.covariance is None
+    np.testing.assert_allclose(pose.matrix, robot.camera.pose, atol=1e-12)

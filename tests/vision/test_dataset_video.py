@@ -1,0 +1,94 @@
+"""The marker in the videos of a LeRobotDataset."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from ball_renderer import SMALL
+from scenes import Ball, stage
+
+from bodyschema.cli.recordings.dataset_video import markers_in_video
+from bodyschema.daemon.config import Config
+from bodyschema.interfaces.errors import ConfigError, RecordingError
+
+pa = pytest.importorskip("pyarrow")
+sys.path.append(str(Path(__file__).parents[1] / "daemon"))
+from small_arm import write_small_arm  # noqa: E402
+
+FPS, CAMERA = 20.0, "observation.images.front"
+CAMERA_TABLE = """eyes = 1
+focal_px = 600.0
+principal_point_px = [159.5, 119.5]
+image_size_px = [320, 240]
+[vision]
+radius_m = 0.02
+"""
+
+
+def path(episode: int, frames: int) -> list[Ball]:
+    """Return where the ball is in each frame of an episode."""
+    return [Ball((0.02 * k / frames - 0.01 * episode, 0.01 * episode, 0.5), 0.02) for k in range(frames)]
+
+
+def film(file: Path, balls: list[Ball]) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"mp4v"), FPS, SMALL.image_size_px)
+    for ball in balls:
+        writer.write(stage(ball).images[0])
+    writer.release()
+
+
+def dataset(folder: Path, version: str) -> Path:
+    """Write the videos of two episodes of 6 and 4 frames, with what describes them."""
+    import pyarrow.parquet as pq
+
+    (folder / "meta").mkdir(parents=True)
+    features = {CAMERA: {"dtype": "video", "names": ["height", "width", "channels"]}}
+    told = {"codebase_version": version, "robot_type": "so101_follower", "features": features}
+    (folder / "meta" / "info.json").write_text(json.dumps(told))
+    if version == "v2.1":
+        for episode, frames in enumerate((6, 4)):
+            file = folder / "videos" / "chunk-000" / CAMERA / f"episode_{episode:06d}.mp4"
+            film(file, path(episode, frames))
+        return folder
+    film(folder / "videos" / CAMERA / "chunk-000" / "file-000.mp4", path(0, 6) + path(1, 4))
+    episodes = folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
+    episodes.parent.mkdir(parents=True)
+    columns = {"episode_index": [0, 1], "chunk_index": [0, 0], "file_index": [0, 0]}
+    columns |= {"from_timestamp": [0.0, 6 / FPS], "to_timestamp": [6 / FPS, 10 / FPS]}
+    named = {key if key == "episode_index" else f"videos/{CAMERA}/{key}": value for key, value in columns.items()}
+    pq.write_table(pa.table(named), episodes)
+    return folder
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Config:
+    return Config.load(write_small_arm(tmp_path, CAMERA_TABLE), {})
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_the_ball_is_followed_episode_by_episode(version: str, config: Config, tmp_path: Path) -> None:
+    track = markers_in_video(config, dataset(tmp_path / "data", version), CAMERA)
+    assert track.run.tolist() == [0] * 6 + [1] * 4
+    np.testing.assert_allclose(track.t, [k / FPS for frames in (6, 4) for k in range(frames)], atol=1e-6)
+    wanted = np.array([ball.x for episode, frames in enumerate((6, 4)) for ball in path(episode, frames)])
+    # Compression moves the disc's outline by about a tenth of a pixel.
+    np.testing.assert_allclose(track.x[:, :2], wanted[:, :2], atol=5e-4)
+    np.testing.assert_allclose(track.x[:, 2], wanted[:, 2], rtol=0.03)
+
+
+def test_a_camera_that_is_not_there_is_named(config: Config, tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=f"no video observation.images.top.*It has {CAMERA}"):
+        markers_in_video(config, dataset(tmp_path / "data", "v2.1"), "observation.images.top")
+
+
+def test_a_video_that_cannot_be_decoded_is_refused(config: Config, tmp_path: Path) -> None:
+    folder = dataset(tmp_path / "data", "v2.1")
+    next(folder.rglob("*.mp4")).write_bytes(b"no video" * 100)
+    with pytest.raises(ConfigError, match="is no film that can be read"):
+        markers_in_video(config, folder, CAMERA)
