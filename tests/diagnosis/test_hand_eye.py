@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from bodyschema.cli.terminal.diagnosis_run import Found, Source
 from bodyschema.diagnosis.diagnosis import Diagnosis
-from bodyschema.diagnosis.fit import fitted
-from bodyschema.diagnosis.observations import Observations
+from bodyschema.diagnosis.fit.fit import fitted
+from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.effects import Effect, Motion, Simulation
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.description import RobotDescription
