@@ -40,7 +40,7 @@ function* problems(state, connected) {
     if (process.answers) for (const said of process.status.health) yield { kind: "", said: `${name}: ${said}` };
     else {
       const since = process.heard ? `has not answered since ${clock(process.heard)}` : `does not answer on ${process.endpoint}`;
-      yield { kind: "bad", said: `The ${name} ${since}. ${MEANS[name]} Start it with \`bodyschema ${name}\`, or both with \`bodyschema run\`; this page goes on by itself.` };
+      yield { kind: "bad", said: `The ${name} ${since}. ${MEANS[name]} Start it with \`bodyschema run ${name}\`, or both with \`bodyschema run\`; this page goes on by itself.` };
     }
   }
 }
