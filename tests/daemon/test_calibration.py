@@ -151,7 +151,7 @@ def said(arm: Planted, **changed) -> str:
 
 
 def test_zeros_that_nothing_shows_are_said_to_be_left_as_drawn() -> None:
-    assert "Kept at nominal: base_yaw, wrist_roll. The measurements cannot tell" in said(planted(1))
+    assert "Kept at nominal: base_yaw, wrist_roll. The measurements cannot separate" in said(planted(1))
 
 
 def test_a_joint_that_hardly_moved_is_named() -> None:
@@ -181,7 +181,7 @@ def corner() -> CalibrationReport:
 
 def test_few_pairs_of_one_corner_do_not_tell_how_well_the_arm_is_made(corner) -> None:
     assert (corner.axes_deg, corner.points_mm) == (None, None)
-    assert "These pairs do not tell how well the arm is made" in "\n".join(sentences(corner))
+    assert "These pairs do not show how accurately the arm is made" in "\n".join(sentences(corner))
 
 
 def test_few_pairs_of_one_corner_show_few_of_the_numbers(corner) -> None:

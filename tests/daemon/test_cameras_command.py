@@ -121,7 +121,7 @@ def test_the_newest_view_is_checked_whatever_the_digits_of_its_number(folder, tm
 
 def test_that_no_ruler_was_measured_is_said(folder) -> None:
     said = " ".join((folder / "said.txt").read_text(encoding="utf-8").split())
-    assert "No image tells whether the board is as large as it says" in said
+    assert "No image shows whether the board has its stated size" in said
 
 
 def test_images_side_by_side_are_split(tmp_path, folder, capsys) -> None:

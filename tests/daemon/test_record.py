@@ -149,7 +149,9 @@ def test_orientations_are_copied_where_every_pair_has_one(sampler, robot, tmp_pa
 
 def test_following_csv_ends_where_orientations_begin(history, sampler, tmp_path) -> None:
     sampler.pairs = [pair(1), pair(2), turned(3), turned(4)]
-    with pytest.raises(RecordingError, match=r"from pair 3 to 4 some tell how the marker is turned .* 2 rows so far"):
+    with pytest.raises(
+        RecordingError, match=r"from pair 3 to 4 some have a marker orientation and some do not. The 2 rows so far"
+    ):
         follow_history(history, JOINTS, tmp_path / "a.csv", lambda: history.next_seq > 4)
     assert len(Recording.read(tmp_path / "a.csv", JOINTS)) == 2
 

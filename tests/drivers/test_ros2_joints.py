@@ -364,7 +364,7 @@ def complaint(robot: Robot) -> str:
 
 def test_the_names_that_come_are_told_where_ours_does_not() -> None:
     said_of_it = complaint(Robot(joints=("pan", "tilt")))
-    assert "nothing about tilt; it tells of elbow, lift, pan" in said_of_it
+    assert "does not name tilt; it names elbow, lift, pan" in said_of_it
 
 
 def test_what_is_wrong_with_all_messages_is_told() -> None:

@@ -45,7 +45,7 @@ def test_the_messages_that_are_explained_are_those_of_the_driver(message) -> Non
 
 
 def test_there_are_messages_explained() -> None:
-    assert len(MESSAGES) > 7
+    assert len(MESSAGES) > 5
 
 
 def test_the_bench_starts_as_shown(capsys) -> None:
