@@ -9,8 +9,8 @@ import msgspec
 
 from bodyschema.interfaces.records import Reason
 from bodyschema.vision.config import VisionConfig
-from bodyschema.vision.tag_body import TagBody
-from bodyschema.vision.tag_config import TagConfig
+from bodyschema.vision.tags.body import TagBody
+from bodyschema.vision.tags.config import TagConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "tags.md").read_text(encoding="utf-8")

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.records import FloatArray
 
 from .colour import Float32Array, Gate
-from .limb_filters import STEP_PX, Filters, filters, places
+from .contour_filters import STEP_PX, Filters, filters, places
 from .polar import ball_colour, mean_of_three, median, rays_round, sample
 
 # Number of samples on the ball for its colour and the noise, and where they begin (share of the radius).
