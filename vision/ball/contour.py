@@ -1,6 +1,6 @@
 """Measure a ball's edge along rays to a hundredth of a pixel, by matched filters adapted to the background.
 
-The filters are those of `limb_filters`. The texture of a ray's background is the most likely one given its samples.
+The filters are those of `contour_filters`. The texture of a ray's background is the most likely one given its samples.
 Colours are rotated so that the first channel is the ball's own colour. Its shading is unknown there, while the other
 two channels show only the ball's gloss.
 

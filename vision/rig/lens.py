@@ -110,7 +110,7 @@ class Lens:
         px = self.project(np.concatenate([ahead, np.ones((*ahead.shape[:2], 1))], axis=2).reshape(-1, 3))
         px = px.reshape(*ahead.shape[:2], 2)
         outward = np.sum(np.diff(px, axis=0) * rays, axis=2) > 0.0
-        inside = ((px >= 0.0) & (px <= np.array(image_size_px) - 1.0)).all(axis=2)[:-1]
+        inside = np.all((px[:-1] >= 0.0) & (px[:-1] <= np.array(image_size_px) - 1.0), axis=2)
         # What comes back into the image behind the fold is no worse than the fold.
         return bool(np.all(outward | ~np.logical_and.accumulate(inside, axis=0)))
 

@@ -1,6 +1,6 @@
 """Measure a tag in one eye's image: its four corners to hundredths of a pixel, with their covariance.
 
-The four edges of the black square are measured where they are straight, between the corners, see `tag_edge`. The blur
+The four edges of the black square are measured where they are straight, between the corners, see `edge`. The blur
 is estimated from the edges themselves. The corners are the intersections of the edges' lines.
 """
 
