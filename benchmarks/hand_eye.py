@@ -26,7 +26,7 @@ from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.toml_file import read_toml
 from bodyschema.vision.one_eye import first_pose
 from bodyschema.vision.pose import Pose, PoseEstimator, Sighting, mirrored
-from bodyschema.vision.tag_body import TAG_CORNERS
+from bodyschema.vision.tags.body import TAG_CORNERS
 from kbmaps import ChainTolerances, RigidChain, RigidLearner, align
 
 ROBOT = Path(__file__).parent.parent / "examples" / "desk_arm" / "robot.toml"

@@ -20,10 +20,10 @@ import numpy as np
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, ImageArray, MarkerFix, StereoFrame
-from bodyschema.vision.blob import Disc, Region, find_patches, measure
-from bodyschema.vision.colour import ColourGate
+from bodyschema.vision.ball.blob import Disc, Region, find_patches, measure
+from bodyschema.vision.ball.colour import ColourGate
+from bodyschema.vision.ball.sphere import Pinhole
 from bodyschema.vision.config import VisionConfig
-from bodyschema.vision.sphere import Pinhole
 from bodyschema.vision.tracker import StereoTracker
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "vision"))

@@ -29,9 +29,9 @@ from bodyschema.robot.description import RobotDescription
 from bodyschema.sim_backend.config import CameraConfig, SimTag
 from bodyschema.sim_backend.eye import StereoEyes
 from bodyschema.sim_backend.raster import EmptyWorld
-from bodyschema.vision.tag_body import TagBody
-from bodyschema.vision.tag_config import TagConfig
-from bodyschema.vision.tag_tracker import TagTracker
+from bodyschema.vision.tags.body import TagBody
+from bodyschema.vision.tags.config import TagConfig
+from bodyschema.vision.tags.tracker import TagTracker
 from kbmaps import ChainParameters, ChainTolerances, RigidChain, RigidLearner
 
 ROBOT = Path(__file__).parent.parent / "examples" / "desk_arm" / "robot.toml"

@@ -28,8 +28,8 @@ from bodyschema.vision.calibration.gather import gathered
 from bodyschema.vision.calibration.images import pair_files, read_pairs
 from bodyschema.vision.calibration.start import pose_of
 from bodyschema.vision.calibration.view import View
-from bodyschema.vision.lens import DISTORTION_NAMES, Model
-from bodyschema.vision.rig import StereoRig, parameter_names, split
+from bodyschema.vision.rig.lens import DISTORTION_NAMES, Model
+from bodyschema.vision.rig.stereo_rig import StereoRig, parameter_names, split
 
 USUAL = Path("/usr/share/doc/opencv-doc/examples/data")
 EVERY = 4

@@ -9,9 +9,8 @@ from msgspec import Meta
 
 from bodyschema.robot.plugins import PluginConfig
 from bodyschema.robot.toml_types import Fraction, Positive
-
-from .cameras.config import CamerasConfig, FurtherCameras
-from .tag_config import ClusterConfig, TagConfig
+from bodyschema.vision.cameras.config import CamerasConfig, FurtherCameras
+from bodyschema.vision.tags.config import ClusterConfig, TagConfig
 
 Ratio = Annotated[float, Meta(gt=1)]
 

@@ -18,14 +18,14 @@ from bodyschema.interfaces.records import (
     StereoFrame,
     frozen_array,
 )
+from bodyschema.vision.ball.blob import Disc, Patch, Region, find_patches, measure, patch_at, roughly
+from bodyschema.vision.ball.colour import gate_of
+from bodyschema.vision.ball.match import StereoMatcher, is_reflection_of
+from bodyschema.vision.ball.size import BallSize
+from bodyschema.vision.ball.sphere import Pinhole
 
-from .ball_size import BallSize
-from .blob import Disc, Patch, Region, find_patches, measure, patch_at, roughly
-from .colour import gate_of
 from .config import VisionConfig
 from .images import check_calibration, check_images
-from .match import StereoMatcher, is_reflection_of
-from .sphere import Pinhole
 from .triangulate import Location
 
 _log = logging.getLogger(__name__)

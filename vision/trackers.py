@@ -5,11 +5,11 @@ from __future__ import annotations
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.plugins import load
+from bodyschema.vision.ball.one_eye import OneEyeBallTracker
+from bodyschema.vision.tags.body import TagBody
+from bodyschema.vision.tags.tracker import TagTracker
 
 from .config import VisionConfig
-from .one_eye_ball import OneEyeBallTracker
-from .tag_body import TagBody
-from .tag_tracker import TagTracker
 from .tracked_camera import MarkerTracker
 from .tracker import StereoTracker
 

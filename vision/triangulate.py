@@ -9,9 +9,8 @@ import numpy as np
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
-
-from .blob import Disc
-from .sphere import Pinhole
+from bodyschema.vision.ball.blob import Disc
+from bodyschema.vision.ball.sphere import Pinhole
 
 
 @dataclass(frozen=True, slots=True)

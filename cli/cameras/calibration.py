@@ -27,11 +27,11 @@ from bodyschema.vision.calibration.live import LiveViews
 from bodyschema.vision.calibration.report import page as report_page
 from bodyschema.vision.calibration.view import EYES, ONE_EYE
 from bodyschema.vision.printing.sheet import rulers_mm
-from bodyschema.vision.rectified import Rectification
-from bodyschema.vision.rig import CalibrationError, OneEyeRig, StereoRig
-from bodyschema.vision.rig_file import read_rig, write_rig
-from bodyschema.vision.spread import covariance_of
-from bodyschema.vision.triangulated import triangulated
+from bodyschema.vision.rig.rectified import Rectification
+from bodyschema.vision.rig.rig_file import read_rig, write_rig
+from bodyschema.vision.rig.spread import covariance_of
+from bodyschema.vision.rig.stereo_rig import CalibrationError, OneEyeRig, StereoRig
+from bodyschema.vision.rig.triangulated import triangulated
 
 from .board_pages import write_page
 

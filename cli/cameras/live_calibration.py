@@ -19,7 +19,7 @@ from bodyschema.vision.calibration.gather import Gathered, require_both
 from bodyschema.vision.calibration.guidance import Coverage
 from bodyschema.vision.calibration.images import ImagePair
 from bodyschema.vision.calibration.live import LiveViews, Look, Outcome
-from bodyschema.vision.rig import CalibrationError
+from bodyschema.vision.rig.stereo_rig import CalibrationError
 
 from .calibration import Tell, pair_in
 

@@ -11,7 +11,7 @@ from bodyschema.interfaces.errors import ConfigError
 from bodyschema.vision.cluster.page import FACE_SIDES, shape_page, tags_page
 from bodyschema.vision.cluster.shapes import Shape, cube, plate
 from bodyschema.vision.cluster.tables import cluster_tables, tag_tables
-from bodyschema.vision.tag_config import Dictionary
+from bodyschema.vision.tags.config import Dictionary
 
 from .board_pages import write_page
 

@@ -27,9 +27,9 @@ from bodyschema.vision.cameras.opened import eyes_of
 from bodyschema.vision.cameras.realsense import RealsenseCamera
 from bodyschema.vision.cameras.serials import connected
 from bodyschema.vision.cameras.watched import PlainEyes, WatchedCamera
-from bodyschema.vision.rectified import RectifiedCamera
-from bodyschema.vision.rig import OneEyeRig, Rig
-from bodyschema.vision.rig_file import read_rig
+from bodyschema.vision.rig.rectified import RectifiedCamera
+from bodyschema.vision.rig.rig_file import read_rig
+from bodyschema.vision.rig.stereo_rig import OneEyeRig, Rig
 from bodyschema.vision.tracked_camera import TrackedCamera
 from bodyschema.vision.trackers import tracker_of
 

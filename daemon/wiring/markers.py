@@ -19,13 +19,13 @@ from bodyschema.interfaces.records import ImageArray, Reason
 from bodyschema.vision.calibration.images import Images, read_pairs
 from bodyschema.vision.cluster.measure import ClusterView, MeasuredCluster, measure_cluster
 from bodyschema.vision.cluster.tables import cluster_tables
-from bodyschema.vision.rectified import Rectification
-from bodyschema.vision.rig import CalibrationError
-from bodyschema.vision.rig_file import read_rig
-from bodyschema.vision.tag_config import Dictionary, TagConfig
-from bodyschema.vision.tag_dictionary import tags_of
-from bodyschema.vision.tag_finder import Seen, TagFinder
-from bodyschema.vision.tag_image import TagImage
+from bodyschema.vision.rig.rectified import Rectification
+from bodyschema.vision.rig.rig_file import read_rig
+from bodyschema.vision.rig.stereo_rig import CalibrationError
+from bodyschema.vision.tags.config import Dictionary, TagConfig
+from bodyschema.vision.tags.dictionary import tags_of
+from bodyschema.vision.tags.finder import Seen, TagFinder
+from bodyschema.vision.tags.image import TagImage
 
 READ_S = 0.2
 _IMAGES = 20  # images during the observation
@@ -37,7 +37,7 @@ def learnt_colour_table(images: Sequence[Path], at: tuple[float, float] | None) 
     Raises:
         ColourUnlearnt: there is no such ball; the message says why.
     """
-    from bodyschema.vision.colour_model import colour_at, colour_of_the_moving, colour_table, read_images
+    from bodyschema.vision.ball.colour_model import colour_at, colour_of_the_moving, colour_table, read_images
 
     shown = read_images(images)
     return colour_table(colour_of_the_moving(shown) if at is None else colour_at(shown[0], *at))
@@ -54,7 +54,7 @@ def moving_colour_table(eyes: StereoEyes, clock: Clock, seconds: float, tell: Ca
         ColourUnlearnt: nothing colourful moved.
         SourceError: the cameras cannot be opened.
     """
-    from bodyschema.vision.colour_model import colour_of_the_moving, colour_table
+    from bodyschema.vision.ball.colour_model import colour_of_the_moving, colour_table
 
     shown: list[ImageArray] = []
     source = ReconnectingSource(eyes, "the cameras", clock)

@@ -44,7 +44,7 @@ def simulation_settings(config: Config) -> SimConfig:
 def _marker(vision: VisionConfig) -> dict[str, Any]:
     """Return the keys of [sim.camera] that show the marker of [vision]."""
     if vision.marker in ("tag", "cluster"):
-        from bodyschema.vision.tag_dictionary import DICTIONARIES
+        from bodyschema.vision.tags.dictionary import DICTIONARIES
 
         return {"tags": _tags(vision), "tag_dictionary": DICTIONARIES[vision.tag.dictionary]}
     ball = {"ball_radius_m": vision.radius_m}
@@ -81,7 +81,7 @@ def _require_found(config: Config, calibration: StereoCalibration, camera: Camer
 
 def _tags(vision: VisionConfig) -> tuple[SimTag, ...]:
     from bodyschema.sim_backend.config import SimTag
-    from bodyschema.vision.tag_config import PlacedTag
+    from bodyschema.vision.tags.config import PlacedTag
 
     placed = (PlacedTag(id=vision.tag.id),) if vision.marker == "tag" else vision.cluster.tags
     return tuple(SimTag(id=tag.id, xyz=tag.xyz, rpy=tag.rpy, side_m=tag.side_m or vision.tag.side_m) for tag in placed)

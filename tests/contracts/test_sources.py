@@ -66,9 +66,9 @@ from bodyschema.vision.cameras.device import OpenCapture
 from bodyschema.vision.cameras.ideal import IdealCamera
 from bodyschema.vision.cameras.opened import eyes_of
 from bodyschema.vision.config import VisionConfig
-from bodyschema.vision.lens import Lens
-from bodyschema.vision.rectified import RectifiedCamera
-from bodyschema.vision.rig import Made, StereoRig
+from bodyschema.vision.rig.lens import Lens
+from bodyschema.vision.rig.rectified import RectifiedCamera
+from bodyschema.vision.rig.stereo_rig import Made, StereoRig
 from bodyschema.vision.tracked_camera import TrackedCamera
 from bodyschema.vision.tracker import StereoTracker
 from bodyschema.vision.trackers import tracker_of

@@ -17,8 +17,8 @@ from bodyschema.cli.cameras.calibration import NORMAL_95, CamerasFile, CheckFile
 from bodyschema.cli.main import app
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.interval import to_its_interval
-from bodyschema.vision.rig import CalibrationError
-from bodyschema.vision.rig_file import read_rig
+from bodyschema.vision.rig.rig_file import read_rig
+from bodyschema.vision.rig.stereo_rig import CalibrationError
 
 
 def called(*arguments: object) -> None:

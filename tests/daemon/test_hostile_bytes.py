@@ -44,7 +44,7 @@ from bodyschema.recordings.recording import Recording, joints_in
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.lerobot import MotorCalibration, calibration_json, read_calibration
 from bodyschema.robot.urdf import UrdfTree
-from bodyschema.vision.rig_file import read_rig
+from bodyschema.vision.rig.rig_file import read_rig
 from kbmaps import KBMapsError
 
 MOST_BYTES = 200 * 2**20  # of memory that reading a small file may take

@@ -27,8 +27,8 @@ from bodyschema.vision.calibration.gather import Gathered
 from bodyschema.vision.calibration.images import pair_files
 from bodyschema.vision.calibration.live import LiveViews
 from bodyschema.vision.calibration.view import View
-from bodyschema.vision.rig import CalibrationError
-from bodyschema.vision.rig_file import read_rig, write_rig
+from bodyschema.vision.rig.rig_file import read_rig, write_rig
+from bodyschema.vision.rig.stereo_rig import CalibrationError
 
 RIGHT = ("A1", "B2")
 

@@ -13,7 +13,7 @@ from small_arm import write_small_arm
 from bodyschema.cli.main import app
 from bodyschema.interfaces.errors import BodyschemaError, ConfigError
 from bodyschema.vision.config import VisionConfig
-from bodyschema.vision.tag_body import TagBody
+from bodyschema.vision.tags.body import TagBody
 
 
 def called(*arguments: object) -> None:

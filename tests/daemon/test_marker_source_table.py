@@ -13,9 +13,9 @@ from bodyschema.daemon.wiring.wiring import marker_source_lines, open_sources
 from bodyschema.drivers.markers.config import NatnetTable, UdpTable
 from bodyschema.drivers.markers.fusing import FusedMarkers
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.vision.lens import Lens
-from bodyschema.vision.rig import Made, StereoRig
-from bodyschema.vision.rig_file import write_rig
+from bodyschema.vision.rig.lens import Lens
+from bodyschema.vision.rig.rig_file import write_rig
+from bodyschema.vision.rig.stereo_rig import Made, StereoRig
 
 JOINTS = '[drivers.ros2]\nrouter = "tcp/127.0.0.1:7461"\n'
 

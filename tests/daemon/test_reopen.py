@@ -11,7 +11,7 @@ from shown_board import SIZE, known_rig
 from bodyschema.daemon.sampler.reconnect import ReconnectingSource
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.records import JointReading, StereoFrame, frozen_array
-from bodyschema.vision.rectified import RectifiedCamera
+from bodyschema.vision.rig.rectified import RectifiedCamera
 
 READING = JointReading(1.0, frozen_array([0.0]))
 

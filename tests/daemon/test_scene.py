@@ -10,7 +10,7 @@ from bodyschema.cli.demo.scene import CUBE_M, prepare
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.wiring import open_sources
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.vision.tag_body import TagBody
+from bodyschema.vision.tags.body import TagBody
 
 STICK_RADIUS_M = 0.005
 

@@ -20,7 +20,7 @@ from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.cameras import camera_checks
 from bodyschema.daemon.wiring.wiring import check_sources
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.vision.rig_file import write_rig
+from bodyschema.vision.rig.rig_file import write_rig
 
 STEREO = """
 focal_px = 300.0

@@ -14,8 +14,8 @@ from bodyschema.interfaces.records import FloatArray, ImageArray, StereoFrame
 from bodyschema.vision.board import Board, Corners, NotFound
 from bodyschema.vision.calibration.images import ImagePair
 from bodyschema.vision.calibration.view import View
-from bodyschema.vision.lens import Model
-from bodyschema.vision.rig import Made, StereoRig, parameter_names, split
+from bodyschema.vision.rig.lens import Model
+from bodyschema.vision.rig.stereo_rig import Made, StereoRig, parameter_names, split
 
 SIZE = (640, 480)
 BOARD = Board()

@@ -10,7 +10,7 @@ from scenes import RADIUS_M, Errors, compare, measure_errors, place
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import MarkerFix
-from bodyschema.vision.limb import Limb
+from bodyschema.vision.ball.contour import Limb
 from bodyschema.vision.tracker import StereoTracker
 
 LOOKS = {

@@ -12,7 +12,7 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import MarkerFix, StereoFrame
 from bodyschema.vision.cameras.annotate import GREEN, RED, Annotator
 from bodyschema.vision.config import VisionConfig
-from bodyschema.vision.tag_config import TagConfig
+from bodyschema.vision.tags.config import TagConfig
 from bodyschema.vision.trackers import tracker_of
 
 CAMERAS = StereoCalibration(

@@ -9,9 +9,9 @@ from ball_renderer import SMALL, in_eyes
 from scenes import RADIUS_M, Ball, reason, stage
 
 from bodyschema.interfaces.records import MarkerFix, Reason
-from bodyschema.vision.ball_size import BallSize
-from bodyschema.vision.blob import Disc
-from bodyschema.vision.sphere import Pinhole
+from bodyschema.vision.ball.blob import Disc
+from bodyschema.vision.ball.size import BallSize
+from bodyschema.vision.ball.sphere import Pinhole
 from bodyschema.vision.tracker import StereoTracker
 from bodyschema.vision.triangulate import Location, locate
 

@@ -21,8 +21,8 @@ from bodyschema.vision.calibration.guidance import Coverage
 from bodyschema.vision.calibration.images import ImagePair
 from bodyschema.vision.calibration.influence import covariance
 from bodyschema.vision.calibration.view import View
-from bodyschema.vision.lens import Lens
-from bodyschema.vision.rig import CalibrationError, lenses_of
+from bodyschema.vision.rig.lens import Lens
+from bodyschema.vision.rig.stereo_rig import CalibrationError, lenses_of
 
 ASKED = Asked(SIZE, ("A1", "B2"), "2026-01-01T00:00:00Z", scale_sigma=0.0)
 PINHOLE = replace(ASKED, model="pinhole")

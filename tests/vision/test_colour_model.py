@@ -11,8 +11,8 @@ from scenes import Ball, Slab, sigmas_off, stage
 
 from bodyschema.daemon.wiring.markers import learnt_colour_table
 from bodyschema.interfaces.records import MarkerFix
-from bodyschema.vision.colour import ColourGate
-from bodyschema.vision.colour_model import ColourUnlearnt, colour_at, colour_of_the_moving, colour_table
+from bodyschema.vision.ball.colour import ColourGate
+from bodyschema.vision.ball.colour_model import ColourUnlearnt, colour_at, colour_of_the_moving, colour_table
 from bodyschema.vision.config import HueBand, VisionConfig
 from bodyschema.vision.tracker import StereoTracker
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bodyschema.vision.lens import Lens, Model
+from bodyschema.vision.rig.lens import Lens, Model
 
 SIZE = (320, 240)
 BARREL: dict[Model, tuple[float, ...]] = {

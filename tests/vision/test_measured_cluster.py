@@ -21,11 +21,11 @@ from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.vision.cluster.measure import ClusterView, MeasuredCluster, measure_cluster
 from bodyschema.vision.cluster.tables import cluster_tables
-from bodyschema.vision.lens import Lens
-from bodyschema.vision.rig import CalibrationError, Made, StereoRig, parameter_names
-from bodyschema.vision.rig_file import write_rig
-from bodyschema.vision.tag_config import PlacedTag
-from bodyschema.vision.tag_image import TagImage
+from bodyschema.vision.rig.lens import Lens
+from bodyschema.vision.rig.rig_file import write_rig
+from bodyschema.vision.rig.stereo_rig import CalibrationError, Made, StereoRig, parameter_names
+from bodyschema.vision.tags.config import PlacedTag
+from bodyschema.vision.tags.image import TagImage
 
 EYES = StereoCalibration(600.0, (319.5, 239.5), 0.12, (640, 480), 0.0)
 SIDE_M = 0.04

@@ -21,12 +21,12 @@ from bodyschema.vision.calibration.calibrate import Asked, Calibrated, calibrate
 from bodyschema.vision.calibration.guidance import Coverage
 from bodyschema.vision.calibration.view import ONE_EYE
 from bodyschema.vision.config import VisionConfig
-from bodyschema.vision.rectified import Rectification
-from bodyschema.vision.rig import OneEyeRig, OtherCameras
-from bodyschema.vision.rig_file import read_rig, write_rig
-from bodyschema.vision.tag_body import TagBody
-from bodyschema.vision.tag_config import ClusterConfig, PlacedTag, TagConfig
-from bodyschema.vision.tag_tracker import TagTracker
+from bodyschema.vision.rig.rectified import Rectification
+from bodyschema.vision.rig.rig_file import read_rig, write_rig
+from bodyschema.vision.rig.stereo_rig import OneEyeRig, OtherCameras
+from bodyschema.vision.tags.body import TagBody
+from bodyschema.vision.tags.config import ClusterConfig, PlacedTag, TagConfig
+from bodyschema.vision.tags.tracker import TagTracker
 from bodyschema.vision.tracked_camera import MarkerTracker
 from bodyschema.vision.trackers import tracker_of
 

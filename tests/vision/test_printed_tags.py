@@ -20,7 +20,7 @@ from bodyschema.vision.cluster.shapes import Shape, cube, plate
 from bodyschema.vision.cluster.tables import cluster_tables, tag_tables
 from bodyschema.vision.config import VisionConfig
 from bodyschema.vision.printing import Page, pdf, svg
-from bodyschema.vision.tag_config import Dictionary
+from bodyschema.vision.tags.config import Dictionary
 from bodyschema.vision.trackers import tracker_of
 
 EYES = StereoCalibration(900.0, (639.5, 479.5), 0.10, (1280, 960), 0.1)

@@ -12,11 +12,11 @@ from scenes import RADIUS_M, Ball, Slab, place, reason, sigmas_off, stage
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.records import MarkerFix, Reason, StereoFrame
-from bodyschema.vision.blob import Disc, Region, find_patches, measure
-from bodyschema.vision.colour import gate_of
+from bodyschema.vision.ball.blob import Disc, Region, find_patches, measure
+from bodyschema.vision.ball.colour import gate_of
+from bodyschema.vision.ball.match import StereoMatcher
+from bodyschema.vision.ball.sphere import Pinhole
 from bodyschema.vision.config import VisionConfig
-from bodyschema.vision.match import StereoMatcher
-from bodyschema.vision.sphere import Pinhole
 from bodyschema.vision.tracker import StereoTracker
 from bodyschema.vision.triangulate import Location
 

@@ -11,8 +11,8 @@ from board_renderer import webcams
 from shown_board import known_rig
 
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.vision.rig import CalibrationError, StereoRig
-from bodyschema.vision.rig_file import read_rig, write_rig
+from bodyschema.vision.rig.rig_file import read_rig, write_rig
+from bodyschema.vision.rig.stereo_rig import CalibrationError, StereoRig
 
 
 @pytest.fixture(params=[False, True], ids=["pinhole", "fisheye"])

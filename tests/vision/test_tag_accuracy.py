@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from tag_renderer import Sheet, photograph
 
 from bodyschema.interfaces.records import FloatArray, MarkerFix
-from bodyschema.vision.tag_body import TagBody
-from bodyschema.vision.tag_config import TagConfig
-from bodyschema.vision.tag_tracker import TagTracker
+from bodyschema.vision.tags.body import TagBody
+from bodyschema.vision.tags.config import TagConfig
+from bodyschema.vision.tags.tracker import TagTracker
 from kbmaps import rotation_vectors
 
 FRAMES = 120

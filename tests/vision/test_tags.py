@@ -16,11 +16,11 @@ from bodyschema.interfaces.errors import ConfigError, SourceError
 from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, StereoFrame
 from bodyschema.vision.config import VisionConfig
 from bodyschema.vision.pose import PoseEstimator, Sighting, mirrored
-from bodyschema.vision.tag_body import TAG_CORNERS, TagBody
-from bodyschema.vision.tag_config import ClusterConfig, PlacedTag, TagConfig
-from bodyschema.vision.tag_edge import PIXEL_CUMULANT, blurred_step
-from bodyschema.vision.tag_image import TagImage, measure_tag
-from bodyschema.vision.tag_tracker import TagTracker
+from bodyschema.vision.tags.body import TAG_CORNERS, TagBody
+from bodyschema.vision.tags.config import ClusterConfig, PlacedTag, TagConfig
+from bodyschema.vision.tags.edge import PIXEL_CUMULANT, blurred_step
+from bodyschema.vision.tags.image import TagImage, measure_tag
+from bodyschema.vision.tags.tracker import TagTracker
 from bodyschema.vision.tracker import StereoTracker
 from bodyschema.vision.trackers import tracker_of
 from kbmaps import rotation_vectors

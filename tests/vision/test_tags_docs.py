@@ -9,8 +9,8 @@ import msgspec
 
 from bodyschema.interfaces.records import Reason
 from bodyschema.vision.config import VisionConfig
-from bodyschema.vision.tag_body import TagBody
-from bodyschema.vision.tag_config import TagConfig
+from bodyschema.vision.tags.body import TagBody
+from bodyschema.vision.tags.config import TagConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "tags.md").read_text(encoding="utf-8")
@@ -28,7 +28,8 @@ def test_the_page_s_cluster_is_one() -> None:
 
 def test_the_page_lists_every_reason_of_the_tag_tracker() -> None:
     files = (
-        ROOT / "vision" / name for name in ("tag_edge.py", "tag_image.py", "tag_finder.py", "tag_tracker.py", "pose.py")
+        ROOT / "vision" / name
+        for name in ("tags/edge.py", "tags/image.py", "tags/finder.py", "tags/tracker.py", "pose.py")
     )
     given = {Reason[name].value for file in files for name in re.findall(r"\bReason\.([A-Z_]+)", file.read_text())}
     assert given == set(re.findall(r"^\| `(\w+)` \|", PAGE, re.MULTILINE))

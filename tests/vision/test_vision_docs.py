@@ -41,11 +41,12 @@ def test_the_page_names_every_colour():
 
 
 def test_the_page_lists_every_reason_that_the_tracker_gives():
-    sources = "".join(file.read_text(encoding="utf-8") for file in (ROOT / "vision").glob("*.py"))
+    files = [file for folder in ("", "ball", "tags") for file in (ROOT / "vision" / folder).glob("*.py")]
+    sources = "".join(file.read_text(encoding="utf-8") for file in files)
     given = {Reason[name].value for name in re.findall(r"\bReason\.([A-Z_]+)", sources)}
     assert given == set(re.findall(r"^\| `(\w+)` \|", PAGE, re.MULTILINE)) & set(Reason)
 
 
-@pytest.mark.parametrize("file", re.findall(r"`(\w+\.py)`", PAGE + METHOD))
+@pytest.mark.parametrize("file", re.findall(r"`([\w/]+\.py)`", PAGE + METHOD))
 def test_every_module_that_the_pages_name_exists(file):
     assert (ROOT / "vision" / file).is_file()

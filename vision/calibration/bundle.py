@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.vision.lens import Lens, Model
-from bodyschema.vision.rig import CalibrationError, lens_of_one, split
+from bodyschema.vision.rig.lens import Lens, Model
+from bodyschema.vision.rig.stereo_rig import CalibrationError, lens_of_one, split
 
 from .view import EYES, Eye, View
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.vision.board import Board
-from bodyschema.vision.lens import DISTORTION_NAMES, Model
-from bodyschema.vision.rig import CalibrationError, Made, OneEyeRig, Rig, StereoRig, lenses_of, split
+from bodyschema.vision.rig.lens import DISTORTION_NAMES, Model
+from bodyschema.vision.rig.stereo_rig import CalibrationError, Made, OneEyeRig, Rig, StereoRig, lenses_of, split
 
 from .bundle import Bundle, solve
 from .guidance import Coverage

@@ -10,7 +10,7 @@ from typing import Protocol
 
 from bodyschema.interfaces.records import ImageArray
 from bodyschema.vision.board import OTHER_BOARD, Board, BoardDetector, Corners, NotFound
-from bodyschema.vision.rig import CalibrationError
+from bodyschema.vision.rig.stereo_rig import CalibrationError
 
 from .guidance import Coverage
 from .images import ImagePair, require_equal_sizes

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.vision.board import Board, Corners
-from bodyschema.vision.lens import Lens
+from bodyschema.vision.rig.lens import Lens
 
 from .start import pose_of
 from .view import EYES, Eye, View, all_px, image_of, seen_by

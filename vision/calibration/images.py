@@ -13,7 +13,7 @@ from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import ImageArray
 from bodyschema.interfaces.whole_files import write_whole
 from bodyschema.vision.image_file import read_image
-from bodyschema.vision.rig import CalibrationError
+from bodyschema.vision.rig.stereo_rig import CalibrationError
 
 _ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
 _EYE = re.compile(r"(?<![a-z])(left|right|l|r)(?![a-z])", re.IGNORECASE)

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.vision.rectified import Rectification
-from bodyschema.vision.rig import CalibrationError, Rig, StereoRig
+from bodyschema.vision.rig.rectified import Rectification
+from bodyschema.vision.rig.stereo_rig import CalibrationError, Rig, StereoRig
 
 from .guidance import Coverage, cell_name
 from .view import image_of

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.vision.board import Corners
-from bodyschema.vision.lens import DISTORTION_NAMES, Lens, Model
-from bodyschema.vision.rig import CalibrationError
+from bodyschema.vision.rig.lens import DISTORTION_NAMES, Lens, Model
+from bodyschema.vision.rig.stereo_rig import CalibrationError
 
 from .view import EYES, Eye, View, seen_by
 

@@ -10,10 +10,10 @@ import numpy as np
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame
 from bodyschema.interfaces.rejections import WORDS
-from bodyschema.vision.blob import Region, find_patches, measure
-from bodyschema.vision.colour import gate_of
+from bodyschema.vision.ball.blob import Region, find_patches, measure
+from bodyschema.vision.ball.colour import gate_of
+from bodyschema.vision.ball.sphere import Pinhole
 from bodyschema.vision.config import VisionConfig
-from bodyschema.vision.sphere import Pinhole
 
 from .annotate_tags import TagDrawing, TagSight, outline
 

@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, ImageArray, MarkerFix, Reason
 from bodyschema.vision.config import VisionConfig
-from bodyschema.vision.tag_body import TagBody
-from bodyschema.vision.tag_dictionary import tags_of
-from bodyschema.vision.tag_finder import TagFinder
-from bodyschema.vision.tag_image import measure_tag
+from bodyschema.vision.tags.body import TagBody
+from bodyschema.vision.tags.dictionary import tags_of
+from bodyschema.vision.tags.finder import TagFinder
+from bodyschema.vision.tags.image import measure_tag
 
 SUBPIXEL_BITS = 4
 AXES = ((60, 60, 255), (60, 220, 60), (255, 140, 60))  # x, y, z

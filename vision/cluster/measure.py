@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.vision.pose import fitted_motion, projection_slopes, turned, whitening
-from bodyschema.vision.rig import CalibrationError
-from bodyschema.vision.tag_body import TAG_CORNERS
-from bodyschema.vision.tag_config import PlacedTag
-from bodyschema.vision.tag_image import TagImage
+from bodyschema.vision.rig.stereo_rig import CalibrationError
+from bodyschema.vision.tags.body import TAG_CORNERS
+from bodyschema.vision.tags.config import PlacedTag
+from bodyschema.vision.tags.image import TagImage
 from bodyschema.vision.triangulate import triangulate
 
 from .shapes import rpy_of

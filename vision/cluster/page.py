@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.vision.printing.sheet import AROUND_MM, LINE_MM, Page, Rectangle, Text, page, pattern, sheets
-from bodyschema.vision.tag_config import Dictionary
-from bodyschema.vision.tag_dictionary import tag_modules
-from bodyschema.vision.tag_edge import MODULES
+from bodyschema.vision.tags.config import Dictionary
+from bodyschema.vision.tags.dictionary import tag_modules
+from bodyschema.vision.tags.edge import MODULES
 
 from .shapes import Cell, Shape
 

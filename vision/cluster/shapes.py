@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.vision.tag_config import PlacedTag
+from bodyschema.vision.tags.config import PlacedTag
 
 Cell = tuple[int, int]
 # Column and row of a face's neighbour on the sheet, and the axis of its frame (x right, y up) that they fold about:

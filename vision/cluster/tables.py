@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from bodyschema.vision.tag_config import Dictionary, PlacedTag, Vector
+from bodyschema.vision.tags.config import Dictionary, PlacedTag, Vector
 
 
 def cluster_tables(dictionary: Dictionary, side_m: float, tags: Sequence[PlacedTag], notes: Sequence[str] = ()) -> str:

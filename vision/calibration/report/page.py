@@ -14,8 +14,8 @@ from bodyschema.vision.calibration.calibrate import Calibrated
 from bodyschema.vision.calibration.gather import Gathered
 from bodyschema.vision.calibration.report import pictures
 from bodyschema.vision.calibration.view import Eye, View, all_px, image_of
-from bodyschema.vision.rectified import Rectification
-from bodyschema.vision.rig import StereoRig
+from bodyschema.vision.rig.rectified import Rectification
+from bodyschema.vision.rig.stereo_rig import StereoRig
 
 _NORMAL_95 = 1.96
 _ARROW_SHARE = 0.04  # of the image's width: arrow length for the 95 % quantile of the residuals

@@ -8,7 +8,7 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
 
-from .rig import StereoRig
+from .stereo_rig import StereoRig
 
 _STEP = 1e-3  # of a parameter's sigma
 

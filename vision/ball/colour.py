@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import ImageArray
-
-from .config import HueBand, VisionConfig
+from bodyschema.vision.config import HueBand, VisionConfig
 
 Float32Array = NDArray[np.float32]
 

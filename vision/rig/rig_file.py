@@ -18,7 +18,7 @@ from bodyschema.robot.toml_text import toml_text
 from bodyschema.robot.toml_types import Positive
 
 from .lens import DISTORTION_NAMES, Lens, Model
-from .rig import Made, OneEyeRig, Rig, StereoRig, parameter_names
+from .stereo_rig import Made, OneEyeRig, Rig, StereoRig, parameter_names
 
 FORMAT, FORMAT_OF_ONE = "bodyschema stereo rig 1", "bodyschema camera 1"
 _AGAIN = "Take the file from a copy, or calibrate again: `bodyschema calibrate cameras`"

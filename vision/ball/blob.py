@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
+from bodyschema.vision.config import VisionConfig
 
 from .colour import Gate
-from .config import VisionConfig
 from .outline import Outline, fit_outline, refine_outline
 from .sphere import Pinhole
 

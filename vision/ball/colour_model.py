@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.records import FloatArray, ImageArray
-
-from .config import HueBand
-from .image_file import read_image
+from bodyschema.vision.config import HueBand
+from bodyschema.vision.image_file import read_image
 
 # Radius around a click for the first colour [px]; the ball is the connected region of nearly that colour.
 _SEED_PX = 3

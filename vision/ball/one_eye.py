@@ -6,12 +6,12 @@ import numpy as np
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, StereoFrame, frozen_array
+from bodyschema.vision.config import VisionConfig
+from bodyschema.vision.images import check_calibration, check_images
 
-from .ball_size import RADIUS_SIGMA
 from .blob import Disc, Region, find_patches, measure
 from .colour import gate_of
-from .config import VisionConfig
-from .images import check_calibration, check_images
+from .size import RADIUS_SIGMA
 from .sphere import Pinhole
 
 # Distances that follow from the ball's size, each better than the last by a factor of its squared size in the image.

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray, frozen_array
 
-from .tag_config import ClusterConfig, PlacedTag, TagConfig
+from .config import ClusterConfig, PlacedTag, TagConfig
 
 # Corners of a tag of side 1 in its own frame (x right, y up, z out of it): as `TagImage` has them.
 TAG_CORNERS = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])

@@ -9,9 +9,9 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
 
-from .tag_config import TagConfig
-from .tag_dictionary import tags_of
-from .tag_image import TagImage, measure_tag
+from .config import TagConfig
+from .dictionary import tags_of
+from .image import TagImage, measure_tag
 
 # Squares are two where their corners are on the mean so far apart, as a share of the perimeter.
 _APART_SHARE = 0.03

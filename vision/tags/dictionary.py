@@ -10,8 +10,8 @@ import numpy as np
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
 
-from .tag_config import Dictionary
-from .tag_edge import MODULES
+from .config import Dictionary
+from .edge import MODULES
 
 # OpenCV's numbers of the dictionaries.
 DICTIONARIES: dict[Dictionary, int] = {

@@ -20,16 +20,16 @@ from bodyschema.interfaces.records import (
     StereoFrame,
     frozen_array,
 )
+from bodyschema.vision.images import check_calibration, check_images
+from bodyschema.vision.one_eye import first_pose
+from bodyschema.vision.pose import Pose, PoseEstimator, Sighting, fitted_motion, mirrored
+from bodyschema.vision.triangulate import triangulate
 
-from .images import check_calibration, check_images
-from .one_eye import first_pose
-from .pose import Pose, PoseEstimator, Sighting, fitted_motion, mirrored
-from .tag_body import TagBody
-from .tag_config import TagConfig
-from .tag_dictionary import require_tag
-from .tag_finder import Seen, TagFinder
-from .tag_image import TagImage
-from .triangulate import triangulate
+from .body import TagBody
+from .config import TagConfig
+from .dictionary import require_tag
+from .finder import Seen, TagFinder
+from .image import TagImage
 
 _log = logging.getLogger(__name__)
 

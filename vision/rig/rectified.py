@@ -17,7 +17,7 @@ from bodyschema.interfaces.protocols import StereoEyes
 from bodyschema.interfaces.records import FloatArray, ImageArray, StereoFrame
 
 from .lens import WIDEST, Lens
-from .rig import CalibrationError, OneEyeRig, Rig
+from .stereo_rig import CalibrationError, OneEyeRig, Rig
 
 _BORDER_POINTS = 64
 

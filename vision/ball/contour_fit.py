@@ -10,11 +10,11 @@ import numpy as np
 from bodyschema.interfaces.records import FloatArray
 
 from .colour import Float32Array, Gate
-from .limb import Limb, find_limb
-from .limb_filters import USUAL_BLUR_PX
+from .contour import Limb, find_limb
+from .contour_filters import USUAL_BLUR_PX
+from .contour_spectrum import Waves, waves
 from .normal import inverse_of_normal
 from .polar import median
-from .waves import Waves, waves
 
 # Most iterations; converged when the limb and its blur changed by less than these [px].
 _LOOKS, _SETTLED_PX, _SETTLED_BLUR_PX = 4, 0.02, 0.05

@@ -14,8 +14,7 @@ import numpy as np
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, Reason
-
-from .triangulate import Location, triangulate
+from bodyschema.vision.triangulate import Location, triangulate
 
 # Relative 1-sigma of a ball's radius measured by hand, and of the size from one place to another after calibration.
 RADIUS_SIGMA, _TOLERANCE = 0.03, 0.004

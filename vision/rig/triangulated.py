@@ -6,7 +6,7 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
 
-from .rig import StereoRig
+from .stereo_rig import StereoRig
 
 
 def triangulated(rig: StereoRig, left_px: FloatArray, right_px: FloatArray) -> FloatArray:

@@ -11,10 +11,10 @@ import numpy as np
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import ImageArray, Reason
+from bodyschema.vision.config import VisionConfig
+from bodyschema.vision.triangulate import Location, locate
 
 from .blob import Disc
-from .config import VisionConfig
-from .triangulate import Location, locate
 
 # A mirror gives back less than this of the light, and its copy stands farther off.
 _MIRRORED_LIGHT = 0.8

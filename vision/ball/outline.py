@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.records import FloatArray
 
 from .colour import Float32Array, Gate
-from .limb_fit import fit_limb
+from .contour_fit import fit_limb
+from .contour_spectrum import waves
 from .normal import inverse_of_normal
 from .polar import ball_colour, mean_of_three, median, rays_round, sample
-from .waves import waves
 
 BoolArray = NDArray[np.bool_]
 

@@ -1,6 +1,6 @@
 """Measure a ball's edge along rays to a hundredth of a pixel, by matched filters adapted to the background.
 
-The filters are those of `limb_filters`. The texture of a ray's background is the most likely one given its samples.
+The filters are those of `contour_filters`. The texture of a ray's background is the most likely one given its samples.
 Colours are rotated so that the first channel is the ball's own colour. Its shading is unknown there, while the other
 two channels show only the ball's gloss.
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.records import FloatArray
 
 from .colour import Float32Array, Gate
-from .limb_filters import STEP_PX, Filters, filters, places
+from .contour_filters import STEP_PX, Filters, filters, places
 from .polar import ball_colour, mean_of_three, median, rays_round, sample
 
 # Number of samples on the ball for its colour and the noise, and where they begin (share of the radius).

@@ -19,7 +19,7 @@ from scipy.special import ndtr
 
 from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
 
-from .tag_config import TagConfig
+from .config import TagConfig
 
 # Black border, data and border of all dictionaries that are offered: 6 + 2 modules.
 MODULES = 8.0

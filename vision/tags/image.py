@@ -1,6 +1,6 @@
 """Measure a tag in one eye's image: its four corners to hundredths of a pixel, with their covariance.
 
-The four edges of the black square are measured where they are straight, between the corners, see `tag_edge`. The blur
+The four edges of the black square are measured where they are straight, between the corners, see `edge`. The blur
 is estimated from the edges themselves. The corners are the intersections of the edges' lines.
 """
 
@@ -14,8 +14,8 @@ from scipy.fft import dct
 
 from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
 
-from .tag_config import TagConfig
-from .tag_edge import LONGEST_REACH_PX, MODULES, SHARPEST_PX, Edge, Light, find_edge
+from .config import TagConfig
+from .edge import LONGEST_REACH_PX, MODULES, SHARPEST_PX, Edge, Light, find_edge
 
 # Most iterations; converged when no corner moved by more than this [px] and the blur by no more than this share.
 _ROUNDS, _SETTLED_PX, _SETTLED_BLUR = 8, 0.01, 0.02

@@ -1,0 +1,1 @@
+"""Find a ball of known colour in images, and measure it."""

@@ -1,0 +1,1 @@
+"""Lenses and the geometry of calibrated cameras."""
