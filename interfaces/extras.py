@@ -8,6 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.interpreter import this_interpreter
 
 # Each extra of pyproject.toml and the modules by which it is recognised.
 MODULES = {
@@ -46,10 +47,10 @@ def missing(module: str, extra: str, what: str) -> ConfigError:
 
 def install_command(extra: str) -> str:
     """Return the command that adds an extra to this installation; it needs no published bodyschema."""
-    pip, here = shutil.which("pip"), Path(sys.executable).absolute().parent
-    own = pip is not None and Path(pip).absolute().parent == here
+    pip, python = shutil.which("pip"), Path(this_interpreter())
+    own = pip is not None and Path(pip).absolute().parent == python.parent
     what = _ALONE.get(extra, f"'bodyschema[{extra}]'")
-    return f"{'pip' if own else f'{sys.executable} -m pip'} install {what}"
+    return f"{'pip' if own else f'{python} -m pip'} install {what}"
 
 
 def no_pybullet() -> str:

@@ -8,9 +8,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 
+def this_interpreter() -> str:
+    """Return the path of this interpreter."""
+    return os.path.abspath(sys.executable)
+
+
 def module_command(module: str, *arguments: str) -> list[str]:
     """Return the command that runs `module` with this interpreter."""
-    return [os.path.abspath(sys.executable), "-P", "-m", module, *arguments]
+    return [this_interpreter(), "-P", "-m", module, *arguments]
 
 
 @contextmanager
