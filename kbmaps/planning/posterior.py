@@ -8,7 +8,7 @@ from typing import Protocol, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import KDTree
+from scipy.spatial import KDTree  # pyright: ignore[reportMissingTypeStubs]
 
 from kbmaps.arrays import FloatArray, IntArray, rows
 from kbmaps.chains.belief import ChainBelief
