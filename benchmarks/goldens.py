@@ -12,6 +12,7 @@ import argparse
 import json
 import math
 import os
+import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -131,7 +132,7 @@ def older_files() -> Iterator[Golden]:
     for file in sorted(OLDER.glob("*.ckpt")):
         yield f"file/{file.name}", checkpoint(file)
     for file in sorted(OLDER.glob("*.sqlite")):
-        with PairReader(file) as reader:
+        with tempfile.TemporaryDirectory() as folder, PairReader(Path(shutil.copy(file, folder))) as reader:
             pairs = list(reader.read())
         yield f"file/{file.name}", {"q": [pair.q for pair in pairs], "x": [pair.x for pair in pairs]}
 

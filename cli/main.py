@@ -83,6 +83,11 @@ RENAMED = {
     ("fleet", "diagnose"): ("fleet",),
 }
 COMMANDS = {name: summary for group in GROUPS.values() for name, summary in group.items()}
+# In cli/commands/, a folder for each group.
+_FOLDERS = dict(zip(GROUPS, ("start", "calibrate", "run", "hardware", "data"), strict=True))
+MODULES = {
+    name: f"bodyschema.cli.commands.{_FOLDERS[title]}.{name}" for title, group in GROUPS.items() for name in group
+}
 # One object each: commands that are apps keep theirs, and two of the same name are refused.
 _SECTIONS = {title: cyclopts.Group(title, sort_key=place) for place, title in enumerate(GROUPS)}
 
@@ -114,7 +119,7 @@ def command_line(called: str | None = None) -> cyclopts.App:
         group = _SECTIONS[title]
         for order, (name, summary) in enumerate(commands.items()):
             own = None if name == called else summary
-            line.command(f"bodyschema.cli.commands.{name}:{name}", name=name, help=own, group=group, sort_key=order)
+            line.command(f"{MODULES[name]}:{name}", name=name, help=own, group=group, sort_key=order)
     return line
 
 

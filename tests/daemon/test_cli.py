@@ -13,7 +13,7 @@ from cyclopts import CycloptsError
 from small_arm import URDF, write_small_arm
 
 from bodyschema.cli.commands.options import print_json
-from bodyschema.cli.main import COMMANDS, RENAMED, app, command_line, present_names
+from bodyschema.cli.main import COMMANDS, MODULES, RENAMED, app, command_line, present_names
 from bodyschema.cli.terminal.screen import two_digits
 from bodyschema.daemon.config import Config
 from bodyschema.interfaces.errors import BusError, ConfigError, RequestError
@@ -57,7 +57,7 @@ def test_help_names_every_command(tmp_path) -> None:
 )
 def test_each_command_says_what_it_needs_and_what_is_next(command, capsys) -> None:
     # As in a process of its own: a summary given to the same page before would be shown in its place.
-    sys.modules.pop(f"bodyschema.cli.commands.{command.split()[0]}", None)
+    sys.modules.pop(MODULES[command.split()[0]], None)
     command_line(command.split()[0])([*command.split(), "--help"], exit_on_error=False, result_action="return_value")
     beginnings = [line.split(" ")[0] for line in capsys.readouterr().out.splitlines()]
     assert ("Needs:" in beginnings, "Next:" in beginnings) == (True, True)

@@ -58,7 +58,7 @@ import sys
 from pathlib import Path
 from bodyschema.daemon.transport import bus
 from bodyschema.cli.terminal import status_view
-from bodyschema.cli.commands import predict, status
+from bodyschema.cli.commands.run import predict, status
 from bodyschema.calibration.plausibility import limits
 from bodyschema.daemon.config import Config
 assert Config.load(Path({str(robot)!r})).robot.chain.joints == 4

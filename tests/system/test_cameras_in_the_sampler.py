@@ -17,7 +17,7 @@ import pytest
 from sampled import LIMIT_S, drawn, on_the_bench, pairs_of, sampling, until
 from v4l2_cameras import ShimCamera, preloaded
 
-from bodyschema.cli.commands.latency import SECONDS
+from bodyschema.cli.commands.calibrate.latency import SECONDS
 from bodyschema.daemon.config import Config
 from bodyschema.interfaces.records import FloatArray
 

@@ -9,8 +9,8 @@ import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from bodyschema.cli.commands.calibrate_cameras import cameras
-from bodyschema.cli.commands.latency import latency
+from bodyschema.cli.commands.calibrate.calibrate_cameras import cameras
+from bodyschema.cli.commands.calibrate.latency import latency
 from bodyschema.cli.commands.options import (
     AS_THEY_ARE,
     LeRobotFile,

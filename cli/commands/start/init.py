@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from bodyschema.cli.commands.config import say
 from bodyschema.cli.commands.options import HERE, flag, several
+from bodyschema.cli.commands.start.config import say
 
 if TYPE_CHECKING:
     from bodyschema.cli.hardware.robot_template import Guess

@@ -1,0 +1,1 @@
+"""Commands that calibrate, diagnose, and replay recordings."""

@@ -1,0 +1,1 @@
+"""The first commands on a new robot."""
