@@ -21,7 +21,6 @@ from typing import Any
 from bodyschema.drivers.bench.device import Device
 from bodyschema.drivers.bench.faults import Storm, mute
 from bodyschema.drivers.bench.faults import storm as storm_of_lines
-from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
 from bodyschema.drivers.dynamixel.bench.arm import storm as storm_of_dynamixel
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.servo import Servo
@@ -39,6 +38,7 @@ from bodyschema.drivers.serial_lines.bench.board import EncoderBoard
 from bodyschema.drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
 from bodyschema.drivers.serial_lines.joints import SerialLineJoints
 from bodyschema.interfaces.errors import SourceLost
+from tests.daemon.virtual_port import VirtualClock, VirtualPort
 
 JOINTS = 3  # in a storm
 JOINTS_OF_AN_ARM = 6

@@ -30,7 +30,6 @@ from bodyschema.daemon.transport.bus import client
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import decode
-from bodyschema.drivers.markers.bench.natnet_server import NatnetServer
 from bodyschema.drivers.markers.datagram import SCHEMA
 from bodyschema.drivers.ros2.bench.node import Node
 from bodyschema.drivers.ros2.bench.zenoh_robot import ZenohRobot
@@ -38,6 +37,7 @@ from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.rpy import rotation_of
+from tests.daemon.natnet_server import NatnetServer
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "desk_arm" / "desk_arm.urdf"
 JOINTS = ("base_yaw", "shoulder_pitch", "elbow_pitch", "wrist_roll")

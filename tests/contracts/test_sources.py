@@ -20,13 +20,14 @@ import numpy as np
 import pytest
 from fake_capture import SIZE_PX, FakeCapture
 from scripted_sources import COV, Scripted
+from virtual_link import VirtualLink
+from virtual_port import VirtualClock, VirtualPort
 
 from bodyschema.cli.demo.scene import cube_tables
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.bench import through_bench
 from bodyschema.daemon.wiring.wiring import driver_of
 from bodyschema.drivers.bench.device import Faults
-from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
 from bodyschema.drivers.dynamixel.bench.chain import Chain, no_faults
 from bodyschema.drivers.dynamixel.bench.servo import Servo
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
@@ -46,7 +47,6 @@ from bodyschema.drivers.markers.stream import MarkerStream
 from bodyschema.drivers.replay import Replay
 from bodyschema.drivers.ros2.bench.faults import Send, intact
 from bodyschema.drivers.ros2.bench.node import Node
-from bodyschema.drivers.ros2.bench.virtual_link import VirtualLink
 from bodyschema.drivers.ros2.config import Ros2Config
 from bodyschema.drivers.ros2.joints import Ros2Joints
 from bodyschema.drivers.serial_lines.bench.board import EncoderBoard

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from scripted_sources import Scripted
+from virtual_port import VirtualClock
 
 from bodyschema.daemon.marker_watch import MarkerWatch
-from bodyschema.drivers.bench.virtual_port import VirtualClock
 from bodyschema.interfaces.records import MarkerFix, MarkerMiss, Reason, frozen_array
 
 COV = frozen_array(np.diag([1e-6, 1e-6, 4e-6]))

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Literal
 
 from servo_arm import Path, ServoArm
+from virtual_port import VirtualPort
 
-from bodyschema.drivers.bench.virtual_port import VirtualPort
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.frames import Code, instructions_in
 from bodyschema.drivers.dynamixel.bench.servo import Servo

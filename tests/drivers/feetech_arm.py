@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Literal
 
 from servo_arm import Path, ServoArm
+from virtual_port import VirtualPort
 
-from bodyschema.drivers.bench.virtual_port import VirtualPort
 from bodyschema.drivers.feetech.bench.arm import Chain, Code, Instruction, instructions_in
 from bodyschema.drivers.feetech.bench.servo import Servo
 from bodyschema.drivers.feetech.config import BusConfig, FeetechConfig, ServoConfig

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 
 import numpy as np
 from bench_arm import HeardPort
+from virtual_port import VirtualClock
 
 from bodyschema.drivers.bench.faults import Planned
-from bodyschema.drivers.bench.virtual_port import VirtualClock
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE, Servo
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig

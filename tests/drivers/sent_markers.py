@@ -6,7 +6,8 @@ import json
 from collections import deque
 from pathlib import Path
 
-from bodyschema.drivers.bench.virtual_port import VirtualClock
+from virtual_port import VirtualClock
+
 from bodyschema.drivers.markers.config import source_tables
 from bodyschema.drivers.markers.datagram import SCHEMA, decode_datagram
 from bodyschema.drivers.markers.report import Packet

@@ -7,9 +7,10 @@ from collections.abc import Callable, Sequence
 from random import Random
 from typing import Any
 
+from virtual_port import VirtualClock, VirtualPort, at_once
+
 from bodyschema.drivers.bench.chain import ServoChain
 from bodyschema.drivers.bench.faults import Planned
-from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort, at_once
 from bodyschema.drivers.servos.config import ServosConfig
 from bodyschema.drivers.servos.joints import ServoJoints
 

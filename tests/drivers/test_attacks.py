@@ -11,10 +11,10 @@ import pytest
 from bench_arm import Arm
 from feetech_arm import FeetechArm
 from servo_arm import TICK
+from virtual_port import VirtualClock, VirtualPort
 
 from bodyschema.daemon.wiring.servos import SCANNERS
 from bodyschema.drivers.bench.device import Device, OnlyAnswers, Reply
-from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
 from bodyschema.drivers.dynamixel.bench.arm import swapped
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.servo import Servo

@@ -7,10 +7,10 @@ import termios
 
 import dynamixel_sdk as sdk
 import pytest
+from virtual_port import VirtualClock, VirtualPort
 
 from bodyschema.drivers.bench.faults import Planned, half, mute, wrong_checksum
 from bodyschema.drivers.bench.pty_shell import PtyShell
-from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.servo import Servo
 from bodyschema.drivers.dynamixel.models import BY_NAME

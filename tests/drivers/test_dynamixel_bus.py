@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from hypothesis import given
 from hypothesis import strategies as st
+from virtual_port import VirtualClock
 
-from bodyschema.drivers.bench.virtual_port import VirtualClock
 from bodyschema.drivers.dynamixel.bench.frames import status_packet
 from bodyschema.drivers.dynamixel.bus import Answer, Bus, Trouble, sync_request
 from bodyschema.drivers.dynamixel.joints import Channel

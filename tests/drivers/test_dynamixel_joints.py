@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from bench_arm import Arm
 from servo_arm import TICK, swing
+from virtual_port import VirtualClock, VirtualPort
 
 from bodyschema.drivers.bench.faults import corrupt, garbage, half, late, mute, wrong_checksum
-from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
 from bodyschema.drivers.dynamixel.bench.arm import storm, swapped
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.servo import Servo

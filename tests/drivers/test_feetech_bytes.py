@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from test_dynamixel_bus import TalkingPort
+from virtual_port import VirtualClock
 
-from bodyschema.drivers.bench.virtual_port import VirtualClock
 from bodyschema.drivers.feetech.bench.arm import Chain, Code, instructions_in, status_packet
 from bodyschema.drivers.feetech.bench.servo import CALIBRATE, Servo
 from bodyschema.drivers.feetech.joints import PACKETS, Bus, Channel

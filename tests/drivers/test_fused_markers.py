@@ -8,8 +8,8 @@ from typing import Self
 
 import numpy as np
 import pytest
+from virtual_port import VirtualClock
 
-from bodyschema.drivers.bench.virtual_port import VirtualClock
 from bodyschema.drivers.markers.fusing import FusedMarkers, Member
 from bodyschema.interfaces.records import MarkerFix, MarkerMiss, Reason, frozen_array
 from bodyschema.robot.rpy import rotation_of

@@ -14,10 +14,10 @@ from bench_arm import Arm
 from feetech_arm import FeetechArm
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from virtual_port import VirtualClock, VirtualPort
 
 from bodyschema.drivers.bench.device import Reply
 from bodyschema.drivers.bench.faults import Planned, Storm, mute
-from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.servo import Servo
 from bodyschema.drivers.dynamixel.bus import Bus

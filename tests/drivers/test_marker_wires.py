@@ -11,10 +11,10 @@ from contextlib import contextmanager, suppress
 
 import numpy as np
 import pytest
+from natnet_server import NatnetServer
 from sent_markers import table
 
 from bodyschema.daemon.wiring.wiring import stream_of
-from bodyschema.drivers.markers.bench.natnet_server import NatnetServer
 from bodyschema.drivers.markers.checks import stream_checks
 from bodyschema.drivers.markers.datagram import SCHEMA
 from bodyschema.drivers.markers.natnet import packets

@@ -8,11 +8,11 @@ from itertools import count
 from pathlib import Path
 
 import pytest
+from virtual_port import VirtualClock, VirtualPort
 
 from bodyschema.daemon.wiring.servos import SCANNERS
 from bodyschema.drivers.bench.device import Faults, OnlyAnswers, Reply, no_faults
 from bodyschema.drivers.bench.pty_shell import PtyShell
-from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.frames import Code, Error, instructions_in
 from bodyschema.drivers.dynamixel.bench.servo import Servo

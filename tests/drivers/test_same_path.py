@@ -16,9 +16,9 @@ from feetech_arm import FeetechArm
 from free_ports import free_endpoint
 from servo_arm import TICK
 from test_serial_lines import BoardArm
+from virtual_port import VirtualClock
 
 from bodyschema.drivers.bench.motion import Angle, played
-from bodyschema.drivers.bench.virtual_port import VirtualClock
 from bodyschema.drivers.ros2.bench.node import Node
 from bodyschema.drivers.ros2.bench.zenoh_robot import ZenohRobot
 from bodyschema.drivers.ros2.config import Ros2Config

@@ -17,10 +17,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from servo_arm import swing
+from virtual_port import VirtualClock, VirtualPort, at_once
 
 from bodyschema.drivers.bench.device import Reply
 from bodyschema.drivers.bench.faults import Planned, corrupt, garbage, half, late, mute, storm, wrong_checksum
-from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort, at_once
 from bodyschema.drivers.serial_lines.bench.board import EncoderBoard
 from bodyschema.drivers.serial_lines.board import Board
 from bodyschema.drivers.serial_lines.config import EncoderConfig, SerialLinesConfig

@@ -6,10 +6,10 @@ from dataclasses import replace
 from importlib.resources import files
 
 import pytest
+from virtual_port import VirtualClock, VirtualPort, at_once
 
 from bodyschema.drivers.bench.device import Reply
 from bodyschema.drivers.bench.faults import mute
-from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort, at_once
 from bodyschema.drivers.dynamixel.bench.chain import Chain as DynamixelChain
 from bodyschema.drivers.dynamixel.bench.servo import Servo as DynamixelServo
 from bodyschema.drivers.dynamixel.joints import DYNAMIXEL

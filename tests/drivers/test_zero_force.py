@@ -9,9 +9,9 @@ import msgspec
 import numpy as np
 import pytest
 from floating_arm import CONSTANT, INERTIA, WEIGHT_N_M, FloatingArm, holding
+from virtual_port import VirtualClock, VirtualPort
 
 from bodyschema.drivers.bench.faults import mute
-from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.frames import Code
 from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE, POSITION_MODE, Servo

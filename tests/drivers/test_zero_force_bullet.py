@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from test_zero_force_process import write_robot
+from virtual_port import VirtualClock, VirtualPort
 
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.wiring import open_drives
-from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE, Servo
 from bodyschema.drivers.dynamixel.joints import DynamixelJoints

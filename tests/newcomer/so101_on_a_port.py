@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
+from virtual_port import VirtualClock, VirtualPort
 
 from bodyschema.daemon.config import Config
-from bodyschema.drivers.bench.virtual_port import VirtualClock, VirtualPort
 from bodyschema.drivers.feetech.bench.arm import Chain
 from bodyschema.drivers.feetech.bench.servo import Servo
 from bodyschema.drivers.feetech.joints import FeetechJoints
