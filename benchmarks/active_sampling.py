@@ -32,15 +32,13 @@ from kbmaps import (
     expected_gain,
     next_pose,
     next_poses,
-    next_stretch,
 )
 from kbmaps.arrays import FloatArray
 
 SIGMA = 0.01
 TEST_DEG = 80.0
-TEST_ROWS, REGION_ROWS, CANDIDATES, GOALS = 500, 200, 200, 30
+TEST_ROWS, REGION_ROWS, CANDIDATES = 500, 200, 200
 LEVELS = (10, 20, 40, 80, 160)
-STEP_RAD, STRETCH = np.radians(2.0), 20
 BOOTSTRAPS = 1000
 
 
@@ -74,7 +72,7 @@ SETUPS = {
     "sag": Setup("d = 7, joints sag by 1 deg, poses within +-80 deg", bend="sag"),
     "eccentric": Setup("d = 7, encoders eccentric by 1 deg, poses within +-80 deg", bend="eccentric"),
 }
-WALK, COST = "walk", "cost"
+COST = "cost"
 RANDOM, CHOSEN, PLANNED = "random", "chosen", "planned"
 
 
@@ -112,18 +110,6 @@ class Trial:
         posterior = ChainPosterior.of(self._learner, noise=SIGMA)
         return next_poses(posterior, region, candidates, count, limits=limits)
 
-    def stretch(self, start: FloatArray) -> FloatArray:
-        """Return poses towards a target at least `STRETCH` steps away: a random target, or the best."""
-        goals = self.arm.angles(GOALS, self._range_deg, self._rng)
-        away = goals - start
-        lengths = np.linalg.norm(away, axis=1)
-        goals = goals[lengths >= STRETCH * STEP_RAD]
-        if self._way == RANDOM:
-            goals = goals[:1]
-        region = self.arm.angles(REGION_ROWS, TEST_DEG, self._rng)
-        posterior = ChainPosterior.of(self._learner, noise=SIGMA)
-        return next_stretch(posterior, region, start, goals, pairs=STRETCH, step=STEP_RAD)
-
 
 def curve(setup: Setup, seed: int, way: str, last: int) -> dict[int, float]:
     """Return the mean error [m] by number of pairs."""
@@ -137,18 +123,6 @@ def curve(setup: Setup, seed: int, way: str, last: int) -> dict[int, float]:
         }[way]
         trial.learn(trial.poses(min(batch, last - trial.pairs)))
         errors[trial.pairs] = trial.error()
-    return errors
-
-
-def walk_curve(seed: int, way: str, last: int) -> dict[int, float]:
-    """Return the mean error [m] by number of pairs for an arm that moves in stretches of 20 steps of 2 degrees."""
-    trial = Trial(Setup(WALK), seed, way)
-    at = np.zeros(7)
-    errors: dict[int, float] = {}
-    while trial.pairs < last:
-        path = trial.stretch(at)
-        trial.learn(path)
-        at, errors[trial.pairs] = path[-1], trial.error()
     return errors
 
 
@@ -243,22 +217,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=20, help="the goal is over 50")
     parser.add_argument("--pairs", type=int, default=80, help="most pairs of a curve")
-    parser.add_argument("--only", choices=[*SETUPS, WALK, COST], action="append", default=[])
+    parser.add_argument("--only", choices=[*SETUPS, COST], action="append", default=[])
     parser.add_argument("--first-seed", type=int, default=0)
     arguments = parser.parse_args()
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     last: int = arguments.pairs
-    parts: list[str] = arguments.only or [*SETUPS, WALK, COST]
+    parts: list[str] = arguments.only or [*SETUPS, COST]
     for part in parts:
         if part == COST:
             cost()
-            continue
-        if part == WALK:
-            walks = {
-                way: Curves.of([walk_curve(seed, way, n) for seed in seeds])
-                for way, n in ((RANDOM, 3 * last), (CHOSEN, last))
-            }
-            compare("d = 7, walking in steps of 2 deg within +-80 deg", (CHOSEN,), walks, 0)
             continue
         setup = SETUPS[part]
         most = {RANDOM: setup.random_times * last, CHOSEN: last, PLANNED: last}

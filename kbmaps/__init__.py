@@ -2,6 +2,8 @@
 
 Needs only numpy and scipy: no I/O, no clock, no logging. Angles [rad], lengths [m], float64. The innermost loops are
 compiled if a C compiler was present at installation: see `kernels_in_use()`. BODYSCHEMA_PURE=1 disables them.
+
+Arrays of a wrong shape raise `ShapeError`, those that are not finite `NonFiniteError`; docstrings name other errors.
 """
 
 from importlib import import_module
@@ -54,9 +56,9 @@ if TYPE_CHECKING:
     from kbmaps.maps.support import SUPPORT_LIMIT, SupportSet
     from kbmaps.memory import Memory
     from kbmaps.model import Estimate, Model, PoseModel, PositionModel
-    from kbmaps.planning.design import ExperimentDesign, next_pose, next_poses, next_stretch
+    from kbmaps.planning.design import ExperimentDesign, next_pose, next_poses
     from kbmaps.planning.expected_gain import ExpectedError, Forecast, candidate_motions, expected_gain
-    from kbmaps.planning.posterior import ChainPosterior, Posterior, systematic_error
+    from kbmaps.planning.posterior import ChainPosterior, Posterior
     from kbmaps.residual.learner import ResidualLearner
     from kbmaps.residual.model import ResidualModel
     from kbmaps.robust import unexplained_variance
@@ -148,14 +150,12 @@ __all__ = [
     "nearest_rotation",
     "next_pose",
     "next_poses",
-    "next_stretch",
     "prediction_errors",
     "quaternions",
     "resolved_rates",
     "rotation_matrices",
     "rotation_vectors",
     "shared_by",
-    "systematic_error",
     "unexplained_variance",
     "with_refitted_tool",
 ]
@@ -208,9 +208,9 @@ _MODULES = {
     "maps.support": ["SUPPORT_LIMIT", "SupportSet"],
     "memory": ["Memory"],
     "model": ["Estimate", "Model", "PoseModel", "PositionModel"],
-    "planning.design": ["ExperimentDesign", "next_pose", "next_poses", "next_stretch"],
+    "planning.design": ["ExperimentDesign", "next_pose", "next_poses"],
     "planning.expected_gain": ["ExpectedError", "Forecast", "candidate_motions", "expected_gain"],
-    "planning.posterior": ["ChainPosterior", "Posterior", "systematic_error"],
+    "planning.posterior": ["ChainPosterior", "Posterior"],
     "residual.learner": ["ResidualLearner"],
     "residual.model": ["ResidualModel"],
     "robust": ["unexplained_variance"],

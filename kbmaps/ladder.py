@@ -211,7 +211,6 @@ class Ladder:
         """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
 
         Raises:
-            ShapeError, NonFiniteError
             DegenerateDataError: no model that may extrapolate has enough pairs yet.
         """
         angles = rows_or_vector("q", q, self._joints)
@@ -223,7 +222,6 @@ class Ladder:
         """Return the answering model's derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d).
 
         Raises:
-            ShapeError, NonFiniteError
             DegenerateDataError: no model that may extrapolate has enough pairs yet.
         """
         angles = rows_or_vector("q", q, self._joints)
@@ -241,7 +239,6 @@ class Ladder:
         """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and True where data is near.
 
         Raises:
-            ShapeError, NonFiniteError
             DegenerateDataError: no model that may extrapolate has enough pairs yet.
         """
         angles = rows_or_vector("q", q, self._joints)

@@ -43,10 +43,6 @@ NAMED_FILES = {
     ("unexplained", "model"): (".kbmap",),
 }
 CHUNK, CHECKSUM_BYTES = 2**20, 32
-# Exceptions that zipfile raises for bytes that are not an archive; RuntimeError if the encryption bit is set.
-NOT_AN_ARCHIVE = (
-    OSError, EOFError, RuntimeError, ValueError, LookupError, struct.error, zlib.error, zipfile.BadZipFile
-)  # fmt: skip
 
 
 class BackupError(BodyschemaError):

@@ -130,7 +130,6 @@ def align(
             neither pose nor marker is known, and nothing else.
 
     Raises:
-        ShapeError, NonFiniteError
         SettingError: sigma is not positive.
         DegenerateDataError: too few pairs, or positions on one line.
 

@@ -32,7 +32,6 @@ class ChainBelief:
         noise: 1-sigma of a measured coordinate about the chain [m], estimated from pairs; 0 without pairs.
 
     Raises:
-        ShapeError, NonFiniteError
         SettingError: a noise below 0.
     """
 
@@ -85,19 +84,11 @@ class ChainBelief:
         return self.root @ self.root.T
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Return the positions (n, 3) [m] of the most probable chain at q (n, d), or (3,) at q (d,).
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return the positions (n, 3) [m] of the most probable chain at q (n, d), or (3,) at q (d,)."""
         return self.parameters.positions(self.mean, rows_or_vector("q", q, self.parameters.reference.joints))
 
     def predict_with_variance(self, q: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return positions at q (n, d) and the first-order variance of each coordinate, both (n, 3) [m, m²].
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return positions at q (n, d) and the first-order variance of each coordinate, both (n, 3) [m, m²]."""
         angles = rows("q", q, self.parameters.reference.joints)
         x, variance = np.empty((len(angles), 3)), np.empty((len(angles), 3))
         for start in range(0, len(angles), _BLOCK):

@@ -31,7 +31,6 @@ class RigidChain:
         prismatic: True for each joint (d,) that slides.
 
     Raises:
-        ShapeError, NonFiniteError
         ChainError: a transform is not rigid or an axis is not of unit length.
 
     Example:
@@ -80,19 +79,12 @@ class RigidChain:
         """Return the pose of the marker frame (4, 4) for q (d,) [rad, m]; (n, 4, 4) for (n, d).
 
         In the measurement frame.
-
-        Raises:
-            ShapeError, NonFiniteError
         """
         checked = rows_or_vector("q", q, self.joints)
         return self._frames(checked)[-1]
 
     def positions(self, q: ArrayLike) -> FloatArray:
-        """Return the marker position (3,) [m] for q (d,), or (n, 3) for (n, d).
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return the marker position (3,) [m] for q (d,), or (n, 3) for (n, d)."""
         return self.poses(q)[..., :3, 3]
 
     def predict(self, q: ArrayLike) -> FloatArray:
@@ -105,9 +97,6 @@ class RigidChain:
         Args:
             q: joint values (d,) or (n, d) [rad, m].
             orthonormal: remove the rounding errors of the fixed transforms, at most 1e-6 each.
-
-        Raises:
-            ShapeError, NonFiniteError
         """
         rotations = self.poses(q)[..., :3, :3]
         return nearest_rotation(rotations) if orthonormal else rotations
@@ -116,19 +105,12 @@ class RigidChain:
         """Return the poses of joints 1..d before they move and of the marker: (d+1, 4, 4) for q (d,).
 
         All are in the measurement frame. For q (n, d): (n, d+1, 4, 4).
-
-        Raises:
-            ShapeError, NonFiniteError
         """
         checked = rows_or_vector("q", q, self.joints)
         return self._frames_of_rows(checked) if checked.ndim == 2 else np.stack(self._frames(checked), axis=-3)
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d).
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d)."""
         checked = rows_or_vector("q", q, self.joints)
         frames = self._frames(checked)
         marker = frames[-1][..., :3, 3]
@@ -143,9 +125,6 @@ class RigidChain:
         """Return the angular velocity (3, d) of the marker frame [rad/rad, or rad/m], or (n, 3, d) for q (n, d).
 
         In the measurement frame: dR/dq_k = [column k]× R.
-
-        Raises:
-            ShapeError, NonFiniteError
         """
         checked = rows_or_vector("q", q, self.joints)
         columns = np.zeros((*checked.shape[:-1], 3, self.joints))
@@ -185,11 +164,7 @@ class RigidChain:
         return np.concatenate([self._net(bases, column) for column in range(3)])
 
     def with_tool(self, marker_shift: ArrayLike) -> RigidChain:
-        """Return the chain with its marker displaced by a vector (3,) [m] given in the marker frame.
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return the chain with its marker displaced by a vector (3,) [m] given in the marker frame."""
         fixed = self.fixed.copy()
         fixed[-1, :3, 3] += fixed[-1, :3, :3] @ vector("marker_shift", marker_shift, 3)
         return RigidChain(fixed, self.axes, self.prismatic)

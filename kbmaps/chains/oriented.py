@@ -47,7 +47,6 @@ class OrientedChain:
         noise: 1-sigma of a measured orientation about one axis [rad].
 
     Raises:
-        ShapeError, NonFiniteError
         SettingError: a noise below 0.
     """
 
@@ -79,20 +78,13 @@ class OrientedChain:
         return RigidChain(fixed, chain.axes, chain.prismatic)
 
     def orientation(self, q: ArrayLike) -> FloatArray:
-        """Return rotations of the marker (n, 3, 3) at q (n, d).
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return rotations of the marker (n, 3, 3) at q (n, d)."""
         return self.orientation_with_variance(q)[0]
 
     def orientation_with_variance(self, q: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Return rotations (n, 3, 3) at q (n, d) and their first-order variance (n, 3) [rad²].
 
         The variance is that of a small turn about each axis of the measurement frame.
-
-        Raises:
-            ShapeError, NonFiniteError
         """
         angles = rows("q", q, self.parameters.reference.joints)
         rotations, variance = np.empty((len(angles), 3, 3)), np.empty((len(angles), 3))

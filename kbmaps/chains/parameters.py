@@ -173,11 +173,7 @@ class ChainParameters:
         return pose
 
     def chain(self, change: ArrayLike) -> RigidChain:
-        """Return the reference chain with a change (size,) built in; axes keep their values in their own frames.
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return the reference chain with a change (size,) built in; axes keep their values in their own frames."""
         geometry = self._geometry(vector("change", change, self.size))
         frames = self._frames.copy()
         frames[:-1, :3, :3] = geometry.rotations @ frames[:-1, :3, :3]
@@ -191,11 +187,7 @@ class ChainParameters:
         return RigidChain(_reorthonormalised(fixed), self.reference.axes, self.reference.prismatic)
 
     def positions(self, change: ArrayLike, q: ArrayLike) -> FloatArray:
-        """Return marker positions [m] (3,) at q (d,), or (n, 3) at (n, d).
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return marker positions [m] (3,) at q (d,), or (n, 3) at (n, d)."""
         angles = rows_or_vector("q", q, self.reference.joints)
         geometry = self._geometry(vector("change", change, self.size))
         placed = self._placed(geometry, np.atleast_2d(angles) + geometry.zeros)
@@ -206,9 +198,6 @@ class ChainParameters:
         """Return the derivative of the positions by the joints (3, d) at q (d,), or (n, 3, d) at (n, d).
 
         Units: m/rad, or m/m.
-
-        Raises:
-            ShapeError, NonFiniteError
         """
         angles = rows_or_vector("q", q, self.reference.joints)
         # A joint offset is added to the reading, so the derivatives by both are the same.

@@ -233,29 +233,18 @@ class RigidLearner:
         self._fit = None
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,)."""
         angles = rows_or_vector("q", q, self.joints)
         return self._parameters.positions(self.belief.mean, angles)
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d); exact.
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d); exact."""
         return self._parameters.jacobian(self.belief.mean, q)
 
     def estimate(self, q: ArrayLike) -> Estimate:
         """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and True where data is near.
 
         Where the given noise does not explain the residuals, the excess is added to sigma everywhere.
-
-        Raises:
-            ShapeError, NonFiniteError
         """
         angles = rows_or_vector("q", q, self.joints)
         fit = self._fitted()

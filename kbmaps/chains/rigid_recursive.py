@@ -15,7 +15,6 @@ from kbmaps.chains.packed import CHAIN, chain_arrays, chain_from_arrays, describ
 from kbmaps.chains.parameters import ChainParameters, ChainTolerances
 from kbmaps.chains.rigid_filter import LEAST_NOISE_M, NOISE_COORDINATES, NOISE_MEMORY, RigidFilter
 from kbmaps.chains.rigid_fit import RigidFit
-from kbmaps.chains.rigid_learner import RigidLearner
 from kbmaps.chains.rigid_window import RigidWindow
 from kbmaps.errors import ModelFormatError, SettingError
 from kbmaps.model import Estimate, near_data, widest
@@ -75,22 +74,6 @@ class RecursiveRigidLearner:
         self._due = _FIRST
         self._pairs = 0
         self._widest: float | None = None
-
-    @classmethod
-    def continuing(cls, batch: RigidLearner, *, window: int = 1000) -> Self:
-        """Return a learner that continues from the result of a batch learner.
-
-        Raises:
-            DegenerateDataError: the batch has learnt no pair.
-            SettingError: window below 16.
-        """
-        scatter = batch.scatter
-        learner = cls(batch.nominal, batch.tolerances, noise=max(scatter.noise, LEAST_NOISE_M), window=window)
-        learner._go_on_from(batch.belief, fitted=True)
-        learner._filter.noise_coordinates = float(np.clip(scatter.freedom, NOISE_COORDINATES, NOISE_MEMORY))
-        learner._pairs = batch.pairs
-        learner._window.farthest = batch.least_sure
-        return learner
 
     @property
     def joints(self) -> int:
@@ -184,19 +167,11 @@ class RecursiveRigidLearner:
         self._go_on_from(belief.with_other_tool(tolerance), fitted=False)
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,)."""
         return self._parameters.positions(self._filter.change, rows_or_vector("q", q, self.joints))
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d); exact.
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d); exact."""
         return self._parameters.jacobian(self._filter.change, q)
 
     def estimate(self, q: ArrayLike) -> Estimate:
@@ -205,9 +180,6 @@ class RecursiveRigidLearner:
         Where the given noise does not explain the residuals of a refit, the excess is added to sigma everywhere.
         Support is judged by the kept pairs, and by the most uncertain one of those before them. They are evaluated once
         after each `learn` (5 ms at 1,000 kept pairs of 7 joints).
-
-        Raises:
-            ShapeError, NonFiniteError
         """
         angles = rows_or_vector("q", q, self.joints)
         x, variance = self._filter.with_variance(np.atleast_2d(angles))

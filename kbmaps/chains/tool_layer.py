@@ -145,11 +145,7 @@ class ToolLayer:
         self._recent, self._fit = self._recent[:0], None
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,)."""
         angles = rows_or_vector("q", q, self.joints)
         return self._model.predict(angles) + self._model.orientation(angles) @ self._posterior().shift
 
@@ -157,9 +153,6 @@ class ToolLayer:
         """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d).
 
         Exact on a `KBMap` or a `RigidChain`, and on any model whose orientations are rotations.
-
-        Raises:
-            ShapeError, NonFiniteError
         """
         if isinstance(self._model, KBMap | RigidChain):
             _, posterior, _ = self._fitted()
@@ -184,9 +177,6 @@ class ToolLayer:
         The model's own variance adds to that of δ. Every pair determines all of δ, so δ is equally certain at all
         configurations. Once there is a pair of the current tool, support is that of the model, or everywhere if the
         model has none.
-
-        Raises:
-            ShapeError, NonFiniteError
         """
         angles = rows_or_vector("q", q, self.joints)
         batch = np.atleast_2d(angles)

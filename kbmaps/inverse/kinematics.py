@@ -74,7 +74,6 @@ class InverseKinematics:
         tolerance, angle_tolerance: distance [m] and angle [rad] that count as reached.
 
     Raises:
-        ShapeError, NonFiniteError
         SettingError: not such a model, lower limits above upper ones, or a setting that is not positive.
         DegenerateDataError: the model has learnt too few pairs to predict.
 

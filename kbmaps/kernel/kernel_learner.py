@@ -115,9 +115,6 @@ class KernelLearner(KernelRegression):
         its noise alone. By the rule of `Estimate`, almost nothing except the pairs themselves would then be in support.
         Where λ is so large that more than the limit remains even at the pairs, they are not in support either. Before
         the first pair, sigma is infinite: only pairs can show the quality of the prior.
-
-        Raises:
-            ShapeError, NonFiniteError
         """
         angles = rows_or_vector("q", q, self.joints)
         batch = np.atleast_2d(angles)

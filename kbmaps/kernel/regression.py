@@ -65,9 +65,6 @@ def slopes(model: Predictor, q: ArrayLike, bases: Sequence[JointBasis]) -> Float
 
     f(θ + h) − f(θ − h) = 2 sin h f'(θ) for any f = a + b cos θ + c sin θ and any h. So this is exact for KB-Maps in any
     form; likewise with 2 h for a prismatic joint.
-
-    Raises:
-        ShapeError, NonFiniteError
     """
     angles = rows_or_vector("q", q, len(bases))
     steps = _STEP * np.eye(len(bases))
@@ -128,11 +125,7 @@ class KernelRegression(ABC):
         return self._fitted().log_evidence
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,)."""
         angles = rows_or_vector("q", q, self.joints)
         x, features = self._behind(np.atleast_2d(angles))
         if self.kept:
@@ -143,9 +136,6 @@ class KernelRegression(ABC):
         """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) at q (n, d).
 
         Exact if the prior model is a KB-Map, also in another form such as a chain.
-
-        Raises:
-            ShapeError, NonFiniteError
         """
         return slopes(self, q, self.bases)
 

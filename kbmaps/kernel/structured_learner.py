@@ -95,11 +95,7 @@ class StructuredLearner(KernelRegression):
         self._fit = None
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and True where data is near.
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return positions at q (n, d), or (d,), 1-sigma per axis against the truth, True where data is near."""
         angles = rows_or_vector("q", q, self.joints)
         batch = np.atleast_2d(angles)
         x, features = self._behind(batch)

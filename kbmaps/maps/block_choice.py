@@ -34,11 +34,7 @@ _SMALLEST_EIGENVALUE = 1e-15
 
 
 def follow_a_path(prior: KBMap, q: ArrayLike) -> bool:
-    """Return True if the configurations q (n, d) [rad, m], in their order, are neighbours on a path.
-
-    Raises:
-        ShapeError, NonFiniteError.
-    """
+    """Return True if the configurations q (n, d) [rad, m], in their order, are neighbours on a path."""
     left, right = BasisStack(prior.bases).halves(rows("q", q, len(prior.bases)))
     square = (left * left).sum(axis=1) * (right * right).sum(axis=1)
     inner = (left[:-1] * left[1:]).sum(axis=1) * (right[:-1] * right[1:]).sum(axis=1)
@@ -58,9 +54,6 @@ def blockwise_precision(prior: KBMap, q: ArrayLike, x: ArrayLike) -> float:
 
     Returns:
         λ as in `ExactLearner.solve`; with too few pairs for `FEWEST_BLOCKS`, one that trusts the prior.
-
-    Raises:
-        ShapeError, NonFiniteError.
     """
     angles, positions = rows("q", q, len(prior.bases)), rows("x", x, POSITION_OUTPUTS)
     if len(angles) != len(positions):

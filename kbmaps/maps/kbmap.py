@@ -92,11 +92,7 @@ class KBMap:
         return self.net.shape[0] == POSE_OUTPUTS
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Return the marker position (3,) [m] for joint angles q (d,) [rad], or (n, 3) for (n, d).
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return the marker position (3,) [m] for joint angles q (d,) [rad], or (n, 3) for (n, d)."""
         return self._kernel.outputs(q, 0, POSITION_OUTPUTS)
 
     def orientation(self, q: ArrayLike, *, orthonormal: bool = False) -> FloatArray:
@@ -115,11 +111,7 @@ class KBMap:
         return nearest_rotation(axes) if orthonormal else axes
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d).
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d)."""
         return self._kernel.derivatives(q, 0, POSITION_OUTPUTS)
 
     def angular_jacobian(self, q: ArrayLike) -> FloatArray:
@@ -139,11 +131,7 @@ class KBMap:
         return nearest_rotation_rates(_as_columns(axes), turning)
 
     def weights(self, q: ArrayLike) -> FloatArray:
-        """Return the full weight vector (3^d,) for q (d,), or (n, 3^d): the Kronecker product over the joints.
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return the full weight vector (3^d,) for q (d,), or (n, 3^d): the Kronecker product over the joints."""
         checked = rows_or_vector("q", q, self.joints)
         full = self._stack.full(np.atleast_2d(checked))
         return full[0] if checked.ndim == 1 else full
@@ -190,7 +178,6 @@ class KBMap:
 
         Raises:
             BasisError: an α that is not within 0..180 degrees (SingularAlphaError: within 80..100).
-            ShapeError, NonFiniteError
         """
         alphas, centres = _one_a_joint("alpha", alpha, self.joints), _one_a_joint("centre", centre, self.joints)
         return self.in_basis(
@@ -210,7 +197,6 @@ class KBMap:
 
         Raises:
             BasisError: a basis whose coefficients are not control points.
-            ShapeError, NonFiniteError
         """
         for k, basis in enumerate(bases):
             if basis.to_bernstein() != basis:

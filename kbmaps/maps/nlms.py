@@ -83,9 +83,6 @@ class NLMS:
         """Return the marker position (3,) [m] at joint angles q (d,) [rad], or (n, 3) at (n, d).
 
         Equal to `map.predict`, without a copy of the map.
-
-        Raises:
-            ShapeError, NonFiniteError
         """
         return self._reader.outputs(q, 0, POSITION_OUTPUTS)
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import BoolArray, FloatArray, rows_or_vector, vector
+from kbmaps.arrays import FloatArray, rows_or_vector, vector
 from kbmaps.errors import SettingError
 from kbmaps.maps.basis import JointBasis
 from kbmaps.maps.stack import BasisStack
@@ -44,7 +44,7 @@ class SupportSet:
         >>> support = SupportSet(learning_bases([-1, -1], [1, 1]))
         >>> support.add([0.0, 0.0])  # something new
         True
-        >>> support.covers([[0.01, 0.0], [1.0, -1.0]])
+        >>> support.unexplained([[0.01, 0.0], [1.0, -1.0]]) < 0.5
         array([ True, False])
     """
 
@@ -103,11 +103,7 @@ class SupportSet:
         return True
 
     def unexplained(self, q: ArrayLike) -> float | FloatArray:
-        """Return the share in [0, 1] of the prior variance at q (d,) that the data leave; (n,) for q (n, d).
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return the share in [0, 1] of the prior variance at q (d,) that the data leave; (n,) for q (n, d)."""
         angles = rows_or_vector("q", q, self._stack.joints)
         left, right = self._normalised(angles)
         if angles.ndim == 1:
@@ -117,22 +113,11 @@ class SupportSet:
         reduced = kernel @ self._inverse[: self._size, : self._size].T
         return np.clip(1.0 - np.square(reduced).sum(axis=1), 0.0, 1.0)
 
-    def covers(self, q: ArrayLike, limit: float = SUPPORT_LIMIT) -> bool | BoolArray:
-        """Return True if at most `limit` of q (d,) is unexplained; (n,) for q (n, d).
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
-        return self.unexplained(q) <= limit
-
     def spread(self, q: ArrayLike) -> float | FloatArray:
         """Return the standard deviation of a predicted coordinate at q (d,), or (n,) for q (n, d).
 
         For coefficients of prior standard deviation 1. Times `ExactSolution.prior_std` it is the 1-sigma [m] that the
         fit leaves.
-
-        Raises:
-            ShapeError, NonFiniteError
         """
         angles = rows_or_vector("q", q, self._stack.joints)
         left, right = self._stack.halves(angles)

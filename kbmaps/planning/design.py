@@ -34,7 +34,6 @@ class ExperimentDesign:
         region: poses (t, d) at which the model is to be accurate.
 
     Raises:
-        ShapeError, NonFiniteError
         SettingError: the region is empty.
     """
 
@@ -135,7 +134,6 @@ def next_pose(
             at a time (coordinate exchange, Meyer and Nachtsheim 1995).
 
     Raises:
-        ShapeError, NonFiniteError
         SettingError: there are no candidates or no region.
     """
     return next_poses(posterior, region, candidates, 1, limits=limits)[0]
@@ -155,7 +153,6 @@ def next_poses(
     then improved in the presence of all others: a joint plan for many pairs is better than repeating `next_pose`.
 
     Raises:
-        ShapeError, NonFiniteError
         SettingError: count is below 1, or there are fewer candidates.
     """
     poses = rows("candidates", candidates, posterior.joints)
@@ -178,29 +175,6 @@ def next_poses(
     return chosen
 
 
-def next_stretch(
-    posterior: Posterior, region: ArrayLike, start: ArrayLike, goals: ArrayLike, *, pairs: int, step: float
-) -> FloatArray:
-    """Return poses (at most `pairs`, d) on the straight path from `start` (d,) towards one of the goals (n, d).
-
-    For an arm that is guided by hand or must be watched all the way. Each path advances in steps of `step` [norm over
-    all joints] and has no more than `pairs` steps. The path with the smallest resulting error is returned.
-
-    Raises:
-        ShapeError, NonFiniteError
-        SettingError: pairs is below 1, step is not positive, or every goal is nearer than a step.
-    """
-    if pairs < 1 or not step > 0.0:
-        raise SettingError(f"pairs must be at least 1 and step greater than 0, got {pairs} and {step!r}")
-    begin = vector("start", start, posterior.joints)
-    ends = rows("goals", goals, posterior.joints)
-    design = ExperimentDesign(posterior, region)
-    ways = [way for end in ends if len(way := _steps(begin, end, pairs, step))]
-    if not ways:
-        raise SettingError(f"every goal is nearer to the start than one step of {step:.3g}")
-    return min(ways, key=lambda way: design.error_after(posterior.roots(way)))
-
-
 def mean_distances(covariances: FloatArray) -> FloatArray:
     """Return the mean length (n,) of Gaussian vectors with covariances (n, 3, 3).
 
@@ -213,12 +187,6 @@ def mean_distances(covariances: FloatArray) -> FloatArray:
     shape = np.maximum(shape, 0.5)
     ratio = np.exp(gammaln(shape + 0.5) - gammaln(shape))
     return cast(FloatArray, np.sqrt(traces / shape) * ratio)
-
-
-def _steps(begin: FloatArray, end: FloatArray, pairs: int, step: float) -> FloatArray:
-    distance = float(np.linalg.norm(end - begin))
-    count = min(int(distance / step), pairs)
-    return begin + np.arange(1, count + 1)[:, None] * (step / max(distance, step)) * (end - begin)
 
 
 def _under(factor: FloatArray, roots: FloatArray) -> FloatArray:

@@ -79,7 +79,6 @@ def expected_gain(
         rng: random generator of the samples.
 
     Raises:
-        ShapeError, NonFiniteError
         SettingError: there is no motion, one without poses, no region, or `pairs` do not ascend from at least 1.
     """
     counts = tuple(pairs)
@@ -122,7 +121,6 @@ def candidate_motions(
         count: number of poses per motion.
 
     Raises:
-        ShapeError, NonFiniteError
         SettingError: no poses seen, limits or names do not fit, or `together` or `count` are below 1.
     """
     poses = np.atleast_2d(np.asarray(seen, dtype=np.float64))

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from copy import copy
-from typing import Protocol, cast
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import KDTree  # pyright: ignore[reportMissingTypeStubs]
 
-from kbmaps.arrays import FloatArray, IntArray, rows
+from kbmaps.arrays import FloatArray, rows
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import ChainParameters
@@ -118,22 +116,8 @@ class ChainPosterior:
         """Number of joints d."""
         return self._parameters.reference.joints
 
-    def with_floor(self, floor: float) -> ChainPosterior:
-        """Return the same with another floor [m], e.g. from `systematic_error` where the noise was not given.
-
-        Raises:
-            SettingError: floor is negative.
-        """
-        changed = copy(self)
-        changed.floor = _checked_floor(floor)
-        return changed
-
     def roots(self, q: ArrayLike) -> FloatArray:
-        """Return matrices R (n, 3, p) [m] at q (n, d): R_i R_jᵀ is the covariance of the positions at q_i and q_j.
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return matrices R (n, 3, p) [m] at q (n, d): R_i R_jᵀ is the covariance of the positions at q_i and q_j."""
         _, jacobian = self._parameters.linearised(self._change, rows("q", q, self.joints))
         return jacobian @ self._spread
 
@@ -142,51 +126,3 @@ def _checked_floor(floor: float) -> float:
     if not (floor >= 0.0 and math.isfinite(floor)):
         raise SettingError(f"floor must be finite and at least 0 m, got {floor!r}")
     return floor
-
-
-# Minimum number of neighbour couples, and of standard errors that their shared part must exceed.
-_LEAST_NEIGHBOURS, _SURE = 10, 2.0
-
-
-def systematic_error(posterior: Posterior, q: ArrayLike, residuals: ArrayLike) -> float:
-    """Return the 1-sigma [m] of the part of a coordinate's residual that neighbouring poses share; 0 if due to chance.
-
-    Noise is independent from pair to pair, while a bending joint or a distorting lens errs alike at poses near each
-    other. The mean product of residuals of neighbours is therefore the systematic part, once the fit's own part has
-    been removed: it makes the residuals of neighbours i and j share −R_i R_jᵀ. The result is a lower bound, since
-    neighbours are not the same pose: the sparser the poses, the more of it counts as noise.
-
-    Args:
-        posterior: of the model that has learnt the pairs.
-        q: poses (n, d) of the pairs, outliers left out.
-        residuals: measured minus predicted positions there (n, 3) [m].
-
-    Raises:
-        ShapeError, NonFiniteError
-    """
-    poses, missed = rows("q", q, posterior.joints), rows("residuals", residuals, 3)
-    if len(poses) != len(missed):
-        raise ShapeError("residuals", f"({len(poses)}, 3) to go with q", missed.shape)
-    if len(poses) < 2:
-        return 0.0
-    one, other = _neighbours(poses)
-    roots = posterior.roots(poses)
-    shared = np.einsum("ni,ni->n", missed[one], missed[other])
-    shared = shared + np.einsum("nip,nip->n", roots[one], roots[other])
-    doubt = float(shared.std()) / math.sqrt(len(shared))
-    mean = float(shared.mean())
-    if len(shared) < _LEAST_NEIGHBOURS or mean <= _SURE * doubt:
-        return 0.0
-    return math.sqrt(mean / 3.0)
-
-
-def _neighbours(poses: FloatArray) -> tuple[IntArray, IntArray]:
-    """Return each pose with its nearest one, each such couple once, distances in standard deviations of the joints."""
-    std = poses.std(axis=0)
-    scaled = poses / np.where(std > 0.0, std, 1.0)
-    nearest = cast(IntArray, KDTree(scaled).query(scaled, 2)[1])  # pyright: ignore[reportUnknownMemberType]
-    # Where poses are equal, a pose may not be found first among its own neighbours.
-    own = np.arange(len(poses))
-    found = np.where(nearest[:, 0] == own, nearest[:, 1], nearest[:, 0])
-    couples = np.unique(np.sort(np.stack([own, found], axis=1), axis=1), axis=0)
-    return couples[:, 0], couples[:, 1]

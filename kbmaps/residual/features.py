@@ -62,7 +62,6 @@ class ResidualScaling:
         load: place of the last load in the frame of the last link (3,) [m]; None: the marker itself.
 
     Raises:
-        ShapeError, NonFiniteError
         SettingError: a range or the spread is not positive.
     """
 

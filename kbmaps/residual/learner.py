@@ -120,28 +120,17 @@ class ResidualLearner:
         self._model = self._fit = None
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,)."""
         return self._rigid.predict(q) if self._is_rigid else self.model.predict(q)
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d), to about 1e-12.
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d), to about 1e-12."""
         return self._rigid.jacobian(q) if self._is_rigid else self.model.jacobian(q)
 
     def estimate(self, q: ArrayLike) -> Estimate:
         """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and True where data is near.
 
         Where the given noise does not explain the residuals, the excess is added to sigma everywhere.
-
-        Raises:
-            ShapeError, NonFiniteError
         """
         if self._is_rigid:
             return self._rigid.estimate(q)

@@ -48,7 +48,6 @@ class ResidualModel:
         noise: 1-sigma of a measured coordinate [m], estimated from pairs; 0 without pairs.
 
     Raises:
-        ShapeError, NonFiniteError
         SettingError: the noise is negative or not finite, or there is no such group.
     """
 
@@ -116,21 +115,13 @@ class ResidualModel:
         return hashlib.blake2b(pack(_KIND, {"scale": self.features.scaling.scale}, arrays), digest_size=8).hexdigest()
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Return positions (n, 3) [m] at q (n, d) [rad, m], or (3,) at q (d,).
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return positions (n, 3) [m] at q (n, d) [rad, m], or (3,) at q (d,)."""
         angles = rows_or_vector("q", q, self.joints)
         x = self.features.positions(self.chain, self.weights, np.atleast_2d(angles))
         return x[0] if angles.ndim == 1 else x
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Return the derivative (n, 3, d) of the positions [m/rad, or m/m], or (3, d) at q (d,).
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return the derivative (n, 3, d) of the positions [m/rad, or m/m], or (3, d) at q (d,)."""
         angles = rows_or_vector("q", q, self.joints)
         if not self.weights:
             return self.chain.jacobian(angles)
@@ -141,11 +132,7 @@ class ResidualModel:
         return slopes[0] if angles.ndim == 1 else slopes
 
     def predict_with_variance(self, q: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return positions at q (n, d) and the first-order variance of each coordinate, both (n, 3) [m, m²].
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return positions at q (n, d) and the first-order variance of each coordinate, both (n, 3) [m, m²]."""
         angles = rows("q", q, self.joints)
         x, variance = np.empty((len(angles), 3)), np.empty((len(angles), 3))
         for start in range(0, len(angles), _BLOCK):
@@ -159,11 +146,7 @@ class ResidualModel:
         return x, variance
 
     def effects(self, q: ArrayLike) -> dict[str, float]:
-        """Return each group's motion of the positions at q (n, d), root mean square of the distances [m]; 0 for no q.
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return each group's motion of the positions at q (n, d), RMS of the distances [m]; 0 for no q."""
         angles = rows("q", q, self.joints)
         point = self.features.linearised(self.change, self.chain, self.weights, angles, tuple(self.weights))
         moves = {group: point.groups[group] @ weights for group, weights in self.weights.items()}

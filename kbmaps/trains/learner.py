@@ -271,7 +271,6 @@ class TensorLearner:
         """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
 
         Raises:
-            ShapeError, NonFiniteError
             DegenerateDataError: there is neither a prior nor enough pairs.
         """
         return self.train.predict(q)
@@ -280,7 +279,6 @@ class TensorLearner:
         """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d); exact.
 
         Raises:
-            ShapeError, NonFiniteError
             DegenerateDataError: there is neither a prior nor enough pairs.
         """
         return self.train.jacobian(q)
@@ -292,7 +290,6 @@ class TensorLearner:
         (`kbmaps.trains.misfit`).
 
         Raises:
-            ShapeError, NonFiniteError
             DegenerateDataError: there is neither a prior nor enough pairs.
         """
         angles = rows_or_vector("q", q, self.joints)

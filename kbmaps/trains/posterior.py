@@ -108,11 +108,7 @@ class TensorPosterior:
         return self._prior.joints
 
     def roots(self, q: ArrayLike) -> FloatArray:
-        """Return matrices R (n, 3, p) [m] at q (n, d): R_i R_jᵀ is the covariance of the positions at q_i and q_j.
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return matrices R (n, 3, p) [m] at q (n, d): R_i R_jᵀ is the covariance of the positions at q_i and q_j."""
         angles = rows("q", q, self.joints)
         linear = self._linear_roots(angles)
         if not self.misfit.any():

@@ -91,21 +91,13 @@ class TensorTrain:
         return len(self.bases)
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Return the marker position (3,) [m] for joint values q (d,) [rad, m], or (n, 3) for (n, d).
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return the marker position (3,) [m] for joint values q (d,) [rad, m], or (n, 3) for (n, d)."""
         checked = rows_or_vector("q", q, self.joints)
         positions = suffixes(self.maps(np.atleast_2d(checked)))[0]
         return positions[0] if checked.ndim == 1 else positions
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d).
-
-        Raises:
-            ShapeError, NonFiniteError
-        """
+        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d)."""
         checked = rows_or_vector("q", q, self.joints)
         angles = np.atleast_2d(checked)
         maps = self.maps(angles)

@@ -16,7 +16,6 @@ from kbmaps import (
     ShapeError,
     next_pose,
     next_poses,
-    next_stretch,
 )
 from kbmaps.planning.design import mean_distances
 
@@ -154,28 +153,6 @@ def test_a_plan_stays_within_the_limits_and_is_no_worse_than_the_candidates(seed
     assert design.error_after(posterior.roots(plan)) < design.error_after(posterior.roots(greedy))
 
 
-def test_a_stretch_goes_in_even_steps_towards_the_goal_that_teaches_most():
-    model, region, goals = planted(4)
-    start = np.array([0.1, -0.1])
-    goals = goals[np.linalg.norm(goals - start, axis=1) > 0.5]
-    path = next_stretch(model, region, start, goals, pairs=5, step=0.1)
-    assert path.shape == (5, 2)
-    np.testing.assert_allclose(np.linalg.norm(np.diff([start, *path], axis=0), axis=1), 0.1)
-    design = ExperimentDesign(model, region)
-    straight = (
-        start
-        + 0.1 * np.arange(1, 6)[:, None] * ((goals - start) / np.linalg.norm(goals - start, axis=1)[:, None])[:, None]
-    )
-    errors = [design.error_after(model.roots(way)) for way in straight]
-    np.testing.assert_allclose(path, straight[int(np.argmin(errors))])
-
-
-def test_a_stretch_ends_at_its_goal():
-    model, region, _ = planted(5)
-    path = next_stretch(model, region, [0.0, 0.0], [[0.31, 0.0]], pairs=50, step=0.1)
-    np.testing.assert_allclose(path, [[0.1, 0.0], [0.2, 0.0], [0.3, 0.0]])
-
-
 @given(seed=seeds)
 @settings(max_examples=10)
 def test_mean_distances_are_within_a_few_percent_of_sampled_ones(seed):
@@ -199,9 +176,6 @@ def test_what_does_not_fit_is_refused():
         lambda: ExperimentDesign(model, region[:0]),
         lambda: next_poses(model, region, q, 0),
         lambda: next_poses(model, region, q, len(q) + 1),
-        lambda: next_stretch(model, region, q[0], q, pairs=0, step=0.1),
-        lambda: next_stretch(model, region, q[0], q, pairs=1, step=0.0),
-        lambda: next_stretch(model, region, q[0], q[:1], pairs=1, step=0.1),
     ):
         with pytest.raises(SettingError):
             refused()

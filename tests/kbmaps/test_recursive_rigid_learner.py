@@ -79,23 +79,6 @@ def test_the_noise_is_estimated_when_no_one_tells_it(sigma):
     assert learner.noise == pytest.approx(sigma, rel=0.1)
 
 
-def test_it_goes_on_from_a_batch_as_the_batch_would():
-    rng = np.random.default_rng(10)
-    arm = rough_arm(rng)
-    unknown = ChainTolerances(axes=np.inf, points=np.inf, tool=np.inf)
-    batch = RigidLearner(arm.nominal, unknown)
-    batch.learn(*arm.pairs(rng, 60, 0.005))
-    recursive = RecursiveRigidLearner.continuing(batch)
-    more = arm.pairs(rng, 60, 0.005)
-    batch.learn(*more)
-    recursive.learn(*more)
-    test = random_q(rng, arm.kinds, 100, 80)
-    one, other = batch.estimate(test), recursive.estimate(test)
-    assert recursive.pairs == 120
-    assert np.abs(other.x - one.x).max() < 0.3 * one.sigma.min()
-    np.testing.assert_allclose(other.sigma, one.sigma, rtol=0.1)
-
-
 @on_both_paths
 def test_a_new_tool_is_learnt_from_few_pairs_without_losing_the_arm():
     rng = np.random.default_rng(4)
