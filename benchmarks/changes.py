@@ -40,7 +40,7 @@ from bodyschema.learning.changes.record import ChangeRecord, KindOfChange
 from bodyschema.learning.solvers.solver import fitted_belief
 from bodyschema.learning.uncertainty import PredictiveUncertainty
 from kbmaps import ChainBelief, ChainParameters, ChainTolerances, Explanation, learning_bases
-from kbmaps.changes.mixture import log_ratios
+from kbmaps.changes.kinds import log_ratios
 from kbmaps.robust import OUTLIER_SIGMAS
 
 # Pairs that the chain knows (half as many more validate it), range of pairs until the change, and pairs to notice it.

@@ -27,7 +27,7 @@ from benchmarks.rough_arm import rough_arm
 from bodyschema.interfaces.records import FloatArray
 from kbmaps import ChangeDetector, SharedNoise
 from kbmaps.changes.detector import PAIRS_BETWEEN_FALSE_ALARMS
-from kbmaps.changes.mixture import SIZES
+from kbmaps.changes.kinds import SIZES
 
 QUIET, LONGEST = (20, 120), 600
 

@@ -27,8 +27,8 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, ImageArray, MarkerFix, StereoFrame
 from bodyschema.robot.description import RobotDescription
 from bodyschema.sim_backend.config import CameraConfig, SimTag
-from bodyschema.sim_backend.eye import StereoEyes
-from bodyschema.sim_backend.raster import EmptyWorld
+from bodyschema.sim_backend.rendering.eye import StereoEyes
+from bodyschema.sim_backend.rendering.raster import EmptyWorld
 from bodyschema.vision.tags.body import TagBody
 from bodyschema.vision.tags.config import TagConfig
 from bodyschema.vision.tags.tracker import TagTracker

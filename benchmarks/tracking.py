@@ -23,8 +23,8 @@ from typing import Any, Generic, Self, TypeVar
 import cv2
 
 from bodyschema.daemon.config import Config
+from bodyschema.daemon.sampler.devices import session_of
 from bodyschema.daemon.sampler.sampler import Sampler
-from bodyschema.daemon.sampler.session import session_of
 from bodyschema.daemon.sampler.sources import Sources
 from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.interfaces.camera import StereoCalibration

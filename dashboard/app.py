@@ -18,7 +18,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from bodyschema.daemon.service.local_web import HEADERS, host_refusal
-from bodyschema.daemon.transport.command_names import CommandName
+from bodyschema.daemon.transport.keys import CommandName
 from bodyschema.daemon.transport.wire import CommandReply, decode, encode
 from bodyschema.dashboard.documents import Process
 from bodyschema.dashboard.hub import Follower, Hub, HubFullError

@@ -3,6 +3,7 @@
 `diagnosis` fits the same effects that `sim_backend` applies.
 """
 
+from bodyschema.effects.corrected import LiveEncoders
 from bodyschema.effects.simulation import Simulated
 
 from .corrected import corrected_file, write_corrected
@@ -10,7 +11,6 @@ from .effect import Effect, Identity
 from .effect_type import EffectType
 from .files import load_simulation, read_effects, read_unexplained, simulation_of, write_extended
 from .gravity import GravityLoad
-from .live import LiveEncoders
 from .motion import Motion
 from .parameter import Parameter
 from .registry import EFFECT_TYPES

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from bodyschema.effects.motion import Motion, transforms
+from bodyschema.effects.simulation import Simulation
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.interfaces.whole_files import write_whole
@@ -18,8 +20,6 @@ from bodyschema.robot.description import RobotDescription
 
 from .effect import Effect
 from .effect_type import StructureEffect, ToolEffect
-from .poses import transforms
-from .simulation import Simulation
 
 
 def corrected_file(robot: RobotDescription) -> str:
@@ -83,3 +83,32 @@ def _moved(robot: RobotDescription, effect: Effect) -> FloatArray:
     slides = robot.chain.prismatic[robot.joints.index(str(effect.where))]
     none = np.zeros(3)
     return transforms(np.concatenate([along, none] if slides else [none, along])[None])[0]
+
+
+class LiveEncoders:
+    """True joint angles from encoder readings, in the order of the readings.
+
+    Every reading drives a backlash. It starts on the side of the first change; before any change, it is centred.
+
+    Args:
+        row_readings: number of readings between rows, for effects that depend on the row before.
+    """
+
+    def __init__(self, simulation: Simulation, row_readings: int = 1) -> None:
+        self._errors = [
+            (place.joint, effect.kind.encoder.live(place, effect.values, row_readings))
+            for effect in simulation.all_effects
+            if effect.kind.encoder is not None
+            for place in [simulation.place(effect)]
+        ]
+
+    def true_angles(self, q: FloatArray, t: float, move: FloatArray) -> FloatArray:
+        """Return true joint angles (d,) [rad, m] at the readings q (d,) and the time t [s].
+
+        Args:
+            move: the move (d,) since the row before, for joints that have not settled.
+        """
+        angles, motion = q.copy(), Motion.at(q, t)
+        for joint, error in self._errors:
+            angles[joint] += error.at(motion, float(move[joint]))
+        return angles

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyschema.effects.joint_errors import JointErrors
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.urdf import PointMass
 
-from .joint_errors import JointErrors
 from .motion import Motion
 from .optics import Optics
 from .parameter import Parameter

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray, frozen_array
 from bodyschema.recordings.recording import Recording
+from kbmaps.rotations import exponentials
 
 _EARLIER_KEPT = 16
 
@@ -136,3 +137,47 @@ def _earlier(motion: Motion, lag_s: float) -> Motion:
     rate = (3.0 * a * since + 2.0 * b) * since + c
     q = ((a * since + b) * since + c) * since + d + (asked - inside)[:, None] * rate
     return Motion(frozen_array(q), motion.t, motion.segment, motion.begun_at)
+
+
+def flanks(torque: FloatArray, hold: float, before: float = 0.0) -> FloatArray:
+    """Return the flank of its backlash on which a joint rests (n,): 1 or -1, the sign of its torque.
+
+    It changes sides when the opposite torque exceeds `hold`: until then friction in the gear keeps it in place.
+
+    Args:
+        torque: gravity's torque about the joint, in the order of the rows [N·m or N], shape (n,).
+        hold: friction [N·m or N].
+        before: flank before the first row; 0 if unknown, then the sign of the first torque counts.
+    """
+    sides = np.where(torque < 0.0, -1.0, 1.0)
+    decided = np.abs(torque) > hold
+    last = np.maximum.accumulate(np.where(decided, np.arange(len(torque)), -1))
+    first = before or (float(sides[0]) if len(sides) else 0.0)
+    return np.where(last >= 0, sides[np.maximum(last, 0)], first)
+
+
+def transforms(values: FloatArray) -> FloatArray:
+    """Return transforms (n, 4, 4) of shifts [m] and rotation vectors [rad] (n, 6)."""
+    T = np.tile(np.eye(4), (len(values), 1, 1))
+    T[:, :3, :3] = exponentials(values[:, 3:6])[0]
+    T[:, :3, 3] = values[:, :3]
+    return T
+
+
+def rotation(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the rotation (3, 3) of a pose's values (6, ...), and the rotation per change of its numbers (3, 3)."""
+    turns, jacobians = exponentials(values[None, 3:6])
+    return turns[0], jacobians[0]
+
+
+def moved_and_turned(shifts: FloatArray, axes: FloatArray, lever: FloatArray) -> FloatArray:
+    """Return moves (n, 3, 6) at levers (n, 3): shifts (n, 3, 3), and turns about the columns of axes (n, 3, 3)."""
+    turned = np.cross(np.swapaxes(axes, 1, 2), lever[:, None, :])
+    return np.concatenate([shifts, np.swapaxes(turned, 1, 2)], axis=2)
+
+
+def moved_by_observer(values: FloatArray, x: FloatArray) -> FloatArray:
+    """Return moves (n, 3, 6) of points x (n, 3) in an observer's frame, by the values (6, ...) of its pose."""
+    turn, by_turn = rotation(values)
+    axes = np.broadcast_to(-turn.T, (len(x), 3, 3))
+    return moved_and_turned(axes, axes @ by_turn, x)

@@ -12,6 +12,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
+from bodyschema.effects.motion import transforms
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.urdf import inverse
@@ -24,7 +25,6 @@ from .gravity import GravityLoad
 from .moments import after, since
 from .motion import Motion
 from .optics import Optics
-from .poses import transforms
 
 # Step of numerical derivatives by the optics' parameters and by a point.
 _STEP = 1e-6

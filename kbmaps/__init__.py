@@ -10,7 +10,6 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from kbmaps.autocorrelation import shared_by
     from kbmaps.chains.align import Alignment, align
     from kbmaps.chains.belief import ChainBelief
     from kbmaps.chains.chain import RigidChain
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
     from kbmaps.changes.naming import Explanation, explanations
     from kbmaps.changes.shared_noise import SharedNoise
     from kbmaps.changes.white_noise import WhiteNoise
-    from kbmaps.contest import Contest, Recent
+    from kbmaps.contest import Contest, Recent, shared_by
     from kbmaps.errors import (
         BasisError,
         ChainError,
@@ -51,8 +50,7 @@ if TYPE_CHECKING:
     from kbmaps.maps.exact import ExactLearner, ExactSolution
     from kbmaps.maps.kbmap import KBMap, prediction_errors
     from kbmaps.maps.kernels import kernels_in_use
-    from kbmaps.maps.nlms import NLMS
-    from kbmaps.maps.step_size import StepSize
+    from kbmaps.maps.nlms import NLMS, StepSize
     from kbmaps.maps.support import SUPPORT_LIMIT, SupportSet
     from kbmaps.memory import Memory
     from kbmaps.model import Estimate, Model, PoseModel, PositionModel
@@ -66,8 +64,7 @@ if TYPE_CHECKING:
     from kbmaps.trains.core_prior import CoreFamily, CorePrior
     from kbmaps.trains.learner import TensorLearner
     from kbmaps.trains.posterior import TensorPosterior
-    from kbmaps.trains.settings import TensorSettings
-    from kbmaps.trains.train import TensorTrain
+    from kbmaps.trains.train import TensorSettings, TensorTrain
 
 __version__ = "0.1.0"
 
@@ -162,7 +159,6 @@ __all__ = [
 
 # Each public name is imported on first use: importing all of them takes 0.7 s of CPU.
 _MODULES = {
-    "autocorrelation": ["shared_by"],
     "chains.align": ["Alignment", "align"],
     "chains.belief": ["ChainBelief"],
     "chains.chain": ["RigidChain"],
@@ -178,7 +174,7 @@ _MODULES = {
     "changes.naming": ["Explanation", "explanations"],
     "changes.shared_noise": ["SharedNoise"],
     "changes.white_noise": ["WhiteNoise"],
-    "contest": ["Contest", "Recent"],
+    "contest": ["Contest", "Recent", "shared_by"],
     "errors": [
         "BasisError",
         "ChainError",
@@ -203,8 +199,7 @@ _MODULES = {
     "maps.exact": ["ExactLearner", "ExactSolution"],
     "maps.kbmap": ["KBMap", "prediction_errors"],
     "maps.kernels": ["kernels_in_use"],
-    "maps.nlms": ["NLMS"],
-    "maps.step_size": ["StepSize"],
+    "maps.nlms": ["NLMS", "StepSize"],
     "maps.support": ["SUPPORT_LIMIT", "SupportSet"],
     "memory": ["Memory"],
     "model": ["Estimate", "Model", "PoseModel", "PositionModel"],
@@ -218,8 +213,7 @@ _MODULES = {
     "trains.core_prior": ["CoreFamily", "CorePrior"],
     "trains.learner": ["TensorLearner"],
     "trains.posterior": ["TensorPosterior"],
-    "trains.settings": ["TensorSettings"],
-    "trains.train": ["TensorTrain"],
+    "trains.train": ["TensorSettings", "TensorTrain"],
 }
 _HOMES = {name: f"kbmaps.{module}" for module, names in _MODULES.items() for name in names}
 

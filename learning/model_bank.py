@@ -3,12 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Protocol
 
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning.learnt_model import LearntModel
-from kbmaps import NLMS, KBMap, NonFiniteError
+from kbmaps import NLMS, KBMap, NonFiniteError, PositionModel
+
+
+class LearntModel(PositionModel, Protocol):
+    """Map from joint angles to positions that later learning does not change."""
+
+    @property
+    def digest(self) -> str:
+        """Hash that identifies the model."""
+        ...
+
+    def to_bytes(self) -> bytes:
+        """Return the model as one self-describing byte string."""
+        ...
+
 
 PRIOR, INSTANT, RIGID, RESIDUAL, EXACT = "prior", "nlms", "rigid", "residual", "exact"
 # Stored net of the instant learner at the time when the current solutions were requested.

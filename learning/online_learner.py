@@ -20,8 +20,7 @@ from bodyschema.learning.model_bank import PRIOR, SOLVED
 from bodyschema.learning.nominal import NominalModel, chain_tolerances
 from bodyschema.learning.regime import LOOKED_BACK, Regime
 from bodyschema.learning.snapshot import Snapshot
-from bodyschema.learning.solvers.client import SolverClient
-from bodyschema.learning.solvers.solver import Solver
+from bodyschema.learning.solvers.solver import Solver, SolverClient
 from bodyschema.learning.state import Counters, LearningState
 from bodyschema.learning.status import CurvePoint, OrientationStatus
 from kbmaps import ChainBelief, Recent

@@ -11,9 +11,9 @@ import msgspec
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning.error_memory import DISCOUNT
 from bodyschema.learning.model_bank import EXACT, PRIOR, RIGID
 from bodyschema.learning.solvers.orientation import OrientationSolution
+from bodyschema.learning.uncertainty import DISCOUNT
 from bodyschema.learning.variance_terms import unexplained
 from kbmaps import (
     ChainBelief,

@@ -13,8 +13,7 @@ from bodyschema.learning.changes.known_arm import KnownArm
 from bodyschema.learning.changes.monitor import LOOKED_BACK as KNOWN_PAIRS
 from bodyschema.learning.changes.monitor import ChangeMonitor, Reference
 from bodyschema.learning.config import LearnerConfig
-from bodyschema.learning.learnt_model import LearntModel
-from bodyschema.learning.model_bank import EXACT, INSTANT, PRIOR, RESIDUAL, RIGID, ModelBank
+from bodyschema.learning.model_bank import EXACT, INSTANT, PRIOR, RESIDUAL, RIGID, LearntModel, ModelBank
 from bodyschema.learning.orientation import OrientationModel, Orientations
 from bodyschema.learning.outlier_gate import DOUBT, OutlierGate, limits_m, sound
 from bodyschema.learning.replay_memory import PairMemory, Permutations

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning.learnt_model import LearntModel
+from bodyschema.learning.model_bank import LearntModel
 from bodyschema.learning.orientation import OrientationModel
 from bodyschema.learning.solvers.solver import LARGEST_NET
 from bodyschema.learning.uncertainty import PredictiveUncertainty

@@ -3,16 +3,161 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
+from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.sim_backend.truth import JointRoles, chain_from_root, turn_between
 
 from .bullet import Body
 from .config import GuideConfig
-from .geometry import turn_between
-from .roles import JointRoles, chain_from_root
 from .truth import TrueRobot
+
+# Postures of one tour. With few, the nearest is farther away, so the tour covers the joint ranges sooner.
+POSTURES = 50
+_BATCH = 1000
+_MOST_BATCHES = 40
+# Share of a joint's range left free at either end.
+_LIMIT_MARGIN = 0.04
+# Candidates for the next hop, and where along each the view is checked.
+_CANDIDATES = 8
+_CHECKS = (0.2, 0.4, 0.6, 0.8)
+# Spacing of the points of a hop in joint space [rad].
+_SPACING = 0.01
+
+
+class Judge(Protocol):
+    """Interface to judge the visibility of the marker at postures q (n, d)."""
+
+    def gazed(self, q: FloatArray) -> FloatArray:
+        """Return q with the head turned to the marker."""
+        ...
+
+    def in_images(self, q: FloatArray) -> np.ndarray:
+        """Return a mask (n,) of the postures with the ball inside both images."""
+        ...
+
+    def clear(self, q: FloatArray) -> bool:
+        """Return True if nothing blocks the view at one posture (d,)."""
+        ...
+
+    def visible(self, q: FloatArray) -> np.ndarray:
+        """Return a mask (n,) of the postures that pass both checks."""
+        ...
+
+
+class GuidePath:
+    """Postures along the path, at constant speed in the joint space of all learnt joints.
+
+    Args:
+        lower, upper: joint limits (d,); guided joints stay within.
+        guided: indices of the guided joints.
+        step: Euclidean distance over all learnt joints, the gaze's included, between postures [rad].
+
+    Raises:
+        ConfigError: the ball is visible at hardly any posture.
+    """
+
+    def __init__(
+        self,
+        judge: Judge,
+        lower: FloatArray,
+        upper: FloatArray,
+        guided: tuple[int, ...],
+        step: float,
+        rng: np.random.Generator,
+    ) -> None:
+        self._judge, self._guided, self._step, self._rng = judge, list(guided), step, rng
+        margin = _LIMIT_MARGIN * (upper - lower)
+        self._lower, self._upper = lower + margin, upper - margin
+        self._pool = self._visible_postures()
+        self._unvisited = list(range(1, len(self._pool)))
+        self._at = self._before = self._pool[0]
+        self._next = self._choose(self._at)
+        self._left_over = 0.0
+
+    @property
+    def waypoints(self) -> FloatArray:
+        """Visible postures (n, d) between which the path runs; it begins at the first."""
+        return self._pool
+
+    def hop(self) -> FloatArray:
+        """Return the postures (n, d) on the way to the next waypoint; n is 0 if it is nearer than a step."""
+        start, end = self._at, self._next
+        after = self._choose(end)
+        curve = self._judge.gazed(np.clip(self._curve(start, end, after), self._lower, self._upper))
+        self._before, self._at, self._next = start, curve[-1], after
+        return self._at_even_steps(np.vstack([start, curve]))
+
+    def replan(self, posture: FloatArray) -> None:
+        """Draw new visible postures (the tool has changed) and go on from `posture` (d,) to the nearest."""
+        self._pool = self._visible_postures()
+        self._unvisited = list(range(len(self._pool)))
+        self._at = self._before = posture
+        self._left_over = 0.0
+        self._next = self._choose(posture)
+
+    def _curve(self, start: FloatArray, end: FloatArray, after: FloatArray) -> FloatArray:
+        """Return a cubic from start to end with Catmull-Rom tangents, so that the path is smooth at its end."""
+        leave, arrive = (end - self._before) / 2, (after - start) / 2
+        count = max(2, int(np.linalg.norm((end - start)[self._guided]) / _SPACING))
+        s = np.linspace(0.0, 1.0, count + 1)[1:, None]
+        return (
+            (2 * s**3 - 3 * s**2 + 1) * start
+            + (s**3 - 2 * s**2 + s) * leave
+            + (3 * s**2 - 2 * s**3) * end
+            + (s**3 - s**2) * arrive
+        )
+
+    def _at_even_steps(self, points: FloatArray) -> FloatArray:
+        """Return postures one step apart along a polyline; the rest at its end is carried over to the next hop."""
+        lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        along = np.concatenate([[0.0], np.cumsum(lengths)])
+        count = int((along[-1] + self._left_over) / self._step)
+        wanted = self._step * np.arange(1, count + 1) - self._left_over
+        self._left_over += along[-1] - self._step * count
+        return np.column_stack([np.interp(wanted, along, column) for column in points.T])
+
+    def _choose(self, start: FloatArray) -> FloatArray:
+        """Return the nearest unvisited posture with a free view all along the hop, else that with the best view."""
+        if not self._unvisited:
+            self._pool = self._visible_postures()
+            self._unvisited = list(range(len(self._pool)))
+        hops = self._pool[self._unvisited] - start
+        nearest = np.argsort(np.linalg.norm(hops[:, self._guided], axis=1), kind="stable")[:_CANDIDATES]
+        best, best_share = int(nearest[0]), -1.0
+        for candidate in nearest:
+            between = self._judge.gazed(start + np.array(_CHECKS)[:, None] * hops[candidate])
+            share = float(self._judge.visible(between).mean())
+            if share > best_share:
+                best, best_share = int(candidate), share
+            if share == 1.0:
+                break
+        return self._pool[self._unvisited.pop(best)]
+
+    def _visible_postures(self) -> FloatArray:
+        """Sample postures (n, d) uniformly over the guided joints' ranges, and return those with a visible ball."""
+        found: list[FloatArray] = []
+        for _ in range(_MOST_BATCHES):
+            q = np.tile((self._lower + self._upper) / 2, (_BATCH, 1))
+            q[:, self._guided] = self._rng.uniform(
+                self._lower[self._guided], self._upper[self._guided], (_BATCH, len(self._guided))
+            )
+            q = self._judge.gazed(q)
+            for posture in q[self._judge.in_images(q)]:
+                if self._judge.clear(posture):
+                    found.append(posture)
+                if len(found) == POSTURES:
+                    return np.array(found)
+        if len(found) < 2:
+            raise ConfigError(
+                "the cameras see the marker in hardly any posture",
+                remedy="Check [camera] xyz and rpy, marker_xyz and the joint limits",
+            )
+        return np.array(found)
+
 
 # Stiffness and damping follow from the arm's inertia: natural frequency [rad/s] and damping ratio of the hand's grip.
 _FREQUENCY = 16.0

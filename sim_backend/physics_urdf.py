@@ -19,9 +19,9 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.limited import read_at_most
 from bodyschema.robot.rpy import rpy_of
 from bodyschema.robot.urdf import MOVING, UrdfJoint, UrdfTree
+from bodyschema.sim_backend.truth import root_link
 
 from .meshes import LARGEST_M, Meshes
-from .roles import root_link
 from .truth import TrueRobot
 
 # The link above the robot's root. It has no inertia, so that the world frame is the root's frame for pybullet too.

@@ -7,10 +7,13 @@ from datetime import datetime, timedelta
 from types import TracebackType
 from typing import Protocol, Self
 
+import numpy as np
+
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.protocols import Clock
-from bodyschema.interfaces.records import JointReading, StereoFrame
+from bodyschema.interfaces.records import FloatArray, JointReading, StereoFrame
 from bodyschema.robot.description import RobotDescription
+from bodyschema.sim_backend.config import EncoderConfig
 
 
 class World(Protocol):
@@ -101,3 +104,26 @@ class SimStereoCamera:
             SourceLost: the renderer's process died.
         """
         return self._world.next_frame(timeout_s)
+
+
+class Encoders:
+    """Encoder model that adds offset and noise to angles and rounds them to whole ticks.
+
+    Args:
+        offsets: reported minus true angle [rad or m], shape (d,).
+        prismatic: which joints slide, shape (d,).
+    """
+
+    def __init__(
+        self, config: EncoderConfig, offsets: FloatArray, prismatic: np.ndarray, rng: np.random.Generator
+    ) -> None:
+        self._tick = np.where(prismatic, 1.0 / config.ticks_per_metre, 2 * np.pi / config.ticks_per_turn)
+        self._noise = config.noise_ticks
+        self._offsets = offsets
+        self._rng = rng
+
+    def read(self, true: FloatArray) -> FloatArray:
+        """Return the readings (d,) [rad or m] at the true angles, or drive positions, `true` (d,)."""
+        exact = (true + self._offsets) / self._tick
+        noisy = exact + self._noise * self._rng.standard_normal(exact.shape)
+        return np.round(noisy) * self._tick

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from enum import IntEnum
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,8 +18,49 @@ from bodyschema.robot.urdf import MOVING, UrdfJoint, UrdfTree, chain_between
 from kbmaps import RigidChain
 
 from .config import ErrorConfig, SimConfig
-from .geometry import joint_motion, transform
-from .randomness import Stream, generator
+
+
+class Stream(IntEnum):
+    """Purpose of a random stream."""
+
+    ERRORS = 1
+    ENCODERS = 2
+    WAYPOINTS = 3
+    BACKGROUND = 4
+    IMAGE_NOISE = 5
+
+
+def generator(seed: int, stream: Stream, *index: int) -> np.random.Generator:
+    """Return the generator of one stream and, if an index is given, of one frame."""
+    return np.random.default_rng([seed, int(stream), *index])
+
+
+def transform(rotation: Rotation, translation: FloatArray) -> FloatArray:
+    """Return the homogeneous transform (4, 4) of a rotation and a translation (3,) [m]."""
+    T = np.eye(4)
+    T[:3, :3] = rotation.as_matrix()
+    T[:3, 3] = translation
+    return T
+
+
+def joint_motion(axis: FloatArray, prismatic: bool, value: float) -> FloatArray:
+    """Return the transform (4, 4) of a joint at `value`: a rotation about its axis [rad] or a slide along it [m]."""
+    if prismatic:
+        return transform(Rotation.identity(), axis * value)
+    return transform(Rotation.from_rotvec(axis * value), np.zeros(3))
+
+
+def cross_matrix(vector: FloatArray) -> FloatArray:
+    """Return the skew-symmetric matrix (3, 3) of `vector` (3,): its product with x is the cross product vector × x."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def turn_between(R_from: FloatArray, R_to: FloatArray) -> FloatArray:
+    """Return the rotation axis (3,) from one orientation (3, 3) to another, times the sine of the angle."""
+    R = R_to @ R_from.T
+    return np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
+
 
 # The offset of a prismatic joint is known better than that of a revolute one: metres of error per radian.
 _METRES_PER_RADIAN = 0.1
@@ -140,3 +182,70 @@ def _pose_error(length: float, angle: float, rng: np.random.Generator) -> FloatA
 def _locked(joint: UrdfJoint, position: float) -> UrdfJoint:
     motion = joint_motion(joint.axis, joint.kind == "prismatic", position)
     return replace(joint, kind="fixed", T_parent_joint=frozen_array(joint.T_parent_joint @ motion))
+
+
+@dataclass(frozen=True)
+class JointRoles:
+    """Roles of the learnt joints in the simulation.
+
+    The path from the cameras to the marker goes up to a common link and then down. Joints on the way up carry the
+    cameras: they gaze. Joints on the way down carry the marker: they are guided. If there is no way down (cameras on
+    the hand, marker fixed in the world), the joints on the way up are guided.
+
+    Attributes:
+        gaze: indices of the gazing joints in q.
+        guided: indices of the guided joints in q, in their order from the robot's root.
+        wrist: the link that carries the marker (or the hand's cameras); the hand holds it.
+        elbow: the link of the guided joint half-way to the wrist, which the other hand holds.
+    """
+
+    gaze: tuple[int, ...]
+    guided: tuple[int, ...]
+    wrist: str
+    elbow: str
+
+    @classmethod
+    def of(cls, robot: RobotDescription) -> JointRoles:
+        """Return the roles of a robot's learnt joints."""
+        way = robot.tree.path(robot.camera.parent_link, robot.robot.marker_link)
+        upward = {joint.name: up for joint, up in way}
+        index = {name: k for k, name in enumerate(robot.joints)}
+        gaze = tuple(k for name, k in index.items() if upward[name])
+        guided = tuple(k for name, k in index.items() if not upward[name])
+        wrist = robot.robot.marker_link
+        if not guided:
+            gaze, guided, wrist = (), gaze[::-1], robot.camera.parent_link
+        elbow = robot.tree.joints[robot.joints[guided[_half_way(robot, guided, wrist)]]].child
+        return cls(gaze=gaze, guided=guided, wrist=wrist, elbow=elbow)
+
+
+def root_link(tree: UrdfTree) -> str:
+    """Return the link that is the child of no joint."""
+    children = {joint.child for joint in tree.joints.values()}
+    return next(link for link in tree.links if link not in children)
+
+
+def chain_from_root(truth: TrueRobot, roles: JointRoles, link: str) -> tuple[RigidChain, tuple[int, ...]]:
+    """Return the true chain from the root to a guided link, over reported angles, and its joints' indices in q."""
+    root = root_link(truth.tree)
+    on_way = {joint.name for joint, _ in truth.tree.path(root, link)}
+    indices = tuple(k for k in roles.guided if truth.robot.joints[k] in on_way)
+    names = tuple(truth.robot.joints[k] for k in indices)
+    chain = chain_between(truth.tree, names, {}, start=root, end=link, T_start_camera=np.eye(4), marker_xyz=np.zeros(3))
+    return with_offsets(chain, truth.offsets[list(indices)]), indices
+
+
+def _half_way(robot: RobotDescription, guided: tuple[int, ...], wrist: str) -> int:
+    """Return the index in `guided` of the joint nearest to half the arm's length, with all joints at zero."""
+    links = [*(robot.tree.joints[robot.joints[k]].child for k in guided), wrist]
+    origins = np.array([_origin(robot.tree, link) for link in links])
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(origins, axis=0), axis=1))])
+    return int(np.abs(along[:-1] - along[-1] / 2).argmin())
+
+
+def _origin(tree: UrdfTree, link: str) -> FloatArray:
+    """Return the position (3,) of a link's frame in the root link with all joints at zero [m]."""
+    T = np.eye(4)
+    for joint, _ in tree.path(root_link(tree), link):
+        T = T @ joint.T_parent_joint
+    return T[:3, 3]

@@ -7,11 +7,13 @@ import subprocess
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
+import msgspec
 import numpy as np
 
 from bodyschema.effects import Simulation
@@ -20,13 +22,13 @@ from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, SourceEnded, SourceError
 from bodyschema.interfaces.records import FloatArray, ImageArray, JointReading, StereoFrame, frozen_array
 from bodyschema.robot.description import RobotDescription
+from bodyschema.sim_backend.config import EncoderConfig, SimConfig
+from bodyschema.sim_backend.physics import Physics
+from bodyschema.sim_backend.rendering.render_client import RenderProcess
+from bodyschema.sim_backend.truth import TrueRobot
 from kbmaps import RigidChain
 
-from .config import SimConfig
-from .physics import Physics
-from .render_client import RenderProcess
 from .sources import SimClock, SimJoints, SimStereoCamera
-from .truth import TrueRobot
 
 log = logging.getLogger(__name__)
 
@@ -283,3 +285,45 @@ def stereo_frame(t: float, images: tuple[ImageArray, ...]) -> StereoFrame:
     for image in images:
         image.setflags(write=False)
     return StereoFrame(t, images[0], images[1] if len(images) > 1 else None)
+
+
+# Finer than any encoder: the user of the angles adds the resolution of the real encoders.
+FINEST = 2**30
+
+
+def exact_encoders(config: SimConfig) -> SimConfig:
+    """Return the configuration with encoders that have no noise and a negligible quantisation."""
+    rate_hz = config.encoders.rate_hz
+    exact = EncoderConfig(ticks_per_turn=FINEST, ticks_per_metre=FINEST, noise_ticks=0.0, rate_hz=rate_hz)
+    return msgspec.structs.replace(config, encoders=exact)
+
+
+def guided_path(
+    robot: RobotDescription,
+    config: SimConfig,
+    duration_s: float,
+    extension: Simulation | None = None,
+    tell: Callable[[float], None] = lambda _: None,
+) -> FloatArray:
+    """Return noise-free encoder readings (n, d) [rad or m], `config.encoders.rate_hz` rows a second.
+
+    Args:
+        tell: called with the simulated seconds done so far.
+
+    Raises:
+        ConfigError: [camera] describes no stereo pair (the hand keeps the marker in its view), or pybullet is not
+            installed.
+    """
+    calibration = stereo_calibration(robot)
+    config = exact_encoders(config)
+    rate_hz = config.encoders.rate_hz
+    rows = []
+    with Physics(TrueRobot.draw(robot, config, extension), calibration, config) as physics:
+        between = physics.rate_hz // rate_hz
+        for row in range(round(duration_s * rate_hz)):
+            for _ in range(between):
+                physics.step()
+            rows.append(physics.read_encoders())
+            if row % rate_hz == 0:
+                tell(row / rate_hz)
+    return np.array(rows)

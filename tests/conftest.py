@@ -82,7 +82,7 @@ def patient_host(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait for a servo's answer as long as a full machine may hold up the bench that gives it."""
     monkeypatch.setattr("bodyschema.drivers.servos.bus.HOST_MARGIN_S", 1.0)
     monkeypatch.setattr("bodyschema.drivers.servos.scan.HOST_S", 1.0)
-    monkeypatch.setattr("bodyschema.drivers.dynamixel.scan.HOST_S", 1.0)
+    monkeypatch.setattr("bodyschema.drivers.dynamixel.bus.HOST_S", 1.0)
 
 
 @pytest.fixture

@@ -11,8 +11,8 @@ import numpy as np
 
 from bodyschema.cli.terminal.progress import TELL_EVERY_S, Say
 from bodyschema.daemon.config import Config
+from bodyschema.daemon.sampler.devices import session_of
 from bodyschema.daemon.sampler.sampler import Sampler
-from bodyschema.daemon.sampler.session import session_of
 from bodyschema.daemon.sampler.sources import Sources
 from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.interfaces.clock import SystemClock

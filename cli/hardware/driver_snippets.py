@@ -10,8 +10,7 @@ import numpy as np
 
 from bodyschema.daemon.config import Config
 from bodyschema.effects import Simulation
-from bodyschema.effects.exports.arm_errors import ArmErrors
-from bodyschema.effects.exports.geometry import geometry_of
+from bodyschema.effects.exports.arm_errors import ArmErrors, geometry_of
 from bodyschema.effects.joint_errors import JointErrors
 from bodyschema.robot.rpy import rpy_of
 

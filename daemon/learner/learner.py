@@ -14,9 +14,8 @@ from collections.abc import Callable, Iterator
 from importlib.metadata import version
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.learner.answers import Answers
+from bodyschema.daemon.learner.answers import Answers, ExpectedMarker
 from bodyschema.daemon.learner.checkpoint import CheckpointError, go_on, write_checkpoint
-from bodyschema.daemon.learner.expected import ExpectedMarker
 from bodyschema.daemon.learner.feed import BEHIND, PairFeed
 from bodyschema.daemon.learner.findings import Changes, Findings, FindingTurns
 from bodyschema.daemon.sampler.history import Page, read_page

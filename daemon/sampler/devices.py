@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import logging
+import socket
 from collections.abc import Iterator, Mapping, Sequence
+from importlib.metadata import version
 from typing import Any, Protocol, runtime_checkable
 
+import msgspec
+
+from bodyschema.daemon.config import Config
 from bodyschema.interfaces.protocols import Clock, JointSource
-from bodyschema.recordings.store.store import PairStore
+from bodyschema.recordings.store.store import PairStore, Session
+from bodyschema.robot.limited import read_at_most
+from bodyschema.robot.toml_file import read_toml
 
 log = logging.getLogger(__name__)
 
@@ -98,3 +105,16 @@ def _said(before: Device, now: Device) -> Iterator[str]:
             f"the firmware of {joint!r} was {before['firmware']}, is {now['firmware']}: compare its angle in a known "
             "pose with `bodyschema watch joints`; pairs before may have another zero"
         )
+
+
+def session_of(config: Config, wall: Clock) -> Session:
+    """Return the session that starts now with `config`."""
+    return Session(
+        joints=config.robot.joints,
+        started_utc=wall.utc(),
+        robot_toml=read_toml(config.file)[1],
+        urdf=read_at_most(config.robot.tree.file).decode("utf-8", errors="replace"),
+        config=msgspec.json.encode(config.tables).decode(),
+        version=version("bodyschema"),
+        host=socket.gethostname(),
+    )

@@ -6,6 +6,7 @@ import logging
 import threading
 
 from bodyschema.daemon.config import Config, DaemonConfig
+from bodyschema.daemon.sampler.devices import session_of
 from bodyschema.daemon.service.reload import reload
 from bodyschema.daemon.service.service import Service
 from bodyschema.interfaces.errors import BodyschemaError
@@ -16,7 +17,6 @@ from bodyschema.recordings.store.store import PairStore
 from .align import JointBuffer
 from .devices import DeviceWatch
 from .gate import Gate
-from .session import session_of
 
 log = logging.getLogger(__name__)
 

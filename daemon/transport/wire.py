@@ -13,13 +13,12 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from bodyschema.daemon.transport.keys import CommandName
 from bodyschema.interfaces.covariance import from_upper, upper_triangle
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import FARTHEST_M, LARGEST_Q, FloatArray, Pair, frozen_array
 from bodyschema.recordings.columns import QUATERNION_TOLERANCE
 from bodyschema.robot.suggest import with_choices
-
-from .command_names import CommandName
 
 JSON = "application/json"
 MSGPACK = "application/msgpack"

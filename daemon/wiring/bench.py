@@ -18,7 +18,7 @@ import msgspec
 from bodyschema.daemon.config import Config
 from bodyschema.drivers.bench.asked_faults import AskedFault, FaultKinds
 from bodyschema.drivers.bench.dry_run import Angle, BenchArm, DryRun
-from bodyschema.drivers.bench.motion import played, swinging
+from bodyschema.drivers.bench.servo_arm import played, swinging
 from bodyschema.drivers.bench.through_driver import LATENCY_MS, READ_S, Behind, ThroughDriver
 from bodyschema.drivers.dynamixel.config import DynamixelConfig
 from bodyschema.drivers.feetech.config import FeetechConfig
@@ -81,7 +81,7 @@ def bench_motion(config: Config, tell: Callable[[float], None]) -> Motion:
     if why:
         angles = swinging(limits_of(config), monotonic())
         return Motion(dict(zip(joints, angles, strict=True)), f"each joint swings slowly by itself ({why})")
-    from bodyschema.sim_backend.guided_path import guided_path
+    from bodyschema.sim_backend.world import guided_path
 
     sim = simulation_settings(config)
     path = guided_path(config.robot, sim, PATH_S, config.simulation, lambda done_s: tell(done_s / PATH_S))
@@ -248,7 +248,7 @@ def _looking_at_lines(
     hardware: SerialLinesConfig, angles: Mapping[str, Angle], open_driver: OpenDriver
 ) -> Iterator[Behind]:
     """Yield joints read from a board on a bench; each look waits for a line measured after it."""
-    from bodyschema.drivers.serial_lines.bench.listener import Listener
+    from bodyschema.drivers.serial_lines.bench.board import Listener
 
     clock = SystemClock()
     quick = msgspec.structs.replace(hardware, baud=BOARD_BAUD, delay_ms=0.0, native_usb=False)

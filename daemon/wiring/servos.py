@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, get_args
 
 from bodyschema.drivers import checks
 from bodyschema.drivers.checks import Check, Holder
+from bodyschema.drivers.dynamixel.bus import PROTOCOL1, Protocol2Scanner
 from bodyschema.drivers.dynamixel.config import Baud as DynamixelBaud
 from bodyschema.drivers.dynamixel.config import DynamixelConfig
 from bodyschema.drivers.dynamixel.joints import DYNAMIXEL
 from bodyschema.drivers.dynamixel.joints import open_serial as open_dynamixel
 from bodyschema.drivers.dynamixel.models import BY_NAME as DYNAMIXEL_MODELS
-from bodyschema.drivers.dynamixel.scan import PROTOCOL1, Protocol2Scanner
 from bodyschema.drivers.feetech.config import Baud as FeetechBaud
 from bodyschema.drivers.feetech.config import FeetechConfig
 from bodyschema.drivers.feetech.joints import FEETECH, FEETECH_SERVOS
@@ -22,7 +22,7 @@ from bodyschema.drivers.feetech.joints import open_serial as open_feetech
 from bodyschema.drivers.feetech.models import BY_NAME as FEETECH_MODELS
 from bodyschema.drivers.scan import ScannedBus, Tell, scan_port, serial_ports
 from bodyschema.drivers.serial_line import adapter_latency_s
-from bodyschema.drivers.serial_lines.checks import encoder_checks as checks_of_encoders
+from bodyschema.drivers.serial_lines.joints import encoder_checks as checks_of_encoders
 from bodyschema.drivers.servos.checks import servo_checks as checks_of_servos
 from bodyschema.drivers.servos.scan import PingScanner
 from bodyschema.interfaces.clock import SystemClock

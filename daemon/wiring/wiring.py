@@ -344,7 +344,7 @@ def marker_source_lines(config: Config) -> Iterator[str]:
 def _simulated(config: Config) -> Iterator[Sources]:
     require_simulation()
     from bodyschema.sim_backend import SimWorld
-    from bodyschema.sim_backend.guided_path import exact_encoders
+    from bodyschema.sim_backend.world import exact_encoders
 
     on_bench = config.tables.sim.servo_bench
     settings = simulation_settings(config)
@@ -368,8 +368,7 @@ def open_postures(config: Config, count: int) -> Iterator[Sources]:
         ConfigError: the simulation cannot be made of this description.
     """
     require_simulation()
-    from bodyschema.sim_backend.posed import PosedWorld
-    from bodyschema.sim_backend.postures import visible_postures
+    from bodyschema.sim_backend.posed import PosedWorld, visible_postures
 
     settings = simulation_settings(config)
     postures = visible_postures(config.robot, settings, count, config.simulation)

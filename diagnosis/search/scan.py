@@ -17,7 +17,7 @@ from bodyschema.diagnosis.fit.fit import LARGEST, Fit
 from bodyschema.diagnosis.fit.products import Products, System
 from bodyschema.diagnosis.fit.worth import choices, nats, ways_to_choose
 from bodyschema.effects import Effect, Identity
-from bodyschema.effects.flank import flanks
+from bodyschema.effects.motion import flanks
 from bodyschema.interfaces.records import FloatArray
 
 # Ripples are searched at every whole number of cycles per turn up to the first limit. Finer ones, up to twice per turn

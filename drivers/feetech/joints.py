@@ -14,10 +14,9 @@ from bodyschema.drivers.servos.channel import Channel as ServoChannel
 from bodyschema.drivers.servos.channel import Sample
 from bodyschema.drivers.servos.handshake import FittedServo
 from bodyschema.drivers.servos.joints import OpenPort, ServoJoints
-from bodyschema.drivers.servos.make import Make
+from bodyschema.drivers.servos.make import Make, Way
 from bodyschema.drivers.servos.model import Model, Register
 from bodyschema.drivers.servos.packets import HEADER, Packets, Status, take_summed
-from bodyschema.drivers.servos.plan import Way
 from bodyschema.drivers.servos.port import Port
 from bodyschema.drivers.servos.scan import Kind
 from bodyschema.drivers.servos.settings import BAUD, HOMING_OFFSET, ID, Setting

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
+from bodyschema.drivers.checks import Check
 from bodyschema.drivers.serial_line import RETRY_S, SerialLine
+from bodyschema.drivers.serial_lines.config import SerialLinesConfig
 from bodyschema.drivers.servos.port import Port
 from bodyschema.drivers.turn_count import TurnCount
 from bodyschema.drivers.turns import SpeedGate
@@ -19,7 +21,7 @@ from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import JointReading, frozen_array
 
 from .board import Board, Counts, Timed
-from .config import TABLE, EncoderConfig, SerialLinesConfig
+from .config import TABLE, EncoderConfig
 from .lines import ASK_HEADER, Header
 
 log = logging.getLogger(__name__)
@@ -347,3 +349,42 @@ def _complaint(joint: str) -> str:
 def _close(port: Port) -> None:
     with suppress(SourceError):
         port.close()
+
+
+READ_S = 1.0
+FEW_PER_S = 50.0
+MANY_TROUBLES = 0.01
+
+
+def encoder_checks(
+    config: SerialLinesConfig, joints: Sequence[str], clock: Clock, *, read_s: float = READ_S
+) -> Iterator[Check]:
+    """Yield checks of the configured encoders and of their reading rate. Open the port for that."""
+    try:
+        with SerialLineJoints(config, joints, clock) as encoders:
+            yield Check("encoders", "ok", f"all {len(joints)} of robot.toml are in the board's header")
+            end, readings = clock.now() + read_s, 0
+            while clock.now() < end:
+                readings += encoders.read(end - clock.now()) is not None
+            yield _rate(readings / read_s)
+            counts = encoders.counts
+            yield _troubles(counts.lines, counts.garbled + counts.missing)
+            for complaint in encoders.health:
+                said, _, fix = complaint.rpartition(": ")
+                yield Check("encoders", "wrong", said, fix)
+    except SourceError as error:
+        yield Check("encoders", "wrong", str(error))
+
+
+def _rate(rate_hz: float) -> Check:
+    said = f"{rate_hz:.0f} readings/s come"
+    if rate_hz < FEW_PER_S:
+        return Check("rate", "warning", said, "a higher rate of the UART, fewer other things that the board does")
+    return Check("rate", "ok", said)
+
+
+def _troubles(lines: int, lost: int) -> Check:
+    said = f"{lost} of {lines + lost} lines were garbled or missing"
+    if lost > MANY_TROUBLES * (lines + lost):
+        return Check("errors", "warning", said, "look at the cable, and whether the board keeps the rate exactly")
+    return Check("errors", "ok", said)

@@ -5,12 +5,16 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
+from typing import Protocol
+
+from bodyschema.drivers.servos.bus import Bus
+from bodyschema.drivers.servos.handshake import FittedServo
+from bodyschema.interfaces.records import JointReading
 
 from .bus import Answer
-from .handshake import FittedServo
 
 # A position this far off the extrapolated one is requested again. Rounding of three positions alone makes two ticks.
 SURPRISE_RAD, SURPRISE_TICKS = math.radians(0.35), 2.0
@@ -158,3 +162,35 @@ class Punctuality:
         self._unsure.append(unsure)
         usual = median(self._unsure)
         return unsure <= max(usual + HELD_UP_S, 2 * usual)
+
+
+class Drive(Protocol):
+    """A component that moves or releases joints of an arm. Called by the reading thread, except `complaints`.
+
+    Torque is off when it is opened. A servo fault never raises an exception: the joints are released.
+    """
+
+    @property
+    def holding(self) -> frozenset[str]:
+        """Joints whose torque may be on now."""
+        ...
+
+    @property
+    def complaints(self) -> tuple[str, ...]:
+        """Current problems, and what to do; from any thread."""
+        ...
+
+    def open(self, buses: Mapping[str, Bus], servos: Sequence[FittedServo]) -> None:
+        """Accept the servos that were found, with torque verified off, in the order of the joints."""
+        ...
+
+    def step(self, reading: JointReading | None, samples: Mapping[str, Sample | None]) -> str | None:
+        """Run once each cycle, after the request, with the reading (None when it was rejected) and the newest samples.
+
+        Return why the joints had to be released in this cycle, so that the other drives release theirs too; else None.
+        """
+        ...
+
+    def release(self, why: str | None) -> None:
+        """Switch torque off and verify it on every joint as far as the bus allows. `why` is None at the regular end."""
+        ...

@@ -10,6 +10,7 @@ from typing import Any
 
 from bodyschema.drivers.checks import Check
 from bodyschema.drivers.echo import without_echo
+from bodyschema.drivers.servos.make import Plan
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import Clock
 
@@ -18,7 +19,6 @@ from .config import ServosConfig
 from .handshake import Finding, FittedServo, ask_again, identify
 from .joints import OpenPort
 from .make import Make
-from .plan import Plan
 
 READ_S = 1.0
 IDENTIFY_S = 1.0  # servos not yet asked by then are not asked any more

@@ -11,6 +11,9 @@ from types import TracebackType
 from typing import Any, Self
 
 from bodyschema.drivers.echo import without_echo
+from bodyschema.drivers.servos.channel import Drive
+from bodyschema.drivers.servos.health import Inspection
+from bodyschema.drivers.servos.make import Plan
 from bodyschema.drivers.turn_count import TurnCount
 from bodyschema.drivers.turns import SpeedGate
 from bodyschema.interfaces.errors import SourceError, SourceLost
@@ -20,12 +23,9 @@ from bodyschema.interfaces.records import JointReading, frozen_array
 from .bus import Bus, Counts, Request
 from .channel import Channel, Punctuality, Sample, middle
 from .config import ServoConfig, ServosConfig
-from .drive import Drive
 from .handshake import RETRY_S, Finding, FittedServo, identify, require_all, restore_torque, switch_torque_off
 from .health import BusHealth, Health, ServoHealth
-from .inspection import Inspection
 from .make import Make
-from .plan import Plan
 from .port import Port
 
 log = logging.getLogger(__name__)

@@ -6,12 +6,79 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from .bus import Bus
+from bodyschema.drivers.servos.bus import Bus, Request
+
 from .channel import Channel
 from .handshake import FittedServo
 from .model import Model
-from .plan import Way
 from .settings import Setting
+
+ATTEMPTS = 5  # if one of six servos loses every twentieth answer, all five fail in one of 700 openings
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """One method of reading a group of servos.
+
+    Attributes:
+        name: for messages.
+        requests: its requests.
+        complaint: what is wrong when the group fails to answer, though all its servos support it; None: some may not.
+    """
+
+    name: str
+    requests: tuple[Request, ...]
+    complaint: str | None = None
+
+
+class Plan:
+    """The fastest read method that works, for each group of servos of a bus."""
+
+    def __init__(self, bus: Bus, groups: Sequence[Sequence[Way]]) -> None:
+        """Try each group's methods several times each. The last one is taken without a try.
+
+        Args:
+            bus: the bus.
+            groups: the methods of each group, the fastest first.
+        """
+        self._bus, self._groups = bus, groups
+        self._taken = [self._first_answered(ways, ATTEMPTS) for ways in groups]
+
+    @property
+    def requests(self) -> list[Request]:
+        """The requests of one reading."""
+        return [request for way in self._ways for request in way.requests]
+
+    @property
+    def name(self) -> str:
+        """Names of the methods in use."""
+        return ", ".join(dict.fromkeys(way.name for way in self._ways))
+
+    @property
+    def complaints(self) -> list[str]:
+        """Problems of groups that are read with a slower method than they support."""
+        slower = [way for ways, taken in zip(self._groups, self._taken, strict=True) for way in ways[:taken]]
+        return [way.complaint for way in slower if way.complaint is not None]
+
+    def improve(self) -> bool:
+        """Try the faster methods of each group once. Return True if one is used from now on."""
+        before = self._taken
+        pairs = zip(self._groups, self._taken, strict=True)
+        self._taken = [self._first_answered(ways[: taken + 1], 1) for ways, taken in pairs]
+        return self._taken != before
+
+    @property
+    def _ways(self) -> list[Way]:
+        return [ways[taken] for ways, taken in zip(self._groups, self._taken, strict=True)]
+
+    def _first_answered(self, ways: Sequence[Way], attempts: int) -> int:
+        for place, way in enumerate(ways[:-1]):
+            if any(self._is_answered(way) for _ in range(attempts)):
+                return place
+        return len(ways) - 1
+
+    def _is_answered(self, way: Way) -> bool:
+        return all(self._bus.ask(request).trouble is None for request in way.requests)
 
 
 @dataclass(frozen=True, slots=True)

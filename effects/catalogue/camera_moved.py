@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from bodyschema.effects.effect_type import CameraEffect
 from bodyschema.effects.moments import since, with_moment
+from bodyschema.effects.motion import moved_by_observer, transforms
 from bodyschema.effects.parameter import T0, Parameter, shifts, turns
-from bodyschema.effects.poses import moved_by_observer, transforms
 from bodyschema.interfaces.records import FloatArray
 
 if TYPE_CHECKING:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from bodyschema.effects.effect_type import CameraEffect
+from bodyschema.effects.motion import moved_by_observer, transforms
 from bodyschema.effects.parameter import Parameter, shifts, turns
-from bodyschema.effects.poses import moved_by_observer, transforms
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 

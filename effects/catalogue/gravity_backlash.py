@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyschema.effects.effect_type import StructureEffect
-from bodyschema.effects.flank import flanks
 from bodyschema.effects.joint_errors import JointErrors
 from bodyschema.effects.moments import with_moment
-from bodyschema.effects.motion import Motion
+from bodyschema.effects.motion import Motion, flanks
 from bodyschema.effects.parameter import Parameter
 from bodyschema.interfaces.records import FloatArray
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from bodyschema.effects.effect_type import StructureEffect
+from bodyschema.effects.motion import moved_and_turned, rotation, transforms
 from bodyschema.effects.parameter import Parameter, shifts, turns
-from bodyschema.effects.poses import moved_and_turned, rotation, transforms
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.urdf import inverse
 

@@ -6,10 +6,14 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Self
 
+import numpy as np
+
+from bodyschema.effects.corrected import corrected_geometry
 from bodyschema.effects.effect import Effect
 from bodyschema.effects.effect_type import StructureEffect
 from bodyschema.effects.joint_errors import JointErrors
 from bodyschema.effects.simulation import Simulation
+from bodyschema.robot.calibrated import CalibratedGeometry
 from bodyschema.robot.urdf import PointMass
 
 BORNE_BY_HAND = 'with hold = "torque_free" the guiding hand bore the weight'
@@ -101,3 +105,19 @@ def moment_notes(simulation: Simulation) -> Iterator[str]:
         if effect.kind.begins:
             at = "" if effect.where is None else f" at {effect.where}"
             yield f"{effect.name}{at}: the file has the arm as it is after t0 = {effect.value('t0'):g}"
+
+
+def geometry_of(simulation: Simulation) -> CalibratedGeometry:
+    """Return the geometry with all effects that it can hold; the described one where there are none."""
+    robot = simulation.robot
+    described = CalibratedGeometry({}, robot.camera.pose, np.array(robot.robot.marker_xyz))
+    return corrected_geometry(simulation) or described
+
+
+def geometry_without_zeros(simulation: Simulation) -> CalibratedGeometry:
+    """Return the geometry without joint offsets."""
+    own, background = (
+        [effect for effect in effects if not effect.kind.is_zero]
+        for effects in (simulation.effects, simulation.background)
+    )
+    return geometry_of(simulation.with_effects(own).with_background(background))

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from bodyschema.effects.effect import Effect
+from bodyschema.effects.exports.arm_errors import geometry_without_zeros
 from bodyschema.effects.gravity import GRAVITY_M_S2, carried
 from bodyschema.effects.simulation import Simulation
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.urdf import inverse
 
 from .arm_errors import BORNE_BY_HAND, LeftOut, moment_notes, residual_note, sentences
-from .geometry import geometry_without_zeros
 
 FORMAT, VERSION = "bodyschema correction", 1
 

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from bodyschema.effects.exports.arm_errors import geometry_without_zeros
 from bodyschema.effects.gravity import GRAVITY_M_S2
 from bodyschema.effects.joint_errors import JointErrors, Wave
 from bodyschema.effects.simulation import Simulation
@@ -28,7 +29,6 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.urdf import MOVING, UrdfJoint, standing
 
 from .arm_errors import ArmErrors, numbers
-from .geometry import geometry_without_zeros
 from .link_parts import LinkParts, placed, rod, texts
 
 MARKER, MEASUREMENT = "marker", "measurement_frame"

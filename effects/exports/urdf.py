@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from bodyschema.effects.exports.arm_errors import geometry_of
 from bodyschema.effects.simulation import Simulation
 from bodyschema.robot.calibrated_files import calibrated_urdf
 
 from .arm_errors import LeftOut, moment_notes, residual_note, sentences
-from .geometry import geometry_of
 
 _WHY_NOT = "a URDF has zeros, links and fixed frames alone"
 

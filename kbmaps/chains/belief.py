@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike
 
 from kbmaps.arrays import FloatArray, IntArray, frozen, rows, rows_or_vector
 from kbmaps.chains.chain import RigidChain
-from kbmaps.chains.packed import CHAIN, chain_arrays, chain_from_arrays
-from kbmaps.chains.parameters import WIDE, ChainParameters, ChainTolerances
+from kbmaps.chains.parameters import CHAIN, WIDE, ChainParameters, ChainTolerances, chain_arrays, chain_from_arrays
 from kbmaps.errors import NonFiniteError, SettingError, ShapeError
 from kbmaps.packed import complete, number, pack, restoring, unpack
 

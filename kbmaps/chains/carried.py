@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike
 
 from kbmaps.arrays import FloatArray, rows_or_vector
 from kbmaps.chains.chain import RigidChain
-from kbmaps.chains.packed import chain_arrays, chain_from_arrays
+from kbmaps.chains.parameters import chain_arrays, chain_from_arrays
 from kbmaps.errors import ModelFormatError
+from kbmaps.maps.basis import describe_bases, parse_bases
 from kbmaps.maps.kbmap import KBMap
-from kbmaps.maps.packed import describe_bases, parse_bases
 from kbmaps.packed import count
 
 

@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 
 from kbmaps.arrays import BoolArray, FloatArray
-from kbmaps.maps.noise_evidence import LinearEvidence
+from kbmaps.maps.evidence import LinearEvidence
 from kbmaps.robust import MEDIAN_NORM, ROUNDING_M
 
 _ROUNDS = 20

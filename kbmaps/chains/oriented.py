@@ -10,11 +10,10 @@ from numpy.typing import ArrayLike
 from scipy.linalg import solve_triangular  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 
 from kbmaps.arrays import FloatArray, frozen, rows
-from kbmaps.autocorrelation import shared_by
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
-from kbmaps.chains.packed import CHAIN, chain_arrays, chain_from_arrays
-from kbmaps.chains.parameters import ChainParameters
+from kbmaps.chains.parameters import CHAIN, ChainParameters, chain_arrays, chain_from_arrays
+from kbmaps.contest import shared_by
 from kbmaps.errors import DegenerateDataError, NonFiniteError, SettingError, ShapeError
 from kbmaps.packed import complete, number, pack, restoring, unpack
 from kbmaps.robust import MEDIAN_NORM

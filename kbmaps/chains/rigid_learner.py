@@ -11,8 +11,15 @@ from numpy.typing import ArrayLike
 from kbmaps.arrays import BoolArray, FloatArray, frozen, rows_or_vector
 from kbmaps.chains.belief import ChainBelief, squared
 from kbmaps.chains.chain import RigidChain
-from kbmaps.chains.packed import CHAIN, chain_arrays, chain_from_arrays, describe_tolerances, parse_tolerances
-from kbmaps.chains.parameters import ChainParameters, ChainTolerances
+from kbmaps.chains.parameters import (
+    CHAIN,
+    ChainParameters,
+    ChainTolerances,
+    chain_arrays,
+    chain_from_arrays,
+    describe_tolerances,
+    parse_tolerances,
+)
 from kbmaps.chains.placed_start import PlacedStart
 from kbmaps.chains.report import ChainReport, Scatter, chain_report
 from kbmaps.chains.rigid_fit import RigidFit, fit_chain

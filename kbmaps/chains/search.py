@@ -4,15 +4,199 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import BoolArray, FloatArray, rows
+from kbmaps.arrays import BoolArray, FloatArray, IntArray, rows
 from kbmaps.chains.chain import RigidChain
-from kbmaps.chains.descents import Descents, ScrewArms
+from kbmaps.chains.parameters import tangents
 from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
 from kbmaps.robust import ROUNDING_M
+from kbmaps.rotations import cross_matrix
+
+_STEPS = 150
+_FIRST_DAMPING, _LEAST_DAMPING, _LEAST_RAISED_DAMPING, _MOST_DAMPING = 1e-2, 1e-14, 1e-8, 1e6
+# A start with a residual [m] this small has found the chain to the last digits.
+_EXACT_M = 1e-12
+# A start ends after this many steps that each reduce the squared residual by less than this share.
+_STALLED, _STALLED_STEPS = 1e-4, 8
+
+
+@dataclass(frozen=True, eq=False)
+class ScrewArms:
+    """Chains given by the location of their joint axes with all joints at zero (Brockett 1984).
+
+    Attributes:
+        axes: unit axes (s, d, 3).
+        points: a point of each axis (s, d, 3), then the marker position (s, d+1, 3) [m].
+    """
+
+    axes: FloatArray
+    points: FloatArray
+
+    def __getitem__(self, chosen: BoolArray | IntArray) -> ScrewArms:
+        return ScrewArms(self.axes[chosen], self.points[chosen])
+
+    def chain(self, index: int, slides: BoolArray) -> RigidChain:
+        """Return one chain; with the joints at zero, all its frames are parallel to the measurement frame."""
+        fixed = np.tile(np.eye(4), (len(slides) + 1, 1, 1))
+        fixed[:, :3, 3] = np.diff(self.points[index], axis=0, prepend=np.zeros((1, 3)))
+        return RigidChain(fixed, self.axes[index], slides)
+
+    def changed(self, steps: FloatArray) -> ScrewArms:
+        """Return the chains after steps (s, 4 d + 3).
+
+        A step holds tilts of the axes about two `tangents` [rad], their shifts along these [m] and the marker's
+        displacement [m].
+        """
+        count, d = self.axes.shape[:2]
+        across = tangents(self.axes.reshape(-1, 3)).reshape(count, d, 3, 2)
+        tilts = steps[:, : 2 * d].reshape(count, d, 2, 1)
+        angles = np.sqrt(np.einsum("sdti,sdti->sdi", tilts, tilts))
+        # The second tangent is axis × first, so a turn by (α, β) moves the axis along (β, −α).
+        along = (across @ np.stack([tilts[:, :, 1], -tilts[:, :, 0]], axis=2))[..., 0]
+        axes = np.cos(angles) * self.axes + np.sinc(angles / np.pi) * along
+        axes /= np.sqrt(np.einsum("sdi,sdi->sd", axes, axes))[..., None]
+        points = self.points.copy()
+        points[:, :-1] += (across @ steps[:, 2 * d : 4 * d].reshape(count, d, 2, 1))[..., 0]
+        points[:, -1] += steps[:, 4 * d :]
+        return ScrewArms(axes, points)
+
+
+@dataclass(frozen=True, eq=False)
+class _Reached:
+    """Marker positions of each chain; pairs come last so that all of them are one vector operation.
+
+    Attributes:
+        turned: R_kᵀ (d+1, s, 3, 3, n), R_k the rotation before joint k, and of the marker.
+        levers: from each joint's point to the marker (d, s, 3, n) [m].
+        residuals: (s, 3, n) [m].
+        squares: their sums of squares (s,) [m²].
+    """
+
+    turned: FloatArray
+    levers: FloatArray
+    residuals: FloatArray
+    squares: FloatArray
+
+    def __getitem__(self, chosen: BoolArray | IntArray) -> _Reached:
+        return _Reached(self.turned[:, chosen], self.levers[:, chosen], self.residuals[chosen], self.squares[chosen])
+
+
+class Descents:
+    """Levenberg-Marquardt from several starting chains at once.
+
+    Args:
+        q: joint angles (n, d) [rad, m].
+        x: marker positions (n, 3) [m].
+        slides: True for each joint (d,) that slides.
+        size: spread of the positions [m].
+    """
+
+    def __init__(self, q: FloatArray, x: FloatArray, slides: BoolArray, size: float) -> None:
+        self._x, self._slides = np.ascontiguousarray(x.T), slides
+        angles = np.where(slides, 0.0, q).T
+        self._sines, self._versines = np.sin(angles), 1.0 - np.cos(angles)
+        self._moves = np.where(slides, q, 0.0).T
+        scales = np.concatenate([np.ones(2 * len(slides)), np.repeat(np.where(slides, 0.0, size), 2), np.full(3, size)])
+        self._free = np.flatnonzero(scales)
+        self._scales = scales
+        self._held = 1e-3 * size**2
+
+    def run(self, starts: ScrewArms, enough: float) -> tuple[ScrewArms, FloatArray]:
+        """Return the fitted chains and their RMS residuals [m]. All stop as soon as one ends at `enough` or below."""
+        arms, count = ScrewArms(starts.axes.copy(), starts.points.copy()), len(starts.axes)
+        pairs = self._x.shape[1]
+        reached = self._reach(arms)
+        gram, slope = self._normal(arms, reached)
+        damping, squares = np.full(count, _FIRST_DAMPING), reached.squares.copy()
+        stalled, steps = np.zeros(count, dtype=np.intp), np.zeros(count, dtype=np.intp)
+        active = np.flatnonzero(squares > pairs * _EXACT_M**2)
+        while len(active):
+            change = self._step(gram[active], slope[active], damping[active])
+            tried = arms[active].changed(change)
+            reached = self._reach(tried)
+            better = reached.squares < squares[active]
+            taken, failed = active[better], active[~better]
+            if len(taken):
+                arms.axes[taken], arms.points[taken] = tried.axes[better], tried.points[better]
+                last, squares[taken] = squares[taken], reached.squares[better]
+                stalled[taken] = np.where(squares[taken] > (1.0 - _STALLED) * last, stalled[taken] + 1, 0)
+                damping[taken] = np.maximum(0.2 * damping[taken], _LEAST_DAMPING)
+                steps[taken] += 1
+                gram[taken], slope[taken] = self._normal(arms[taken], reached[better])
+            damping[failed] = np.maximum(4.0 * damping[failed], _LEAST_RAISED_DAMPING)
+            ended = (stalled >= _STALLED_STEPS) | (steps >= _STEPS) | (damping > _MOST_DAMPING)
+            ended |= squares <= pairs * _EXACT_M**2
+            if (squares[ended] <= pairs * enough**2).any():
+                break
+            active = active[~ended[active]]
+        return arms, np.sqrt(squares / pairs)
+
+    def _reach(self, arms: ScrewArms) -> _Reached:
+        count, d = arms.axes.shape[:2]
+        n = self._x.shape[1]
+        turned = np.empty((d + 1, count, 3, 3, n))
+        turned[0] = np.eye(3)[:, :, None]
+        # R_{k+1}ᵀ = R_kᵀ − sin q [a]× R_kᵀ + (1 − cos q) [a]×² R_kᵀ (Rodrigues)
+        cross = cross_matrix(arms.axes)
+        terms = np.concatenate([-cross, cross @ cross], axis=2)
+        for k in range(d):
+            parts = (terms[:, k] @ turned[k].reshape(count, 3, 3 * n)).reshape(count, 2, 3, 3, n)
+            np.multiply(parts[:, 0], self._sines[k], out=parts[:, 0])
+            parts[:, 1] *= self._versines[k]
+            np.add(turned[k], parts[:, 0], out=turned[k + 1])
+            turned[k + 1] += parts[:, 1]
+        links = np.diff(arms.points, axis=1).swapaxes(0, 1)[:, :, None]
+        spans = (links @ turned[1:].reshape(d, count, 3, 3 * n)).reshape(d, count, 3, n)
+        for k in np.flatnonzero(self._slides):
+            axis = (arms.axes[:, k, None] @ turned[k].reshape(count, 3, 3 * n)).reshape(count, 3, n)
+            spans[k] += self._moves[k] * axis
+        levers = spans[::-1].cumsum(axis=0)[::-1]
+        residuals = self._x - arms.points[:, 0, :, None] - levers[0]
+        return _Reached(turned, levers, residuals, np.einsum("sin,sin->s", residuals, residuals))
+
+    def _normal(self, arms: ScrewArms, reached: _Reached) -> tuple[FloatArray, FloatArray]:
+        """Return the Gram matrices (s, f, f) of the Jacobians and their products with the residuals (s, f).
+
+        A tilt of an axis about u moves the marker by (R_k u − R_{k+1} u) × lever, a shift by v moves it by
+        R_k v − R_{k+1} v.
+        """
+        count, d = arms.axes.shape[:2]
+        n = self._x.shape[1]
+        across = tangents(arms.axes.reshape(-1, 3)).reshape(count, d, 3, 2).transpose(1, 0, 3, 2)
+        turned = reached.turned.reshape(d + 1, count, 3, 3 * n)
+        moved = (across @ (turned[:-1] - turned[1:])).reshape(d, count, 2, 3, n)
+        lever = reached.levers[:, :, None]
+        jacobian = np.empty((count, 4 * d + 3, 3, n))
+        tilts = jacobian[:, : 2 * d].reshape(count, d, 2, 3, n).swapaxes(0, 1)
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            np.multiply(moved[..., j, :], lever[..., k, :], out=tilts[..., i, :])
+            tilts[..., i, :] -= moved[..., k, :] * lever[..., j, :]
+        for k in np.flatnonzero(self._slides):
+            turned_axis = np.cross(across[k], arms.axes[:, k, None])
+            parts = (turned_axis @ turned[k]).reshape(count, 2, 3, n)
+            tilts[k] = self._moves[k] * parts
+        jacobian[:, 2 * d : 4 * d].reshape(count, d, 2, 3, n)[...] = moved.swapaxes(0, 1)
+        jacobian[:, 4 * d :] = reached.turned[-1]
+        design = jacobian.reshape(count, 4 * d + 3, 3 * n)
+        if len(self._free) < 4 * d + 3:
+            design = design[:, self._free]
+        scales = self._scales[self._free]
+        gram = design @ design.swapaxes(1, 2) * (scales[:, None] * scales)
+        return gram, (design @ reached.residuals.reshape(count, 3 * n, 1))[..., 0] * scales
+
+    def _step(self, gram: FloatArray, slope: FloatArray, damping: FloatArray) -> FloatArray:
+        held = np.einsum("sff->sf", gram) + self._held
+        damped = gram.copy()
+        np.einsum("sff->sf", damped)[...] += damping[:, None] * held
+        steps = np.zeros((len(gram), len(self._scales)))
+        steps[:, self._free] = self._scales[self._free] * np.linalg.solve(damped, slope[..., None])[..., 0]
+        return steps
+
 
 # A start whose residual is below this multiple of the noise has found the chain.
 _EXPLAINED = 1.2

@@ -8,7 +8,7 @@ import numpy as np
 
 from kbmaps.arrays import FloatArray, IntArray
 from kbmaps.changes.bends import Runs, log_evidence, probable_bends
-from kbmaps.changes.mixture import log_ratios
+from kbmaps.changes.kinds import log_ratios
 
 # Runs of neighbours count by their means; a run's length is this share of its age, at most this many pairs.
 _RUN_SHARE, _LONGEST_RUN = 0.04, 6

@@ -10,8 +10,7 @@ import numpy as np
 
 from kbmaps.arrays import FloatArray
 from kbmaps.chains.belief import ChainBelief
-from kbmaps.changes.kinds import OTHER, ChangeKind
-from kbmaps.changes.mixture import SIZES
+from kbmaps.changes.kinds import OTHER, SIZES, ChangeKind
 from kbmaps.robust import OUTLIER_SIGMAS
 
 # Maximum number of pairs, evenly spread. They are not weighted up for the others: their noise would look like a change

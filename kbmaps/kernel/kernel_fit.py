@@ -17,9 +17,8 @@ import numpy as np
 from kbmaps.arrays import FloatArray
 from kbmaps.errors import SettingError
 from kbmaps.kernel.product_kernel import ProductKernel
-from kbmaps.maps.evidence import most_evident
+from kbmaps.maps.evidence import VARIANCE_FLOOR, LinearEvidence, most_evident
 from kbmaps.maps.factor import ShiftedGram
-from kbmaps.maps.noise_evidence import VARIANCE_FLOOR, LinearEvidence
 
 Precision = float | Literal["evidence"] | None
 

@@ -18,8 +18,7 @@ from kbmaps.errors import DegenerateDataError, ModelFormatError, SettingError
 from kbmaps.kernel.kept_pairs import KeptPairs
 from kbmaps.kernel.kernel_fit import Precision
 from kbmaps.kernel.regression import KernelRegression
-from kbmaps.maps.basis import JointBasis
-from kbmaps.maps.packed import describe_bases, parse_bases
+from kbmaps.maps.basis import JointBasis, describe_bases, parse_bases
 from kbmaps.maps.support import SUPPORT_LIMIT
 from kbmaps.memory import Memory, describe_memory, parse_memory
 from kbmaps.model import Estimate

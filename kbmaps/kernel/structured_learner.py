@@ -11,13 +11,20 @@ from numpy.typing import ArrayLike
 
 from kbmaps.arrays import FloatArray, frozen, rows_or_vector
 from kbmaps.chains.chain import RigidChain
-from kbmaps.chains.packed import CHAIN, chain_arrays, chain_from_arrays, describe_tolerances, parse_tolerances
-from kbmaps.chains.parameters import WIDE, ChainParameters, ChainTolerances
+from kbmaps.chains.parameters import (
+    CHAIN,
+    WIDE,
+    ChainParameters,
+    ChainTolerances,
+    chain_arrays,
+    chain_from_arrays,
+    describe_tolerances,
+    parse_tolerances,
+)
 from kbmaps.kernel.kept_pairs import KeptPairs
 from kbmaps.kernel.kernel_fit import KernelFit
 from kbmaps.kernel.regression import KernelRegression
-from kbmaps.maps.basis import JointBasis, check_bases
-from kbmaps.maps.packed import describe_bases, parse_bases
+from kbmaps.maps.basis import JointBasis, check_bases, describe_bases, parse_bases
 from kbmaps.memory import Memory, describe_memory, parse_memory
 from kbmaps.model import Estimate, near_data, widest
 from kbmaps.packed import complete, count, named, pack, restoring, unpack

@@ -11,8 +11,14 @@ from numpy.typing import ArrayLike
 from kbmaps.arrays import BoolArray, FloatArray, rows_or_vector
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
-from kbmaps.chains.packed import CHAIN, chain_arrays, chain_from_arrays, describe_tolerances, parse_tolerances
-from kbmaps.chains.parameters import ChainTolerances
+from kbmaps.chains.parameters import (
+    CHAIN,
+    ChainTolerances,
+    chain_arrays,
+    chain_from_arrays,
+    describe_tolerances,
+    parse_tolerances,
+)
 from kbmaps.chains.rigid_learner import RigidLearner
 from kbmaps.model import Estimate, near_data, widest
 from kbmaps.packed import complete, named, pack, restoring, unpack

@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike
 from kbmaps.arrays import FloatArray, IntArray, frozen, rows, rows_or_vector
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
-from kbmaps.chains.packed import CHAIN, chain_arrays, chain_from_arrays
-from kbmaps.chains.parameters import ChainParameters
+from kbmaps.chains.parameters import CHAIN, ChainParameters, chain_arrays, chain_from_arrays
 from kbmaps.errors import NonFiniteError, SettingError, ShapeError
 from kbmaps.packed import complete, named, numbers, pack, restoring, unpack
 from kbmaps.residual.features import ResidualFeatures, ResidualScaling

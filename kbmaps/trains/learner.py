@@ -13,19 +13,16 @@ from numpy.typing import ArrayLike
 from kbmaps.arrays import BoolArray, FloatArray, rows, rows_or_vector, vector
 from kbmaps.chains.chain import RigidChain
 from kbmaps.errors import DegenerateDataError, ModelFormatError, SettingError, ShapeError
-from kbmaps.maps.basis import JointBasis
-from kbmaps.maps.packed import describe_bases, parse_bases
+from kbmaps.maps.basis import JointBasis, describe_bases, parse_bases
 from kbmaps.maps.stack import BasisStack
 from kbmaps.model import Estimate, near_data
 from kbmaps.packed import complete, count, flag, named, number, pack, restoring, unpack
 from kbmaps.pairs import checked_pairs, stored_pairs
 from kbmaps.trains.core_evidence import USUAL_ELLIPSE_STD, core_equations, likely_ellipse_std
 from kbmaps.trains.core_prior import CORE_NUMBERS, CoreFamily, CorePrior
-from kbmaps.trains.misfit import misfit_sizes
-from kbmaps.trains.posterior import TensorPosterior
+from kbmaps.trains.posterior import TensorPosterior, misfit_sizes
 from kbmaps.trains.search import PLAUSIBLE, Fit, Pairs, information, refine, search
-from kbmaps.trains.settings import TensorSettings, parse_settings
-from kbmaps.trains.train import TensorTrain
+from kbmaps.trains.train import TensorSettings, TensorTrain, parse_settings
 
 KIND = "tensor learner, 3"
 _FIELDS = ("bases", "settings", "pairs", "waiting", "searches", "length")

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bodyschema.interfaces.records import FloatArray, Pair
-from bodyschema.learning.learnt_model import LearntModel
+from bodyschema.learning.model_bank import LearntModel
 from bodyschema.learning.uncertainty import PredictiveUncertainty
 from kbmaps import ChainBelief, ChangeDetector, ChangeKind, KBMap, ResidualModel, SharedNoise, Suspicion, WhiteNoise
 from kbmaps.changes.detector import MOST_SURPRISES

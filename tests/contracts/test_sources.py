@@ -45,8 +45,7 @@ from bodyschema.drivers.markers.fusing import FusedMarkers, Member
 from bodyschema.drivers.markers.report import Packet
 from bodyschema.drivers.markers.stream import MarkerStream
 from bodyschema.drivers.replay import Replay
-from bodyschema.drivers.ros2.bench.faults import Send, intact
-from bodyschema.drivers.ros2.bench.node import Node
+from bodyschema.drivers.ros2.bench.node import Node, Send, intact
 from bodyschema.drivers.ros2.config import Ros2Config
 from bodyschema.drivers.ros2.joints import Ros2Joints
 from bodyschema.drivers.serial_lines.bench.board import EncoderBoard

@@ -26,7 +26,7 @@ from bodyschema.cli.install.restore import restore
 from bodyschema.cli.main import command_line
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner.checkpoint import read_checkpoint, write_checkpoint
-from bodyschema.daemon.sampler.session import session_of
+from bodyschema.daemon.sampler.devices import session_of
 from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.interfaces.clock import SystemClock

@@ -19,7 +19,7 @@ from bodyschema.cli.main import app
 from bodyschema.cli.terminal.calibration_view import sentences
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner.checkpoint import write_checkpoint
-from bodyschema.daemon.sampler.session import session_of
+from bodyschema.daemon.sampler.devices import session_of
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import RecordingError
 from bodyschema.interfaces.records import MarkerFix

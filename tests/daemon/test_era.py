@@ -10,8 +10,7 @@ from guided_arm import Scene, make_pair, nominal_model
 
 from bodyschema.learning.changes.known_arm import KnownArm
 from bodyschema.learning.config import LearnerConfig
-from bodyschema.learning.learnt_model import LearntModel
-from bodyschema.learning.model_bank import EXACT, PRIOR, RESIDUAL, RIGID
+from bodyschema.learning.model_bank import EXACT, PRIOR, RESIDUAL, RIGID, LearntModel
 from bodyschema.learning.regime import Regime
 from bodyschema.learning.solvers.solver import Solved, fitted_residual
 from bodyschema.learning.uncertainty import UncertaintyTracker

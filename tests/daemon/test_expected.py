@@ -10,7 +10,7 @@ from scripted_sources import Scripted
 from small_arm import write_small_arm
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.learner.expected import ExpectedMarker
+from bodyschema.daemon.learner.answers import ExpectedMarker
 from bodyschema.daemon.wiring.wiring import open_joints, open_marker_topic
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, SourceLost
@@ -101,7 +101,7 @@ def test_where_no_data_was_it_is_told_only_with_how_sure_it_is(has_sigma) -> Non
 
 
 def test_a_robot_that_comes_later_is_waited_for(monkeypatch) -> None:
-    monkeypatch.setattr("bodyschema.daemon.learner.expected.RETRY_S", 0.0)
+    monkeypatch.setattr("bodyschema.daemon.learner.answers.RETRY_S", 0.0)
     topic = Topic(absent=3)
     readings = [JointReading(t, frozen_array([0.1, 0.2])) for t in (1.0, 2.0)]
     expected = ExpectedMarker(Joints(readings, ("a", "b")), topic, Model, SystemClock())

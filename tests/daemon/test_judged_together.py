@@ -12,13 +12,12 @@ from bodyschema.interfaces.records import Pair
 from bodyschema.learning.changes.known_arm import KnownArm
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.core import MOST_TOGETHER
-from bodyschema.learning.error_memory import ErrorMemory
 from bodyschema.learning.model_bank import INSTANT
 from bodyschema.learning.nominal import NominalModel
 from bodyschema.learning.online_learner import OnlineLearner
 from bodyschema.learning.regime import Regime
 from bodyschema.learning.solvers.solver import DirectSolver
-from bodyschema.learning.uncertainty import UncertaintyTracker
+from bodyschema.learning.uncertainty import ErrorMemory, UncertaintyTracker
 from kbmaps import NLMS, ChainTolerances
 
 TOGETHER_S = 1.0

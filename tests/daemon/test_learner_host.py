@@ -15,8 +15,7 @@ from small_arm import write_small_arm
 from told_statuses import LEARNER
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.learner.background import Background
-from bodyschema.daemon.learner.host import attend, run_learners, session_settings
+from bodyschema.daemon.learner.host import Background, attend, run_learners, session_settings
 from bodyschema.daemon.learner.learner import Learner
 from bodyschema.daemon.learner.solver_pool import SolverPool
 from bodyschema.daemon.learner.solver_process import SolverLostError

@@ -10,8 +10,7 @@ from guided_arm import built_chain, make_pair, near, new_learning, nominal_model
 
 from bodyschema.daemon.learner.solver_process import SolverProcess
 from bodyschema.interfaces.records import FloatArray, Pair
-from bodyschema.learning.learnt_model import LearntModel
-from bodyschema.learning.model_bank import RESIDUAL
+from bodyschema.learning.model_bank import RESIDUAL, LearntModel
 from bodyschema.learning.online_learner import OnlineLearner
 from bodyschema.learning.solvers.solver import DirectSolver, Task
 from kbmaps import ChainTolerances, KBMap, ResidualModel, RigidChain

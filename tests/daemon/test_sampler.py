@@ -17,8 +17,8 @@ from scripted_sources import COV, FRAME_S, Scripted, Walk, World, simulated
 from small_arm import write_small_arm
 
 from bodyschema.daemon.config import Config
+from bodyschema.daemon.sampler.devices import session_of
 from bodyschema.daemon.sampler.sampler import Sampler
-from bodyschema.daemon.sampler.session import session_of
 from bodyschema.daemon.sampler.sources import Sources
 from bodyschema.daemon.transport.bus import ZenohSession, client
 from bodyschema.daemon.transport.keys import Keys

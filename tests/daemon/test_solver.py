@@ -6,8 +6,7 @@ from guided_arm import Scene, built_chain, near, nominal_model, path
 
 import bodyschema.learning.solvers.solver as solver_module
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning.learnt_model import LearntModel
-from bodyschema.learning.model_bank import EXACT, RESIDUAL, RIGID
+from bodyschema.learning.model_bank import EXACT, RESIDUAL, RIGID, LearntModel
 from bodyschema.learning.solvers.solver import FOLDED, KEPT, DirectSolver, Task, fitted_belief
 from kbmaps import ChainTolerances, RigidChain
 

@@ -6,8 +6,7 @@ from guided_arm import JOINTS, nominal_model
 
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.model_bank import RIGID
-from bodyschema.learning.solvers.client import SolverClient
-from bodyschema.learning.solvers.solver import Solved, Task
+from bodyschema.learning.solvers.solver import Solved, SolverClient, Task
 from kbmaps import ChainTolerances
 
 NOMINAL = nominal_model()

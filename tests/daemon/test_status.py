@@ -17,8 +17,8 @@ from told_statuses import LEARNER, SAMPLER
 from bodyschema.cli.main import app
 from bodyschema.cli.terminal.status_view import Seen, Watcher, as_json, screen
 from bodyschema.daemon.config import Config
+from bodyschema.daemon.sampler.devices import session_of
 from bodyschema.daemon.sampler.sampler import Sampler
-from bodyschema.daemon.sampler.session import session_of
 from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.interfaces.clock import SystemClock

@@ -24,13 +24,12 @@ from small_arm import write_small_arm
 from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler import history, simulation
+from bodyschema.daemon.sampler.devices import session_of
 from bodyschema.daemon.sampler.sampler import Sampler
-from bodyschema.daemon.sampler.session import session_of
 from bodyschema.daemon.sampler.sources import Sources
 from bodyschema.daemon.transport import status, wire
 from bodyschema.daemon.transport.bus import ZenohSession, client
-from bodyschema.daemon.transport.command_names import CommandName
-from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.keys import CommandName, Keys
 from bodyschema.daemon.transport.wire import MSGPACK, IkReply, IkRequest, JointsRequest, PredictReply, decode, encode
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import RequestError

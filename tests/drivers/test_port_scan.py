@@ -16,8 +16,8 @@ from bodyschema.drivers.bench.pty_shell import PtyShell
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.frames import Code, Error, instructions_in
 from bodyschema.drivers.dynamixel.bench.servo import Servo
+from bodyschema.drivers.dynamixel.bus import LIKELY_FIRST
 from bodyschema.drivers.dynamixel.models import BY_NAME
-from bodyschema.drivers.dynamixel.scan import LIKELY_FIRST
 from bodyschema.drivers.feetech.bench.arm import Chain as FeetechChain
 from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
 from bodyschema.drivers.feetech.joints import FeetechPackets

@@ -18,7 +18,7 @@ from servo_arm import TICK
 from test_serial_lines import BoardArm
 from virtual_port import VirtualClock
 
-from bodyschema.drivers.bench.motion import Angle, played
+from bodyschema.drivers.bench.servo_arm import Angle, played
 from bodyschema.drivers.ros2.bench.node import Node
 from bodyschema.drivers.ros2.bench.zenoh_robot import ZenohRobot
 from bodyschema.drivers.ros2.config import Ros2Config
@@ -28,7 +28,7 @@ from bodyschema.interfaces.protocols import JointSource
 from bodyschema.interfaces.records import FloatArray, JointReading
 from bodyschema.robot.description import RobotDescription
 from bodyschema.sim_backend import SimConfig, SimWorld
-from bodyschema.sim_backend.guided_path import guided_path
+from bodyschema.sim_backend.world import guided_path
 from kbmaps import ExactLearner, JointBasis, KBMap
 
 pytestmark = pytest.mark.skipif(find_spec("pybullet") is None, reason="no pybullet; to run it: pip install -e '.[sim]'")

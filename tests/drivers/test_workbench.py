@@ -12,10 +12,9 @@ from bodyschema.drivers.bench.device import Reply
 from bodyschema.drivers.bench.faults import mute
 from bodyschema.drivers.dynamixel.bench.chain import Chain as DynamixelChain
 from bodyschema.drivers.dynamixel.bench.servo import Servo as DynamixelServo
-from bodyschema.drivers.dynamixel.joints import DYNAMIXEL
+from bodyschema.drivers.dynamixel.joints import DYNAMIXEL, settings_of
 from bodyschema.drivers.dynamixel.models import BY_NAME as DYNAMIXELS
 from bodyschema.drivers.dynamixel.models import MODELS
-from bodyschema.drivers.dynamixel.settings import settings_of
 from bodyschema.drivers.feetech.bench.arm import Chain as FeetechChain
 from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
 from bodyschema.drivers.feetech.joints import FEETECH

@@ -7,7 +7,7 @@ import pytest
 from effect_arms import arm, sized, walk
 
 from bodyschema.effects import Effect, Motion, Simulation
-from bodyschema.effects.flank import flanks
+from bodyschema.effects.motion import flanks
 
 MOTION = walk()
 JOINT = "elbow"

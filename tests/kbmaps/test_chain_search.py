@@ -5,7 +5,7 @@ import pytest
 from planted_chains import random_chain, random_q
 
 from kbmaps import ChainTolerances, DegenerateDataError, RigidLearner, SettingError, ShapeError, find_chain
-from kbmaps.chains.descents import Descents, ScrewArms
+from kbmaps.chains.search import Descents, ScrewArms
 
 
 @pytest.mark.parametrize("kinds", ["RRRRRRR", "RRRRRR", "RRPRR"])

@@ -19,7 +19,7 @@ from kbmaps import (
     explanations,
 )
 from kbmaps.changes.detector import MOST_SURPRISES
-from kbmaps.changes.mixture import log_ratios
+from kbmaps.changes.kinds import log_ratios
 
 SIGMA = 0.002
 TOLERANCES = ChainTolerances(axes=0.003, points=0.001, zeros=0.003, tool=0.001)

@@ -8,8 +8,8 @@ from planted_chains import bases_for, random_q
 
 from kbmaps import JointBasis
 from kbmaps.maps.design import Design
+from kbmaps.maps.exact import nearest_solution
 from kbmaps.maps.factor import ShiftedGram
-from kbmaps.maps.least_squares import nearest_solution
 
 seeds = st.integers(0, 2**32 - 1)
 kinds = st.text("RP", min_size=1, max_size=4)

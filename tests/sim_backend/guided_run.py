@@ -13,7 +13,7 @@ from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.toml_file import read_toml
 from bodyschema.sim_backend import SimConfig, model_file
 from bodyschema.sim_backend.physics import Physics
-from bodyschema.sim_backend.scene import Scene
+from bodyschema.sim_backend.rendering.scene import Scene
 from bodyschema.sim_backend.truth import TrueRobot
 
 

@@ -11,10 +11,8 @@ from bodyschema.interfaces.records import MarkerFix
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.toml_file import read_toml
 from bodyschema.sim_backend import EncoderConfig, SimConfig, model_file
-from bodyschema.sim_backend.joints import JointPaths
-from bodyschema.sim_backend.physics import Physics
-from bodyschema.sim_backend.posed import PosedWorld
-from bodyschema.sim_backend.postures import visible_postures
+from bodyschema.sim_backend.physics import JointPaths, Physics
+from bodyschema.sim_backend.posed import PosedWorld, visible_postures
 from bodyschema.sim_backend.truth import TrueRobot
 from bodyschema.vision.config import VisionConfig
 from bodyschema.vision.tracked_camera import TrackedCamera

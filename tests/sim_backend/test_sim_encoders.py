@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bodyschema.sim_backend import EncoderConfig
-from bodyschema.sim_backend.encoders import Encoders
+from bodyschema.sim_backend.sources import Encoders
 
 TICK = 2 * np.pi / 4096
 ANGLES = st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3).map(np.array)

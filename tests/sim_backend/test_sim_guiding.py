@@ -9,8 +9,7 @@ from bodyschema.sim_backend.bullet import Body
 from bodyschema.sim_backend.config import CameraConfig, SimTag
 from bodyschema.sim_backend.physics import TorqueFreeArm
 from bodyschema.sim_backend.physics_urdf import physics_urdf
-from bodyschema.sim_backend.roles import JointRoles
-from bodyschema.sim_backend.truth import TrueRobot
+from bodyschema.sim_backend.truth import JointRoles, TrueRobot
 
 SEEDS = (1, pytest.param(2, marks=pytest.mark.soak))
 

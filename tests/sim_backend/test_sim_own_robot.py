@@ -7,8 +7,7 @@ from guided_run import described, guide, in_eye, step_degrees
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.sim_backend import SimConfig, SimWorld
 from bodyschema.sim_backend.physics import Physics
-from bodyschema.sim_backend.roles import JointRoles
-from bodyschema.sim_backend.truth import TrueRobot
+from bodyschema.sim_backend.truth import JointRoles, TrueRobot
 
 # A carriage on a rail with a two-joint arm, no inertias given, and a camera on a mast.
 URDF = """<robot name="carriage">

@@ -10,8 +10,7 @@ from guided_run import shipped
 from bodyschema.interfaces.errors import SourceEnded
 from bodyschema.interfaces.records import FloatArray, StereoFrame
 from bodyschema.sim_backend import SimConfig, true_chain
-from bodyschema.sim_backend.posed import PosedWorld
-from bodyschema.sim_backend.postures import visible_postures
+from bodyschema.sim_backend.posed import PosedWorld, visible_postures
 
 LIMIT_S = 500.0
 POSTURES = 3

@@ -10,8 +10,8 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.sim_backend import CameraConfig
 from bodyschema.sim_backend.bullet import load_pybullet
 from bodyschema.sim_backend.config import SimTag
-from bodyschema.sim_backend.eye import TO_LIGHT, StereoEyes, cluttered_room
-from bodyschema.sim_backend.raster import Grid, Raster
+from bodyschema.sim_backend.rendering.eye import TO_LIGHT, StereoEyes, cluttered_room
+from bodyschema.sim_backend.rendering.raster import Grid, Raster
 
 PLAIN = CameraConfig(noise=0, clutter=0)
 UNTURNED = np.eye(3)

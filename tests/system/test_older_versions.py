@@ -19,7 +19,7 @@ from bodyschema.cli.install.backup import Backup, write_backup
 from bodyschema.cli.install.restore import restore
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner.checkpoint import CheckpointError, read_checkpoint
-from bodyschema.daemon.sampler.session import session_of
+from bodyschema.daemon.sampler.devices import session_of
 from bodyschema.daemon.transport.status import LearnerStatus
 from bodyschema.daemon.transport.wire import PairMessage, pair_to_wire
 from bodyschema.interfaces.clock import SystemClock
@@ -93,7 +93,7 @@ KILLED_WHILE_MIGRATING = """
 import os, signal, sys
 from pathlib import Path
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.sampler.session import session_of
+from bodyschema.daemon.sampler.devices import session_of
 from bodyschema.recordings.store import schema as store_schema
 from bodyschema.recordings.store.store import PairStore
 from bodyschema.interfaces.clock import SystemClock

@@ -16,7 +16,7 @@ from two_processes import KEYS, answer, ended_well, learner_with, running, write
 
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner.checkpoint import generations, read_checkpoint
-from bodyschema.daemon.sampler.session import session_of
+from bodyschema.daemon.sampler.devices import session_of
 from bodyschema.daemon.transport.wire import CommandRequest, encode, pair_to_wire
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import StoreError

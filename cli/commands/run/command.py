@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
-from bodyschema.daemon.transport.command_names import BOTHS, SAMPLERS, CommandName
+from bodyschema.daemon.transport.keys import BOTHS, SAMPLERS, CommandName
 
 Process = Literal["sampler", "learner"]
 

@@ -97,8 +97,8 @@ def _both(robot: Path, state_dir: Path | None, *, sim: bool, view: bool, verbose
 def _sampler(robot: Path, state_dir: Path | None, *, sim: bool, exit_at_end: bool) -> None:
     from bodyschema.cli.install.units import devices_of
     from bodyschema.daemon.config import Config
+    from bodyschema.daemon.sampler.devices import session_of
     from bodyschema.daemon.sampler.sampler import LOOPS, Sampler
-    from bodyschema.daemon.sampler.session import session_of
     from bodyschema.daemon.service.notify import Notifier
     from bodyschema.daemon.service.service import Service
     from bodyschema.daemon.service.signals import on_termination

@@ -5,7 +5,7 @@ from __future__ import annotations
 from bodyschema.diagnosis.report.panels import Panel
 from bodyschema.diagnosis.report.residuals import Residuals
 from bodyschema.effects import Effect
-from bodyschema.effects.flank import flanks
+from bodyschema.effects.motion import flanks
 
 from .plots import load, over_quantity
 from .presenter import Found, Presenter, Workshop

@@ -15,7 +15,7 @@ from bodyschema.diagnosis.report.residuals import Residuals
 from bodyschema.diagnosis.report.result import Cause
 from bodyschema.effects import Effect, corrected_file
 from bodyschema.effects.effect_type import EffectType
-from bodyschema.effects.poses import transforms
+from bodyschema.effects.motion import transforms
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.rpy import rpy_of

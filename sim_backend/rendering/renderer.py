@@ -1,4 +1,4 @@
-"""The renderer's process, `python -m bodyschema.sim_backend.renderer MEMORY REQUESTS ANSWERS`: inherited descriptors.
+"""The renderer: `python -m bodyschema.sim_backend.rendering.renderer MEMORY REQUESTS ANSWERS`, inherited descriptors.
 
 It ends when its parent closes the pipe or has exited: then its frames have no reader.
 """
@@ -16,8 +16,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.records import FloatArray, ImageArray
+from bodyschema.sim_backend.bullet import Body
 
-from .bullet import Body
 from .eye import TO_LIGHT, StereoEyes
 from .raster import Raster
 from .render_messages import SLOTS, Frame, Message, Setup, Tool, frame_bytes, receive, slot_images

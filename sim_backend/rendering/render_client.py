@@ -16,9 +16,9 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import SourceLost
 from bodyschema.interfaces.interpreter import module_command
 from bodyschema.interfaces.records import ImageArray
+from bodyschema.sim_backend.config import SimConfig
+from bodyschema.sim_backend.physics_urdf import PhysicsUrdf
 
-from .config import SimConfig
-from .physics_urdf import PhysicsUrdf
 from .render_messages import SLOTS, Frame, Setup, Tool, frame_bytes, send, slot_images
 from .scene import Scene
 
@@ -131,7 +131,7 @@ class RenderProcess:
 
 def _start(memory: int, requests: int, answers: int) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
-        module_command("bodyschema.sim_backend.renderer", str(memory), str(requests), str(answers)),
+        module_command("bodyschema.sim_backend.rendering.renderer", str(memory), str(requests), str(answers)),
         pass_fds=(memory, requests, answers),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,

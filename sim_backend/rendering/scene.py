@@ -9,9 +9,8 @@ import numpy as np
 from bodyschema.effects import Motion, Simulation
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
-
-from .bullet import Body
-from .truth import TrueRobot
+from bodyschema.sim_backend.bullet import Body
+from bodyschema.sim_backend.truth import TrueRobot
 
 
 @dataclass(frozen=True, slots=True)

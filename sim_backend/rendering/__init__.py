@@ -1,0 +1,1 @@
+"""Rendered stereo images: what the cameras see, in a process of its own."""
