@@ -26,6 +26,7 @@ from kbmaps import (
     rotation_matrices,
     unexplained_variance,
 )
+from kbmaps.robust import ROUNDING_M
 
 from .chain_figures import ChainFigures, is_told
 
@@ -35,8 +36,6 @@ Trusted = Literal["nothing", "links", "urdf"]
 # How many pairs are asked. No arm is quite rigid, and thousands of pairs would take its sag for bad workmanship.
 JUDGED_PAIRS = 300
 SLIDE_ZEROS_M = 0.02
-# No measured coordinate is surer.
-ROUNDING_M = 1e-9
 # A parameter counts as determined if its uncertainty falls below this share of the prior one.
 MUCH_SURER = 1.0 / 3.0
 # Of what is said to be known, and of what is not, once it has been fitted: then far more than the fit can be off.

@@ -11,6 +11,8 @@ from typing import Literal
 
 from .scan import serial_ports
 
+MANY_TROUBLES = 0.01  # share of lost readings that deserves a warning
+READ_S = 1.0  # how long a check of the rate lasts
 State = Literal["ok", "warning", "wrong"]
 ROOT = Path("/")
 LATENCY_TIMER = "sys/bus/usb-serial/devices/{}/latency_timer"

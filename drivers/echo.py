@@ -10,7 +10,7 @@ from bodyschema.interfaces.protocols import Clock
 log = logging.getLogger(__name__)
 
 PROBE = b"\x00"  # not the start of any packet
-BITS_PER_BYTE = 10
+BITS_PER_BYTE = 10  # including start and stop bit
 HOST_S = 3e-3  # the operating system's share of the delay
 
 

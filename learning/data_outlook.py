@@ -14,6 +14,7 @@ from bodyschema.learning.snapshot import MEAN_OVER_RMS
 from bodyschema.learning.status import Outlook
 from bodyschema.learning.uncertainty import PredictiveUncertainty
 from kbmaps import ChainBelief, ChainPosterior, ChainTolerances, candidate_motions, expected_gain, shared_by
+from kbmaps.chains.rigid_filter import LEAST_NOISE_M
 from kbmaps.planning.expected_gain import ALL, SAME
 from kbmaps.robust import OUTLIER_SIGMAS
 
@@ -25,8 +26,6 @@ POSES = 100
 WORTH = 0.05
 # A gain below this share of the noise of a single measurement is not noticeable.
 NOTICED = 0.1
-# Lower bound of the noise [m]: no camera is better, and the formulas need a positive value.
-LEAST_NOISE_M = 1e-6
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from bodyschema.learning.changes.monitor import LOOKED_BACK as KNOWN_PAIRS
 from bodyschema.learning.changes.monitor import ChangeMonitor, Reference
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.model_bank import EXACT, INSTANT, PRIOR, RESIDUAL, RIGID, LearntModel, ModelBank
-from bodyschema.learning.orientation import OrientationModel, Orientations
+from bodyschema.learning.orientation import FEWEST_TO_BELIEVE, OrientationModel, Orientations
 from bodyschema.learning.outlier_gate import DOUBT, OutlierGate, limits_m, sound
 from bodyschema.learning.replay_memory import PairMemory, Permutations
 from bodyschema.learning.solvers.orientation import OrientationSolution
@@ -34,8 +34,6 @@ JUDGED_LATE = 100
 # With this share of new pairs, the last solution no longer applies: the new one is judged by these pairs alone.
 JUDGED_ANEW = 0.25
 LOOKED_BACK_IN_REPLAY = 4
-# Minimum number of pairs to trust the chain before it has predicted any; fewer cannot expose a wrong chain.
-FEWEST_TO_BELIEVE = 3
 NO_TURN = (math.nan,) * 4
 
 BoolArray = NDArray[np.bool_]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.model_bank import LearntModel
-from bodyschema.learning.orientation import OrientationModel
+from bodyschema.learning.orientation import MEAN_OVER_RMS, OrientationModel
 from bodyschema.learning.solvers.solver import LARGEST_NET
 from bodyschema.learning.uncertainty import PredictiveUncertainty
 from bodyschema.learning.variance_terms import unexplained
@@ -19,8 +19,6 @@ from kbmaps import KBMap, SupportSet, quaternions
 
 # With a larger share of the prior's variance remaining, joint angles are not in the data's support.
 IN_SUPPORT = 0.25
-# Mean length of a Gaussian error over its RMS length, three equal axes: sqrt(8 / π) / sqrt(3).
-MEAN_OVER_RMS = 0.9213
 
 
 class NoFrameError(RequestError):

@@ -20,6 +20,7 @@ from bodyschema.learning.variance_terms import (
     VarianceTerm,
 )
 from kbmaps import ChainBelief, Contest, JointBasis, Recent, ResidualModel, SupportSet
+from kbmaps.contest import CLEARLY
 from kbmaps.robust import OUTLIER_SIGMAS
 
 # Weight of the error one pair back: the memory is about 50 pairs long.
@@ -93,8 +94,6 @@ def _resolution(samples: float) -> float:
     return math.sqrt(2.0 / max(samples, 2.0))
 
 
-# A discrepancy below this many standard errors may be chance.
-CLEARLY = 2.0
 # Below this number of pairs, the discrepancy with the last tool counts too.
 WARM = 10.0
 _SUPPORT, _CONTEST = "support_q", "squares_"

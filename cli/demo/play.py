@@ -17,6 +17,7 @@ from typing import IO, Literal
 import numpy as np
 
 from bodyschema.cli.demo.scene import Scene
+from bodyschema.cli.replay.processes import END_LIMIT_S, START_LIMIT_S
 from bodyschema.cli.terminal.screen import rejected
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.service.signals import with_parent
@@ -30,9 +31,6 @@ from bodyschema.learning.status import Outlook
 
 from .judge import Judge, Verdict
 from .plot import CurveRow
-
-START_LIMIT_S = 60.0
-END_LIMIT_S = 15.0
 
 
 class Daemon:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from random import Random
 from typing import Protocol
 
-BITS_PER_BYTE = 10  # including start and stop bit
+from bodyschema.drivers.echo import BITS_PER_BYTE
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 
-from bodyschema.drivers.checks import Check
+from bodyschema.drivers.checks import MANY_TROUBLES, READ_S, Check
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import Clock
 
@@ -13,9 +13,7 @@ from .config import Ros2Config
 from .joints import SILENT_AFTER_S, Ros2Joints
 from .link import OpenLink, open_zenoh
 
-READ_S = 1.0
 FEW_PER_S = 20.0
-MANY_TROUBLES = 0.01
 WAIT_S = 0.1
 LAST_PART = re.compile(r"[;.] (?!.*[;.] )", re.DOTALL)
 

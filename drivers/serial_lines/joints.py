@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
-from bodyschema.drivers.checks import Check
+from bodyschema.drivers.checks import MANY_TROUBLES, READ_S, Check
+from bodyschema.drivers.echo import BITS_PER_BYTE
 from bodyschema.drivers.serial_line import RETRY_S, SerialLine
 from bodyschema.drivers.serial_lines.config import SerialLinesConfig
 from bodyschema.drivers.servos.port import Port
@@ -26,7 +27,6 @@ from .lines import ASK_HEADER, Header
 
 log = logging.getLogger(__name__)
 
-BITS_PER_BYTE = 10
 HEADER_S = 4.0  # an Arduino restarts when its port is opened, which takes two seconds
 ASK_EVERY_S = 0.5
 ANCHOR_S = 2.0
@@ -351,9 +351,7 @@ def _close(port: Port) -> None:
         port.close()
 
 
-READ_S = 1.0
 FEW_PER_S = 50.0
-MANY_TROUBLES = 0.01
 
 
 def encoder_checks(

@@ -11,13 +11,13 @@ from enum import StrEnum
 from itertools import chain
 from typing import TypeVar
 
+from bodyschema.drivers.echo import BITS_PER_BYTE
 from bodyschema.interfaces.protocols import Clock
 
 from .model import Layout, Model, Register
 from .packets import Garbled, Packets, Status
 from .port import Port
 
-BITS_PER_BYTE = 10
 SLOWEST_DELAY_S = 510e-6  # largest Return Delay Time
 HOST_MARGIN_S = 3e-3  # the operating system's share of an answer's delay
 TOO_EARLY = 0.9  # an answer within this share of its time on the wire belongs to another request

@@ -8,7 +8,7 @@ from itertools import pairwise, zip_longest
 from statistics import median, quantiles
 from typing import Any
 
-from bodyschema.drivers.checks import Check
+from bodyschema.drivers.checks import MANY_TROUBLES, READ_S, Check
 from bodyschema.drivers.echo import without_echo
 from bodyschema.drivers.servos.make import Plan
 from bodyschema.interfaces.errors import SourceError
@@ -20,10 +20,8 @@ from .handshake import Finding, FittedServo, ask_again, identify
 from .joints import OpenPort
 from .make import Make
 
-READ_S = 1.0
 IDENTIFY_S = 1.0  # servos not yet asked by then are not asked any more
 FEW_PER_S = 100.0
-MANY_TROUBLES = 0.01
 LONGEST_DELAY_S = 50e-6
 TYPE = "servos"
 FAST_BAUD = 1_000_000

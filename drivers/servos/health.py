@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from bodyschema.drivers.servos.bus import Bus, Exchange, Request
 from bodyschema.drivers.servos.channel import Drive
 from bodyschema.drivers.servos.handshake import FittedServo
+from bodyschema.drivers.servos.scan import VOLT_PER_UNIT
 from bodyschema.interfaces.errors import SourceLost
 from bodyschema.interfaces.protocols import Clock
 
@@ -17,8 +18,6 @@ from .handshake import Finding
 from .model import Model, Register
 
 log = logging.getLogger(__name__)
-
-VOLT_PER_UNIT = 0.1  # for all series of all vendors; temperatures are in °C
 
 
 @dataclass(frozen=True, slots=True)

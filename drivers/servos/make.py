@@ -7,13 +7,12 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from bodyschema.drivers.servos.bus import Bus, Request
+from bodyschema.drivers.servos.handshake import ATTEMPTS
 
 from .channel import Channel
 from .handshake import FittedServo
 from .model import Model
 from .settings import Setting
-
-ATTEMPTS = 5  # if one of six servos loses every twentieth answer, all five fail in one of 700 openings
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from bodyschema.drivers.scan import FoundServo, ScannedPort
+from bodyschema.drivers.servos.handshake import ATTEMPTS
 from bodyschema.interfaces.protocols import Clock
 
 from .bus import BITS_PER_BYTE, SLOWEST_DELAY_S, Bus, Exchange, Request, Trouble
@@ -15,8 +16,7 @@ from .packets import Garbled, Packets, Status
 IDS = range(253)
 HOST_S = 5e-3  # the operating system's share of an answer's delay
 APART_S = 1e-3  # shortest time between two requests
-ATTEMPTS = 5
-VOLT_PER_UNIT = 0.1
+VOLT_PER_UNIT = 0.1  # for all series of all vendors; temperatures are in °C
 OVERHEAD_OF_PING = 6  # bytes of the request in the older protocols
 
 

@@ -26,7 +26,7 @@ _SMALL_BEND = 0.1
 _GATE = 21.0
 # The noise estimate starts with the weight of this many coordinates, and forgets all but this many of the last ones.
 NOISE_COORDINATES, NOISE_MEMORY = 6.0, 900.0
-LEAST_NOISE_M = 1e-6
+LEAST_NOISE_M = 1e-6  # no camera is better, and the formulas need a positive value
 _EYE = np.eye(3)
 
 
