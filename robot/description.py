@@ -39,13 +39,15 @@ class RobotSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The table [robot].
 
     Attributes:
-        name: the robot's name, one chunk of its zenoh keys.
-        urdf: the URDF file, relative to robot.toml.
-        joints: the joints that are read and learnt, in the order of q.
+        name: letters, digits, `_`, `.`, `-`; part of the zenoh keys.
+        urdf: file, relative to robot.toml; meshes and masses are not needed.
+        joints: the joints to read and learn, from camera to marker; the order of `q` everywhere. At most twelve
+            revolute joints, more if some are prismatic.
         marker_link: the link that carries the marker.
         marker_xyz: the marker in that link [m].
-        marker_known: False when the marker's place is only roughly known: fitted first, and not a finding.
-        hold: who bears the arm's weight while recording.
+        marker_known: false: `marker_xyz` is a guess and is fitted first.
+        hold: what bears the arm while recording: `torque_free` (your hand), `zero_force` (the motors compensate
+            gravity), `held` (the motors hold position).
         held_at: positions [rad or m] of other joints between camera and marker, which stand still; 0 where not named.
     """
 
@@ -63,12 +65,15 @@ class CameraSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The table [camera]: the measurement frame, and the stereo geometry where there is one.
 
     Attributes:
-        parent_link: the link the cameras stand on or ride on.
+        parent_link: the link that the cameras are mounted on: the base, a head, a flange. Joints between it and the
+            marker belong into `joints`.
         xyz, rpy: pose of the left optical frame in it [m], [rad], URDF convention.
-        pose_known: False when the instrument stands anywhere: fitted first, and not a finding.
-        eyes: 2 of a stereo pair, 1 of one camera alone.
-        focal_px, principal_point_px, baseline_m, image_size_px: the rectified stereo pair; all or none. One camera
-            alone has no baseline_m.
+        pose_known: false: `xyz` and `rpy` are a guess and are fitted first.
+        eyes: 2 of a stereo pair, 1 of a single camera.
+        focal_px: of the rectified stereo pair [px]; this and the next three, or none of them.
+        principal_point_px: column and row [px]; pixel centres are integers.
+        baseline_m: distance of the cameras [m]; not with `eyes = 1`.
+        image_size_px: width and height [px].
         pixel_sigma: 1-sigma of a marker centre's image coordinates [px].
     """
 

@@ -59,7 +59,7 @@ class CameraConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         rate_hz: stereo frames a second.
         noise: 1-sigma of the image noise [grey levels].
         clutter: number of coloured objects in the background; 0 is a plain wall.
-        scene_step: the arm is rendered at every so manieth pixel and scaled up; the marker's surroundings never are.
+        scene_step: 2: the arm is rendered at half resolution, except around the marker; 1 takes four times as long.
         supersampling: samples across one pixel around the marker.
         light: how brightly all but the marker is lit; with less than 1 a ball glows, as a lamp does.
         ball_radius_m: radius of the marker ball [m]; without this key, as [vision] has it.
@@ -135,7 +135,12 @@ class GuideConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class ToolChange(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One of [[sim.tool_changes]]: from `at_s` [s] on the hand holds a tool with its ball at `marker_xyz` [m]."""
+    """One of [[sim.tool_changes]].
+
+    Attributes:
+        at_s: simulated time of the change [s].
+        marker_xyz: the new tool's marker in the marker link [m].
+    """
 
     at_s: NonNegative
     marker_xyz: tuple[float, float, float]

@@ -34,6 +34,7 @@ class LoginConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A table `login`: name and password in place of a client certificate.
 
     Attributes:
+        user: name.
         password_file: its first line is the password; relative to the file that names it.
     """
 

@@ -5,11 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import msgspec
-import pytest
-
-from bodyschema.daemon.config import LARGEST_MAP, DaemonConfig
-from bodyschema.learning.config import LearnerConfig
+from bodyschema.daemon.config import LARGEST_MAP
 from bodyschema.learning.model_bank import TRUSTED
 from bodyschema.learning.nominal import PAIRS_TO_REFIT
 from bodyschema.learning.online_learner import REGION_RAD
@@ -19,16 +15,6 @@ from bodyschema.learning.solvers.solver import KEPT, LARGEST_NET, WINDOW
 from kbmaps.contest import CLEARLY, SHORTEST
 
 PAGE = (Path(__file__).parents[2] / "docs" / "learner.md").read_text(encoding="utf-8")
-SETTINGS = re.search(r"```toml\n(.*?)```", PAGE, re.DOTALL)[1]
-WITHOUT_DEFAULT = {"state_dir", "keep_days", "keep_mb"}
-
-
-@pytest.mark.parametrize(("table", "kind"), [("learner", LearnerConfig), ("daemon", DaemonConfig)])
-def test_the_page_s_settings_are_the_defaults_and_all_of_them(table: str, kind: type) -> None:
-    shown = msgspec.toml.decode(SETTINGS)[table]
-    assert msgspec.convert(shown, kind) == kind()
-    assert set(kind.__struct_fields__) - set(shown) <= WITHOUT_DEFAULT
-    assert all(f"# {name} = " in SETTINGS for name in set(kind.__struct_fields__) - set(shown))
 
 
 def test_the_page_has_every_model() -> None:

@@ -18,7 +18,7 @@ from bodyschema.cli.main import command_line
 from bodyschema.daemon.config import Config
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.recordings.recording import Recording
-from bodyschema.robot.description import CameraSection, RobotDescription, RobotSection
+from bodyschema.robot.description import CameraSection, RobotDescription
 from kbmaps import RigidChain
 
 ROOT = Path(__file__).parents[2]
@@ -157,12 +157,6 @@ def test_the_page_s_orientations_look_where_it_says(forward: str, down: str, rpy
     pose = CameraSection(parent_link="base", rpy=tuple(json.loads(code(rpy)))).pose
     assert pose[:3, 2] == pytest.approx(AXES[forward], abs=1e-4)
     assert pose[:3, 1] == pytest.approx(AXES[down], abs=1e-4)
-
-
-@pytest.mark.parametrize(("section", "heading"), [(RobotSection, "**`[robot]`**"), (CameraSection, "**`[camera]`**")])
-def test_the_page_has_every_key_of_the_description(section, heading: str) -> None:
-    body = PAGE.split(heading)[1].split("\n\n")[1]
-    assert re.findall(r"^\| `(\w+)` \|", body, re.MULTILINE) == list(section.__struct_fields__)
 
 
 def guided_recording(robot: RobotDescription, rows: int) -> str:

@@ -78,7 +78,11 @@ class TwoConfig(UvcSettings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class SideBySideConfig(UvcSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [vision.cameras.side_by_side]: one camera with both eyes in its image, the left one on the left."""
+    """The table [vision.cameras.side_by_side]: one camera with both eyes in its image, the left one on the left.
+
+    Attributes:
+        device: its name in /dev/v4l/by-id or by-path.
+    """
 
     device: str
 
