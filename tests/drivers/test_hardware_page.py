@@ -54,20 +54,6 @@ def test_the_lines_that_are_shown_are_lines() -> None:
     assert parse(found[2].encode()) == Reading(12, 3456789, (1023, None))
 
 
-def test_the_defaults_that_are_shown_are_the_defaults() -> None:
-    shown = tomllib.loads(re.sub(r"^# (?=(rate|max|restore)[a-z_]* =)", "", block("toml"), flags=re.MULTILINE))
-    table = shown["drivers"]["dynamixel"]
-    plain = msgspec.convert({**tomllib.loads(block("toml"))["drivers"]["dynamixel"]}, type=type_of_table())
-    for key in ("rate_hz", "max_speed_deg_s", "max_move_deg", "restore_torque"):
-        assert table[key] == getattr(plain, key)
-
-
-def type_of_table():
-    from bodyschema.drivers.dynamixel.config import DynamixelConfig
-
-    return DynamixelConfig
-
-
 def test_the_bench_starts_as_shown(tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     exec(block("python", "speak to"), {})
