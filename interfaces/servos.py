@@ -18,7 +18,7 @@ class Sample(Protocol):
 
 
 class Fitted(Protocol):
-    """An identified servo; see `bodyschema.drivers.servos.handshake.FittedServo`."""
+    """An identified servo; see `bodyschema.drivers.servos.handshake.IdentifiedServo`."""
 
     @property
     def id(self) -> int: ...

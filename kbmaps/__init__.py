@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from kbmaps.chains.rigid_recursive import RecursiveRigidLearner
     from kbmaps.chains.search import find_chain
     from kbmaps.chains.tool_layer import ToolLayer, with_refitted_tool
-    from kbmaps.changes.detector import ChangeDetector, Suspicion
+    from kbmaps.changes.detector import ChangeDetector, ChangeScore
     from kbmaps.changes.kinds import ChangeKind, any_change, change_kinds
     from kbmaps.changes.naming import Explanation, explanations
     from kbmaps.changes.shared_noise import SharedNoise
     from kbmaps.changes.white_noise import WhiteNoise
-    from kbmaps.contest import Contest, Recent, shared_by
+    from kbmaps.contest import PrequentialComparison, Recent, shared_by
     from kbmaps.errors import (
         BasisError,
         ChainError,
@@ -81,7 +81,7 @@ __all__ = [
     "ChainTolerances",
     "ChangeDetector",
     "ChangeKind",
-    "Contest",
+    "ChangeScore",
     "CoreFamily",
     "CorePrior",
     "DegenerateDataError",
@@ -110,6 +110,7 @@ __all__ = [
     "PoseModel",
     "PositionModel",
     "Posterior",
+    "PrequentialComparison",
     "Recent",
     "RecursiveRigidLearner",
     "ResidualLearner",
@@ -125,7 +126,6 @@ __all__ = [
     "StepSize",
     "StructuredLearner",
     "SupportSet",
-    "Suspicion",
     "TensorLearner",
     "TensorPosterior",
     "TensorSettings",
@@ -169,12 +169,12 @@ _MODULES = {
     "chains.rigid_recursive": ["RecursiveRigidLearner"],
     "chains.search": ["find_chain"],
     "chains.tool_layer": ["ToolLayer", "with_refitted_tool"],
-    "changes.detector": ["ChangeDetector", "Suspicion"],
+    "changes.detector": ["ChangeDetector", "ChangeScore"],
     "changes.kinds": ["ChangeKind", "any_change", "change_kinds"],
     "changes.naming": ["Explanation", "explanations"],
     "changes.shared_noise": ["SharedNoise"],
     "changes.white_noise": ["WhiteNoise"],
-    "contest": ["Contest", "Recent", "shared_by"],
+    "contest": ["PrequentialComparison", "Recent", "shared_by"],
     "errors": [
         "BasisError",
         "ChainError",

@@ -73,7 +73,7 @@ class Recent:
     means: Mapping[str, float]
 
 
-class Contest:
+class PrequentialComparison:
     """Squared distances between predictions and measurements, pair by pair, for the last pairs.
 
     Prequential errors (Dawid 1984), compared in pairs: two models meet the same noise at the same pair, so their

@@ -17,7 +17,7 @@ from kbmaps.chains.parameters import ChainTolerances
 from kbmaps.chains.rigid_learner import RigidLearner
 from kbmaps.chains.rigid_recursive import RecursiveRigidLearner
 from kbmaps.chains.tool_layer import ToolLayer
-from kbmaps.contest import Contest
+from kbmaps.contest import PrequentialComparison
 from kbmaps.errors import KBMapsError, ModelFormatError, SettingError
 from kbmaps.kernel.kernel_learner import KernelLearner
 from kbmaps.kernel.structured_learner import StructuredLearner
@@ -70,8 +70,8 @@ class Ladder:
     """Holds models side by side, lets each learn at its own pace, and answers with the best predictor.
 
     Each pair is predicted by every model before it is learnt. The answer comes from the most trusted model that is not
-    clearly worse than another on the last pairs (`Contest`). Where that model has no data and may not extrapolate, the
-    best of the models that may answers.
+    clearly worse than another on the last pairs (`PrequentialComparison`). Where that model has no data and may not
+    extrapolate, the best of the models that may answers.
 
     A model that fails, has too few pairs yet, or predicts values that are not finite, is left out, without effect on
     the others. It keeps learning when due, and returns when its predictions are finite; its earlier predictions then do
@@ -110,7 +110,7 @@ class Ladder:
         self._q, self._x, self._sigma = np.empty((0, self._joints)), np.empty((0, 3)), np.empty(0)
         self._asked = dict.fromkeys(self._rungs, 0)
         self._failures: dict[str, str] = {}
-        self._contest = Contest()
+        self._contest = PrequentialComparison()
         for name in self._rungs:
             self._hear(name, self._q)
         self._answering = self._answers_first()
@@ -307,7 +307,7 @@ class Ladder:
         judges, errors = fields["judges"], arrays["errors"]
         if errors.ndim != 2 or not (errors >= 0.0)[~np.isnan(errors)].all() or not set(judges) <= set(self._rungs):
             raise ModelFormatError("its contest names unknown models")
-        self._contest = Contest(dict(zip(judges, errors, strict=True)), count(fields["judged"], "judged"))
+        self._contest = PrequentialComparison(dict(zip(judges, errors, strict=True)), count(fields["judged"], "judged"))
         self._answering = fields["answering"]
         if len(self._rungs) != len(entries) or self._answering not in self._rungs:
             raise ModelFormatError("two of its models have one name, or the one that answers is not on it")

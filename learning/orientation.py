@@ -18,9 +18,9 @@ from bodyschema.learning.variance_terms import unexplained
 from kbmaps import (
     ChainBelief,
     ChainParameters,
-    Contest,
     KBMap,
     OrientedChain,
+    PrequentialComparison,
     RigidChain,
     SupportSet,
     fitted_orientation,
@@ -161,7 +161,7 @@ class Orientations:
         self._chains: dict[str, OrientedChain] = {}
         self._map: KBMap | None = None
         self._map_noise = self._noise = 0.0
-        self._contest = Contest()
+        self._contest = PrequentialComparison()
         self.pairs = 0
         self.answering = PRIOR
         self.errors: dict[str, AngleMemory] = {}

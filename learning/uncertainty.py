@@ -19,7 +19,7 @@ from bodyschema.learning.variance_terms import (
     QueryPoints,
     VarianceTerm,
 )
-from kbmaps import ChainBelief, Contest, JointBasis, Recent, ResidualModel, SupportSet
+from kbmaps import ChainBelief, JointBasis, PrequentialComparison, Recent, ResidualModel, SupportSet
 from kbmaps.contest import CLEARLY
 from kbmaps.robust import OUTLIER_SIGMAS
 
@@ -174,7 +174,7 @@ class UncertaintyTracker:
     def _begin(self, expected_m: float) -> None:
         self._expected_m = expected_m
         self.errors = {name: ErrorMemory(expected_m) for name in (PRIOR, INSTANT)}
-        self._contest = Contest()
+        self._contest = PrequentialComparison()
         self._residuals: ErrorMemory | None = None
         self._misfits: dict[str, FloatArray] = {}
         self._support = GrowingSupport(self._bases)
@@ -336,7 +336,7 @@ class UncertaintyTracker:
 
     def forget_contest(self) -> None:
         """Drop the comparison, because some pairs turned out not to belong to this tool."""
-        self._contest = Contest()
+        self._contest = PrequentialComparison()
 
     def prior_changed(self, errors: FloatArray) -> None:
         """Record another prior for the same pairs; its errors (n, 3) [m] at them."""
@@ -401,7 +401,7 @@ class UncertaintyTracker:
         self._support.add(arrays[_SUPPORT])
         self.errors, self._residuals = dict(state.errors), state.residuals
         squares = {name.removeprefix(_CONTEST): v for name, v in arrays.items() if name.startswith(_CONTEST)}
-        self._contest = Contest(squares, state.judged)
+        self._contest = PrequentialComparison(squares, state.judged)
         self._misfits = {name: np.array(missed) for name, missed in state.misfits.items()}
         self._trusted = state.trusted
         self._misfits_before = {name: np.array(missed) for name, missed in state.misfits_before.items()}

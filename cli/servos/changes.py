@@ -14,11 +14,11 @@ from bodyschema.daemon.wiring.eeprom import (
     ID,
     Change,
     Done,
-    FittedServo,
+    EepromEditor,
+    IdentifiedServo,
     Outcome,
     Setting,
     Wanted,
-    Workbench,
     entry_of,
     model_called,
     setting_called,
@@ -63,7 +63,7 @@ def assignments(texts: Sequence[str]) -> list[tuple[str, str]]:
     return found
 
 
-def plan(workbench: Workbench, wanted: Sequence[Wanted], wishes: Sequence[tuple[str, str]]) -> list[Planned]:
+def plan(workbench: EepromEditor, wanted: Sequence[Wanted], wishes: Sequence[tuple[str, str]]) -> list[Planned]:
     """Plan the writes. Queries the servos, and writes nothing.
 
     Raises:
@@ -89,7 +89,7 @@ def plan(workbench: Workbench, wanted: Sequence[Wanted], wishes: Sequence[tuple[
     return planned
 
 
-def plan_zeros(workbench: Workbench, wanted: Sequence[Wanted]) -> list[Planned]:
+def plan_zeros(workbench: EepromEditor, wanted: Sequence[Wanted]) -> list[Planned]:
     """Plan homing offsets that set the joints to 0 at their present positions; writes nothing.
 
     Raises:
@@ -108,7 +108,7 @@ def plan_zeros(workbench: Workbench, wanted: Sequence[Wanted]) -> list[Planned]:
     return planned
 
 
-def _require_heeded(wanted: Wanted, servo: FittedServo, setting: Setting, then: int) -> None:
+def _require_heeded(wanted: Wanted, servo: IdentifiedServo, setting: Setting, then: int) -> None:
     """Raise ConfigError if the servo would ignore such an offset, or cannot store it."""
     gentle = "`bodyschema servos --zero` without --in-servo prints zero_ticks for robot.toml, which serve as well"
     what = f"joint {servo.joint!r} would need the homing offset {setting.shown(then)}"
@@ -121,7 +121,7 @@ def _require_heeded(wanted: Wanted, servo: FittedServo, setting: Setting, then: 
         )
 
 
-def zero_ticks(workbench: Workbench, wanted: Sequence[Wanted]) -> list[tuple[FittedServo, int]]:
+def zero_ticks(workbench: EepromEditor, wanted: Sequence[Wanted]) -> list[tuple[IdentifiedServo, int]]:
     """Return each servo's present position: the zero_ticks that put its joint at 0 there. Writes nothing."""
     found = []
     for one in wanted:
@@ -132,7 +132,7 @@ def zero_ticks(workbench: Workbench, wanted: Sequence[Wanted]) -> list[tuple[Fit
 
 
 def carry_out(
-    workbench: Workbench, planned: Iterable[Planned], log: ServoLog, clock: Clock, *, undoes: int | None = None
+    workbench: EepromEditor, planned: Iterable[Planned], log: ServoLog, clock: Clock, *, undoes: int | None = None
 ) -> list[Done]:
     """Switch torque off and verify it, then write what is needed; log each write before sending it to the servo.
 
@@ -155,7 +155,7 @@ def carry_out(
     return done
 
 
-def _written(workbench: Workbench, group: Sequence[Planned]) -> list[Done]:
+def _written(workbench: EepromEditor, group: Sequence[Planned]) -> list[Done]:
     """Write all planned values of one setting on one port; with baud rates, write all before querying any servo."""
     first = group[0]
     if first.change.setting.name != BAUD:
@@ -174,7 +174,7 @@ def rate_of(setting: Setting, value: int) -> int:
     return next(int(word) for word, known in setting.words.items() if known == value)
 
 
-def plan_undo(workbench: Workbench, entries: Sequence[LoggedWrite]) -> tuple[list[Planned], list[str]]:
+def plan_undo(workbench: EepromEditor, entries: Sequence[LoggedWrite]) -> tuple[list[Planned], list[str]]:
     """Plan the writes that restore the old values; also return what is left unchanged, with reasons. Writes nothing."""
     planned, left = [], []
     for entry in reversed(entries):

@@ -10,7 +10,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from bodyschema.daemon.wiring.eeprom import Change, Done, FittedServo, Outcome, Setting
+from bodyschema.daemon.wiring.eeprom import Change, Done, IdentifiedServo, Outcome, Setting
 
 from .changes import Planned
 
@@ -44,7 +44,7 @@ def done_table(done: Sequence[Done]) -> RenderableType:
     return Group(table, *said)
 
 
-def settings_table(servo: FittedServo, values: Sequence[tuple[Setting, int]]) -> RenderableType:
+def settings_table(servo: IdentifiedServo, values: Sequence[tuple[Setting, int]]) -> RenderableType:
     """Return a table of a servo's writable settings: names, present values, permitted values."""
     table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
     for heading in ("register", "", "now", "may be"):
@@ -56,7 +56,7 @@ def settings_table(servo: FittedServo, values: Sequence[tuple[Setting, int]]) ->
     return Group(Text(head, style="bold"), table)
 
 
-def settings_json(found: Sequence[tuple[FittedServo, Sequence[tuple[Setting, int]]]]) -> str:
+def settings_json(found: Sequence[tuple[IdentifiedServo, Sequence[tuple[Setting, int]]]]) -> str:
     """Return the servos' writable settings as JSON; values and bounds are those of the register."""
     servos = [
         {
@@ -74,13 +74,13 @@ def settings_json(found: Sequence[tuple[FittedServo, Sequence[tuple[Setting, int
     return json.dumps({"schema": SCHEMA, "servos": servos})
 
 
-def zero_lines(found: Sequence[tuple[FittedServo, int]]) -> list[str]:
+def zero_lines(found: Sequence[tuple[IdentifiedServo, int]]) -> list[str]:
     """Return the robot.toml lines that put each joint at 0 at its present position."""
     width = max(len(servo.joint) for servo, _ in found)
     return [f"{servo.joint:{width}}  zero_ticks = {ticks}    # {_moves(servo, ticks)}" for servo, ticks in found]
 
 
-def _moves(servo: FittedServo, ticks: int) -> str:
+def _moves(servo: IdentifiedServo, ticks: int) -> str:
     if ticks == servo.zero_ticks:
         return "as it is"
     degrees = math.degrees(servo.angle(ticks))

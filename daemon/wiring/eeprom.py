@@ -20,11 +20,11 @@ from bodyschema.drivers.feetech.config import FeetechConfig
 from bodyschema.drivers.feetech.joints import FEETECH
 from bodyschema.drivers.feetech.joints import open_serial as open_feetech
 from bodyschema.drivers.servos.config import ServoConfig
-from bodyschema.drivers.servos.handshake import FittedServo
+from bodyschema.drivers.servos.handshake import IdentifiedServo
 from bodyschema.drivers.servos.model import Model
 from bodyschema.drivers.servos.port import Port
 from bodyschema.drivers.servos.settings import BAUD, HOMING_OFFSET, ID, Setting, setting_called
-from bodyschema.drivers.servos.workbench import Change, Done, Outcome, Workbench
+from bodyschema.drivers.servos.workbench import Change, Done, EepromEditor, Outcome
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, SourceError
 from bodyschema.robot.suggest import did_you_mean
@@ -35,11 +35,11 @@ __all__ = [
     "ID",
     "Change",
     "Done",
-    "FittedServo",
+    "EepromEditor",
+    "IdentifiedServo",
     "Outcome",
     "Setting",
     "Wanted",
-    "Workbench",
     "configured",
     "entry_of",
     "model_called",
@@ -111,11 +111,11 @@ def stranger(port: str, baud: int, id: int) -> Wanted:
     )
 
 
-def workbench_of(table: str) -> Workbench:
+def workbench_of(table: str) -> EepromEditor:
     """Return the EEPROM editor for servos of a vendor."""
     clock = SystemClock()
     openers = {"dynamixel": _open_dynamixel, "feetech": _open_feetech}
-    return Workbench(TABLES[table][0], clock, lambda port, baud: openers[table](port, baud, clock))
+    return EepromEditor(TABLES[table][0], clock, lambda port, baud: openers[table](port, baud, clock))
 
 
 def entry_of(joint: str, id: int, model: Model) -> ServoConfig:
@@ -131,7 +131,7 @@ def _open_feetech(port: str, baud: int, clock: SystemClock) -> tuple[Port, float
     return open_feetech(msgspec.convert({"port": port, "baud": baud}, FeetechBus), clock)
 
 
-def settings_by_name(workbench: Workbench, model: Model) -> Mapping[str, Setting]:
+def settings_by_name(workbench: EepromEditor, model: Model) -> Mapping[str, Setting]:
     """Return the writable settings of a model."""
     return {setting.name: setting for setting in workbench.make.settings(model)}
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from bodyschema.drivers.servos.channel import Sample
-from bodyschema.drivers.servos.handshake import FittedServo
+from bodyschema.drivers.servos.handshake import IdentifiedServo
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray, frozen_array
@@ -80,7 +80,7 @@ class Gaze(PoweredJoints):
         """Set the target angles (g,) [rad] of the head's joints at `t` [s]. May be called from any thread."""
         self._aim = (t, frozen_array(angles))
 
-    def _prepare(self, servo: FittedServo) -> int:
+    def _prepare(self, servo: IdentifiedServo) -> int:
         """Return the present position as the goal, so that the joint does not move when its torque goes on."""
         if self._read(servo, "homing_offset") != 0:
             raise RequestError(
@@ -137,7 +137,7 @@ class Gaze(PoweredJoints):
                 f"joint {self._head[worst]!r} stays {math.degrees(off[worst]):.0f}° from where it should be. Free it"
             )
 
-    def _ticks(self, servo: FittedServo, ahead: float, samples: Mapping[str, Sample | None]) -> int:
+    def _ticks(self, servo: IdentifiedServo, ahead: float, samples: Mapping[str, Sample | None]) -> int:
         """Return the goal register of a command `ahead` of the joint [rad], relative to the servo's position."""
         sample = samples[servo.joint]
         if sample is None:

@@ -17,12 +17,12 @@ from bodyschema.drivers.servos.bus import Answer
 from bodyschema.drivers.servos.bus import Bus as ServoBus
 from bodyschema.drivers.servos.channel import Channel as ServoChannel
 from bodyschema.drivers.servos.channel import Drive, Sample
-from bodyschema.drivers.servos.handshake import FittedServo
+from bodyschema.drivers.servos.handshake import IdentifiedServo
 from bodyschema.drivers.servos.joints import OpenPort, ServoJoints
-from bodyschema.drivers.servos.make import Make, Way
 from bodyschema.drivers.servos.model import Layout, Model, Register
 from bodyschema.drivers.servos.port import Port
 from bodyschema.drivers.servos.settings import BAUD, HOMING_OFFSET, ID, Setting
+from bodyschema.drivers.servos.vendor import ServoVendor, Way
 from bodyschema.interfaces.protocols import Clock
 
 BAUDS2 = (9600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
@@ -118,7 +118,7 @@ LARGEST_POSITION1 = 28_672  # in multi-turn mode
 class Channel(ServoChannel):
     """The answers of one servo since the bus was opened."""
 
-    def __init__(self, servo: FittedServo) -> None:
+    def __init__(self, servo: IdentifiedServo) -> None:
         """Start without answers."""
         super().__init__(servo)
         self._clock = DeviceClock(TICK_S, TICKS)
@@ -154,10 +154,10 @@ class Channel(ServoChannel):
         return abs(position) <= LARGEST_POSITION1
 
 
-def ways_of(bus: ServoBus, servos: Sequence[FittedServo], config: BusConfig) -> list[list[Way]]:
+def ways_of(bus: ServoBus, servos: Sequence[IdentifiedServo], config: BusConfig) -> list[list[Way]]:
     """Return the read methods of each group: Protocol 1.0 as one, and each series of Protocol 2.0."""
     alone = [servo for servo in servos if servo.model.protocol == 1]
-    series: dict[int, list[FittedServo]] = {}
+    series: dict[int, list[IdentifiedServo]] = {}
     for servo in servos:
         if servo.model.protocol == 2:
             series.setdefault(servo.model.layout.block.address, []).append(servo)
@@ -186,7 +186,7 @@ def open_serial(config: BusConfig, clock: Clock) -> tuple[Port, float]:
     return port, latency_s
 
 
-DYNAMIXEL = Make(
+DYNAMIXEL = ServoVendor(
     DynamixelConfig.table,
     BY_NUMBER,
     HARDWARE_ERRORS,

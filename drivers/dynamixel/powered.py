@@ -15,7 +15,7 @@ import numpy as np
 
 from bodyschema.drivers.servos.bus import Bus as ServoBus
 from bodyschema.drivers.servos.channel import Sample
-from bodyschema.drivers.servos.handshake import FittedServo, switch_torque_off
+from bodyschema.drivers.servos.handshake import IdentifiedServo, switch_torque_off
 from bodyschema.drivers.servos.model import Register
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.protocols import Clock
@@ -56,7 +56,7 @@ class PoweredJoints(ABC):
         self._joints = tuple(joints)
         self._requests: SimpleQueue[tuple[bool, Future[str]]] = SimpleQueue()
         self._buses: dict[str, Bus] = {}
-        self._servos: list[FittedServo] = []
+        self._servos: list[IdentifiedServo] = []
         self._places: list[int] = []
         self._sent: dict[str, int] = {}
         self._looked, self._next_look = 0, -math.inf
@@ -93,7 +93,7 @@ class PoweredJoints(ABC):
 
     # --- `Drive`, by the thread that reads
 
-    def open(self, buses: Mapping[str, ServoBus], servos: Sequence[FittedServo]) -> None:
+    def open(self, buses: Mapping[str, ServoBus], servos: Sequence[IdentifiedServo]) -> None:
         """Implement `Drive.open`."""
         self._buses = {name: bus for name, bus in buses.items() if isinstance(bus, Bus)}
         by_joint = {servo.joint: place for place, servo in enumerate(servos)}
@@ -145,7 +145,7 @@ class PoweredJoints(ABC):
     # --- differs by kind of drive
 
     @abstractmethod
-    def _prepare(self, servo: FittedServo) -> int:
+    def _prepare(self, servo: IdentifiedServo) -> int:
         """Check the servo's own limits and return a goal with which its torque is safe to switch on.
 
         Raises:
@@ -217,7 +217,7 @@ class PoweredJoints(ABC):
         log.warning("%s is on: %s have torque", self.name, ", ".join(self._joints))
         return self._said_on()
 
-    def _prepared(self, servo: FittedServo) -> int:
+    def _prepared(self, servo: IdentifiedServo) -> int:
         """Check that torque is off and the mode right, set a safe goal and arm the watchdog; return the goal."""
         if self._read(servo, "torque") != 0:
             raise RequestError(f"joint {servo.joint!r} has torque already: another program moves it")
@@ -230,7 +230,7 @@ class PoweredJoints(ABC):
             self._write(servo, name, value)
         return goal
 
-    def _wrong_mode(self, servo: FittedServo, found: int) -> str:
+    def _wrong_mode(self, servo: IdentifiedServo, found: int) -> str:
         return (
             f"joint {servo.joint!r} (ID {servo.id}) is in operating mode {found}, not {self.mode_name} ({self.mode}). "
             f"It is kept in the servo's EEPROM; type: "
@@ -318,7 +318,7 @@ class PoweredJoints(ABC):
         for (bus, register), by_id in groups.items():
             self._buses[bus].sync_write(register, by_id)
 
-    def _write(self, servo: FittedServo, name: str, value: int) -> None:
+    def _write(self, servo: IdentifiedServo, name: str, value: int) -> None:
         """Write a register and read it back. Raise RequestError if the value differs."""
         register = servo.model.layout[name]
         found = None
@@ -329,7 +329,7 @@ class PoweredJoints(ABC):
                 return
         raise RequestError(f"joint {servo.joint!r} (ID {servo.id}): {name} was set to {value} and is {found}")
 
-    def _read(self, servo: FittedServo, name: str) -> int:
+    def _read(self, servo: IdentifiedServo, name: str) -> int:
         """Return the value of a register. Raise RequestError without an answer."""
         bus, register = self._buses[servo.bus], servo.model.layout[name]
         exchange = None

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from bodyschema.drivers.servos.channel import Sample
-from bodyschema.drivers.servos.handshake import FittedServo
+from bodyschema.drivers.servos.handshake import IdentifiedServo
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray, frozen_array
@@ -77,7 +77,7 @@ class ZeroForce(PoweredJoints):
             said += (f"zero_force: the current limit of {names} does not bear the arm here: it sinks. Hold it",)
         return said
 
-    def _prepare(self, servo: FittedServo) -> int:
+    def _prepare(self, servo: IdentifiedServo) -> int:
         wanted = self._ticks(servo, self._limit[self._joints.index(servo.joint)])
         allowed = self._read(servo, "current_limit")
         if abs(wanted) > allowed:
@@ -114,6 +114,6 @@ class ZeroForce(PoweredJoints):
         )
 
     @staticmethod
-    def _ticks(servo: FittedServo, current: float) -> int:
+    def _ticks(servo: IdentifiedServo, current: float) -> int:
         """Return the register value of a current [A] that turns the joint forward."""
         return round(servo.direction * current / (servo.model.current_unit or math.nan))

@@ -12,14 +12,14 @@ from bodyschema.drivers.servos.bus import Answer, Request, spare_after
 from bodyschema.drivers.servos.bus import Bus as ServoBus
 from bodyschema.drivers.servos.channel import Channel as ServoChannel
 from bodyschema.drivers.servos.channel import Sample
-from bodyschema.drivers.servos.handshake import FittedServo
+from bodyschema.drivers.servos.handshake import IdentifiedServo
 from bodyschema.drivers.servos.joints import OpenPort, ServoJoints
-from bodyschema.drivers.servos.make import Make, Way
 from bodyschema.drivers.servos.model import Model, Register
 from bodyschema.drivers.servos.packets import HEADER, Packets, Status, take_summed
 from bodyschema.drivers.servos.port import Port
 from bodyschema.drivers.servos.scan import Kind
 from bodyschema.drivers.servos.settings import BAUD, HOMING_OFFSET, ID, Setting
+from bodyschema.drivers.servos.vendor import ServoVendor, Way
 from bodyschema.interfaces.protocols import Clock
 
 BROADCAST = 0xFE
@@ -172,7 +172,7 @@ def open_serial(config: BusConfig, clock: Clock) -> tuple[Port, float]:
     return SerialLine.open(config.port, config.baud, clock.now), latency_s
 
 
-def ways_of(bus: ServoBus, servos: Sequence[FittedServo], config: BusConfig) -> list[list[Way]]:
+def ways_of(bus: ServoBus, servos: Sequence[IdentifiedServo], config: BusConfig) -> list[list[Way]]:
     """Return the read methods of each group: the STS and SMS series, which support Sync Read, and the others."""
     together = [servo for servo in servos if servo.model.protocol == STS]
     if len(together) < 2 or config.sync_read != "auto":
@@ -182,7 +182,7 @@ def ways_of(bus: ServoBus, servos: Sequence[FittedServo], config: BusConfig) -> 
     return [*groups, [_one_by_one(bus, alone)]] if alone else groups
 
 
-def _sync_read(servos: Sequence[FittedServo]) -> Way:
+def _sync_read(servos: Sequence[IdentifiedServo]) -> Way:
     layout, ids = servos[0].model.layout, tuple(servo.id for servo in servos)
     block = layout.block
 
@@ -193,12 +193,12 @@ def _sync_read(servos: Sequence[FittedServo]) -> Way:
     return Way("Sync Read", (request,), SYNC_READ_FAILED)
 
 
-def _one_by_one(bus: ServoBus, servos: Sequence[FittedServo]) -> Way:
+def _one_by_one(bus: ServoBus, servos: Sequence[IdentifiedServo]) -> Way:
     requests = (bus.read_request(servo.model, servo.id, servo.model.layout.block) for servo in servos)
     return Way("one by one", tuple(requests))
 
 
-FEETECH = Make(FeetechConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Channel, ways_of, settings_of, -1)
+FEETECH = ServoVendor(FeetechConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Channel, ways_of, settings_of, -1)
 
 
 class FeetechJoints(ServoJoints):

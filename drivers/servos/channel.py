@@ -11,7 +11,7 @@ from statistics import median
 from typing import Protocol
 
 from bodyschema.drivers.servos.bus import Bus
-from bodyschema.drivers.servos.handshake import FittedServo
+from bodyschema.drivers.servos.handshake import IdentifiedServo
 from bodyschema.interfaces.records import JointReading
 
 from .bus import Answer
@@ -65,7 +65,7 @@ class Channel(ABC):
         surprising: the newest sample deviates from the trend of the two before it.
     """
 
-    def __init__(self, servo: FittedServo) -> None:
+    def __init__(self, servo: IdentifiedServo) -> None:
         """Start without answers."""
         self.servo = servo
         self.newest: Sample | None = None
@@ -180,7 +180,7 @@ class Drive(Protocol):
         """Current problems, and what to do; from any thread."""
         ...
 
-    def open(self, buses: Mapping[str, Bus], servos: Sequence[FittedServo]) -> None:
+    def open(self, buses: Mapping[str, Bus], servos: Sequence[IdentifiedServo]) -> None:
         """Accept the servos that were found, with torque verified off, in the order of the joints."""
         ...
 

@@ -10,15 +10,15 @@ from typing import Any
 
 from bodyschema.drivers.checks import MANY_TROUBLES, READ_S, Check
 from bodyschema.drivers.echo import without_echo
-from bodyschema.drivers.servos.make import Plan
+from bodyschema.drivers.servos.vendor import Plan
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import Clock
 
 from .bus import Bus, Request
 from .config import ServosConfig
-from .handshake import Finding, FittedServo, ask_again, identify
+from .handshake import Finding, IdentifiedServo, ask_again, identify
 from .joints import OpenPort
-from .make import Make
+from .vendor import ServoVendor
 
 IDENTIFY_S = 1.0  # servos not yet asked by then are not asked any more
 FEW_PER_S = 100.0
@@ -28,7 +28,7 @@ FAST_BAUD = 1_000_000
 
 
 def servo_checks(
-    make: Make, config: ServosConfig[Any], clock: Clock, open_port: OpenPort, *, read_s: float = READ_S
+    make: ServoVendor, config: ServosConfig[Any], clock: Clock, open_port: OpenPort, *, read_s: float = READ_S
 ) -> Iterator[Check]:
     """Yield checks of presence, health and reading rate of the servos. Open the ports for that."""
     with ExitStack() as stack:
@@ -50,7 +50,7 @@ def servo_checks(
             yield Check(TYPE, "wrong", str(error))
 
 
-def _identified(make: Make, config: ServosConfig[Any], buses: dict[str, Bus], clock: Clock) -> list[Finding]:
+def _identified(make: ServoVendor, config: ServosConfig[Any], buses: dict[str, Bus], clock: Clock) -> list[Finding]:
     found: list[Finding] = []
     end = clock.now() + IDENTIFY_S
     for servo in config.servos:
@@ -71,7 +71,7 @@ def _presence(found: Sequence[Finding]) -> Iterator[Check]:
         yield Check(TYPE, "ok", f"all {len(found)} answer, each of the model that robot.toml names")
 
 
-def _health(make: Make, bus: Bus, servo: FittedServo) -> Iterator[Check]:
+def _health(make: ServoVendor, bus: Bus, servo: IdentifiedServo) -> Iterator[Check]:
     layout = servo.model.layout
     exchange = ask_again(bus, bus.read_request(servo.model, servo.id, layout.state))
     if exchange.trouble is not None:
@@ -90,7 +90,7 @@ def _health(make: Make, bus: Bus, servo: FittedServo) -> Iterator[Check]:
         yield Check(TYPE, "ok", f"joint {servo.joint} holds its place: `bodyschema run` switches its torque off")
 
 
-def _delays(servos: Sequence[FittedServo]) -> Iterator[Check]:
+def _delays(servos: Sequence[IdentifiedServo]) -> Iterator[Check]:
     for name in dict.fromkeys(servo.bus for servo in servos):
         slow = [s for s in servos if s.bus == name and s.return_delay_s > LONGEST_DELAY_S]
         if slow:
@@ -101,10 +101,10 @@ def _delays(servos: Sequence[FittedServo]) -> Iterator[Check]:
 
 
 def _pace(
-    make: Make,
+    make: ServoVendor,
     config: ServosConfig[Any],
     buses: dict[str, Bus],
-    servos: Sequence[FittedServo],
+    servos: Sequence[IdentifiedServo],
     clock: Clock,
     read_s: float,
 ) -> Iterator[Check]:

@@ -27,7 +27,7 @@ SCAN = "`bodyschema scan --robot robot.toml` looks for them at all rates and IDs
 
 
 @dataclass(frozen=True, slots=True)
-class FittedServo:
+class IdentifiedServo:
     """A servo as it was found.
 
     Attributes:
@@ -99,7 +99,7 @@ class Finding:
 
     config: ServoConfig
     found: str
-    servo: FittedServo | None = None
+    servo: IdentifiedServo | None = None
     may_come_back: bool = False
 
 
@@ -120,7 +120,7 @@ def identify(bus: Bus, config: ServoConfig, model: Model, known: Mapping[int, Mo
         return Finding(config, _absence(bus, model, config.id, trouble), may_come_back=True)
     if _is_garbled(bus, model, config.id):
         return Finding(config, GARBLED, may_come_back=True)
-    servo = FittedServo(
+    servo = IdentifiedServo(
         joint=config.joint,
         bus=bus.name,
         id=config.id,
@@ -137,7 +137,7 @@ def identify(bus: Bus, config: ServoConfig, model: Model, known: Mapping[int, Mo
     return Finding(config, model.name, servo)
 
 
-def require_all(findings: Iterable[Finding], ports: str) -> list[FittedServo]:
+def require_all(findings: Iterable[Finding], ports: str) -> list[IdentifiedServo]:
     """Return the servos. Raise SourceError with a table of all servos if any is not as configured."""
     findings = list(findings)
     wrong = [finding for finding in findings if finding.servo is None]
@@ -154,7 +154,7 @@ def require_all(findings: Iterable[Finding], ports: str) -> list[FittedServo]:
     raise SourceError(message)
 
 
-def switch_torque_off(bus: Bus, servo: FittedServo) -> FittedServo:
+def switch_torque_off(bus: Bus, servo: IdentifiedServo) -> IdentifiedServo:
     """Switch its torque off where it is on, and make sure; the servo with what it was like.
 
     Raises:
@@ -176,7 +176,7 @@ def switch_torque_off(bus: Bus, servo: FittedServo) -> FittedServo:
     return replace(servo, had_torque=had_torque)
 
 
-def torque_is_on(bus: Bus, servo: FittedServo) -> bool:
+def torque_is_on(bus: Bus, servo: IdentifiedServo) -> bool:
     """Return True if the servo's torque is on. Raise SourceLost if it does not answer."""
     data, trouble = read_register(bus, servo.model, servo.id, servo.model.layout["torque"])
     if data is None:
@@ -184,7 +184,7 @@ def torque_is_on(bus: Bus, servo: FittedServo) -> bool:
     return data != b"\x00"
 
 
-def restore_torque(bus: Bus, servo: FittedServo) -> None:
+def restore_torque(bus: Bus, servo: IdentifiedServo) -> None:
     """Switch its torque on again where it was on, its goal being where it is."""
     layout = servo.model.layout
     position, trouble = read_register(bus, servo.model, servo.id, layout["position"])

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from bodyschema.drivers.servos.bus import Bus, Exchange, Request
 from bodyschema.drivers.servos.channel import Drive
-from bodyschema.drivers.servos.handshake import FittedServo
+from bodyschema.drivers.servos.handshake import IdentifiedServo
 from bodyschema.drivers.servos.scan import VOLT_PER_UNIT
 from bodyschema.interfaces.errors import SourceLost
 from bodyschema.interfaces.protocols import Clock
@@ -112,7 +112,7 @@ class Health:
         """Note that a servo does not answer when it is asked alone."""
         self._absent[joint] = trouble
 
-    def of(self, servo: FittedServo, sample: Sample | None, lost: str | None) -> ServoHealth:
+    def of(self, servo: IdentifiedServo, sample: Sample | None, lost: str | None) -> ServoHealth:
         """Return the state of a servo; `lost` is the joint that lost its turn count."""
         joint = servo.joint
         voltage, temperature = self._supplies.get(joint, (None, None))
@@ -148,7 +148,7 @@ class Inspection:
     def __init__(
         self,
         buses: Mapping[str, Bus],
-        servos: Sequence[FittedServo],
+        servos: Sequence[IdentifiedServo],
         health: Health,
         drives: Sequence[Drive],
         clock: Clock,
@@ -186,7 +186,7 @@ class Inspection:
                 return f"joint {servo.joint!r} (ID {servo.id}): {trouble}"
         return None
 
-    def _is_confirmed(self, servo: FittedServo, exchange: Exchange) -> bool:
+    def _is_confirmed(self, servo: IdentifiedServo, exchange: Exchange) -> bool:
         """Ask again for an alert or torque where the checksum lets one in 256 wrong answers through."""
         told = _state_in(servo, exchange)
         if not any(told) or not self._buses[servo.bus].is_weak(self._state_request(servo)):
@@ -194,26 +194,26 @@ class Inspection:
         again = self._ask_state(servo)
         return again.trouble is None and _state_in(servo, again) == told
 
-    def _judge(self, servo: FittedServo, exchange: Exchange) -> None:
+    def _judge(self, servo: IdentifiedServo, exchange: Exchange) -> None:
         has_torque, bits = _state_in(servo, exchange)
         if has_torque and not any(servo.joint in drive.holding for drive in self._drives):
             raise SourceLost(f"the torque of joint {servo.joint!r} was switched on by another program", retry_s=0.0)
         self._health.note_alert(servo.joint, bits)
 
-    def _ask_supply(self, servo: FittedServo) -> None:
+    def _ask_supply(self, servo: IdentifiedServo) -> None:
         bus = self._buses[servo.bus]
         exchange = bus.ask(bus.read_request(servo.model, servo.id, supply_of(servo.model)))
         if exchange.trouble is None:
             self._health.note_supply(servo.joint, servo.model, exchange.answers[0].status.data)
 
-    def _ask_state(self, servo: FittedServo) -> Exchange:
+    def _ask_state(self, servo: IdentifiedServo) -> Exchange:
         return self._buses[servo.bus].ask(self._state_request(servo))
 
-    def _state_request(self, servo: FittedServo) -> Request:
+    def _state_request(self, servo: IdentifiedServo) -> Request:
         return self._buses[servo.bus].read_request(servo.model, servo.id, servo.model.layout.state)
 
 
-def _state_in(servo: FittedServo, exchange: Exchange) -> tuple[int, int]:
+def _state_in(servo: IdentifiedServo, exchange: Exchange) -> tuple[int, int]:
     """Return the torque flag and the hardware error bits."""
     status, layout = exchange.answers[0].status, servo.model.layout
     has_register = "hardware_error" in layout

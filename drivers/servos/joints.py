@@ -13,7 +13,7 @@ from typing import Any, Self
 from bodyschema.drivers.echo import without_echo
 from bodyschema.drivers.servos.channel import Drive
 from bodyschema.drivers.servos.health import Inspection
-from bodyschema.drivers.servos.make import Plan
+from bodyschema.drivers.servos.vendor import Plan
 from bodyschema.drivers.turn_count import TurnCount
 from bodyschema.drivers.turns import SpeedGate
 from bodyschema.interfaces.errors import SourceError, SourceLost
@@ -23,10 +23,10 @@ from bodyschema.interfaces.records import JointReading, frozen_array
 from .bus import Bus, Counts, Request
 from .channel import Channel, Punctuality, Sample, middle
 from .config import ServoConfig, ServosConfig
-from .handshake import RETRY_S, Finding, FittedServo, identify, require_all, restore_torque, switch_torque_off
+from .handshake import RETRY_S, Finding, IdentifiedServo, identify, require_all, restore_torque, switch_torque_off
 from .health import BusHealth, Health, ServoHealth
-from .make import Make
 from .port import Port
+from .vendor import ServoVendor
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +58,7 @@ class ServoJoints:
 
     def __init__(
         self,
-        make: Make,
+        make: ServoVendor,
         config: ServosConfig[Any],
         joints: Sequence[str],
         clock: Clock,
@@ -97,7 +97,7 @@ class ServoJoints:
         self._last_t = -math.inf
         self._health = Health(make.errors)
         self._counts = {name: Counts() for name in config.buses}
-        self.servos: list[FittedServo] = []
+        self.servos: list[IdentifiedServo] = []
         self.epoch = self.dropped = 0
 
     @property

@@ -15,11 +15,11 @@ from bodyschema.interfaces.protocols import Clock
 
 from .bus import Bus, Trouble
 from .config import ServoConfig
-from .handshake import ATTEMPTS, FittedServo, identify, read_register, switch_torque_off
-from .make import Make
+from .handshake import ATTEMPTS, IdentifiedServo, identify, read_register, switch_torque_off
 from .model import Model, Register
 from .port import Port
 from .settings import ID, Setting
+from .vendor import ServoVendor
 
 EEPROM_S = 0.02  # a servo may be deaf so long while it writes
 LOCK = "lock"
@@ -41,7 +41,7 @@ class Outcome(StrEnum):
 class Change:
     """A number that is to be written: `then` in the place of `now`."""
 
-    servo: FittedServo
+    servo: IdentifiedServo
     setting: Setting
     now: int
     then: int
@@ -62,13 +62,13 @@ class Done:
     said: str = ""
 
 
-class Workbench:
+class EepromEditor:
     """Servos whose EEPROM is looked at and changed. Use as a context manager; it opens ports when they are needed.
 
     The bus of a servo is its port.
     """
 
-    def __init__(self, make: Make, clock: Clock, open_at: OpenAt) -> None:
+    def __init__(self, make: ServoVendor, clock: Clock, open_at: OpenAt) -> None:
         """Store the arguments; open nothing yet."""
         self.make, self._clock, self._open_at = make, clock, open_at
         self._buses: dict[str, tuple[int, Bus]] = {}
@@ -97,7 +97,7 @@ class Workbench:
         self._buses[port] = (baud, self.make.bus(port, heard, self._clock, latency_s))
         return self._buses[port][1]
 
-    def fitted(self, bus: Bus, config: ServoConfig, model: Model) -> FittedServo:
+    def fitted(self, bus: Bus, config: ServoConfig, model: Model) -> IdentifiedServo:
         """Return the servo as found on the bus. Raise SourceError if it is another, or does not answer."""
         finding = identify(bus, config, model, self.make.models)
         if finding.servo is None:
@@ -123,14 +123,14 @@ class Workbench:
         by_protocol = {model.protocol: model for model in self.make.models.values()}
         return any(bus.ping(model, id).trouble is not Trouble.TIMEOUT for model in by_protocol.values())
 
-    def value(self, bus: Bus, servo: FittedServo, setting: Setting) -> int:
+    def value(self, bus: Bus, servo: IdentifiedServo, setting: Setting) -> int:
         """Return the setting's value in the servo's EEPROM. Raise SourceError if the servo does not answer."""
         data, trouble = read_register(bus, servo.model, servo.id, setting.register)
         if data is None:
             raise SourceError(f"joint {servo.joint!r} (ID {servo.id}) on {bus.name}: {trouble}. Nothing was written")
         return setting.register.value(data)
 
-    def position(self, bus: Bus, servo: FittedServo) -> int:
+    def position(self, bus: Bus, servo: IdentifiedServo) -> int:
         """Return the servo's position [ticks]. Raise SourceError if it does not answer."""
         position = servo.model.layout["position"]
         data, trouble = read_register(bus, servo.model, servo.id, position)
@@ -138,14 +138,14 @@ class Workbench:
             raise SourceError(f"joint {servo.joint!r} (ID {servo.id}) on {bus.name}: {trouble}")
         return position.value(data)
 
-    def homing_offset(self, bus: Bus, servo: FittedServo) -> int:
+    def homing_offset(self, bus: Bus, servo: IdentifiedServo) -> int:
         """Return the homing offset that makes the servo's present position its `zero_ticks`, modulo full turns."""
         moved = round(servo.zero_ticks - self.position(bus, servo))
         turn = servo.ticks_per_turn
         wanted = servo.homing_offset + self.make.homing_sign * moved
         return wanted if turn is None else (wanted + turn // 2) % turn - turn // 2
 
-    def torque_off(self, bus: Bus, servos: Iterable[FittedServo]) -> None:
+    def torque_off(self, bus: Bus, servos: Iterable[IdentifiedServo]) -> None:
         """Switch the torque of all servos off, and verify it. Raise SourceError if one stays on."""
         for servo in servos:
             switch_torque_off(bus, servo)
@@ -201,13 +201,13 @@ class Workbench:
             return self._locked(self.bus(port, baud), Done(change, Outcome.KEPT, register.value(data), said))
         return _lost(change, trouble)
 
-    def _tell(self, bus: Bus, servo: FittedServo, register: Register, value: int) -> None:
+    def _tell(self, bus: Bus, servo: IdentifiedServo, register: Register, value: int) -> None:
         """Write, whatever is answered: under which ID and at which rate it is answered depends on the firmware."""
         bus.write(servo.model, servo.id, register, register.bytes(value))
         bus.settle()
         bus.listen(self._clock.now() + EEPROM_S)
 
-    def _unlock(self, bus: Bus, servo: FittedServo) -> None:
+    def _unlock(self, bus: Bus, servo: IdentifiedServo) -> None:
         """Unlock the servo's EEPROM; values written while it is locked are lost at power-off."""
         if LOCK in servo.model.layout:
             self._tell(bus, servo, servo.model.layout[LOCK], 0)

@@ -99,7 +99,7 @@ MOST_SURPRISES = 3000
 
 
 @dataclass(frozen=True, eq=False)
-class Suspicion:
+class ChangeScore:
     """Probability of a change.
 
     Attributes:
@@ -282,7 +282,7 @@ class ChangeDetector:
         information = (information - explained) / variances[:, None, None]
         return onsets, information, (score - np.matvec(crossed.transpose(0, 2, 1), self._mean)) / variances[:, None]
 
-    def suspicion(self) -> Suspicion:
+    def suspicion(self) -> ChangeScore:
         """Return the probability of a change after the pairs so far, at least one."""
         onsets, information, score = self.sums()
         terms = np.stack([log_ratios(information[:, at, at], score[:, at], self._sizes) for at in self._places], axis=1)
@@ -291,7 +291,7 @@ class ChangeDetector:
         self._looked_at, self._log_odds = self.pairs, suspicion.log_odds
         return suspicion
 
-    def suspicion_if_it_bends(self) -> Suspicion:
+    def suspicion_if_it_bends(self) -> ChangeScore:
         """Return the probability of a change if the arm may bend, before and after; at least one pair.
 
         The bends are those that the pairs make probable. It costs some hundred times as much as `suspicion`: use it
@@ -325,10 +325,10 @@ class ChangeDetector:
             self._bends_before = log_evidence_of_bends(angles, scale * errors, scale * known, turning)
         return self._bends_before
 
-    def _suspected(self, onsets: IntArray, terms: FloatArray) -> Suspicion:
+    def _suspected(self, onsets: IntArray, terms: FloatArray) -> ChangeScore:
         log_odds = float(np.logaddexp.reduce(terms, axis=None))
         shares = np.exp(terms - log_odds)
-        return Suspicion(log_odds, log_odds > self._limit, onsets, shares.sum(axis=1), shares.sum(axis=0))
+        return ChangeScore(log_odds, log_odds > self._limit, onsets, shares.sum(axis=1), shares.sum(axis=0))
 
     def _grown_noise(self) -> SharedNoise:
         """Return the noise, or more where the newest pairs scatter more: that is not a change of the arm."""

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from bodyschema.interfaces.records import FloatArray, Pair
 from bodyschema.learning.model_bank import LearntModel
 from bodyschema.learning.uncertainty import PredictiveUncertainty
-from kbmaps import ChainBelief, ChangeDetector, ChangeKind, KBMap, ResidualModel, SharedNoise, Suspicion, WhiteNoise
+from kbmaps import ChainBelief, ChangeDetector, ChangeKind, ChangeScore, KBMap, ResidualModel, SharedNoise, WhiteNoise
 from kbmaps.changes.detector import MOST_SURPRISES
 from kbmaps.changes.white_noise import inverse_roots
 
@@ -178,7 +178,7 @@ class ChangeMonitor:
         self._earlier: deque[_Watched] = deque(maxlen=LOOKED_BACK)
         self._detector: ChangeDetector | None = None
         self._white = WhiteNoise.as_claimed(0)
-        self._change: Suspicion | None = None
+        self._change: ChangeScore | None = None
         self._look_at = 0
         self._odds = self._refuted_odds = -math.inf
         self._shown: _Shown | None = None

@@ -26,7 +26,7 @@ from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
 from bodyschema.drivers.feetech.joints import Bus as FeetechBus
 from bodyschema.drivers.feetech.models import BY_NAME as FEETECH_MODELS
 from bodyschema.drivers.scan import scan_port
-from bodyschema.drivers.servos.workbench import Workbench
+from bodyschema.drivers.servos.workbench import EepromEditor
 from bodyschema.interfaces.errors import SourceLost
 
 Change = Callable[[bytes, list[Reply], float], list[Reply]]
@@ -83,7 +83,7 @@ def test_a_scan_through_an_echo_finds_the_servos() -> None:
 
 def test_an_echo_is_not_taken_for_a_servo_with_that_id() -> None:
     clock, chain = VirtualClock(), Chain([Servo(BY_NAME["MX-28"], 1, lambda _: 0.0)])
-    with Workbench(DYNAMIXEL, clock, lambda _, baud: (VirtualPort(Wire(chain, echo), clock, baud), 0.0)) as bench:
+    with EepromEditor(DYNAMIXEL, clock, lambda _, baud: (VirtualPort(Wire(chain, echo), clock, baud), 0.0)) as bench:
         bus = bench.bus("bench", 1_000_000)
         assert [bench.is_taken(bus, id) for id in (1, 2)] == [True, False]
 

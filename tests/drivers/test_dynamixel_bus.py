@@ -11,7 +11,7 @@ from bodyschema.drivers.dynamixel.bus import Answer, Bus, Trouble, sync_request
 from bodyschema.drivers.dynamixel.joints import Channel
 from bodyschema.drivers.dynamixel.models import BY_NAME
 from bodyschema.drivers.dynamixel.packets import Status
-from bodyschema.drivers.servos.handshake import FittedServo
+from bodyschema.drivers.servos.handshake import IdentifiedServo
 
 DATA = bytes(range(16))
 PIECES = st.lists(
@@ -47,8 +47,8 @@ class TalkingPort:
         """Do nothing: there is nothing to close."""
 
 
-def fitted(model: str) -> FittedServo:
-    return FittedServo("joint", "arm", 1, BY_NAME[model], 1, 2048, 46, 0, 3, 0, 0.0)
+def fitted(model: str) -> IdentifiedServo:
+    return IdentifiedServo("joint", "arm", 1, BY_NAME[model], 1, 2048, 46, 0, 3, 0, 0.0)
 
 
 @given(PIECES)

@@ -15,7 +15,7 @@ from bodyschema.drivers.feetech.bench.servo import CALIBRATE, Servo
 from bodyschema.drivers.feetech.joints import PACKETS, Bus, Channel
 from bodyschema.drivers.feetech.models import BY_NAME, MODELS
 from bodyschema.drivers.servos.bus import Answer, Request
-from bodyschema.drivers.servos.handshake import FittedServo
+from bodyschema.drivers.servos.handshake import IdentifiedServo
 from bodyschema.drivers.servos.model import Register
 from bodyschema.drivers.servos.packets import Garbled, Status
 
@@ -67,7 +67,7 @@ def test_only_intact_answers_of_who_was_asked_are_believed_whatever_comes(pieces
 @pytest.mark.parametrize(("model", "size"), [("STS3215", 15), ("SCS0009", 11)])
 @given(data=st.data())
 def test_any_block_is_a_possible_sample_or_refused(model, size, data) -> None:
-    servo = FittedServo("joint", "arm", 1, BY_NAME[model], 1, 2048, 778, 0, 0, 0, 0.0)
+    servo = IdentifiedServo("joint", "arm", 1, BY_NAME[model], 1, 2048, 778, 0, 0, 0, 0.0)
     block = data.draw(st.binary(min_size=size, max_size=size))
     sample = Channel(servo).take(Answer(Status(1, 0, block, size + 6), 100.0, 100.001, 99.999))
     assert sample is None or abs(sample.ticks) <= (30_719 if model == "STS3215" else 1023)

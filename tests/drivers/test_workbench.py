@@ -20,7 +20,7 @@ from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
 from bodyschema.drivers.feetech.joints import FEETECH
 from bodyschema.drivers.feetech.models import BY_NAME as FEETECHS
 from bodyschema.drivers.servos.config import ServoConfig
-from bodyschema.drivers.servos.workbench import Change, Outcome, Workbench
+from bodyschema.drivers.servos.workbench import Change, EepromEditor, Outcome
 from bodyschema.interfaces.errors import ConfigError, SourceError
 
 RATE = 1_000_000
@@ -37,7 +37,7 @@ class Arm:
         self.models = [known[name] for name in models]
         kinds = (DynamixelChain, DynamixelServo) if is_dynamixel else (FeetechChain, FeetechServo)
         self.chain = kinds[0]([kinds[1](model, id, lambda _: angle) for id, model in enumerate(self.models, 1)])
-        self.bench = Workbench(DYNAMIXEL if is_dynamixel else FEETECH, self.clock, self.open)
+        self.bench = EepromEditor(DYNAMIXEL if is_dynamixel else FEETECH, self.clock, self.open)
 
     def open(self, port: str, baud: int):
         return VirtualPort(self.chain, self.clock, outwards=at_once, inwards=at_once, baud=baud), 0.0

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from kbmaps import Contest, Recent, ShapeError
+from kbmaps import PrequentialComparison, Recent, ShapeError
 
 TRUSTED = ("rigid", "bent")
 
@@ -18,8 +18,8 @@ def squares(measured: np.ndarray, offsets: tuple[float, float]) -> dict[str, flo
     }
 
 
-def contest(rigid: float, bent: float, pairs: int, noise: float = 0.005, seed: int = 0) -> Contest:
-    rng, held = np.random.default_rng(seed), Contest()
+def contest(rigid: float, bent: float, pairs: int, noise: float = 0.005, seed: int = 0) -> PrequentialComparison:
+    rng, held = np.random.default_rng(seed), PrequentialComparison()
     for _ in range(pairs):
         held.add(squares(noise * rng.normal(size=3), (rigid, bent)))
     return held
@@ -45,7 +45,7 @@ def test_a_small_difference_is_seen_below_a_noise_that_both_meet():
 def test_noise_alone_seldom_unseats_the_more_trusted_model():
     chosen = []
     for seed in range(200):
-        rng, held = np.random.default_rng(seed), Contest()
+        rng, held = np.random.default_rng(seed), PrequentialComparison()
         for _ in range(100):
             held.add(dict(zip(TRUSTED, np.square(rng.normal(size=2)).tolist(), strict=True)))
         chosen.append(held.best(TRUSTED, "none"))
@@ -58,14 +58,14 @@ def test_with_too_few_pairs_who_answered_goes_on(pairs):
 
 
 def test_a_prediction_that_is_not_finite_is_none():
-    held = Contest()
+    held = PrequentialComparison()
     for _ in range(20):
         held.add({"rigid": math.nan, "bent": 0.1})
     assert held.best(TRUSTED, "rigid") == "bent"
 
 
 def test_outliers_that_all_models_meet_do_not_hide_who_is_better():
-    rng, held = np.random.default_rng(1), Contest()
+    rng, held = np.random.default_rng(1), PrequentialComparison()
     for k in range(300):
         measured = 0.002 * rng.normal(size=3) + (0.3 * rng.normal(size=3) if k % 7 == 0 else 0.0)
         held.add(squares(measured, (0.004, 0.001)))
@@ -92,7 +92,7 @@ def test_a_model_that_became_another_one_is_judged_anew():
 def test_a_contest_goes_on_from_its_errors():
     held = contest(0.01, 0.001, 350)
     held.add({"rigid": math.nan, "bent": 1.0})
-    again = Contest(held.errors, held.pairs)
+    again = PrequentialComparison(held.errors, held.pairs)
     for one in (held, again):
         one.add({"rigid": 1.0})
     assert again.pairs == held.pairs
@@ -102,27 +102,27 @@ def test_a_contest_goes_on_from_its_errors():
 
 def test_errors_of_different_numbers_of_pairs_are_refused():
     with pytest.raises(ShapeError):
-        Contest({"rigid": [0.1], "bent": [0.1, 0.2]})
+        PrequentialComparison({"rigid": [0.1], "bent": [0.1, 0.2]})
 
 
 @pytest.mark.parametrize("failing", [5, 10, 40])
 def test_a_model_that_fails_lately_does_not_answer(failing: int):
     """Check recent failures, however good the model was before and however large its errors are now."""
-    held = Contest()
+    held = PrequentialComparison()
     for k in range(100):
         held.add({"rigid": 0.002**2, "bent": 0.0005**2 if k < 100 - failing else 0.1**2})
     assert held.best(TRUSTED, "none") == "rigid"
 
 
 def test_errors_are_told_on_the_same_pairs_for_all():
-    held = Contest()
+    held = PrequentialComparison()
     for k in range(60):
         held.add({"rigid": 0.004**2 if k < 30 else 0.001**2} | ({} if k < 40 else {"bent": 0.002**2}))
     assert held.recent("rigid") == Recent(20, {"rigid": pytest.approx(0.001), "bent": pytest.approx(0.002)})
 
 
 def test_a_model_of_few_pairs_is_not_told_beside_an_older_one():
-    held = Contest()
+    held = PrequentialComparison()
     for k in range(60):
         held.add({"rigid": 0.001**2} | ({} if k < 55 else {"bent": 0.002**2}))
     assert held.recent("rigid") == Recent(50, {"rigid": pytest.approx(0.001)})
@@ -130,12 +130,12 @@ def test_a_model_of_few_pairs_is_not_told_beside_an_older_one():
 
 
 def test_before_any_pair_no_errors_are_told():
-    assert Contest().recent("rigid") == Recent(0, {})
+    assert PrequentialComparison().recent("rigid") == Recent(0, {})
 
 
 def test_neighbours_that_fare_alike_count_as_one():
     """Check that one stretch of a path where a model does better is no proof, however many pairs were taken there."""
-    held = Contest()
+    held = PrequentialComparison()
     for k in range(60):
         held.add({"rigid": 1.0 + 0.01 * k, "bent": 1.0})
     for _ in range(60):
@@ -154,7 +154,7 @@ def test_a_model_that_was_found_late_is_judged_on_pairs_that_it_had_not_learnt()
 def test_pairs_that_come_together_count_as_one_after_the_other():
     rng = np.random.default_rng(3)
     values = {name: rng.random(250) for name in TRUSTED}
-    together, each = Contest(), Contest()
+    together, each = PrequentialComparison(), PrequentialComparison()
     for begin in range(0, 250, 25):
         together.add({name: squared[begin : begin + 25] for name, squared in values.items()})
     for k in range(250):
@@ -165,4 +165,4 @@ def test_pairs_that_come_together_count_as_one_after_the_other():
 
 def test_as_many_pairs_are_asked_of_each_model():
     with pytest.raises(ShapeError, match="squares"):
-        Contest().add({"rigid": [0.1, 0.2], "bent": [0.1]})
+        PrequentialComparison().add({"rigid": [0.1, 0.2], "bent": [0.1]})

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from bodyschema.cli.servos.changes import Planned
     from bodyschema.cli.servos.log import ServoLog
-    from bodyschema.daemon.wiring.eeprom import Wanted, Workbench
+    from bodyschema.daemon.wiring.eeprom import EepromEditor, Wanted
 
 RATE = 1_000_000
 
@@ -171,7 +171,7 @@ def _wanted(
     return [stranger(port, baud, id)]
 
 
-def _workbench(wanted: Sequence[Wanted]) -> Workbench:
+def _workbench(wanted: Sequence[Wanted]) -> EepromEditor:
     from bodyschema.daemon.wiring.eeprom import workbench_of
 
     return workbench_of(wanted[0].table)
@@ -186,7 +186,7 @@ def _log(robot: Path, port: str | None) -> ServoLog:
 
 
 def _carry_out(
-    workbench: Workbench,
+    workbench: EepromEditor,
     planned: Sequence[Planned],
     log: ServoLog,
     *,

@@ -10,7 +10,7 @@ from bodyschema.drivers.servos.bus import Bus, Request
 from bodyschema.drivers.servos.handshake import ATTEMPTS
 
 from .channel import Channel
-from .handshake import FittedServo
+from .handshake import IdentifiedServo
 from .model import Model
 from .settings import Setting
 
@@ -81,7 +81,7 @@ class Plan:
 
 
 @dataclass(frozen=True, slots=True)
-class Make:
+class ServoVendor:
     """A servo vendor.
 
     Attributes:
@@ -100,8 +100,8 @@ class Make:
     models: Mapping[int, Model] = field(repr=False)
     errors: Mapping[int, str]
     bus: type[Bus]
-    channel: Callable[[FittedServo], Channel]
-    ways: Callable[[Bus, Sequence[FittedServo], Any], Sequence[Sequence[Way]]]
+    channel: Callable[[IdentifiedServo], Channel]
+    ways: Callable[[Bus, Sequence[IdentifiedServo], Any], Sequence[Sequence[Way]]]
     settings: Callable[[Model], Sequence[Setting]]
     homing_sign: Literal[1, -1]
     tick_s: float = 0.0
