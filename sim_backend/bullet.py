@@ -16,7 +16,7 @@ import numpy as np
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.extras import missing
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.sim_backend.truth import cross_matrix
+from bodyschema.sim_backend.geometry import cross_matrix
 
 from .physics_urdf import PhysicsUrdf
 

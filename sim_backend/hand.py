@@ -9,7 +9,8 @@ import numpy as np
 
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.sim_backend.truth import JointRoles, chain_from_root, turn_between
+from bodyschema.sim_backend.geometry import turn_between
+from bodyschema.sim_backend.truth import JointRoles, chain_from_root
 
 from .bullet import Body
 from .config import GuideConfig

@@ -15,7 +15,7 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.limited import read_at_most
-from bodyschema.sim_backend.truth import transform
+from bodyschema.sim_backend.geometry import transform
 
 MESHES = (".stl", ".obj", ".dae")
 LARGEST_MESH_BYTES = 64 * 2**20  # the meshes of public arms have 0.1 to 20 MB

@@ -18,11 +18,12 @@ from bodyschema.robot.description import RobotDescription
 from bodyschema.sim_backend.bullet import Body
 from bodyschema.sim_backend.config import SimConfig
 from bodyschema.sim_backend.physics_urdf import physics_urdf
+from bodyschema.sim_backend.randomness import Stream, generator
 from bodyschema.sim_backend.rendering.render_client import RenderProcess
 from bodyschema.sim_backend.rendering.scene import Scene, scene_of
 from bodyschema.sim_backend.sight import Gaze, Sight
 from bodyschema.sim_backend.sources import Encoders
-from bodyschema.sim_backend.truth import JointRoles, Stream, TrueRobot, generator
+from bodyschema.sim_backend.truth import JointRoles, TrueRobot
 from bodyschema.sim_backend.world import stereo_calibration
 from kbmaps import RigidChain
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from enum import IntEnum
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,49 +17,8 @@ from bodyschema.robot.urdf import MOVING, UrdfJoint, UrdfTree, chain_between
 from kbmaps import RigidChain
 
 from .config import ErrorConfig, SimConfig
-
-
-class Stream(IntEnum):
-    """Purpose of a random stream."""
-
-    ERRORS = 1
-    ENCODERS = 2
-    WAYPOINTS = 3
-    BACKGROUND = 4
-    IMAGE_NOISE = 5
-
-
-def generator(seed: int, stream: Stream, *index: int) -> np.random.Generator:
-    """Return the generator of one stream and, if an index is given, of one frame."""
-    return np.random.default_rng([seed, int(stream), *index])
-
-
-def transform(rotation: Rotation, translation: FloatArray) -> FloatArray:
-    """Return the homogeneous transform (4, 4) of a rotation and a translation (3,) [m]."""
-    T = np.eye(4)
-    T[:3, :3] = rotation.as_matrix()
-    T[:3, 3] = translation
-    return T
-
-
-def joint_motion(axis: FloatArray, prismatic: bool, value: float) -> FloatArray:
-    """Return the transform (4, 4) of a joint at `value`: a rotation about its axis [rad] or a slide along it [m]."""
-    if prismatic:
-        return transform(Rotation.identity(), axis * value)
-    return transform(Rotation.from_rotvec(axis * value), np.zeros(3))
-
-
-def cross_matrix(vector: FloatArray) -> FloatArray:
-    """Return the skew-symmetric matrix (3, 3) of `vector` (3,): its product with x is the cross product vector × x."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-
-
-def turn_between(R_from: FloatArray, R_to: FloatArray) -> FloatArray:
-    """Return the rotation axis (3,) from one orientation (3, 3) to another, times the sine of the angle."""
-    R = R_to @ R_from.T
-    return np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
-
+from .geometry import joint_motion, transform
+from .randomness import Stream, generator
 
 # The offset of a prismatic joint is known better than that of a revolute one: metres of error per radian.
 _METRES_PER_RADIAN = 0.1

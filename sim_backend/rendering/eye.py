@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, ImageArray
 from bodyschema.sim_backend.config import CameraConfig, SimTag
+from bodyschema.sim_backend.randomness import Stream, generator
 from bodyschema.sim_backend.rendering.raster import EmptyWorld, Grid, Raster
-from bodyschema.sim_backend.truth import Stream, generator
 
 _BALL_AMBIENT, _BALL_DIFFUSE, _SPECULAR = 0.55, 0.4, 0.12
 _SHININESS = 20
