@@ -13,6 +13,7 @@ import numpy as np
 
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler.reconnect import ResilientWriter
+from bodyschema.daemon.sampler.sources import answer_simulation
 from bodyschema.daemon.service.service import Service, with_health
 from bodyschema.daemon.transport.bus import Request, ZenohSession
 from bodyschema.daemon.transport.keys import Keys
@@ -35,7 +36,6 @@ from .powered import asked
 from .reconnect import ReconnectingSource
 from .rules import SamplerRules
 from .servo_status import accept_turns, buses_of, complaints_of, servos_of
-from .simulation import answer_simulation
 from .sources import Sources
 
 log = logging.getLogger(__name__)

@@ -23,7 +23,7 @@ from small_arm import write_small_arm
 
 from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.sampler import history, simulation
+from bodyschema.daemon.sampler import history, sources
 from bodyschema.daemon.sampler.devices import session_of
 from bodyschema.daemon.sampler.sampler import Sampler
 from bodyschema.daemon.sampler.sources import Sources
@@ -42,7 +42,7 @@ PAGE = (ROOT / "docs" / "zenoh.md").read_text(encoding="utf-8")
 LIMIT_S = 500.0
 MESSAGES = {
     name: kind
-    for module in (wire, status, simulation)
+    for module in (wire, status, sources)
     for name, kind in inspect.getmembers(module, inspect.isclass)
     if issubclass(kind, msgspec.Struct) and kind.__module__ == module.__name__
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import cyclopts
 from cyclopts import Parameter
@@ -21,6 +21,13 @@ from bodyschema.cli.commands.options import (
     print_json,
     robot_file,
 )
+
+if TYPE_CHECKING:
+    from bodyschema.calibration.report import CalibrationReport
+    from bodyschema.calibration.rigid_chain import Calibration, Trusted
+    from bodyschema.daemon.config import Config
+    from bodyschema.recordings.recording import Recording
+    from bodyschema.robot.description import RobotDescription
 
 CAMERA_FRAME = "calibrated_camera"
 
@@ -103,77 +110,127 @@ def arm(
     Next: `bodyschema run --robot OUT/robot.toml` starts from what was learnt. With --lerobot the joint offsets go into
     the servos instead, by LeRobot's own calibration file.
     """
-    import math
-
-    from rich.console import Console
-
-    from bodyschema.calibration.hand_eye import in_shell_lines, write_launch_file
     from bodyschema.calibration.plausibility.check import plausibility, told_sigma
     from bodyschema.calibration.plausibility.limits import require_units
     from bodyschema.calibration.report import CalibrationReport
-    from bodyschema.calibration.rigid_chain import Calibration, CalibrationError
-    from bodyschema.cli.terminal.calibration_view import two_tools, view
     from bodyschema.daemon.config import Config
-    from bodyschema.daemon.learner.checkpoint import first_pair
-    from bodyschema.interfaces.errors import RequestError
-    from bodyschema.recordings import files as recordings
-    from bodyschema.robot.calibrated_files import write_calibrated
 
-    if write and (lerobot is None or out is not None):
-        raise RequestError(
-            "--write is for --lerobot FILE, and without --out: offsets belong into the servos or into a URDF, not both"
-        )
-    if trust_urdf and only is not None:
-        raise RequestError("--trust-urdf has no offsets to find. Give it, or --only offsets")
-    trusted = "urdf" if trust_urdf else "nothing" if only is None else "links"
+    _require_one_target(lerobot, out, write=write)
+    trusted = _trusted(only, trust_urdf=trust_urdf)
     config = Config.load(robot_file(robot, source))
     description, source = config.robot, source or config.store_file
-    if source.suffix.lower() in recordings.STORE_ENDINGS:
-        stored = recordings.stored_pairs(source)
-        recording = recordings.of_robot(stored.recording, description.joints, source)
-        first = first or first_pair(stored, source.with_name(config.checkpoint_file.name), description.name)
-    else:
-        recording = taken.opened(config, source, lerobot)
-    first = first or 1
-    recording = recordings.between(recording, first, last, source)
+    recording, first = _rows(config, source, taken, lerobot, (first, last))
     sigma_m = None if sigma_mm is None else 1e-3 * sigma_mm
     require_units(description, recording, source)
     seen = plausibility(description, recording.q, recording.x, sigma_m=told_sigma(recording) or sigma_m)
     if seen.misread:
         seen.require(source, force=force)
-    settings = {"sigma_m": sigma_m, "zeros_rad": math.radians(zeros_deg)}
-    found = Calibration.of(description, recording, **settings, trusted=trusted)
-    free = None if trusted == "nothing" else Calibration.of(description, recording, **settings)
+    found, free = _fitted(description, recording, sigma_m, zeros_deg, trusted)
     report = CalibrationReport.of(found, seen, source.name, first, camera_frame, free)
     if report.other_tool_from is None:
         seen.require(source, force=force)
-    written = launch = None
     if out is not None or write:
-        if report.other_tool_from is not None:
-            raise CalibrationError(f"nothing was written. {two_tools(report)}")
-        if report.beyond is not None and not force:
-            raise CalibrationError(f"nothing was written. {report.doubt} Or write it as it is with --force")
-    if out is not None:
-        heading = f"Calibrated by bodyschema from {report.pairs} pairs of {source.name}"
-        written = write_calibrated(description, found.figures.geometry, out, heading, replace=force)
-        launch = write_launch_file(report.hand_eye, out)
-    lines: list[str] = []
-    if lerobot is not None:
-        offsets = {zero.joint: math.radians(zero.zero) for zero in report.zeros if zero.half_width is not None}
-        lines = lerobot_lines(config, lerobot, offsets, write=write)
+        _require_writable(report, force=force)
+    told = [] if out is None else _written(config, found, report, out, replace=force)
+    lines = [] if lerobot is None else _into_servos(config, report, lerobot, write=write)
     if as_json:
         print_json(report)
-        return
+    else:
+        _show(report, lines, told)
+
+
+def _require_one_target(lerobot: Path | None, out: Path | None, *, write: bool) -> None:
+    from bodyschema.interfaces.errors import RequestError
+
+    if write and (lerobot is None or out is not None):
+        raise RequestError(
+            "--write is for --lerobot FILE, and without --out: offsets belong into the servos or into a URDF, not both"
+        )
+
+
+def _trusted(only: str | None, *, trust_urdf: bool) -> Trusted:
+    """Return what of the URDF is right."""
+    from bodyschema.interfaces.errors import RequestError
+
+    if trust_urdf and only is not None:
+        raise RequestError("--trust-urdf has no offsets to find. Give it, or --only offsets")
+    return "urdf" if trust_urdf else "nothing" if only is None else "links"
+
+
+def _rows(
+    config: Config, source: Path, taken: SourceOptions, lerobot: Path | None, between: tuple[int | None, int | None]
+) -> tuple[Recording, int]:
+    """Return the rows to learn, and the number of the first; of a store, those with the present tool."""
+    from bodyschema.daemon.learner.checkpoint import first_pair
+    from bodyschema.recordings import files as recordings
+
+    first, last = between
+    if source.suffix.lower() in recordings.STORE_ENDINGS:
+        stored = recordings.stored_pairs(source)
+        recording = recordings.of_robot(stored.recording, config.robot.joints, source)
+        first = first or first_pair(stored, source.with_name(config.checkpoint_file.name), config.robot.name)
+    else:
+        recording = taken.opened(config, source, lerobot)
+    first = first or 1
+    return recordings.between(recording, first, last, source), first
+
+
+def _fitted(
+    description: RobotDescription, recording: Recording, sigma_m: float | None, zeros_deg: float, trusted: Trusted
+) -> tuple[Calibration, Calibration | None]:
+    """Return the calibration, and that with everything free where the URDF is trusted."""
+    import math
+
+    from bodyschema.calibration.rigid_chain import Calibration
+
+    zeros_rad = math.radians(zeros_deg)
+    found = Calibration.of(description, recording, sigma_m=sigma_m, zeros_rad=zeros_rad, trusted=trusted)
+    if trusted == "nothing":
+        return found, None
+    return found, Calibration.of(description, recording, sigma_m=sigma_m, zeros_rad=zeros_rad)
+
+
+def _require_writable(report: CalibrationReport, *, force: bool) -> None:
+    from bodyschema.calibration.rigid_chain import CalibrationError
+    from bodyschema.cli.terminal.calibration_view import two_tools
+
+    if report.other_tool_from is not None:
+        raise CalibrationError(f"nothing was written. {two_tools(report)}")
+    if report.beyond is not None and not force:
+        raise CalibrationError(f"nothing was written. {report.doubt} Or write it as it is with --force")
+
+
+def _written(config: Config, found: Calibration, report: CalibrationReport, out: Path, *, replace: bool) -> list[str]:
+    """Write the calibrated robot into `out`; return what to say of it."""
+    from bodyschema.calibration.hand_eye import write_launch_file
+    from bodyschema.robot.calibrated_files import write_calibrated
+
+    heading = f"Calibrated by bodyschema from {report.pairs} pairs of {report.source}"
+    written = write_calibrated(config.robot, found.figures.geometry, out, heading, replace=replace)
+    launch = write_launch_file(report.hand_eye, out)
+    return [
+        f"{launch} written, which publishes the same.",
+        f"\n{written} written. Next: stop what runs with {config.file.name} (the new one has its ports), then "
+        f"`bodyschema run --robot {written}`",
+    ]
+
+
+def _into_servos(config: Config, report: CalibrationReport, lerobot: Path, *, write: bool) -> list[str]:
+    """Return what the joint offsets change in LeRobot's calibration file."""
+    import math
+
+    offsets = {zero.joint: math.radians(zero.zero) for zero in report.zeros if zero.half_width is not None}
+    return lerobot_lines(config, lerobot, offsets, write=write)
+
+
+def _show(report: CalibrationReport, lines: list[str], written: list[str]) -> None:
+    from rich.console import Console
+
+    from bodyschema.calibration.hand_eye import in_shell_lines
+    from bodyschema.cli.terminal.calibration_view import view
+
     console = Console(highlight=False)
     console.print(view(report))
-    for line in ["", *lines] if lines else []:
+    in_ros = f"\nIn ROS 2:\n{in_shell_lines(report.hand_eye)}"
+    for line in [*(["", *lines] if lines else []), in_ros, *written]:
         console.print(line, markup=False, soft_wrap=True)
-    console.print(f"\nIn ROS 2:\n{in_shell_lines(report.hand_eye)}", markup=False, soft_wrap=True)
-    if written is not None:
-        console.print(f"{launch} written, which publishes the same.", markup=False, soft_wrap=True)
-        console.print(
-            f"\n{written} written. Next: stop what runs with {config.file.name} (the new one has its ports), then "
-            f"`bodyschema run --robot {written}`",
-            markup=False,
-            soft_wrap=True,
-        )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -19,6 +20,55 @@ if TYPE_CHECKING:
 CAMERAS, BOARD = Path("cameras.toml"), Path("board.pdf")
 
 
+@Parameter(name="*")
+@dataclass(frozen=True)
+class KnownCameras:
+    """What is known of the cameras beforehand."""
+
+    baseline_mm: Annotated[
+        float | None,
+        Parameter(help="Distance of the eyes measured by hand [mm]; refused where the images contradict it."),
+    ] = None
+    scale_sigma_percent: Annotated[
+        float, Parameter(help="How well the size of a square is known, 1-sigma [%].", validator=Number(gte=0, lt=10))
+    ] = 0.1
+    lens: Annotated[
+        Literal["auto", "pinhole", "fisheye", "rational"], Parameter(help="`auto`: what foretells views better.")
+    ] = "auto"
+    left_serial: Annotated[
+        str,
+        Parameter(help="Serial number of the left camera, kept in the file; live, it is known.", show_default=False),
+    ] = ""
+    right_serial: Annotated[str, Parameter(help="Serial number of the right camera.", show_default=False)] = ""
+
+    def wanted(self) -> Wanted:
+        """Return what the calibration is to find."""
+        from bodyschema.cli.cameras.calibration import Wanted
+
+        serials = (self.left_serial, self.right_serial)
+        return Wanted(serials, self.lens, 0.01 * self.scale_sigma_percent, self.baseline_mm)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Instead:
+    """What to do instead of calibrating."""
+
+    check: Annotated[bool, flag("Check that a calibration still holds, from one look at the board.")] = False
+    calibration: Annotated[
+        Path | None,
+        Parameter(help="With --check: the calibration; else cameras.toml, live the one in robot.toml."),
+    ] = None
+    seconds: Annotated[
+        float, Parameter(help="With --check, live: how long the board is waited for [s].", validator=Number(gt=0))
+    ] = 60.0
+    print_board: Annotated[bool, flag("Write the board as a page to print, OUT.pdf or OUT.svg, and end.")] = False
+    paper: Annotated[str, Parameter(help="Of --print-board: A4, A3, A2, A1, A0, letter, legal or tabloid.")] = "A4"
+
+
+UNKNOWN, CALIBRATE = KnownCameras(), Instead()
+
+
 def cameras(
     images: EyeImages = None,
     /,
@@ -26,21 +76,7 @@ def cameras(
     robot: RobotFile = HERE,
     files: EyeFiles = BY_NAME,
     printed: PrintedBoard = AS_PRINTED,
-    baseline_mm: Annotated[
-        float | None,
-        Parameter(help="Distance of the eyes measured by hand [mm]; refused where the images contradict it."),
-    ] = None,
-    scale_sigma_percent: Annotated[
-        float, Parameter(help="How well the size of a square is known, 1-sigma [%].", validator=Number(gte=0, lt=10))
-    ] = 0.1,
-    lens: Annotated[
-        Literal["auto", "pinhole", "fisheye", "rational"], Parameter(help="`auto`: what foretells views better.")
-    ] = "auto",
-    left_serial: Annotated[
-        str,
-        Parameter(help="Serial number of the left camera, kept in the file; live, it is known.", show_default=False),
-    ] = "",
-    right_serial: Annotated[str, Parameter(help="Serial number of the right camera.", show_default=False)] = "",
+    known: KnownCameras = UNKNOWN,
     save: Annotated[
         Path | None, Parameter(help="Live: keep the images of all views in this folder, as IMAGES has them.")
     ] = None,
@@ -48,16 +84,7 @@ def cameras(
         Path | None,
         Parameter(help="The file to write, with a report beside it; else cameras.toml, live beside robot.toml."),
     ] = None,
-    check: Annotated[bool, flag("Check that a calibration still holds, from one look at the board.")] = False,
-    calibration: Annotated[
-        Path | None,
-        Parameter(help="With --check: the calibration; else cameras.toml, live the one in robot.toml."),
-    ] = None,
-    seconds: Annotated[
-        float, Parameter(help="With --check, live: how long the board is waited for [s].", validator=Number(gt=0))
-    ] = 60.0,
-    print_board: Annotated[bool, flag("Write the board as a page to print, OUT.pdf or OUT.svg, and end.")] = False,
-    paper: Annotated[str, Parameter(help="Of --print-board: A4, A3, A2, A1, A0, letter, legal or tabloid.")] = "A4",
+    instead: Instead = CALIBRATE,
     as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
 ) -> None:
     """Calibrate two cameras, or the lens of one, from views of a board: writes cameras.toml and a report.
@@ -84,22 +111,33 @@ def cameras(
 
     Next: open the report; `bodyschema calibrate cameras --check` whenever a camera may have been touched.
     """
+    if instead.print_board:
+        _print_board(printed.drawn(), instead.paper, out or BOARD)
+    elif instead.check:
+        _check(images, files, printed, robot, instead, as_json=as_json)
+    else:
+        _calibrate(images, files, printed, robot, known, save, out, as_json=as_json)
+
+
+def _calibrate(
+    images: Path | None,
+    files: EyeFiles,
+    printed: PrintedBoard,
+    robot: Path,
+    known: KnownCameras,
+    save: Path | None,
+    out: Path | None,
+    *,
+    as_json: bool,
+) -> None:
     from rich.console import Console
 
-    from bodyschema.cli.cameras.calibration import Wanted, figures, write_calibrated_cameras
+    from bodyschema.cli.cameras.calibration import figures, write_calibrated_cameras
     from bodyschema.cli.cameras.calibration_view import cameras_view
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.wiring.cameras import calibration_file, names_calibration
 
-    if print_board:
-        _print_board(printed.drawn(), paper, out or BOARD)
-        return
-    if check:
-        _check(images, files, printed, robot, calibration, seconds, as_json=as_json)
-        return
-    board = printed.board()
-    wanted = Wanted((left_serial, right_serial), lens, 0.01 * scale_sigma_percent, baseline_mm)
-    named = True
+    board, wanted, named = printed.board(), known.wanted(), True
     if images is not None:
         found, result = _of_images(images, files, board, wanted)
         out = out or CAMERAS
@@ -108,7 +146,7 @@ def cameras(
         found, result = _live(config, board, wanted, save)
         out, named = out or calibration_file(config), names_calibration(config)
     report = write_calibrated_cameras(result, found, out)
-    told = figures(result, found, size_was_measured=printed.ruler_mm is not None or baseline_mm is not None)
+    told = figures(result, found, size_was_measured=printed.ruler_mm is not None or known.baseline_mm is not None)
     if as_json:
         print_json(told)
         return
@@ -124,8 +162,7 @@ def _check(
     files: EyeFiles,
     printed: PrintedBoard,
     robot: Path,
-    calibration: Path | None,
-    seconds: float,
+    instead: Instead,
     *,
     as_json: bool,
 ) -> None:
@@ -138,10 +175,10 @@ def _check(
 
     board = printed.board()
     if images is not None:
-        found, name = checked(calibration or CAMERAS, files.of(images), board)
+        found, name = checked(instead.calibration or CAMERAS, files.of(images), board)
     else:
         config = Config.load(robot)
-        found, name = _checked_live(config, calibration or calibration_file(config), board, seconds)
+        found, name = _checked_live(config, instead.calibration or calibration_file(config), board, instead.seconds)
     if as_json:
         print_json(found)
     else:
