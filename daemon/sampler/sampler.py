@@ -12,6 +12,7 @@ from importlib.metadata import version
 import numpy as np
 
 from bodyschema.daemon.config import Config
+from bodyschema.daemon.sampler.devices import SamplerRules
 from bodyschema.daemon.sampler.reconnect import ResilientWriter
 from bodyschema.daemon.sampler.sources import answer_simulation
 from bodyschema.daemon.service.service import Service, with_health
@@ -34,7 +35,6 @@ from .gaze_loop import gaze_of
 from .history import answer_pairs
 from .powered import asked
 from .reconnect import ReconnectingSource
-from .rules import SamplerRules
 from .servo_status import accept_turns, buses_of, complaints_of, servos_of
 from .sources import Sources
 

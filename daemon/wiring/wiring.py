@@ -29,13 +29,12 @@ from bodyschema.daemon.wiring.simulation import simulation_settings
 from bodyschema.drivers.checks import Check
 from bodyschema.drivers.dynamixel.config import DynamixelConfig
 from bodyschema.drivers.feetech.config import FeetechConfig
-from bodyschema.drivers.markers.checks import stream_checks
 from bodyschema.drivers.markers.config import AnySource, NatnetTable, Ros2Table, UdpTable, ZenohTable
 from bodyschema.drivers.markers.datagram import decode_datagram
 from bodyschema.drivers.markers.fusing import FusedMarkers, Member
 from bodyschema.drivers.markers.keys import KeyReceiver, topic_receiver
 from bodyschema.drivers.markers.natnet.client import NatnetReceiver
-from bodyschema.drivers.markers.stream import MarkerStream
+from bodyschema.drivers.markers.stream import MarkerStream, stream_checks
 from bodyschema.drivers.markers.udp import UdpReceiver
 from bodyschema.drivers.ros2.config import Ros2Config
 from bodyschema.drivers.serial_lines.config import SerialLinesConfig

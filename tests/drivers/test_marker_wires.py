@@ -15,11 +15,10 @@ from natnet_server import NatnetServer
 from sent_markers import table
 
 from bodyschema.daemon.wiring.wiring import stream_of
-from bodyschema.drivers.markers.checks import stream_checks
 from bodyschema.drivers.markers.datagram import SCHEMA
 from bodyschema.drivers.markers.natnet import packets
 from bodyschema.drivers.markers.report import Unusable
-from bodyschema.drivers.markers.stream import MarkerStream
+from bodyschema.drivers.markers.stream import MarkerStream, stream_checks
 from bodyschema.drivers.ros2 import rmw
 from bodyschema.drivers.ros2.bench.zenoh_robot import ZenohRobot
 from bodyschema.drivers.ros2.cdr import CdrWriter
