@@ -181,16 +181,7 @@ class Ladder:
         }
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
-        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,), in the order of recording.
-
-        Args:
-            q: joint values.
-            x: measured positions.
-            sigma: 1-sigma of the positions [m], () or (n,); None where it is to be estimated.
-
-        Raises:
-            ShapeError, NonFiniteError, SettingError (a sigma that is not positive): nothing has changed.
-        """
+        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, in the order of recording; see `Model.learn`."""
         angles, positions, sigmas = checked_pairs(q, x, sigma, self._joints)
         begin, end = self.pairs, self.pairs + len(angles)
         self._q = np.concatenate([self._q, angles])

@@ -113,16 +113,7 @@ class ToolLayer:
         return self._fitted()[2].copy()
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
-        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
-
-        Args:
-            q: joint values.
-            x: measured positions.
-            sigma: 1-sigma of the positions [m], () or (n,); None where it is to be estimated.
-
-        Raises:
-            ShapeError, NonFiniteError, SettingError (a sigma that is not positive): nothing has changed.
-        """
+        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,); see `Model.learn`."""
         angles, positions, sigmas = checked_pairs(q, x, sigma, self.joints)
         self._recent = self._recent.joined(self._residuals(angles, positions, sigmas))
         self._pairs += len(angles)

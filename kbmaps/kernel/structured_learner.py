@@ -88,16 +88,7 @@ class StructuredLearner(KernelRegression):
         return math.sqrt(self._fitted().prior_variance)
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
-        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
-
-        Args:
-            q: joint values.
-            x: measured positions.
-            sigma: 1-sigma of the positions [m], () or (n,); None where it is to be estimated.
-
-        Raises:
-            ShapeError, NonFiniteError, SettingError (a sigma that is not positive): nothing has changed.
-        """
+        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,); see `Model.learn`."""
         self._pairs.add(*self._pairs.checked(q, x, sigma), self._nominal)
         self._fit = None
 

@@ -230,11 +230,7 @@ class KBMap:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> KBMap:
-        """Return the map in the bytes of `to_bytes`.
-
-        Raises:
-            ModelFormatError: the bytes are damaged, truncated, or of another format.
-        """
+        """Return the map in the bytes of `to_bytes`."""
         return cls(*serial.decode(data))
 
     def _require_orientation(self) -> None:

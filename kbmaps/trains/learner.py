@@ -175,16 +175,7 @@ class TensorLearner:
         return np.zeros(0, dtype=np.bool_) if self._fit is None else ~self._fit.used
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
-        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
-
-        Args:
-            q: joint values.
-            x: measured positions.
-            sigma: 1-sigma of a coordinate [m], () or (n,); None where the learner has to estimate it.
-
-        Raises:
-            ShapeError, NonFiniteError, SettingError (a sigma that is not positive): nothing has changed.
-        """
+        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,); see `Model.learn`."""
         angles, positions, sigmas = checked_pairs(q, x, sigma, self.joints)
         self._q = np.concatenate([self._q, angles])
         self._x = np.concatenate([self._x, positions])
@@ -320,11 +311,7 @@ class TensorLearner:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """Return the learner in the bytes of `to_bytes`.
-
-        Raises:
-            ModelFormatError: the bytes are damaged, truncated, or of another format.
-        """
+        """Return the learner in the bytes of `to_bytes`."""
         content, arrays = unpack(data, KIND)
         with restoring("a tensor learner"):
             named(content, "the fields", _FIELDS)

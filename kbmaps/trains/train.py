@@ -148,11 +148,7 @@ class TensorTrain:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> TensorTrain:
-        """Return the map in the bytes of `to_bytes`.
-
-        Raises:
-            ModelFormatError: the bytes are damaged, truncated, or of another format.
-        """
+        """Return the map in the bytes of `to_bytes`."""
         fields, arrays = unpack(data, KIND)
         with restoring("a tensor train"):
             complete(arrays, ("cores",))
