@@ -1,4 +1,4 @@
-"""Golden outputs: `python -m benchmarks.goldens FILE [--data FOLDER] [--seeds N]` writes FILE, or compares with it.
+"""Golden outputs: `python -m tests.goldens FILE [--data FOLDER] [--seeds N]` writes FILE, or compares with it.
 
 Written before a change and compared after it: a move keeps every figure, a merge keeps it to 1e-9. Figures are the
 predictions and sigmas of each model, the online learner on a guided arm, diagnoses of hidden cases, and the opening of
@@ -52,7 +52,7 @@ SAME = 1e-9
 SCENARIOS = ("none", "one", "two")
 CASE_PAIRS = 300
 LEARNT_ROWS = 200
-OLDER = Path(__file__).parents[1] / "tests" / "daemon" / "older_versions"
+OLDER = Path(__file__).parent / "daemon" / "older_versions"
 Golden = tuple[str, object]
 
 
@@ -169,7 +169,7 @@ def differences(name: str, before: object, after: object) -> Iterator[str]:
 
 def main() -> None:
     """Write the golden outputs, or compare with those of an earlier run; exit code 1 where they differ."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.goldens")
+    parser = argparse.ArgumentParser(prog="python -m tests.goldens")
     parser.add_argument("file", type=Path, help="written if it does not exist, else compared with")
     parser.add_argument("--data", type=Path, help="folder with a folder of each recording")
     parser.add_argument("--seeds", type=int, default=2, help="hidden cases of each scenario")
