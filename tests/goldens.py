@@ -149,7 +149,7 @@ def checkpoint(file: Path) -> object:
 
 def plain(value: object) -> object:
     """Return the value as JSON holds it."""
-    return msgspec.to_builtins(value, enc_hook=lambda array: np.asarray(array).tolist())
+    return json.loads(json.dumps(msgspec.to_builtins(value, enc_hook=lambda array: np.asarray(array).tolist())))
 
 
 def differences(name: str, before: object, after: object) -> Iterator[str]:
