@@ -2,18 +2,22 @@
 
 | entity | archetype | content |
 | --- | --- | --- |
-| /measurement_frame | ViewCoordinates | x right, y down, z forward |
+| /robot/<link> | Transform3D, LineStrips3D | the link at the row's readings, in the root link's frame |
+| /measurement_frame | ViewCoordinates, Transform3D | x right, y down, z forward; its pose on the robot |
+| /measurement_frame/left, right | Pinhole | the cameras of robot.toml |
 | /measurement_frame/marker | Points3D | the marker of the row, and with an orientation its Transform3D |
+| /measurement_frame/predicted | Points3D | the marker that the robot's description predicts |
 | /measurement_frame/path | LineStrips3D | all positions, a strip for each segment; on no timeline |
 | /joints/<name> | Scalars | the joint's angle [rad], or m where it slides |
 
-Timelines: `pair`, counted from 1, and `time` [s], which is `Recording.play_times`.
+Timelines: `pair`, counted from 1, and `time` [s], which is `Recording.play_times`. Without a robot there are no links,
+no cameras and no prediction.
 """
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +27,30 @@ from bodyschema.interfaces.errors import RecordingError
 from bodyschema.interfaces.extras import install_command
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.recordings.recording import Recording
+from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.links import link_poses
+from kbmaps.rotations import quaternions
 
-from .store.store import Devices
-
-FRAME, JOINTS = "measurement_frame", "joints"
+FRAME, JOINTS, ROBOT = "measurement_frame", "joints", "robot"
 RADIUS_M = 0.004
+_GREY, _ORANGE = (150, 150, 155), (240, 140, 30)
 
 
-def write_rerun(recording: Recording, file: Path, _devices: Sequence[Devices] = ()) -> None:
-    """Write `recording` to `file`.
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What stands around the markers of a recording.
+
+    Attributes:
+        robot: the description, with camera and marker where they are.
+        predicted: the marker positions that it predicts in the measurement frame (n, 3) [m].
+    """
+
+    robot: RobotDescription
+    predicted: FloatArray
+
+
+def write_rerun(recording: Recording, file: Path, scene: Scene | None = None) -> None:
+    """Write `recording` to `file`, with the robot and the cameras of `scene`.
 
     Raises:
         RecordingError: the extra `rerun` is not installed, or the file cannot be written.
@@ -50,6 +69,8 @@ def write_rerun(recording: Recording, file: Path, _devices: Sequence[Devices] = 
         rr.TimeColumn("time", duration=recording.play_times),
     ]
     _send_markers(rr, stream, recording, rows)
+    if scene is not None:
+        _send_scene(rr, stream, recording, scene, rows)
     for name, angles in zip(recording.joints, recording.q.T, strict=True):
         entity = rr.new_entity_path([JOINTS, name])
         stream.send_columns(entity, indexes=rows, columns=rr.Scalars.columns(scalars=np.ascontiguousarray(angles)))
@@ -66,6 +87,50 @@ def _send_markers(rr: Any, stream: Any, recording: Recording, rows: list[Any]) -
         turned = rr.Transform3D.columns(translation=recording.x, quaternion=recording.orientation)
         stream.send_columns(entity, indexes=rows, columns=turned)
     stream.send_columns(entity, indexes=rows, columns=points)
+
+
+def _send_scene(rr: Any, stream: Any, recording: Recording, scene: Scene, rows: list[Any]) -> None:
+    robot = scene.robot
+    stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    poses = link_poses(robot, recording.q)
+    for link, ends in _lines(robot).items():
+        entity = rr.new_entity_path([ROBOT, link])
+        _send_poses(rr, stream, entity, poses[link], rows)
+        stream.log(entity, rr.LineStrips3D(ends, colors=_GREY, radii=RADIUS_M), static=True)
+    _send_poses(rr, stream, FRAME, poses[robot.camera.parent_link] @ robot.camera.pose, rows)
+    predicted = rr.Points3D.columns(
+        positions=scene.predicted, radii=np.full(len(recording), RADIUS_M), colors=[_ORANGE] * len(recording)
+    )
+    stream.send_columns(f"{FRAME}/predicted", indexes=rows, columns=predicted)
+    eyes = robot.calibration
+    if eyes is None:
+        return
+    for name, place in zip(("left", "right"), eyes.eyes_m, strict=False):
+        lens = rr.Pinhole(
+            focal_length=eyes.focal_px,
+            principal_point=np.array(eyes.principal_point_px) + 0.5,  # to Rerun integers are corners of pixels
+            resolution=eyes.image_size_px,
+        )
+        stream.log(f"{FRAME}/{name}", rr.Transform3D(translation=place), lens, static=True)
+
+
+def _send_poses(rr: Any, stream: Any, entity: str, poses: FloatArray, rows: list[Any]) -> None:
+    """Send poses (n, 4, 4), on no timeline where they are all the same."""
+    turns = quaternions(poses[:, :3, :3])
+    if (poses == poses[0]).all():
+        stream.log(entity, rr.Transform3D(translation=poses[0, :3, 3], quaternion=turns[0]), static=True)
+        return
+    moved = rr.Transform3D.columns(translation=poses[:, :3, 3], quaternion=turns)
+    stream.send_columns(entity, indexes=rows, columns=moved)
+
+
+def _lines(robot: RobotDescription) -> dict[str, list[FloatArray]]:
+    """Return the lines (2, 3) [m] from the origin of each link to its joints, and to the marker."""
+    lines: dict[str, list[FloatArray]] = {link: [] for link in robot.tree.links}
+    for joint in robot.tree.joints.values():
+        lines[joint.parent].append(np.array([np.zeros(3), joint.T_parent_joint[:3, 3]]))
+    lines[robot.robot.marker_link].append(np.array([np.zeros(3), robot.robot.marker_xyz]))
+    return lines
 
 
 def runs(recording: Recording) -> list[FloatArray]:
