@@ -70,6 +70,11 @@ def arm(
         Literal["offsets"] | None,
         Parameter(help="offsets: joint offsets, camera and tool; the links are right as the URDF has them."),
     ] = None,
+    next_poses: Annotated[
+        Path | None,
+        Parameter(help="Write the poses to visit next into this file (.json, .csv), the most informative first."),
+    ] = None,
+    poses: Annotated[int, Parameter(help="How many poses of --next-poses.", validator=Number(gte=1, lte=200))] = 20,
     camera_frame: Annotated[str, Parameter(help="What ROS calls the measurement frame, for TF.")] = CAMERA_FRAME,
     taken: SourceOptions = AS_THEY_ARE,
     lerobot: LeRobotFile = None,
@@ -108,6 +113,7 @@ def arm(
     from rich.console import Console
 
     from bodyschema.calibration.hand_eye import in_shell_lines, write_launch_file
+    from bodyschema.calibration.next_poses import NextPoses, check_target
     from bodyschema.calibration.plausibility.check import plausibility, told_sigma
     from bodyschema.calibration.plausibility.limits import require_units
     from bodyschema.calibration.report import CalibrationReport
@@ -125,6 +131,8 @@ def arm(
         )
     if trust_urdf and only is not None:
         raise RequestError("--trust-urdf has no offsets to find. Give it, or --only offsets")
+    if next_poses is not None:
+        check_target(next_poses, replace=force)
     trusted = "urdf" if trust_urdf else "nothing" if only is None else "links"
     config = Config.load(robot_file(robot, source))
     description, source = config.robot, source or config.store_file
@@ -158,9 +166,16 @@ def arm(
         written = write_calibrated(description, found.figures.geometry, out, heading, replace=force)
         launch = write_launch_file(report.hand_eye, out)
     lines: list[str] = []
+    if next_poses is not None:
+        plan = NextPoses.of(found, poses)
+        plan.write(next_poses, replace=force)
+        lines = [
+            f"{poses} poses written to {next_poses}. Model error over the range, without noise: "
+            f"{1e3 * plan.expected_m:.2g} mm expected now, {1e3 * plan.expected_after_m:.2g} mm with them.",
+        ]
     if lerobot is not None:
         offsets = {zero.joint: math.radians(zero.zero) for zero in report.zeros if zero.half_width is not None}
-        lines = lerobot_lines(config, lerobot, offsets, write=write)
+        lines += lerobot_lines(config, lerobot, offsets, write=write)
     if as_json:
         print_json(report)
         return
