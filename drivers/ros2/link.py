@@ -88,7 +88,8 @@ def open_session(router: str) -> zenoh.Session:
         return zenoh.open(config)
     except zenoh.ZError as error:
         raise SourceLost(
-            f"no zenoh router answers on {router}. Start it on the robot: ros2 run rmw_zenoh_cpp rmw_zenohd",
+            f"no zenoh router answers on {router}. Start it on the robot: ros2 run rmw_zenoh_cpp rmw_zenohd, or where "
+            "its nodes use DDS zenoh-bridge-ros2dds",
             retry_s=RETRY_S,
         ) from error
 
@@ -148,9 +149,10 @@ def open_zenoh(config: Ros2Config, clock: Clock) -> Link:
     Raises:
         SourceLost: the router is not there.
     """
+    key = rmw.topic_key(config.domain, config.topic, JOINT_STATE, rmw.ANY)
     session = open_session(config.router)
     try:
-        return ZenohLink(session, rmw.topic_key(config.domain, config.topic, JOINT_STATE, rmw.ANY), clock)
+        return ZenohLink(session, config.topic.strip("/") if config.via == "ros2dds" else key, clock)
     except BaseException:
         session.close()
         raise
