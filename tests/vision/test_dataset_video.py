@@ -1,4 +1,4 @@
-"""The marker in the videos of a LeRobotDataset."""
+"""The marker in the videos of a LeRobotDataset, and in the images of a ROS bag."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from ball_renderer import SMALL
 from scenes import Ball, stage
 
-from bodyschema.cli.recordings.dataset_video import markers_in_video
+from bodyschema.cli.recordings.dataset_video import markers_in_images, markers_in_video
 from bodyschema.daemon.config import Config
 from bodyschema.interfaces.errors import ConfigError, RecordingError
 from bodyschema.vision.cameras import videos
@@ -120,3 +120,18 @@ def test_a_video_that_cannot_be_decoded_is_refused(config: Config, tmp_path: Pat
     next(folder.rglob("*.mp4")).write_bytes(b"no video" * 100)
     with pytest.raises(ConfigError, match=r"is no film that can be read.*ffmpeg -i"):
         markers_in_video(config, folder, CAMERA)
+
+
+def test_the_ball_is_followed_in_a_bags_compressed_images(config: Config, tmp_path: Path) -> None:
+    pytest.importorskip("rosbags")
+    from written_bags import BEGUN_S, compressed_image, write_bag
+
+    balls, times = path(0, 6), [k / FPS for k in range(6)]
+    jpegs = [cv2.imencode(".jpg", stage(ball).images[0])[1].tobytes() for ball in balls]
+    sent = [(t, compressed_image(t, jpeg)) for t, jpeg in zip([*times, times[-1]], [*jpegs, jpegs[-1]], strict=True)]
+    bag = write_bag(tmp_path / "bag", {"/camera/image/compressed": ("CompressedImage", sent)}, mcap=True)
+    track = markers_in_images(config, bag, "/camera/image/compressed")
+    np.testing.assert_allclose(track.t - BEGUN_S, times, atol=1e-6)
+    np.testing.assert_allclose(track.x[:, :2], [ball.x[:2] for ball in balls], atol=5e-4)
+    with pytest.raises(RecordingError, match=r"--video /tag: there is no such topic of sensor_msgs/msg/Compressed"):
+        markers_in_images(config, bag, "/tag")
