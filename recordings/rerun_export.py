@@ -33,7 +33,7 @@ from kbmaps.rotations import quaternions
 
 FRAME, JOINTS, ROBOT = "measurement_frame", "joints", "robot"
 RADIUS_M = 0.004
-_GREY, _ORANGE = (150, 150, 155), (240, 140, 30)
+_GREY, _ORANGE = 0x96969BFF, 0xF08C1EFF
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,9 +98,9 @@ def _send_scene(rr: Any, stream: Any, recording: Recording, scene: Scene, rows: 
         _send_poses(rr, stream, entity, poses[link], rows)
         stream.log(entity, rr.LineStrips3D(ends, colors=_GREY, radii=RADIUS_M), static=True)
     _send_poses(rr, stream, FRAME, poses[robot.camera.parent_link] @ robot.camera.pose, rows)
-    predicted = rr.Points3D.columns(
-        positions=scene.predicted, radii=np.full(len(recording), RADIUS_M), colors=[_ORANGE] * len(recording)
-    )
+    n = len(recording)
+    orange = np.full(n, _ORANGE, dtype=np.uint32)
+    predicted = rr.Points3D.columns(positions=scene.predicted, radii=np.full(n, RADIUS_M), colors=orange)
     stream.send_columns(f"{FRAME}/predicted", indexes=rows, columns=predicted)
     eyes = robot.calibration
     if eyes is None:
