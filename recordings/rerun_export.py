@@ -3,6 +3,7 @@
 | entity | archetype | content |
 | --- | --- | --- |
 | /robot/<link> | Transform3D, LineStrips3D | the link at the row's readings, in the root link's frame |
+| /robot/<link>/mesh_<number> | Asset3D, Transform3D | the meshes of the link that are there |
 | /measurement_frame | ViewCoordinates, Transform3D | x right, y down, z forward; its pose on the robot |
 | /measurement_frame/left, right | Pinhole | the cameras of robot.toml |
 | /measurement_frame/marker | Points3D | the marker of the row, and with an orientation its Transform3D |
@@ -17,7 +18,8 @@ no cameras and no prediction.
 from __future__ import annotations
 
 import importlib
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +38,16 @@ RADIUS_M = 0.004
 _GREY, _ORANGE = 0x96969BFF, 0xF08C1EFF
 
 
+@dataclass(frozen=True)
+class LinkMesh:
+    """A mesh, with its place in its link [m], its orientation (x, y, z, w), and its scale along each axis."""
+
+    file: Path
+    place: tuple[float, ...]
+    quaternion: tuple[float, ...]
+    scale: tuple[float, ...]
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """What stands around the markers of a recording.
@@ -43,10 +55,12 @@ class Scene:
     Attributes:
         robot: the description, with camera and marker where they are.
         predicted: the marker positions that it predicts in the measurement frame (n, 3) [m].
+        meshes: of the links that have any (STL, OBJ).
     """
 
     robot: RobotDescription
     predicted: FloatArray
+    meshes: Mapping[str, Sequence[LinkMesh]] = field(default_factory=dict)
 
 
 def write_rerun(recording: Recording, file: Path, scene: Scene | None = None) -> None:
@@ -97,6 +111,10 @@ def _send_scene(rr: Any, stream: Any, recording: Recording, scene: Scene, rows: 
         entity = rr.new_entity_path([ROBOT, link])
         _send_poses(rr, stream, entity, poses[link], rows)
         stream.log(entity, rr.LineStrips3D(ends, colors=_GREY, radii=RADIUS_M), static=True)
+        for number, mesh in enumerate(scene.meshes.get(link, ())):
+            placed = rr.Transform3D(translation=mesh.place, quaternion=mesh.quaternion, scale=mesh.scale)
+            shape = rr.new_entity_path([ROBOT, link, f"mesh_{number}"])
+            stream.log(shape, placed, rr.Asset3D(path=mesh.file), static=True)
     _send_poses(rr, stream, FRAME, poses[robot.camera.parent_link] @ robot.camera.pose, rows)
     n = len(recording)
     orange = np.full(n, _ORANGE, dtype=np.uint32)

@@ -9,9 +9,10 @@ from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.effects import Motion, Simulation, load_simulation
 from bodyschema.effects.exports.geometry import geometry_of
+from bodyschema.effects.exports.link_parts import LinkParts
 from bodyschema.recordings.files import RERUN, of_robot
 from bodyschema.recordings.recording import Recording
-from bodyschema.recordings.rerun_export import Scene
+from bodyschema.recordings.rerun_export import LinkMesh, Scene
 
 
 def scene_for(out: Path, robot: Path, recording: Recording) -> Scene | None:
@@ -39,4 +40,23 @@ def scene_of(simulation: Simulation, recording: Recording) -> Scene:
         for name, joint in robot.tree.joints.items()
     }
     robot = replace(robot, tree=replace(robot.tree, joints=joints))
-    return Scene(robot.with_placement(geometry.T_parent_camera, geometry.marker_xyz), predicted)
+    placed = robot.with_placement(geometry.T_parent_camera, geometry.marker_xyz)
+    return Scene(placed, predicted, _meshes(robot.tree.file))
+
+
+def _meshes(urdf: Path) -> dict[str, list[LinkMesh]]:
+    """Return the meshes of each link that are there."""
+    found: dict[str, list[LinkMesh]] = {}
+    parts = LinkParts.of(urdf, urdf.parent)
+    meshes = {mesh["name"]: mesh for mesh in parts.meshes}
+    for link, geoms in parts.geoms.items():
+        for geom in (geom for geom in geoms if geom["type"] == "mesh"):
+            mesh, (w, x, y, z) = meshes[geom["mesh"]], _numbers(geom["quat"])
+            scale = _numbers(mesh.get("scale", "1 1 1"))
+            one = LinkMesh(urdf.parent / mesh["file"], _numbers(geom["pos"]), (x, y, z, w), scale)
+            found.setdefault(link, []).append(one)
+    return found
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    return tuple(map(float, text.split()))

@@ -103,16 +103,38 @@ def test_a_camera_at_an_unknown_place_is_fitted(tmp_path: Path) -> None:
     assert scene.predicted == pytest.approx(elsewhere, abs=1e-6)
 
 
+MESH = """<link name="upper"><visual><origin xyz="0.1 0 0" rpy="0 0 1.5707963"/>
+<geometry><mesh filename="upper.stl" scale="0.001 0.001 0.001"/></geometry></visual></link>"""
+
+
+def with_a_mesh(robot: Path) -> Path:
+    """Give the upper arm a mesh of one triangle in mm."""
+    urdf = robot.with_name("arm.urdf")
+    urdf.write_text(urdf.read_text().replace('<link name="upper"/>', MESH))
+    corners = np.array([[0, 0, 1], [0, 0, 0], [100, 0, 0], [0, 100, 0]], dtype="<f4")
+    urdf.with_name("upper.stl").write_bytes(bytes(80) + b"\x01\0\0\0" + corners.tobytes() + b"\0\0")
+    return robot
+
+
+def test_meshes_keep_their_place_and_scale(tmp_path: Path, recording: Recording) -> None:
+    scene = scene_of(load_simulation(with_a_mesh(write_small_arm(tmp_path, CAMERA))), recording)
+    ((link, (mesh,)),) = scene.meshes.items()
+    assert (link, mesh.file, mesh.place, mesh.scale) == ("upper", tmp_path / "upper.stl", (0.1, 0, 0), (0.001,) * 3)
+    assert mesh.quaternion == pytest.approx([0, 0, np.sqrt(0.5), np.sqrt(0.5)])
+
+
 def test_rerun_reads_robot_cameras_and_both_markers(tmp_path: Path, recording: Recording) -> None:
     reader = pytest.importorskip("rerun.chunk").RrdReader
-    robot, out = write_small_arm(tmp_path, CAMERA + BUMPED), tmp_path / "a.rrd"
+    robot, out = with_a_mesh(write_small_arm(tmp_path, CAMERA + BUMPED)), tmp_path / "a.rrd"
     recording.write_csv(tmp_path / "a.csv")
     app(["export", str(tmp_path / "a.csv"), str(out), "--robot", str(robot)], result_action="return_value")
     read: dict[str, np.ndarray] = {}
+    meshes = 0
     for chunk in reader(out).stream():
         batch = chunk.to_record_batch()
+        meshes += "Asset3D:blob" in batch.schema.names
         for name in batch.schema.names:
-            if ":" in name:
+            if ":" in name and "Asset3D" not in name:
                 read[f"{chunk.entity_path} {name}"] = np.array([row[0] for row in batch.column(name).to_pylist()])
 
     def pose(entity: str) -> tuple[Rotation, np.ndarray]:
@@ -126,4 +148,5 @@ def test_rerun_reads_robot_cameras_and_both_markers(tmp_path: Path, recording: R
     assert shown == pytest.approx(place, abs=1e-6)
     assert not np.allclose(turned.as_rotvec()[0], turned.as_rotvec()[1])
     assert read["/measurement_frame/marker Points3D:positions"] == pytest.approx(recording.x, abs=1e-6)
+    assert meshes == 1
     assert {"/robot/base LineStrips3D:strips", "/robot/upper LineStrips3D:strips"} <= read.keys()
