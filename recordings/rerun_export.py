@@ -73,7 +73,7 @@ def write_rerun(recording: Recording, file: Path, scene: Scene | None = None) ->
     try:
         file.touch()  # this error names the file; rerun's does not
         stream = rr.RecordingStream("bodyschema")
-        stream.save(file)
+        stream.save(file, default_blueprint=_layout(scene))
     except RuntimeError as error:
         raise RecordingError(f"cannot be written: {error}", file=file) from error
     stream.log(FRAME, rr.ViewCoordinates.RDF, static=True)
@@ -149,6 +149,14 @@ def _lines(robot: RobotDescription) -> dict[str, list[FloatArray]]:
         lines[joint.parent].append(np.array([np.zeros(3), joint.T_parent_joint[:3, 3]]))
     lines[robot.robot.marker_link].append(np.array([np.zeros(3), robot.robot.marker_xyz]))
     return lines
+
+
+def _layout(scene: Scene | None) -> Any:
+    """Return how the viewer shows the file at first: space beside the joints."""
+    views = importlib.import_module("rerun.blueprint")
+    space = views.Spatial3DView(origin=FRAME if scene is None else "/")
+    joints = views.TimeSeriesView(origin=JOINTS)
+    return views.Blueprint(views.Horizontal(space, joints, column_shares=[2, 1]), collapse_panels=True)
 
 
 def runs(recording: Recording) -> list[FloatArray]:
