@@ -89,25 +89,29 @@ def test_a_camera_that_sees_hardly_any_pose_is_said() -> None:
         NextPoses.of(replace(before, robot=blind), 5)
 
 
-@pytest.mark.parametrize("ending", ["json", "csv"])
-def test_calibrate_writes_the_poses_for_other_programs(tmp_path: Path, ending: str, capsys) -> None:
+def test_poses_are_written_for_other_programs(tmp_path: Path) -> None:
+    plan = NextPoses.of(first_calibration(1), 3)
+    for ending in ("json", "csv"):
+        plan.write(tmp_path / f"poses.{ending}", replace=False)
+    found = json.loads((tmp_path / "poses.json").read_text())
+    assert (found["schema"], found["joints"], found["units"]) == (1, list(plan.joints), ["rad"] * 4)
+    names, *poses = csv.reader((tmp_path / "poses.csv").read_text().splitlines())
+    assert names == list(plan.joints)
+    assert np.array(poses, dtype=float) == pytest.approx(np.array(found["poses"]))
+    with pytest.raises(RecordingError, match="there already"):
+        plan.write(tmp_path / "poses.csv", replace=False)
+    with pytest.raises(RecordingError, match=r"end in \.json or \.csv"):
+        plan.write(tmp_path / "poses.txt", replace=False)
+
+
+def test_calibrate_writes_the_poses_and_what_they_gain(tmp_path: Path, capsys) -> None:
     arm = Arm(3)
     shutil.copytree(DESK_ARM, tmp_path, dirs_exist_ok=True)
     Recording(arm.robot.joints, arm.q, arm.x).write_csv(tmp_path / "pairs.csv")
-    out = tmp_path / f"poses.{ending}"
-    words = ["calibrate", str(tmp_path / "pairs.csv"), "--next-poses", str(out), "--poses", "3"]
-    command_line("calibrate")(words, exit_on_error=False, result_action="return_value")
-    assert "3 poses written" in capsys.readouterr().out
-    if ending == "json":
-        found = json.loads(out.read_text())
-        assert (found["schema"], found["joints"], found["units"]) == (1, list(arm.robot.joints), ["rad"] * 4)
-        assert np.array(found["poses"]).shape == (3, 4)
-    else:
-        names, *poses = csv.reader(out.read_text().splitlines())
-        assert names == list(arm.robot.joints)
-        assert np.array(poses, dtype=float).shape == (3, 4)
-    with pytest.raises(RecordingError, match="there already"):
-        command_line("calibrate")(words, exit_on_error=False, result_action="return_value")
+    words = ["calibrate", str(tmp_path / "pairs.csv"), "--only", "offsets", "--next-poses", str(tmp_path / "poses.csv")]
+    command_line("calibrate")([*words, "--poses", "3"], exit_on_error=False, result_action="return_value")
+    assert re.search(r"3 poses written.*mm expected now, [\d.]+ mm with them", capsys.readouterr().out)
+    assert len((tmp_path / "poses.csv").read_text().splitlines()) == 4
 
 
 @pytest.fixture
