@@ -28,7 +28,7 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.recordings.recording import Recording
 
 READERS = Path(__file__).resolve().parents[1] / "examples" / "correction"
-ROBOTS = ("ur5_laser", "wam_laser")
+ROBOTS = ("ur5_laser", "wam_laser", "tiago_eyehand")
 TENTHS, HELD_OUT = 10, (1, 4, 7)
 DRAWS = 2000
 

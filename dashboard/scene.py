@@ -8,8 +8,9 @@ from bodyschema.daemon.transport.wire import PredictReply
 from bodyschema.interfaces.records import FloatArray, Pair
 from bodyschema.learning.status import ChainCalibration, LearntFigure
 from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.links import link_poses
 from bodyschema.robot.rpy import pose_of
-from bodyschema.robot.urdf import MOVING, standing
+from bodyschema.robot.urdf import MOVING
 
 from .documents import ArmDocument
 
@@ -61,19 +62,10 @@ def _links(
     robot: RobotDescription, q: FloatArray
 ) -> tuple[dict[str, FloatArray], list[tuple[FloatArray, FloatArray]], list[FloatArray]]:
     """Return poses (4, 4) of all links, the lines from joint to joint, and the places of joints that move."""
-    tree, angles = robot.tree, {**robot.robot.held_at, **dict(zip(robot.joints, q.tolist(), strict=True))}
-    children = {joint.child for joint in tree.joints.values()}
-    poses = {link: np.eye(4) for link in tree.links if link not in children}
-    lines, moving, open_ = list[tuple[FloatArray, FloatArray]](), list[FloatArray](), list(poses)
-    for link in open_:  # grows during the loop
-        for joint in (joint for joint in tree.joints.values() if joint.parent == link):
-            pose = poses[link] @ standing(joint, False, angles.get(joint.name, 0.0))
-            poses[joint.child] = pose
-            lines.append((poses[link][:3, 3], pose[:3, 3]))
-            if joint.kind in MOVING:
-                moving.append(pose[:3, 3])
-            open_.append(joint.child)
-    return poses, lines, moving
+    poses = {link: pose[0] for link, pose in link_poses(robot, q[None]).items()}
+    joints = robot.tree.joints.values()
+    lines = [(poses[joint.parent][:3, 3], poses[joint.child][:3, 3]) for joint in joints]
+    return poses, lines, [poses[joint.child][:3, 3] for joint in joints if joint.kind in MOVING]
 
 
 def _moved(T: FloatArray, point: FloatArray) -> FloatArray:

@@ -19,9 +19,10 @@ MODULES = {
     "fleet": ("distributed",),
     "bags": ("rosbags",),
     "realsense": ("pyrealsense2",),
+    "av1": ("av",),
 }
-# Packages without wheels for some machines are no extras: installing all of them has to work everywhere.
-_ALONE = {"realsense": "pyrealsense2"}
+# These are no extras: pyrealsense2 has no wheels for some machines, and few need PyAV, which LeRobot brings.
+_ALONE = {"realsense": "pyrealsense2", "av1": "av"}
 
 
 def require_extra(extra: str, what: str) -> None:

@@ -15,7 +15,7 @@ from bodyschema.interfaces.records import Pair
 from bodyschema.recordings.recording import CSV, PARQUET, Recording, joints_in
 
 from .mcap_export import write_mcap
-from .rerun_export import write_rerun
+from .rerun_export import Scene, write_rerun
 from .store.store import Devices, PairReader
 
 log = logging.getLogger(__name__)
@@ -23,11 +23,11 @@ log = logging.getLogger(__name__)
 MCAP, RERUN, URDF = ".mcap", ".rrd", ".urdf"
 STORE_ENDINGS = (".sqlite", ".sqlite3", ".db")
 
-_WRITERS: dict[str, Callable[[Recording, Path, Sequence[Devices]], None]] = {
-    CSV: lambda recording, file, _: recording.write_csv(file),
-    PARQUET: lambda recording, file, _: recording.write_parquet(file),
-    MCAP: write_mcap,
-    RERUN: write_rerun,
+_WRITERS: dict[str, Callable[[Recording, Path, Sequence[Devices], Scene | None], None]] = {
+    CSV: lambda recording, file, *_: recording.write_csv(file),
+    PARQUET: lambda recording, file, *_: recording.write_parquet(file),
+    MCAP: lambda recording, file, devices, _: write_mcap(recording, file, devices),
+    RERUN: lambda recording, file, _, scene: write_rerun(recording, file, scene),
 }
 
 
@@ -148,18 +148,19 @@ def check_target(out: Path, *, force: bool) -> None:
         raise RecordingError("the file is there already", file=out, remedy="Give another name, or --force")
 
 
-def write(recording: Recording, out: Path, devices: Sequence[Devices] = ()) -> None:
+def write(recording: Recording, out: Path, devices: Sequence[Devices] = (), scene: Scene | None = None) -> None:
     """Write `recording` in the format of the ending of `out`. The file appears once it is complete.
 
     Args:
         devices: what the joints were read with; only MCAP stores it.
+        scene: the robot and its cameras; only Rerun's files show it.
 
     Raises:
         RecordingError: it cannot be written, or an extra that the format needs is not installed.
     """
     part = out.with_name(f".{out.stem}.part{out.suffix}")
     try:
-        _WRITERS[out.suffix.lower()](recording, part, devices)
+        _WRITERS[out.suffix.lower()](recording, part, devices, scene)
         os.replace(part, out)
     except RecordingError as error:
         raise RecordingError(error.what, file=out, remedy=error.remedy) from error

@@ -26,6 +26,7 @@ BAG_ENDINGS = (".db3", ".mcap", ".bag")
 METADATA = "metadata.yaml"
 JOINT_STATE = "sensor_msgs/msg/JointState"
 TF = "tf2_msgs/msg/TFMessage"
+IMAGE = "sensor_msgs/msg/CompressedImage"
 # How positions are taken from a message, by its type: position, quaternion or None, covariance (6, 6) or None.
 Taken = tuple[Any, Any, Any]
 _MARKERS: Mapping[str, Callable[[Any], Taken]] = {
@@ -86,6 +87,18 @@ def read_bag(source: Path, joints: tuple[str, ...], topics: BagTopics, marker: M
         if marker is None:
             marker = _marker_track(bag, _marker_topic(bag, topics), topics.frame)
     return joined(joints, found, marker.earlier(topics.delay_s), source)
+
+
+def read_images(source: Path, topic: str) -> Iterator[tuple[float, bytes]]:
+    """Yield the times of compressed images [s], and the images as JPEG or PNG files.
+
+    Raises:
+        RecordingError: rosbags is not installed, the bag cannot be read, or it has no such topic.
+    """
+    with _opened(source) as bag:
+        topics = [each for each, kind in bag.types.items() if kind == IMAGE]
+        for received, message in bag.messages(_asked(bag, topic, topics, "--video", IMAGE)):
+            yield _stamp(message.header, received), message.data.tobytes()
 
 
 @dataclass(frozen=True)
@@ -216,7 +229,8 @@ def _marker_topic(bag: _Bag, topics: BagTopics) -> str:
         )
     raise bag.wrong(
         "there is no topic with positions of a marker",
-        "Record PointStamped, PoseStamped, TransformStamped or TF of it, or give --markers FILE.csv.",
+        "Record PointStamped, PoseStamped, TransformStamped or TF of it; or give --markers FILE.csv, or --video and "
+        "the topic of its camera's compressed images.",
     )
 
 

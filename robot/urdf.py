@@ -243,16 +243,18 @@ def _assemble(
 
 def standing(joint: UrdfJoint, upward: bool, position: float) -> FloatArray:
     """Return the transform (4, 4) across a joint that is held at `position` [rad or m]."""
-    T_parent_child = joint.T_parent_joint @ _motion(joint, position)
+    T_parent_child = joint.T_parent_joint @ motions(joint, np.array([position]))[0]
     return inverse(T_parent_child) if upward else T_parent_child
 
 
-def _motion(joint: UrdfJoint, position: float) -> FloatArray:
-    T = np.eye(4)
+def motions(joint: UrdfJoint, positions: FloatArray) -> FloatArray:
+    """Return the transforms (n, 4, 4) of a joint's frame by its own motion to positions (n,) [rad or m]."""
+    T = np.tile(np.eye(4), (len(positions), 1, 1))
+    moved = positions[:, None] * joint.axis
     if joint.kind in REVOLUTE:
-        T[:3, :3] = exponentials((joint.axis * position)[None])[0][0]
+        T[:, :3, :3] = exponentials(moved)[0]
     elif joint.kind == "prismatic":
-        T[:3, 3] = joint.axis * position
+        T[:, :3, 3] = moved
     return T
 
 

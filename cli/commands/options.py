@@ -53,7 +53,10 @@ class SourceOptions:
     ] = None
     video: Annotated[
         str | None,
-        Parameter(help="Of a dataset: track the marker in this camera's videos, such as observation.images.front."),
+        Parameter(
+            help="Track the marker in a camera's pictures: of a dataset such as observation.images.front, of a bag the "
+            "topic of its compressed images."
+        ),
     ] = None
     lerobot_unit: Annotated[
         Literal["degrees", "range_m100_100"] | None,

@@ -22,7 +22,7 @@ from bodyschema.robot.lerobot import (
 from bodyschema.robot.suggest import did_you_mean
 from bodyschema.robot.urdf import MOVING, UrdfTree
 
-from .robot_template import guess_of, key_name, quoted, robot_toml
+from .robot_template import Seen, guess_of, key_name, quoted, robot_toml
 from .scan_report import ScannedPort
 
 BAUD = 1_000_000
@@ -55,9 +55,7 @@ def lerobot_arm(name: str) -> LeRobotArm:
     return ARMS[name]
 
 
-def lerobot_robot_toml(
-    arm: LeRobotArm, urdf: Path, robot: Path, calibration: Path, port: str, cameras: Sequence[str] = ()
-) -> str:
+def lerobot_robot_toml(arm: LeRobotArm, urdf: Path, robot: Path, calibration: Path, port: str, seen: Seen) -> str:
     """Return the text of a robot.toml for `arm`.
 
     Args:
@@ -73,7 +71,7 @@ def lerobot_robot_toml(
         name=key_name(calibration.stem)
     )
     servos = _servos(arm, tree, read_calibration(calibration, arm.joints), calibration)
-    return robot_toml(guess, cameras) + _servo_tables(arm, servos, calibration, port)
+    return robot_toml(guess, seen) + _servo_tables(arm, servos, calibration, port)
 
 
 def lerobot_port(arm: LeRobotArm, scan: Scan) -> str:

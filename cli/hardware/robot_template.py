@@ -22,6 +22,22 @@ class Guess(NamedTuple):
     camera_link: str
 
 
+class Seen(NamedTuple):
+    """What the cameras are and what they look for.
+
+    Attributes:
+        cameras: those that are plugged in; with two or more, the first two are the eyes.
+        webcam: one camera alone, in their place.
+        tag_mm: side of the tag; ball_mm: diameter of the ball. Without both a ball of 40 mm.
+    """
+
+    cameras: Sequence[str] = ()
+    webcam: str | None = None
+    tag_mm: float | None = None
+    ball_mm: float | None = None
+
+
+_NOTHING_SEEN = Seen()
 _FINGER = re.compile(r"gripper|finger|jaw|knuckle", re.IGNORECASE)
 EXAMPLE = Guess("my_robot", "my_robot.urdf", ["joint_1", "joint_2"], "hand", "base_link")
 
@@ -52,12 +68,7 @@ xyz = [0.0, 0.0, 0.0]
 rpy = [-1.5707963267948966, 0.0, -1.5707963267948966]
 # true once the pose was measured; false fits it first.
 pose_known = false
-# The rectified stereo pair, from its calibration; all or none. One camera alone: eyes = 1, and no baseline_m.
-# focal_px = 600.0
-# principal_point_px = [319.5, 239.5]
-# baseline_m = 0.09
-# image_size_px = [640, 480]
-
+{eyes}
 # Where the two processes listen; this machine only, unless you say otherwise.
 [zenoh]
 sampler = "tcp/127.0.0.1:7447"
@@ -75,11 +86,7 @@ max_step_deg = 3.0
 # recording = "recording.csv"
 
 [vision]
-# red, orange, yellow, green, cyan, blue, magenta, or a band of hues as the table [vision.colour].
-colour = "red"
-# Of the marker ball [m].
-radius_m = 0.020
-
+{marker}
 # Another program that measures the marker, in the place of cameras: udp, natnet, zenoh or ros2. docs/marker_sources.md
 # [marker_source]
 # kind = "udp"
@@ -89,42 +96,83 @@ radius_m = 0.020
 # CHECK: the cameras; `bodyschema scan` names those that are plugged in, docs/cameras.md has the rest.
 {cameras}"""
 
+_TWO_EYES = """\
+# The rectified stereo pair, from its calibration; all or none. One camera alone: eyes = 1, and no baseline_m.
+# focal_px = 600.0
+# principal_point_px = [319.5, 239.5]
+# baseline_m = 0.09
+# image_size_px = [640, 480]
+"""
+_ONE_EYE = """\
+# One camera alone: depth comes from the size of the marker.
+eyes = 1
+"""
+_BALL = """\
+# red, orange, yellow, green, cyan, blue, magenta, or a band of hues as the table [vision.colour].
+colour = "red"
+# Of the marker ball [m].
+radius_m = {radius_m}
+"""
+_TAG = """\
+marker = "tag"
+
+[vision.tag]
+# Its number, and the side of its black square as measured [m].
+id = 0
+side_m = {side_m}
+"""
 _CAMERAS = """\
 [vision.cameras]
-# calibration = "cameras.toml"   # as `bodyschema calibrate cameras` wrote it; without it images are rectified already
+{hidden}calibration = "cameras.toml"   # as `bodyschema calibrate cameras` writes it; else images are rectified
 # latency_s = 0.0                # as `bodyschema calibrate latency` says, with its latency_sigma_s
-# One camera alone is the table [vision.cameras.one] with device in the place of left and right: docs/one_camera.md.
-[vision.cameras.two]
-left = {left}
-right = {right}
-image_size_px = [640, 480]
+{devices}image_size_px = [640, 480]
 fps = 30.0
 # exposure_s = 0.005             # a short one: a moving ball blurs. Without a value the camera chooses.
 # gain = 64
 # white_balance_k = 4600
 # focus = 0
 """
+_TWO = """\
+# One camera alone is the table [vision.cameras.one] with device in the place of left and right: docs/one_camera.md.
+[vision.cameras.two]
+left = {left}
+right = {right}
+"""
+_ONE = """\
+
+[vision.cameras.one]
+device = {device}
+"""
 _EXAMPLES = "/dev/v4l/by-id/usb-LEFT-video-index0", "/dev/v4l/by-id/usb-RIGHT-video-index0"
 
 
-def robot_toml(guess: Guess, cameras: Sequence[str] = ()) -> str:
-    """Return the text of a commented robot.toml; with two cameras or more, the first two are its eyes."""
+def robot_toml(guess: Guess, seen: Seen = _NOTHING_SEEN) -> str:
+    """Return the text of a commented robot.toml."""
     joints = "[" + ", ".join(quoted(joint) for joint in guess.joints) + "]"
+    marker = _BALL.format(radius_m=_metres((seen.ball_mm or 40.0) / 2))
     return _TEMPLATE.format(
         name=quoted(guess.name),
         urdf=quoted(guess.urdf),
         joints=joints,
         marker_link=quoted(guess.marker_link),
         camera_link=quoted(guess.camera_link),
-        cameras=_camera_tables(cameras),
+        eyes=_TWO_EYES if seen.webcam is None else _ONE_EYE,
+        marker=marker if seen.tag_mm is None else _TAG.format(side_m=_metres(seen.tag_mm)),
+        cameras=_camera_tables(seen),
     )
 
 
-def _camera_tables(cameras: Sequence[str]) -> str:
+def _metres(length_mm: float) -> str:
+    return f"{1e-3 * length_mm:.6g}"
+
+
+def _camera_tables(seen: Seen) -> str:
     """Return the cameras' tables; with fewer than two cameras, an example that is commented out."""
-    left, right = map(quoted, cameras[:2] if len(cameras) >= 2 else _EXAMPLES)
-    text = _CAMERAS.format(left=left, right=right)
-    if len(cameras) >= 2:
+    if seen.webcam is not None:
+        return _CAMERAS.format(hidden="", devices=_ONE.format(device=quoted(seen.webcam)))
+    left, right = map(quoted, seen.cameras[:2] if len(seen.cameras) >= 2 else _EXAMPLES)
+    text = _CAMERAS.format(hidden="# ", devices=_TWO.format(left=left, right=right))
+    if len(seen.cameras) >= 2:
         return text
     return "".join(line if line.startswith("#") else f"# {line}" for line in text.splitlines(keepends=True))
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bodyschema.cli.hardware.lerobot_robot import joint_servos
-from bodyschema.cli.recordings.dataset_video import markers_in_video
+from bodyschema.cli.recordings.dataset_video import markers_in_images, markers_in_video
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.servos import require_servos
 from bodyschema.interfaces.errors import RecordingError
@@ -26,7 +26,7 @@ class Taken:
 
     Attributes:
         joint_topic, marker_topic, marker_frame: of a bag; see `BagTopics`.
-        video: of a dataset: the camera in whose videos the marker is tracked.
+        video: the camera in whose videos the marker is tracked; of a bag, the topic of its images.
         markers: a file with the marker's positions: t, x, y, z, and in `segment` the episode.
         lerobot: LeRobot's calibration of the arm that a dataset was recorded with.
         lerobot_unit: of a dataset's readings.
@@ -64,6 +64,8 @@ def opened(config: Config, source: Path, taken: Taken) -> Recording:
             )
         return read_lerobot_dataset(source, _units(config, source, taken), marker.earlier(taken.delay_s))
     if is_bag(source):
+        if marker is None and taken.video is not None:
+            marker = markers_in_images(config, source, taken.video)
         robot = config.tables.drivers.ros2
         names = {} if robot is None else robot.names
         topics = BagTopics(taken.joint_topic, taken.marker_topic, taken.marker_frame, names, taken.delay_s)

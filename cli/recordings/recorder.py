@@ -8,6 +8,7 @@ from pathlib import Path
 from threading import Event
 from typing import TextIO
 
+from bodyschema.cli.recordings.rerun_scene import scene_for
 from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.wire import PairsReply, decode, pair_from_wire
@@ -16,7 +17,7 @@ from bodyschema.interfaces.records import Pair
 from bodyschema.recordings import files as recordings
 from bodyschema.recordings.csv_file import write_csv_rows
 from bodyschema.recordings.parquet_file import INTEGER_COLUMNS
-from bodyschema.recordings.recording import CSV
+from bodyschema.recordings.recording import CSV, Recording
 from bodyschema.recordings.store.damage import Damage
 from bodyschema.robot.description import RobotDescription
 
@@ -70,7 +71,7 @@ class History:
         self._news.wait(LIVE_WAIT_S)
 
 
-def copy_history(history: History, joints: tuple[str, ...], out: Path) -> int:
+def copy_history(history: History, robot: RobotDescription, out: Path) -> int:
     """Write all existing pairs into `out`; return their number.
 
     Raises:
@@ -86,11 +87,15 @@ def copy_history(history: History, joints: tuple[str, ...], out: Path) -> int:
             file=out,
             remedy="Move the arm in front of the camera, or wait for pairs with --follow",
         )
-    recordings.write(recordings.from_pairs(pairs, joints), out)
+    _write(recordings.from_pairs(pairs, robot.joints), out, robot)
     return len(pairs)
 
 
-def follow_history(history: History, joints: tuple[str, ...], out: Path, stopped: Callable[[], bool]) -> int:
+def _write(recording: Recording, out: Path, robot: RobotDescription) -> None:
+    recordings.write(recording, out, scene=scene_for(out, robot.file, recording))
+
+
+def follow_history(history: History, robot: RobotDescription, out: Path, stopped: Callable[[], bool]) -> int:
     """Write pairs into `out` as they arrive until `stopped`; return their number.
 
     CSV is written line by line, so that all rows survive an abrupt end. The other formats are only complete with their
@@ -103,11 +108,11 @@ def follow_history(history: History, joints: tuple[str, ...], out: Path, stopped
         pairs: list[Pair] = []
         _follow(history, stopped, pairs.extend)
         if pairs:
-            recordings.write(recordings.from_pairs(pairs, joints), out)
+            _write(recordings.from_pairs(pairs, robot.joints), out, robot)
         return len(pairs)
     try:
         with out.open("w", encoding="utf-8", newline="\n") as stream:
-            rows = _CsvRows(stream, joints)
+            rows = _CsvRows(stream, robot.joints)
             _follow(history, stopped, rows.add)
     except OSError as error:
         raise RecordingError(f"cannot be written: {error.strerror or error}", file=out) from error

@@ -113,9 +113,18 @@ def tracked_video(config: Config, file: Path) -> TrackedCamera:
     Raises:
         ConfigError: there is no calibration of the camera, or the marker cannot be.
     """
+    return _tracked(config, videos=VideosConfig(left=str(file.absolute()), speed=0.0))
+
+
+def tracked_images(config: Config, folder: Path) -> TrackedCamera:
+    """Return the images *.jpg in `folder`, at the times in its times.txt, as `tracked_video` does."""
+    files, times = folder.absolute() / "*.jpg", folder.absolute() / "times.txt"
+    return _tracked(config, images=ImagesConfig(left=str(files), times=str(times), speed=0.0))
+
+
+def _tracked(config: Config, **layout: VideosConfig | ImagesConfig) -> TrackedCamera:
     given = cameras_of(config)
-    videos = VideosConfig(left=str(file.absolute()), speed=0.0)
-    cameras = CamerasConfig(calibration=None if given is None else given.calibration, videos=videos)
+    cameras = CamerasConfig(calibration=None if given is None else given.calibration, **layout)  # pyright: ignore[reportArgumentType]
     vision = msgspec.structs.replace(config.tables.vision, cameras=cameras, further_cameras=())
     seen = config.with_tables(msgspec.structs.replace(config.tables, vision=vision))
     camera = camera_of(seen, open_eyes(seen, SystemClock()))

@@ -40,8 +40,9 @@ class Ros2Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The table [drivers.ros2].
 
     Attributes:
-        router: where rmw_zenohd listens.
-        domain: ROS_DOMAIN_ID of the robot.
+        router: where rmw_zenohd, or the zenoh bridge, listens.
+        via: rmw_zenoh, or zenoh-bridge-ros2dds for robots on DDS.
+        domain: ROS_DOMAIN_ID of the robot, for rmw_zenoh.
         topic: the joint states.
         names: the name of a joint in ROS, by its name in [robot] joints; joints left out have the same name.
         max_delay_s: a message is rejected if it arrives this much later than the fastest one.
@@ -53,6 +54,7 @@ class Ros2Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     router: str = "tcp/127.0.0.1:7447"
+    via: Literal["rmw_zenoh", "ros2dds"] = "rmw_zenoh"
     domain: Annotated[int, Meta(ge=0, le=232)] = 0
     topic: str = "/joint_states"
     names: dict[str, str] = {}
@@ -78,6 +80,8 @@ class Ros2Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             yield ("topic",), f"{self.topic!r} is no name of a topic", "Write one as `ros2 topic list` does"
         if self.marker is not None and not TOPIC.fullmatch(self.marker.topic):
             yield ("marker", "topic"), f"{self.marker.topic!r} is no name of a topic", "Write /bodyschema/marker"
+        if self.marker is not None and self.via == "ros2dds":
+            yield ("marker",), "predictions are published for rmw_zenoh alone", "Take the table out"
         for joint in self.names:
             if joint not in joints:
                 yield ("names", joint), f"unknown joint {joint!r}", did_you_mean(joint, joints)

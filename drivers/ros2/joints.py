@@ -153,6 +153,11 @@ def silence(
 
 def _unheard(config: Ros2Config, topics: Sequence[rmw.Topic]) -> str:
     wanted = "/" + config.topic.strip("/")
+    if config.via == "ros2dds":
+        return (
+            f"the bridge at {config.router} passes on nothing of {wanted}; see whether the robot publishes it in the "
+            f"bridge's domain: ros2 topic hz {wanted}"
+        )
     here = [topic for topic in topics if topic.domain == config.domain]
     other_types = {topic.type for topic in here if topic.name == wanted} - {JOINT_STATE.name}
     if other_types:

@@ -67,8 +67,8 @@ class Link(Protocol):
 OpenLink = Callable[[Ros2Config, Clock], Link]
 
 
-def open_session(router: str) -> zenoh.Session:
-    """Open a session with this router only: it neither listens nor scouts.
+def open_session(router: str, start: str = "ros2 run rmw_zenoh_cpp rmw_zenohd") -> zenoh.Session:
+    """Open a session with this router only: it neither listens nor scouts. `start` is the command that starts it.
 
     Raises:
         SourceLost: the router is not there.
@@ -88,7 +88,7 @@ def open_session(router: str) -> zenoh.Session:
         return zenoh.open(config)
     except zenoh.ZError as error:
         raise SourceLost(
-            f"no zenoh router answers on {router}. Start it on the robot: ros2 run rmw_zenoh_cpp rmw_zenohd",
+            f"no zenoh router answers on {router}. Start it on the robot: {start}",
             retry_s=RETRY_S,
         ) from error
 
@@ -148,9 +148,13 @@ def open_zenoh(config: Ros2Config, clock: Clock) -> Link:
     Raises:
         SourceLost: the router is not there.
     """
-    session = open_session(config.router)
+    key = rmw.topic_key(config.domain, config.topic, JOINT_STATE, rmw.ANY)
+    if config.via == "ros2dds":
+        key, session = config.topic.strip("/"), open_session(config.router, "zenoh-bridge-ros2dds -l tcp/0.0.0.0:7447")
+    else:
+        session = open_session(config.router)
     try:
-        return ZenohLink(session, rmw.topic_key(config.domain, config.topic, JOINT_STATE, rmw.ANY), clock)
+        return ZenohLink(session, key, clock)
     except BaseException:
         session.close()
         raise

@@ -1,4 +1,4 @@
-"""Encode and decode sensor_msgs/JointState, geometry_msgs/PointStamped and PoseWithCovarianceStamped."""
+"""Encode and decode sensor_msgs/JointState; encode PointStamped, PoseWithCovarianceStamped and tf2_msgs/TFMessage."""
 
 from __future__ import annotations
 
@@ -33,6 +33,10 @@ POINT_STAMPED = MessageType(
 POSE_WITH_COVARIANCE_STAMPED = MessageType(
     "geometry_msgs::msg::dds_::PoseWithCovarianceStamped_",
     "RIHS01_26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e",
+)
+TF_MESSAGE = MessageType(
+    "tf2_msgs::msg::dds_::TFMessage_",
+    "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
 )
 
 
@@ -114,6 +118,24 @@ def encode_pose(
     writer = CdrWriter()
     write_header(writer, header)
     for values in (x, quaternion, covariance):
+        writer.float64_array(values)
+    return writer.to_bytes()
+
+
+def encode_transform(header: Header, child: str, x: tuple[float, ...], quaternion: tuple[float, ...]) -> bytes:
+    """Encode tf2_msgs/TFMessage with the pose of one frame.
+
+    Args:
+        header: of the transform; its frame is the parent.
+        child: the frame.
+        x: its position in the parent [m], 3 numbers.
+        quaternion: its orientation (x, y, z, w).
+    """
+    writer = CdrWriter()
+    writer.uint32(1)
+    write_header(writer, header)
+    writer.string(child)
+    for values in (x, quaternion):
         writer.float64_array(values)
     return writer.to_bytes()
 

@@ -19,6 +19,7 @@ GID_BYTES = 16
 DOMAIN = re.compile(r"[0-9]{1,3}")  # 0 … 232
 # Reliable, volatile, keep the last 10. A field is empty where it is rmw_zenoh's default, whose depth is 42.
 QOS = "::,10:,:,:,,"
+LATCHED_QOS = ":1:,1:,:,:,,"  # transient local, keep the last one
 # Sizes of attachments: since rmw_zenoh 0.2.4, and before, with field names.
 ATTACHMENT_BYTES, NAMED_ATTACHMENT_BYTES = 33, 77
 
@@ -47,10 +48,10 @@ def node_token(domain: int, session: str, node: str) -> str:
     return f"{GRAPH}/{domain}/{session}/0/0/NN/%/%/{node}"
 
 
-def publisher_token(domain: int, session: str, node: str, topic: str, kind: MessageType) -> str:
+def publisher_token(domain: int, session: str, node: str, topic: str, kind: MessageType, qos: str = QOS) -> str:
     """Return the liveliness token of that node's publisher, the second entity of the session."""
     mangled = "%" + topic.strip("/").replace("/", "%")
-    return f"{GRAPH}/{domain}/{session}/0/1/{PUBLISHER}/%/%/{node}/{mangled}/{kind.name}/{kind.digest}/{QOS}"
+    return f"{GRAPH}/{domain}/{session}/0/1/{PUBLISHER}/%/%/{node}/{mangled}/{kind.name}/{kind.digest}/{qos}"
 
 
 def publishers_key() -> str:

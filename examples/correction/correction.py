@@ -7,6 +7,8 @@ import json
 import math
 import sys
 
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+
 
 class Correction:
     """True joint angles and marker pose of an arm from its readings, with the effects that bodyschema found."""
@@ -15,40 +17,50 @@ class Correction:
         file = json.loads(text)
         if (file.get("format"), file.get("version")) != ("bodyschema correction", 1):
             raise ValueError("not a correction of version 1")
-        self.effects, joints = file["effects"], file["joints"]
-        self.chain = [(k, joints[k]["parent"], joints[k]["slides"], joints[k]["pose"]) for k in file["outwards"]]
-        self.ends = [(file[end]["parent"], file[end]["pose"]) for end in ("camera", "marker")]
+        self.effects, joints, order = file["effects"], file["joints"], file["outwards"]
+        self.joints = [(joint["slides"], joint["pose"]) for joint in joints]
+        self.parents = [joint["parent"] for joint in joints]
+        self.camera, self.marker = (
+            (self.way_to(file[end]["parent"]), file[end]["pose"]) for end in ("camera", "marker")
+        )
         self.loose = [effect for effect in self.effects if effect["effect"] == "gravity_backlash"]
         self.springs = [(k, joint["compliance"]) for k, joint in enumerate(joints) if joint["compliance"]]
-        self.masses = [(joint["mass_kg"], *joint["moment_kg_m"]) for joint in joints]
-        self.gravity = file["gravity_m_s2"]
+        loaded = {k for k, _ in self.springs} | {effect["joint"] for effect in self.loose}
+        self.inside = [(k, self.parents[k]) for k in order if any(k in self.way_to(each) for each in loaded)]
+        self.outside = [k for k in reversed(order) if loaded & set(self.way_to(k))]
+        self.moments = [joint["moment_kg_m"] for joint in joints]
+        self.masses = [sum(joints[n]["mass_kg"] for n in order if k in self.way_to(n)) for k in range(len(joints))]
+        self.gravity = (0.0, 0.0, -file["gravity_m_s2"])
+
+    def way_to(self, joint):
+        """Return the numbers of the joints from the root link to a joint, itself included."""
+        return [] if joint < 0 else [*self.way_to(self.parents[joint]), joint]
 
     def read(self, q, pace=1.0):
         """Return true joint angles, and the marker's pose (3 rows of 4) in the measurement frame, at the next readings.
 
         pace: time since the last readings, as a multiple of the usual one; None after an interruption.
         """
-        unloaded = angles = [reading + 0.0 for reading in q]
+        angles = [reading + 0.0 for reading in q]
         for effect in self.effects:
             angles[effect["joint"]] += self.error(effect, q, pace)
-        frames = self.frames(angles)
+        poses = [self.moved(k, angle) for k, angle in enumerate(angles)]
+        unloaded = list(angles)
         for _ in range(3 if self.springs else 0):  # what gives moves its own load
-            torques, angles = self.torques(frames), list(unloaded)
+            torques = self.torques(poses)
             for k, compliance in self.springs:
-                angles[k] += compliance * torques[k]
-            frames = self.frames(angles)
-        if self.loose:
-            torques, angles = self.torques(frames), list(angles)
-            for effect in self.loose:  # the state: the side on which the joint rests
-                (width, hold), torque = effect["values"], torques[effect["joint"]]
-                if not effect["state"] or abs(torque) > hold:
-                    effect["state"][:] = [-1.0 if torque < 0.0 else 1.0]
-                angles[effect["joint"]] += 0.5 * width * effect["state"][0]
-            frames = self.frames(angles)
-        camera, marker = (product(frames[parent], pose) for parent, pose in self.ends)
-        a, b, c, x, d, e, f, y, g, h, i, z = camera
+                angles[k] = unloaded[k] + compliance * torques[k]
+                poses[k] = self.moved(k, angles[k])
+        torques = self.torques(poses) if self.loose else {}
+        for effect in self.loose:  # the state: the side on which the joint rests
+            k, (width, hold) = effect["joint"], effect["values"]
+            if not effect["state"] or abs(torques[k]) > hold:
+                effect["state"][:] = [-1.0 if torques[k] < 0.0 else 1.0]
+            angles[k] += 0.5 * width * effect["state"][0]
+            poses[k] = self.moved(k, angles[k])
+        a, b, c, x, d, e, f, y, g, h, i, z = self.reached(self.camera, poses, IDENTITY)
         back = (a, d, g, -a * x - d * y - g * z, b, e, h, -b * x - e * y - h * z, c, f, i, -c * x - f * y - i * z)
-        return angles, product(back, marker)
+        return angles, self.reached(self.marker, poses, back)
 
     def error(self, effect, q, pace):
         """Return the error that an effect adds to the reading of its joint."""
@@ -85,33 +97,48 @@ class Correction:
             return 0.0
         raise ValueError(f"unknown effect {kind}")
 
-    def frames(self, angles):
-        """Return frames of all joints in the root link's; the last is that link's own."""
-        frames = [(1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)] * (len(angles) + 1)
-        for k, parent, slides, pose in self.chain:
-            a, b, c, x, d, e, f, y, g, h, i, z = product(frames[parent], pose)
-            if slides:
-                s = angles[k]
-                frames[k] = a, b, c, x + s * c, d, e, f, y + s * f, g, h, i, z + s * i
-            else:
-                u, v = math.cos(angles[k]), math.sin(angles[k])
-                first = u * a + v * b, u * b - v * a, c, x, u * d + v * e, u * e - v * d, f, y
-                frames[k] = *first, u * g + v * h, u * h - v * g, i, z
-        return frames
+    def moved(self, k, angle):
+        """Return the pose of a joint's frame in its parent's."""
+        slides, (a, b, c, x, d, e, f, y, g, h, i, z) = self.joints[k]
+        if slides:
+            return a, b, c, x + angle * c, d, e, f, y + angle * f, g, h, i, z + angle * i
+        u, v = math.cos(angle), math.sin(angle)
+        return (
+            u * a + v * b,
+            u * b - v * a,
+            c,
+            x,
+            u * d + v * e,
+            u * e - v * d,
+            f,
+            y,
+            u * g + v * h,
+            u * h - v * g,
+            i,
+            z,
+        )
 
-    def torques(self, frames):
-        """Return gravity's torque about each joint, or force along it."""
-        mass, mx, my = ([0.0] * len(frames) for _ in range(3))
-        torques = [0.0] * (len(frames) - 1)
-        for k, parent, slides, _ in reversed(self.chain):
-            a, b, c, x, d, e, f, y, *_, i, _ = frames[k]
-            m, u, v, w = self.masses[k]
-            mass[k] += m
-            mx[k] += m * x + a * u + b * v + c * w
-            my[k] += m * y + d * u + e * v + f * w
-            arm = f * (mx[k] - mass[k] * x) - c * (my[k] - mass[k] * y)
-            torques[k] = self.gravity * (-mass[k] * i if slides else arm)
-            mass[parent], mx[parent], my[parent] = mass[parent] + mass[k], mx[parent] + mx[k], my[parent] + my[k]
+    def reached(self, end, poses, pose):
+        """Return the pose of the camera or the marker where that of the root link is `pose`."""
+        for k in end[0]:
+            pose = product(pose, poses[k])
+        return product(pose, end[1])
+
+    def torques(self, poses):
+        """Return gravity's torque about each joint that gives or is loose, or force along it."""
+        gravity, moments, torques = {-1: self.gravity}, list(self.moments), {}
+        for k, parent in self.inside:
+            (a, b, c, _, d, e, f, _, g, h, i, _), (x, y, z) = poses[k], gravity[parent]
+            gravity[k] = a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z
+        for k in self.outside:
+            (u, v, w), mass, parent = moments[k], self.masses[k], self.parents[k]
+            if k in gravity:
+                x, y, z = gravity[k]
+                torques[k] = mass * z if self.joints[k][0] else u * y - v * x
+            if parent >= 0:
+                (a, b, c, x, d, e, f, y, g, h, i, z), (p, q, r) = poses[k], moments[parent]
+                p, q, r = p + a * u + b * v + c * w, q + d * u + e * v + f * w, r + g * u + h * v + i * w
+                moments[parent] = p + mass * x, q + mass * y, r + mass * z
         return torques
 
 

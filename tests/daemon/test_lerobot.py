@@ -121,6 +121,23 @@ def test_joints_of_another_urdf_are_named(tmp_path) -> None:
         config("--urdf", desk_arm, "--calibration", SO101 / "leader.json", "--port", "x", "--robot", tmp_path / "r")
 
 
+@pytest.mark.parametrize(("marker", "expected"), [("--tag-mm=49.8", 0.0498), ("--ball-mm=40", 0.02)])
+def test_one_webcam_and_its_marker_need_no_editing(tmp_path, marker, expected) -> None:
+    words = ["--calibration", SO101 / "follower.json", "--port", "x", "--webcam", "/dev/v4l/by-id/cam", marker]
+    config(*words, "--robot", tmp_path / "robot.toml")
+    found = Config.load(tmp_path / "robot.toml", {})
+    vision = found.tables.vision
+    assert found.robot.camera.eyes == 1
+    assert vision.cameras.one.device == "/dev/v4l/by-id/cam"
+    assert (vision.tag.side_m if vision.marker == "tag" else vision.radius_m) == expected
+
+
+def test_any_webcam_without_one_says_so(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("bodyschema.daemon.wiring.wiring.connected_cameras", lambda: ())
+    with pytest.raises(ConfigError, match="--webcam any: no camera is plugged in"):
+        config("--calibration", SO101 / "follower.json", "--port", "x", "--webcam", "any", "--robot", tmp_path / "r")
+
+
 def test_zero_is_the_middle_of_the_recorded_range(tmp_path) -> None:
     servos = robot_of("follower", tmp_path / "robot.toml").tables.drivers.feetech.servos
     assert servos[0].zero_ticks == (743 + 3460) / 2

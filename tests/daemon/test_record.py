@@ -30,6 +30,10 @@ def pair(seq: int, store: str = "one") -> Pair:
     return Pair(store, seq, 1, float(seq), "utc", rng.normal(size=2), rng.normal(size=3), np.eye(3) * 1e-6)
 
 
+def robot_in(folder: Path) -> RobotDescription:
+    return RobotDescription.load(folder / "robot.toml")
+
+
 class FakeSampler:
     """A fake sampler that serves `pairs`, a page at a time."""
 
@@ -117,7 +121,7 @@ def test_following_writes_what_comes_until_it_is_stopped(history, sampler, tmp_p
         return history.next_seq > 6
 
     out = tmp_path / f"a.{ending}"
-    assert follow_history(history, JOINTS, out, stopped) == 6
+    assert follow_history(history, robot_in(tmp_path), out, stopped) == 6
     if ending != "mcap":
         assert Recording.read(out, JOINTS).q.tolist() == [pair.q.tolist() for pair in sampler.pairs]
 
@@ -131,7 +135,7 @@ def test_following_csv_leaves_whole_lines_at_any_moment(history, sampler, tmp_pa
             seen.append(len(Recording.read(tmp_path / "a.csv", JOINTS)))
         return history.next_seq > 5
 
-    follow_history(history, JOINTS, tmp_path / "a.csv", stopped)
+    follow_history(history, robot_in(tmp_path), tmp_path / "a.csv", stopped)
     assert seen == [2, 4, 5]
 
 
@@ -152,12 +156,12 @@ def test_following_csv_ends_where_orientations_begin(history, sampler, tmp_path)
     with pytest.raises(
         RecordingError, match=r"from pair 3 to 4 some have a marker orientation and some do not. The 2 rows so far"
     ):
-        follow_history(history, JOINTS, tmp_path / "a.csv", lambda: history.next_seq > 4)
+        follow_history(history, robot_in(tmp_path), tmp_path / "a.csv", lambda: history.next_seq > 4)
     assert len(Recording.read(tmp_path / "a.csv", JOINTS)) == 2
 
 
 def test_following_without_any_pair_leaves_no_file(history: History, tmp_path: Path) -> None:
-    assert follow_history(history, JOINTS, tmp_path / "a.csv", lambda: True) == 0
+    assert follow_history(history, robot_in(tmp_path), tmp_path / "a.csv", lambda: True) == 0
     assert not (tmp_path / "a.csv").exists()
 
 

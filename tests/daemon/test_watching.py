@@ -14,7 +14,7 @@ from shown_board import known_rig
 from small_arm import write_small_arm
 
 from bodyschema.cli.cameras.mjpeg import MOST_VIEWERS, MjpegServer
-from bodyschema.cli.hardware.robot_template import EXAMPLE, robot_toml
+from bodyschema.cli.hardware.robot_template import EXAMPLE, Seen, robot_toml
 from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.cameras import camera_checks
@@ -205,7 +205,7 @@ def test_doctor_opens_what_is_there(tmp_path) -> None:
 
 
 def test_two_cameras_that_are_plugged_in_are_the_eyes_of_a_new_robot() -> None:
-    text = robot_toml(EXAMPLE, ["/dev/v4l/by-id/a", "/dev/v4l/by-id/b"])
+    text = robot_toml(EXAMPLE, Seen(["/dev/v4l/by-id/a", "/dev/v4l/by-id/b"]))
     assert 'left = "/dev/v4l/by-id/a"\nright = "/dev/v4l/by-id/b"\n' in text
 
 

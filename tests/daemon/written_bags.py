@@ -16,7 +16,7 @@ BEGUN_S = 1_700_000_000
 _NAMES = {
     kind: f"{package}/msg/{kind}"
     for package, kinds in {
-        "sensor_msgs": ["JointState"],
+        "sensor_msgs": ["CompressedImage", "JointState"],
         "geometry_msgs": [
             "Point", "PointStamped", "Pose", "PoseStamped", "PoseWithCovariance", "PoseWithCovarianceStamped",
             "Quaternion", "Transform", "TransformStamped", "Vector3",
@@ -53,6 +53,10 @@ def point_stamped(t: float, x: np.ndarray, frame: str = "camera") -> Any:
 
 def pose_stamped(t: float, x: np.ndarray, frame: str = "camera") -> Any:
     return made("PoseStamped", header(t, frame), made("Pose", made("Point", *map(float, x)), quaternion()))
+
+
+def compressed_image(t: float, file: bytes) -> Any:
+    return made("CompressedImage", header(t, "camera"), "jpeg", np.frombuffer(file, np.uint8))
 
 
 def pose_with_covariance(t: float, x: np.ndarray, frame: str = "camera") -> Any:

@@ -68,6 +68,22 @@ def test_namespace_and_domain_are_told_apart(endpoint) -> None:
     assert other.received == 0
 
 
+def test_joint_states_of_a_dds_robot_are_read_from_its_bridge(endpoint) -> None:
+    with robot(endpoint, topic="/arm/joint_states", via="ros2dds") as arm:
+        arm.start()
+        with joints(endpoint, topic="/arm/joint_states", via="ros2dds") as source:
+            reading = first(source)
+    assert reading.q == pytest.approx([PATHS[name](reading.t) for name in NAMES], abs=0.05)
+
+
+def test_a_bridge_that_passes_on_nothing_is_named(endpoint) -> None:
+    with robot(endpoint, via="ros2dds"), joints(endpoint, via="ros2dds") as source:
+        deadline = time.monotonic() + LIMIT_S
+        while not source.health and time.monotonic() < deadline:
+            source.read(0.5)
+    assert "the bridge at" in source.health[0]
+
+
 def test_without_a_router_it_is_said_how_to_start_one(endpoint) -> None:
     with pytest.raises(SourceLost, match="ros2 run rmw_zenoh_cpp rmw_zenohd"), joints(endpoint):
         pass

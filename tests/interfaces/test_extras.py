@@ -32,7 +32,11 @@ def test_the_command_installs_into_this_environment(monkeypatch, pip: str | None
 def test_the_command_names_an_extra_that_exists_or_a_package(extra: str) -> None:
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     named = extras.install_command(extra).rpartition(" ")[2].strip("'")
-    assert named.removeprefix("bodyschema[").removesuffix("]") in {*project["optional-dependencies"], "pyrealsense2"}
+    assert named.removeprefix("bodyschema[").removesuffix("]") in {
+        *project["optional-dependencies"],
+        "pyrealsense2",
+        "av",
+    }
 
 
 @pytest.mark.parametrize(("minor", "remedy"), [(11, "bodyschema[sim]"), (13, "no wheel for 3.13")])

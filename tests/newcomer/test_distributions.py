@@ -10,6 +10,7 @@ import sys
 import tarfile
 import venv
 import zipfile
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 
@@ -22,9 +23,9 @@ PURE = {**os.environ, "BODYSCHEMA_PURE": "1"}
 OTHER = {"daemon/__init__.py": "OTHER = True\n", "daemon/daemon.py": "", "daemon/runner.py": ""}
 
 
-def build(source: Path, target: str, folder: Path) -> Path:
+def build(source: Path, target: str, folder: Path, environment: Mapping[str, str] = PURE) -> Path:
     command = [sys.executable, "-m", "hatchling", "build", "-t", target, "-d", str(folder)]
-    subprocess.run(command, cwd=source, env=PURE, capture_output=True, check=True, timeout=LIMIT_S)
+    subprocess.run(command, cwd=source, env=environment, capture_output=True, check=True, timeout=LIMIT_S)
     return next(folder.glob("*.whl" if target == "wheel" else "*.tar.gz"))
 
 
@@ -94,6 +95,16 @@ def test_the_kernels_run_on_machines_of_2018() -> None:
     needed = {tuple(map(int, found)) for found in re.findall(rb"GLIBC_(\d+)\.(\d+)", library.read_bytes())}
     assert max(needed) <= (2, 28)
     assert set(re.findall(rb"lib\w+\.so[.\d]*", library.read_bytes())) <= {b"libc.so.6", b"libm.so.6"}
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler; to run it: apt-get install gcc python3-dev")
+def test_auditwheel_finds_the_compiled_wheel_fit_for_manylinux(tmp_path: Path) -> None:
+    pytest.importorskip("auditwheel", reason="no auditwheel; to run it: pip install auditwheel")
+    compiled = build(ROOT / "kbmaps", "wheel", tmp_path, {**os.environ, "BODYSCHEMA_PURE": "0"})
+    command = [sys.executable, "-m", "auditwheel", "show", str(compiled)]
+    told = subprocess.run(command, capture_output=True, text=True, check=True, timeout=LIMIT_S).stdout
+    (minor,) = re.findall(r'platform tag: "manylinux_2_(\d+)', told.replace("\n", " "))
+    assert int(minor) <= 28
 
 
 def test_links_that_came_as_text_are_mended(tmp_path: Path) -> None:

@@ -20,9 +20,9 @@ PAGE = (DOCS / "lerobot.md").read_text(encoding="utf-8")
 SO101 = DOCS.parent / "examples" / "so101"
 ROWS = 300
 TRUST, AGAIN = (f"bodyschema calibrate {name}.csv --trust-urdf" for name in ("so101", "again"))
-INIT, EXPORT, DIFFERENCE, WRITE = (
+INIT, SIMULATE, EXPORT, DIFFERENCE, WRITE = (
     next(command for command in commands_of(PAGE) if re.search(word, command))
-    for word in ("init", "--markers", r"\.json$", "--write")
+    for word in ("init", "simulate", "--markers", r"\.json$", "--write")
 )
 
 
@@ -55,6 +55,16 @@ def test_offsets_go_into_the_servos_and_errors_fall(page: TypedPage) -> None:
     after = expected_mm(page.type(AGAIN))
     assert after == pytest.approx(expected_mm(page.shown(AGAIN)), rel=0.2)
     assert after[0] < before[0] / 2
+
+
+def test_without_an_arm_the_offsets_are_found(page: TypedPage) -> None:
+    page.type(INIT)
+    assert page.type(SIMULATE) == page.shown(SIMULATE)
+    before = expected_mm(page.type(TRUST))
+    found = page.type(DIFFERENCE)
+    read = [float(degrees) for degrees in re.findall(r"readings ([+-][\d.]+)°", found)]
+    assert read == pytest.approx([2.5, -3.0, 1.5], abs=0.15)
+    assert expected_mm(found)[0] < before[0] / 3
 
 
 def offsets(text: str) -> list[int]:

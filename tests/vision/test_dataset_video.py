@@ -1,4 +1,4 @@
-"""The marker in the videos of a LeRobotDataset."""
+"""The marker in the videos of a LeRobotDataset, and in the images of a ROS bag."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ import pytest
 from ball_renderer import SMALL
 from scenes import Ball, stage
 
-from bodyschema.cli.recordings.dataset_video import markers_in_video
+from bodyschema.cli.recordings.dataset_video import markers_in_images, markers_in_video
 from bodyschema.daemon.config import Config
 from bodyschema.interfaces.errors import ConfigError, RecordingError
+from bodyschema.vision.cameras import videos
 
 pa = pytest.importorskip("pyarrow")
 sys.path.append(str(Path(__file__).parents[1] / "daemon"))
@@ -87,8 +88,50 @@ def test_a_camera_that_is_not_there_is_named(config: Config, tmp_path: Path) -> 
         markers_in_video(config, dataset(tmp_path / "data", "v2.1"), "observation.images.top")
 
 
+def test_an_av1_video_without_pyav_says_what_to_install(config: Config, tmp_path: Path, monkeypatch) -> None:
+    folder = dataset(tmp_path / "data", "v2.1")
+    codec = cv2.VideoCapture(str(next(folder.rglob("*.mp4")))).get(cv2.CAP_PROP_FOURCC)
+    monkeypatch.setattr(videos, "_AV1", round(codec))
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(ConfigError, match=r"is in AV1, which OpenCV cannot decode.*pip install av\. Or convert it"):
+        markers_in_video(config, folder, CAMERA)
+
+
+def test_the_ball_is_followed_in_av1_as_lerobot_encodes_it(config: Config, tmp_path: Path) -> None:
+    av = pytest.importorskip("av", reason="no PyAV; to run it: pip install av")
+    folder = dataset(tmp_path / "data", "v2.1")
+    for episode, file in enumerate(sorted(folder.rglob("*.mp4"))):
+        with av.open(str(file), "w") as container:
+            stream = container.add_stream("libsvtav1", rate=int(FPS), options={"crf": "30", "g": "2"})
+            stream.width, stream.height = SMALL.image_size_px
+            stream.pix_fmt = "yuv420p"
+            for ball in path(episode, (6, 4)[episode]):
+                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(stage(ball).images[0]), format="bgr24")
+                container.mux(stream.encode(frame))
+            container.mux(stream.encode())
+    track = markers_in_video(config, folder, CAMERA)
+    assert track.run.tolist() == [0] * 6 + [1] * 4
+    wanted = np.array([ball.x for episode, frames in enumerate((6, 4)) for ball in path(episode, frames)])
+    np.testing.assert_allclose(track.x[:, :2], wanted[:, :2], atol=5e-4)
+
+
 def test_a_video_that_cannot_be_decoded_is_refused(config: Config, tmp_path: Path) -> None:
     folder = dataset(tmp_path / "data", "v2.1")
     next(folder.rglob("*.mp4")).write_bytes(b"no video" * 100)
-    with pytest.raises(ConfigError, match="is no film that can be read"):
+    with pytest.raises(ConfigError, match=r"is no film that can be read.*ffmpeg -i"):
         markers_in_video(config, folder, CAMERA)
+
+
+def test_the_ball_is_followed_in_a_bags_compressed_images(config: Config, tmp_path: Path) -> None:
+    pytest.importorskip("rosbags")
+    from written_bags import BEGUN_S, compressed_image, write_bag
+
+    balls, times = path(0, 6), [k / FPS for k in range(6)]
+    jpegs = [cv2.imencode(".jpg", stage(ball).images[0])[1].tobytes() for ball in balls]
+    sent = [(t, compressed_image(t, jpeg)) for t, jpeg in zip([*times, times[-1]], [*jpegs, jpegs[-1]], strict=True)]
+    bag = write_bag(tmp_path / "bag", {"/camera/image/compressed": ("CompressedImage", sent)}, mcap=True)
+    track = markers_in_images(config, bag, "/camera/image/compressed")
+    np.testing.assert_allclose(track.t - BEGUN_S, times, atol=1e-6)
+    np.testing.assert_allclose(track.x[:, :2], [ball.x[:2] for ball in balls], atol=5e-4)
+    with pytest.raises(RecordingError, match=r"--video /tag: there is no such topic of sensor_msgs/msg/Compressed"):
+        markers_in_images(config, bag, "/tag")

@@ -2,16 +2,75 @@
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
 
 from bodyschema.interfaces.errors import ConfigError, SourceError
+from bodyschema.interfaces.extras import install_command
 from bodyschema.interfaces.records import FloatArray, ImageArray, frozen_array
 
 from .config import VideosConfig
 from .film import read_times
+
+_AV1 = int.from_bytes(b"AV01", "little")
+_CONVERT = "`ffmpeg -i OLD.mp4 -c:v libx264 -crf 18 NEW.mp4`"
+
+
+class _Film(Protocol):
+    """What is used of cv2.VideoCapture."""
+
+    def grab(self) -> bool: ...
+
+    def read(self) -> tuple[bool, Any]: ...
+
+    def get(self, prop: int, /) -> float: ...
+
+    def release(self) -> None: ...
+
+
+class _Av1Film:
+    """An AV1 film decoded by PyAV, which OpenCV's wheels cannot."""
+
+    def __init__(self, file: Path) -> None:
+        try:
+            av = importlib.import_module("av")
+        except ImportError as error:
+            remedy = f"Type: {install_command('av1')}. Or convert it: {_CONVERT}"
+            raise ConfigError("is in AV1, which OpenCV cannot decode", file=file, remedy=remedy) from error
+        self._container = av.open(str(file))
+        stream = self._container.streams.video[0]
+        stream.thread_type = "AUTO"
+        self._frames = self._container.decode(stream)
+        self._told = {
+            cv2.CAP_PROP_FRAME_WIDTH: float(stream.width),
+            cv2.CAP_PROP_FRAME_HEIGHT: float(stream.height),
+            cv2.CAP_PROP_FPS: float(stream.average_rate or 0.0),
+        }
+
+    def grab(self) -> bool:
+        return next(self._frames, None) is not None
+
+    def read(self) -> tuple[bool, ImageArray | None]:
+        frame = next(self._frames, None)
+        return (False, None) if frame is None else (True, frame.to_ndarray(format="bgr24"))
+
+    def get(self, prop: int, /) -> float:
+        return self._told[prop]
+
+    def release(self) -> None:
+        self._container.close()
+
+
+def _film(file: Path) -> _Film:
+    capture = cv2.VideoCapture(str(file))
+    if round(capture.get(cv2.CAP_PROP_FOURCC)) != _AV1:
+        return capture
+    capture.release()
+    return _Av1Film(file)
 
 
 class VideoRoll:
@@ -32,7 +91,7 @@ class VideoRoll:
         self._files = [folder / name for name in ((both,) if both else (config.left, config.right)) if name]
         eyes = [str(name) for name in (config.left, config.right) if name is not None]
         self.serials = (f"{both}/left", f"{both}/right") if both else tuple(eyes)
-        self._captures: list[cv2.VideoCapture] = []
+        self._captures: list[_Film] = []
         sizes, counts, rates = zip(*(_measured(file) for file in self._files), strict=True)
         if len(set(sizes)) > 1:
             said = " and ".join(f"{width}x{height}" for width, height in sizes)
@@ -60,7 +119,7 @@ class VideoRoll:
 
     def open(self, place: int) -> None:
         """Prepare to read the pair at `place`."""
-        self._captures = [cv2.VideoCapture(str(file)) for file in self._files]
+        self._captures = [_film(file) for file in self._files]
         for _ in range(place):  # seeking is not exact in every film
             for capture in self._captures:
                 capture.grab()
@@ -89,7 +148,7 @@ def _measured(file: Path) -> tuple[tuple[int, int], int, float]:
     """Return the size of the frames, the number that can be read, and their rate [1/s]."""
     if not file.is_file():
         raise ConfigError("there is no such film", file=file, remedy="Files are named relative to robot.toml")
-    capture = cv2.VideoCapture(str(file))
+    capture = _film(file)
     try:
         count = 0
         while capture.grab():  # what the file says of itself is often wrong
@@ -99,5 +158,5 @@ def _measured(file: Path) -> tuple[tuple[int, int], int, float]:
     finally:
         capture.release()
     if not count:
-        raise ConfigError("is no film that can be read", file=file)
+        raise ConfigError("is no film that can be read", file=file, remedy=f"Convert it: {_CONVERT}")
     return size, count, rate_hz

@@ -77,6 +77,11 @@ def arm(
         Literal["offsets"] | None,
         Parameter(help="offsets: joint offsets, camera and tool; the links are right as the URDF has them."),
     ] = None,
+    next_poses: Annotated[
+        Path | None,
+        Parameter(help="Write the poses to visit next into this file (.json, .csv), the most informative first."),
+    ] = None,
+    poses: Annotated[int, Parameter(help="How many poses of --next-poses.", validator=Number(gte=1, lte=200))] = 20,
     camera_frame: Annotated[str, Parameter(help="What ROS calls the measurement frame, for TF.")] = CAMERA_FRAME,
     taken: SourceOptions = AS_THEY_ARE,
     lerobot: LeRobotFile = None,
@@ -110,6 +115,7 @@ def arm(
     Next: `bodyschema run --robot OUT/robot.toml` starts from what was learnt. With --lerobot the joint offsets go into
     the servos instead, by LeRobot's own calibration file.
     """
+    from bodyschema.calibration.next_poses import check_target
     from bodyschema.calibration.plausibility.check import plausibility, told_sigma
     from bodyschema.calibration.plausibility.limits import require_units
     from bodyschema.calibration.report import CalibrationReport
@@ -117,6 +123,8 @@ def arm(
 
     _require_one_target(lerobot, out, write=write)
     trusted = _trusted(only, trust_urdf=trust_urdf)
+    if next_poses is not None:
+        check_target(next_poses, replace=force)
     config = Config.load(robot_file(robot, source))
     description, source = config.robot, source or config.store_file
     recording, first = _rows(config, source, taken, lerobot, (first, last))
@@ -132,7 +140,8 @@ def arm(
     if out is not None or write:
         _require_writable(report, force=force)
     told = [] if out is None else _written(config, found, report, out, replace=force)
-    lines = [] if lerobot is None else _into_servos(config, report, lerobot, write=write)
+    lines = [] if next_poses is None else _planned(found, next_poses, poses)
+    lines += [] if lerobot is None else _into_servos(config, report, lerobot, write=write)
     if as_json:
         print_json(report)
     else:
@@ -212,6 +221,18 @@ def _written(config: Config, found: Calibration, report: CalibrationReport, out:
         f"{launch} written, which publishes the same.",
         f"\n{written} written. Next: stop what runs with {config.file.name} (the new one has its ports), then "
         f"`bodyschema run --robot {written}`",
+    ]
+
+
+def _planned(found: Calibration, file: Path, count: int) -> list[str]:
+    """Write the poses to measure next into `file`; return what they would gain."""
+    from bodyschema.calibration.next_poses import NextPoses
+
+    plan = NextPoses.of(found, count)
+    plan.write(file, replace=True)
+    return [
+        f"{count} poses written to {file}. Model error over the range, without noise: "
+        f"{1e3 * plan.expected_m:.2g} mm expected now, {1e3 * plan.expected_after_m:.2g} mm with them."
     ]
 
 

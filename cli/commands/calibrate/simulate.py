@@ -38,13 +38,15 @@ def simulate(
     from rich.console import Console
 
     from bodyschema.calibration.plausibility.limits import require_units
+    from bodyschema.cli.recordings.rerun_scene import scene_for
     from bodyschema.cli.recordings.synthesis import simulated, with_noise, without_consequence
     from bodyschema.effects import load_simulation
     from bodyschema.recordings import files as recordings
 
     if out is not None:
         recordings.check_target(out, force=force)
-    simulation = load_simulation(robot_file(robot, like))
+    robot = robot_file(robot, like)
+    simulation = load_simulation(robot)
     recording = recordings.opened(like, simulation.robot.joints)
     require_units(simulation.robot, recording, like)
     result = simulated(simulation, recording)
@@ -56,7 +58,7 @@ def simulate(
     if out is None:
         result.write_csv_to(sys.stdout)
         return
-    recordings.write(result, out)
+    recordings.write(result, out, scene=scene_for(out, robot, result))
     count = len(simulation.effects)
     effects = "without effects" if not count else f"with {count} effect{'s' if count > 1 else ''}"
     Console(highlight=False, soft_wrap=True).print(

@@ -41,7 +41,8 @@ def export(
     """Turn pairs into files of other programs, and a robot with what was found into MJCF, URDF or a correction.
 
     A store may be in use by a running sampler. MCAP opens in Foxglove: joints and positions under `/pair`, the marker
-    under `/marker`, and as metadata what the joints were read with (servos, firmware, homing offsets).
+    under `/marker`, and as metadata what the joints were read with (servos, firmware, homing offsets). .rrd opens in
+    Rerun: the moving robot, its cameras, and the marker as measured and as robot.toml or extended.toml predicts it.
 
     A robot is an extended.toml that `bodyschema diagnose` wrote, or a robot.toml. What the format cannot hold is
     printed, and stands in the file. examples/correction has programs that read the correction at run time.
@@ -53,6 +54,7 @@ def export(
     """
     from rich.console import Console
 
+    from bodyschema.cli.recordings.rerun_scene import scene_for
     from bodyschema.daemon.config import Config
     from bodyschema.interfaces.errors import RequestError
     from bodyschema.recordings import files as recordings
@@ -68,7 +70,10 @@ def export(
         recording, devices = recordings.from_store(source), recordings.devices_of(source)
     else:
         recording, devices = taken.opened(Config.load(robot), source, lerobot), []
-    recordings.write(recording, out, devices)
+    scene = scene_for(out, robot, recording) if robot.exists() else None
+    if scene is None and out.suffix.lower() == recordings.RERUN:
+        console.print(f"Without robot and cameras: there is no {robot}. Give --robot", markup=False)
+    recordings.write(recording, out, devices, scene)
     console.print(f"{len(recording)} pairs written to {out}", markup=False)
 
 

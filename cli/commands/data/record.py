@@ -42,7 +42,6 @@ def record(
     recordings.check_target(out, force=force)
     config = Config.load(robot)
     console = Console(highlight=False, soft_wrap=True)
-    joints = config.robot.joints
     with client(config.route("sampler")) as bus:
         history = History(bus, config.robot, from_seq)
         if follow:
@@ -50,9 +49,9 @@ def record(
             with on_termination(wishes.end):
                 if not as_json:
                     console.print(f"writing pairs to {out} as they come; Ctrl-C ends it", markup=False)
-                count = follow_history(history, joints, out, lambda: wishes.ending)
+                count = follow_history(history, config.robot, out, lambda: wishes.ending)
         else:
-            count = copy_history(history, joints, out)
+            count = copy_history(history, config.robot, out)
     if as_json:
         print_json(
             {"file": str(out), "pairs": count, "last_seq": history.next_seq - 1, "missing": history.missing.count}

@@ -8,15 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
+from cyclopts.validators import Number
 
 from bodyschema.cli.commands.options import HERE, flag, several
 from bodyschema.cli.commands.start.config import say
 
 if TYPE_CHECKING:
-    from bodyschema.cli.hardware.robot_template import Guess
+    from bodyschema.cli.hardware.robot_template import Guess, Seen
     from bodyschema.cli.servos.fitting import Candidate, Fitting
 
-SCAN = "scan"
+SCAN, ANY = "scan", "any"
 
 
 def init(
@@ -37,6 +38,16 @@ def init(
     calibration: Annotated[Path | None, Parameter(help="LeRobot's calibration of this arm, a JSON file.")] = None,
     port: Annotated[tuple[str, ...], several("Scan only this port")] = (),
     baud: Annotated[tuple[int, ...], several("Scan only at this rate")] = (),
+    webcam: Annotated[
+        str | None,
+        Parameter(help="One camera alone: its name in /dev/v4l/by-id, or `any` where only one is plugged in."),
+    ] = None,
+    tag_mm: Annotated[
+        float | None, Parameter(help="The marker is a tag with a side of so many mm.", validator=Number(gt=0, lte=500))
+    ] = None,
+    ball_mm: Annotated[
+        float | None, Parameter(help="The marker is a red ball of this diameter.", validator=Number(gt=0, lte=500))
+    ] = None,
     yes: Annotated[bool, flag("Do not ask: the joints of the URDF get the servos in the order of their IDs.")] = False,
     sim: Annotated[bool, flag("A whole example: the simulated upper body.")] = False,
 ) -> None:
@@ -45,7 +56,8 @@ def init(
     With --urdf the longest chain of joints is filled in; fingers and joints that mimic others are left out. With
     --from scan each joint gets a servo: you are asked which, and the result is checked against the URDF. With
     --lerobot IDs, directions and zeros come from LeRobot's calibration: one robot.toml for a leader, another one for a
-    follower. Without --urdf the names are examples. Nothing is written to any servo.
+    follower. --webcam, --tag-mm and --ball-mm fill in camera and marker. Without --urdf the names are examples. Nothing
+    is written to any servo.
 
     Needs: your robot's URDF; with --from scan, powered servos; with --lerobot, LeRobot's calibration of the arm; with
     --sim, nothing.
@@ -58,17 +70,20 @@ def init(
     _require_one_way(sim=sim, lerobot=lerobot, source=source, urdf=urdf)
     if os.path.lexists(robot):
         raise ConfigError("is there already", file=robot, remedy="Give another --robot, or move it away")
+    seen = _seen(webcam, tag_mm, ball_mm, plugged_in=bool(lerobot or source))
     try:
         if sim:
             _copy_model(robot)
         elif lerobot is not None:
-            write_new(robot, _of_lerobot(lerobot, urdf, robot, calibration, port))
+            write_new(robot, _of_lerobot(lerobot, urdf, robot, calibration, port, seen))
         elif source is not None and urdf is not None:
-            _with_servos(_guess(urdf, robot, marker_link, camera_link), robot, _candidates(source, port, baud), yes=yes)
+            guess = _guess(urdf, robot, marker_link, camera_link)
+            _with_servos(guess, robot, _candidates(source, port, baud), seen, yes=yes)
         else:
             from bodyschema.cli.hardware.robot_template import EXAMPLE, robot_toml
 
-            write_new(robot, robot_toml(EXAMPLE if urdf is None else _guess(urdf, robot, marker_link, camera_link)))
+            guess = EXAMPLE if urdf is None else _guess(urdf, robot, marker_link, camera_link)
+            write_new(robot, robot_toml(guess, seen))
     except OSError as error:
         raise ConfigError(f"cannot be written: {error.strerror}", file=robot, remedy="Give another --robot") from error
     following = "run --sim" if sim else "watch joints" if lerobot or source else "config"
@@ -85,22 +100,38 @@ def _require_one_way(*, sim: bool, lerobot: str | None, source: str | None, urdf
         raise ConfigError("--from needs the robot's URDF", remedy="Give it with --urdf")
 
 
+def _seen(webcam: str | None, tag_mm: float | None, ball_mm: float | None, *, plugged_in: bool) -> Seen:
+    """Return the cameras, those that are plugged in if `plugged_in`, and the marker."""
+    from bodyschema.cli.hardware.robot_template import Seen
+    from bodyschema.daemon.wiring.wiring import connected_cameras
+    from bodyschema.interfaces.errors import ConfigError
+
+    if tag_mm is not None and ball_mm is not None:
+        raise ConfigError("--tag-mm and --ball-mm exclude each other", remedy="Give the one that is on the hand")
+    cameras = connected_cameras() if plugged_in or webcam == ANY else ()
+    if webcam == ANY:
+        if len(cameras) != 1:
+            what = f"the cameras here are {', '.join(cameras)}" if cameras else "no camera is plugged in"
+            raise ConfigError(f"--webcam any: {what}", remedy="Give the name of one, from /dev/v4l/by-id")
+        webcam = cameras[0]
+    return Seen(cameras, webcam, tag_mm, ball_mm)
+
+
 def _guess(urdf: Path, robot: Path, marker_link: str | None, camera_link: str | None) -> Guess:
     from bodyschema.cli.hardware.robot_template import guess_from
 
     return guess_from(urdf, robot, marker_link=marker_link, camera_link=camera_link)
 
 
-def _with_servos(guess: Guess, robot: Path, candidates: Sequence[Candidate], *, yes: bool) -> None:
+def _with_servos(guess: Guess, robot: Path, candidates: Sequence[Candidate], seen: Seen, *, yes: bool) -> None:
     """Write robot.toml with a servo for each joint, and take it back where it does not fit the URDF."""
     from bodyschema.cli.hardware.robot_template import robot_toml
     from bodyschema.cli.servos.fitting import first_of, fit, servo_tables
     from bodyschema.daemon.config import Config
-    from bodyschema.daemon.wiring.wiring import connected_cameras
     from bodyschema.interfaces.errors import BodyschemaError
 
     fitting = fit(guess.joints, candidates, first_of if yes else _asked)
-    text = robot_toml(guess._replace(joints=list(fitting.servos)), connected_cameras()) + servo_tables(fitting)
+    text = robot_toml(guess._replace(joints=list(fitting.servos)), seen) + servo_tables(fitting)
     write_new(robot, text)
     try:
         Config.load(robot)
@@ -111,11 +142,12 @@ def _with_servos(guess: Guess, robot: Path, candidates: Sequence[Candidate], *, 
         say(line)
 
 
-def _of_lerobot(name: str, urdf: Path | None, robot: Path, calibration: Path | None, ports: Sequence[str]) -> str:
+def _of_lerobot(
+    name: str, urdf: Path | None, robot: Path, calibration: Path | None, ports: Sequence[str], seen: Seen
+) -> str:
     """Return a robot.toml for an arm of LeRobot."""
     from bodyschema.cli.hardware.lerobot_robot import lerobot_arm, lerobot_port, lerobot_robot_toml
     from bodyschema.daemon.wiring import servos as servo_wiring
-    from bodyschema.daemon.wiring.wiring import connected_cameras
     from bodyschema.interfaces.errors import ConfigError
     from bodyschema.robot.lerobot import where_calibrations_are
 
@@ -131,7 +163,7 @@ def _of_lerobot(name: str, urdf: Path | None, robot: Path, calibration: Path | N
     if len(ports) != 1:
         ports = servo_wiring.ports_to_scan(ports, None)
         ports = [lerobot_port(arm, lambda bauds: servo_wiring.scan(ports, bauds, lambda _: None))]
-    return lerobot_robot_toml(arm, urdf, robot, calibration, ports[0], connected_cameras())
+    return lerobot_robot_toml(arm, urdf, robot, calibration, ports[0], seen)
 
 
 def write_new(file: Path, text: str) -> None:

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import zenoh
 
@@ -24,7 +24,15 @@ class ZenohRobot:
         published: number of messages so far.
     """
 
-    def __init__(self, nodes: Sequence[Node], listen: str, *, domain: int = 0, topic: str = "/joint_states") -> None:
+    def __init__(
+        self,
+        nodes: Sequence[Node],
+        listen: str,
+        *,
+        domain: int = 0,
+        topic: str = "/joint_states",
+        via: Literal["rmw_zenoh", "ros2dds"] = "rmw_zenoh",
+    ) -> None:
         """Prepare without opening anything.
 
         Args:
@@ -32,7 +40,9 @@ class ZenohRobot:
             listen: endpoint of the router, such as tcp/127.0.0.1:7447.
             domain: ROS_DOMAIN_ID.
             topic: of the joint states.
+            via: whose keys: those of rmw_zenoh, or of zenoh-bridge-ros2dds.
         """
+        self._via = via
         self._nodes, self._listen, self._domain, self._topic = list(nodes), listen, domain, topic
         self._session: zenoh.Session | None = None
         self._threads: list[threading.Thread] = []
@@ -53,9 +63,11 @@ class ZenohRobot:
             config.insert_json5(key, json.dumps(value))
         self._session = session = zenoh.open(config)
         self._stop.clear()
-        token = rmw.publisher_token(self._domain, str(session.info.zid()), "bench", self._topic, JOINT_STATE)
-        self._token = session.liveliness().declare_token(token)
-        key = rmw.topic_key(self._domain, self._topic, JOINT_STATE)
+        key = self._topic.strip("/")
+        if self._via == "rmw_zenoh":
+            token = rmw.publisher_token(self._domain, str(session.info.zid()), "bench", self._topic, JOINT_STATE)
+            self._token = session.liveliness().declare_token(token)
+            key = rmw.topic_key(self._domain, self._topic, JOINT_STATE)
         # Like a robot with rmw_zenoh, drop what a slow reader cannot take.
         self._publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
         return self
@@ -81,7 +93,7 @@ class ZenohRobot:
         """Publish a node's message of time `t` [s]."""
         sent = node.at(t)
         if sent is not None:
-            self._publisher.put(sent.payload, attachment=sent.attached)
+            self._publisher.put(sent.payload, attachment=sent.attached if self._via == "rmw_zenoh" else None)
             self.published += 1
 
     def start(self) -> None:

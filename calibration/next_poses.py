@@ -1,0 +1,141 @@
+"""Poses to measure next, chosen to reduce what a calibration leaves uncertain."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyschema.interfaces.errors import RecordingError
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.whole_files import write_whole
+from bodyschema.robot.links import link_poses
+from kbmaps import ChainPosterior, ExperimentDesign, next_poses
+
+from .rigid_chain import Calibration
+
+JSON, CSV = ".json", ".csv"
+# Shares of a joint's range at each end, and of the image at each edge, that poses keep away from.
+_JOINT_MARGIN, _IMAGE_MARGIN = 0.03, 0.05
+# More candidates gain less than 2 %.
+_CANDIDATES, _REGION = 600, 200
+_BATCH, _BATCHES = 2000, 50
+
+
+@dataclass(frozen=True, eq=False)
+class NextPoses:
+    """Poses to measure next, the most informative first.
+
+    Attributes:
+        joints: names in the order of q.
+        prismatic: True for each joint (d,) that slides.
+        q: joint readings (n, d) [rad or m].
+        expected_m: mean error of the present calibration over all poses that are allowed [m].
+        expected_after_m: the same once these poses have been measured.
+    """
+
+    robot: str
+    joints: tuple[str, ...]
+    prismatic: NDArray[np.bool_]
+    q: FloatArray
+    expected_m: float
+    expected_after_m: float
+
+    @classmethod
+    def of(cls, calibration: Calibration, count: int, seed: int = 0) -> NextPoses:
+        """Choose `count` poses.
+
+        They are within the joint limits, the marker is in the image (where [camera] describes one), and no link is
+        lower than in the recording, so that an arm on a table stays above it.
+
+        Raises:
+            RecordingError: hardly any pose is allowed.
+        """
+        rng = np.random.default_rng(seed)
+        allowed = np.empty((0, len(calibration.robot.joints)))
+        for _ in range(_BATCHES):
+            allowed = np.concatenate([allowed, allowed_poses(calibration, rng)])
+            if len(allowed) >= _CANDIDATES + _REGION:
+                break
+        if len(allowed) < 2 * count:
+            raise RecordingError(
+                f"only {len(allowed)} poses are within the limits, in view of the camera, and no lower than the "
+                "recording",
+                file=calibration.recording.file,
+                remedy="Record poses that are farther apart, or ask for fewer",
+            )
+        region, candidates = np.split(allowed[: _CANDIDATES + _REGION], [min(_REGION, len(allowed) // 2)])
+        posterior = ChainPosterior.of(calibration.learner)
+        design = ExperimentDesign(posterior, region)
+        chosen = next_poses(posterior, region, candidates, count)
+        return cls(
+            robot=calibration.robot.name,
+            joints=calibration.robot.joints,
+            prismatic=calibration.robot.chain.prismatic,
+            q=chosen,
+            expected_m=design.error,
+            expected_after_m=design.error_after(posterior.roots(chosen)),
+        )
+
+    def write(self, file: Path, *, replace: bool) -> None:
+        """Write the poses as JSON or CSV, by the ending of `file`.
+
+        Raises:
+            RecordingError: the file is there already, or cannot be written.
+        """
+        check_target(file, replace=replace)
+        try:
+            write_whole({file: (self._json() if file.suffix.lower() == JSON else self._csv())})
+        except OSError as error:
+            raise RecordingError(f"cannot be written: {error.strerror}", file=file) from error
+
+    def _json(self) -> bytes:
+        value = {
+            "schema": 1,
+            "robot": self.robot,
+            "joints": self.joints,
+            "units": ["m" if slides else "rad" for slides in self.prismatic],
+            "poses": self.q.tolist(),
+            "expected_m": self.expected_m,
+            "expected_after_m": self.expected_after_m,
+        }
+        return msgspec.json.format(msgspec.json.encode(value), indent=2) + b"\n"
+
+    def _csv(self) -> bytes:
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([self.joints, *self.q.tolist()])
+        return text.getvalue().encode()
+
+
+def check_target(file: Path, *, replace: bool) -> None:
+    """Raise RecordingError unless poses can be written to `file`: known ending, no file in the way."""
+    if file.suffix.lower() not in (JSON, CSV):
+        raise RecordingError(f"files of poses end in {JSON} or {CSV}", file=file, remedy="Give another name")
+    if file.exists() and not replace:
+        raise RecordingError("the file is there already", file=file, remedy="Give another name, or --force")
+
+
+def allowed_poses(calibration: Calibration, rng: np.random.Generator) -> FloatArray:
+    """Draw joint readings (n, d), and return those that a next pose may have."""
+    robot, recording = calibration.robot, calibration.recording
+    margin = _JOINT_MARGIN * (robot.upper - robot.lower)
+    q = rng.uniform(robot.lower + margin, robot.upper - margin, (_BATCH, len(robot.joints)))
+    kept = _lowest(calibration, q) >= _lowest(calibration, recording.q).min()
+    if robot.calibration is not None:
+        size = np.array(robot.calibration.image_size_px * (2 if robot.calibration.is_stereo else 1))
+        x = calibration.learner.predict(q)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            pixels = robot.calibration.project(x)[:, : len(size)]
+        inside = (pixels > _IMAGE_MARGIN * size) & (pixels < (1.0 - _IMAGE_MARGIN) * size)
+        kept &= (x[:, 2] > 0.0) & inside.all(axis=1)
+    return q[kept]
+
+
+def _lowest(calibration: Calibration, q: FloatArray) -> FloatArray:
+    """Return the height [m] of the lowest link's origin at each of q (n, d), along z of the root link."""
+    return np.min([poses[:, 2, 3] for poses in link_poses(calibration.robot, q).values()], axis=0)
