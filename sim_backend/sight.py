@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.robot.rpy import rotation_of
 
 from .bullet import Body
 from .config import CameraConfig
@@ -45,7 +45,7 @@ class Sight:
         self._body = body
         self._radius = camera.marker_radius_m
         # Where the tags face, in the chain's last frame, shape (tags, 3); a ball has none.
-        turns = [truth.tool_turn @ Rotation.from_euler("xyz", tag.rpy).as_matrix() for tag in camera.tags]
+        turns = [truth.tool_turn @ rotation_of(np.array(tag.rpy)) for tag in camera.tags]
         self._facing = np.array([turn[:, 2] for turn in turns]).reshape(-1, 3)
         self._near_pairs = self._clearance_pairs()
         self._chain = truth.chain(np.array(truth.robot.robot.marker_xyz))
