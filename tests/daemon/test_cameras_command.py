@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 from board_renderer import Photographer, Printed, Taken
-from shown_board import photographed
+from shown_board import photographed, true_vector
 
 from bodyschema.cli.cameras.calibration import NORMAL_95, CamerasFile, CheckFile
 from bodyschema.cli.main import app
@@ -44,7 +44,8 @@ def test_a_folder_of_images_becomes_a_calibration(folder) -> None:
     rig = read_rig(folder / "cameras.toml")
     truth = photographed()[0]
     assert abs(rig.baseline_m - truth.baseline_m) < 2.5 * rig.baseline_sigma_m
-    assert rig.serials == ("A1", "")
+    assert np.abs((rig.vector - true_vector(truth)) / rig.sigma).max() < 5.0
+    assert (rig.model, rig.serials) == ("pinhole", ("A1", ""))
 
 
 def test_the_report_is_one_file_with_a_picture_of_every_image(folder) -> None:
