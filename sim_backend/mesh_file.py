@@ -244,19 +244,15 @@ def _numbers(text: str | None, kind: Any) -> np.ndarray:
 
 def _placement(element: Any) -> FloatArray:
     """Return one of a node's transforms, (4, 4)."""
-    from scipy.spatial.transform import Rotation
-
     numbers = _numbers(element.text, np.float64)
     match element.tag.rpartition("}")[2]:
         case "matrix":
             return numbers.reshape(4, 4)
         case "translate":
-            return transform(Rotation.identity(), numbers.reshape(3))
+            return transform(np.zeros(3), numbers.reshape(3))
         case "rotate":
             x, y, z, degrees = numbers
             length = float(np.hypot(np.hypot(x, y), z))
-            return transform(
-                Rotation.from_rotvec(np.radians(degrees) * np.array([x, y, z]) / (length or 1.0)), np.zeros(3)
-            )
+            return transform(np.radians(degrees) * np.array([x, y, z]) / (length or 1.0), np.zeros(3))
         case _:
             return np.diag([*numbers.reshape(3), 1.0])

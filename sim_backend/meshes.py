@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
 from bodyschema.interfaces.records import FloatArray
 
@@ -155,6 +154,8 @@ def _keys(points: FloatArray, cell: float) -> np.ndarray:
 
 def _hull(triangles: FloatArray) -> FloatArray:
     """Return about the convex hull of triangles as triangles (m, 3, 3); of what is flat its box, 1 mm thick."""
+    from scipy.spatial import ConvexHull, QhullError  # only large meshes need it, and it takes half a second
+
     points = triangles.reshape(-1, 3)
     low, high = points.min(axis=0), points.max(axis=0)
     corners = points[np.unique((points @ _DIRECTIONS.T).argmax(axis=0))]

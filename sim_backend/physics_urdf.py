@@ -12,7 +12,6 @@ from xml.etree import ElementTree
 
 import msgspec
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.errors import RobotError
 from bodyschema.interfaces.records import FloatArray
@@ -21,6 +20,7 @@ from bodyschema.robot.rpy import rpy_of
 from bodyschema.robot.urdf import MOVING, UrdfJoint, UrdfTree
 from bodyschema.sim_backend.truth import root_link
 
+from .geometry import turn_of_z
 from .meshes import LARGEST_M, Meshes
 from .truth import TrueRobot
 
@@ -190,8 +190,7 @@ class _Writer:
             length = float(np.linalg.norm(end))
             if joint.parent != link or length < _SHORTEST_ROD_M or joint.child not in self._moving:
                 continue
-            turn = Rotation.align_vectors(end[None] / length, [[0.0, 0.0, 1.0]])[0]
-            rod = _shape_at(kind, (end / 2).tolist(), rpy_of(turn.as_matrix()).tolist())
+            rod = _shape_at(kind, (end / 2).tolist(), rpy_of(turn_of_z(end / length)).tolist())
             radius = float(np.clip(_ROD_SHARE * length, *_ROD_RADII_M))
             ElementTree.SubElement(
                 ElementTree.SubElement(rod, "geometry"), "cylinder", radius=repr(radius), length=repr(length)

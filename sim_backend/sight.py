@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.pointing import Pointing
+from bodyschema.robot.rpy import rotation_of
 from bodyschema.sim_backend.truth import JointRoles
 from kbmaps import RigidChain
 
@@ -95,7 +95,7 @@ class Sight:
         self._body = body
         self._radius = camera.marker_radius_m
         # Where the tags face, in the chain's last frame, shape (tags, 3); a ball has none.
-        turns = [truth.tool_turn @ Rotation.from_euler("xyz", tag.rpy).as_matrix() for tag in camera.tags]
+        turns = [truth.tool_turn @ rotation_of(np.array(tag.rpy)) for tag in camera.tags]
         self._facing = np.array([turn[:, 2] for turn in turns]).reshape(-1, 3)
         self._near_pairs = self._clearance_pairs()
         self._chain = truth.chain(np.array(truth.robot.robot.marker_xyz))

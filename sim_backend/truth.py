@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from bodyschema.effects import Effect, Simulation
 from bodyschema.effects.effect_type import ToolEffect
@@ -17,7 +16,7 @@ from bodyschema.robot.urdf import MOVING, UrdfJoint, UrdfTree, chain_between
 from kbmaps import RigidChain
 
 from .config import ErrorConfig, SimConfig
-from .geometry import joint_motion, transform
+from .geometry import joint_motion, rotation, transform
 from .randomness import Stream, generator
 
 # The offset of a prismatic joint is known better than that of a revolute one: metres of error per radian.
@@ -74,7 +73,7 @@ class TrueRobot:
         for effect in extension.all_effects:
             if effect.kind.rigid and isinstance(effect.kind, ToolEffect):
                 tool_error = tool_error + effect.kind.shift(effect.values)
-        tool_turn = Rotation.from_rotvec(errors.tool_rotation_rad * rng.standard_normal(3)).as_matrix()
+        tool_turn = rotation(errors.tool_rotation_rad * rng.standard_normal(3))
         for name, joint in joints.items():
             if joint.kind in MOVING and name not in robot.joints:
                 held_at = robot.robot.held_at.get(name, 0.0) - offsets.get(name, 0.0)
@@ -134,7 +133,7 @@ def _offset(joint: UrdfJoint, errors: ErrorConfig, rng: np.random.Generator) -> 
 
 def _pose_error(length: float, angle: float, rng: np.random.Generator) -> FloatArray:
     shift, turn = length * rng.standard_normal(3), angle * rng.standard_normal(3)
-    return transform(Rotation.from_rotvec(turn), shift)
+    return transform(turn, shift)
 
 
 def _locked(joint: UrdfJoint, position: float) -> UrdfJoint:

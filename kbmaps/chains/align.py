@@ -21,6 +21,8 @@ _OUTLIER_SIGMAS = 15.0
 _ROUNDS = 60
 _START_PAIRS = 300
 _STEP_TOLERANCE = 1e-12
+# Starting points are only compared: the best one is fitted again, to the tolerance above.
+_TRIAL_TOLERANCE = 1e-5
 # Singular values below this share of the largest are directions that the data do not determine.
 _RANK_TOLERANCE = 1e-7
 
@@ -193,7 +195,7 @@ def _start_shift(fit: _Fit, sigma: float, turns: FloatArray | None) -> FloatArra
     for start in starts:
         trial = _Fit(fit.nominal_rotations[chosen], fit.nominal_positions[chosen], fit.x[chosen], True, True)
         trial.shift = start
-        _fit_robustly(trial, sigma)
+        _fit_robustly(trial, sigma, _TRIAL_TOLERANCE)
         spread = trial.spread(0.0)
         # A new start must be clearly better, so that rounding does not choose among equals.
         if spread < 0.9 * best_spread - ROUNDING_M:
@@ -223,7 +225,7 @@ def _shift_by_turns(fit: _Fit, turns: FloatArray) -> FloatArray:
     return cast(FloatArray, np.linalg.lstsq(columns.reshape(-1, 6), target.ravel(), rcond=_RANK_TOLERANCE)[0])[:3]
 
 
-def _fit_robustly(fit: _Fit, sigma: float) -> BoolArray:
+def _fit_robustly(fit: _Fit, sigma: float, tolerance: float = _STEP_TOLERANCE) -> BoolArray:
     """Fit robustly by graduated non-convexity, then by least squares on the inliers; return the inliers (n,).
 
     Geman-McClure weights whose scale shrinks from the largest residual to that of the bulk (Yang et al. 2020,
@@ -241,14 +243,14 @@ def _fit_robustly(fit: _Fit, sigma: float) -> BoolArray:
         weights = (scale**2 / (scale**2 + norms**2)) ** 2 if scale > 0.0 else weights
         step = fit.improve(weights)
         norms = fit.norms()
-        if scale == goal and step < _STEP_TOLERANCE:
+        if scale == goal and step < tolerance:
             break
     inliers = np.ones(len(fit.x), dtype=np.bool_)
     for _ in range(_ROUNDS):
         chosen = norms <= max(_OUTLIER_SIGMAS * fit.spread(sigma), ROUNDING_M)
         step = fit.improve(chosen.astype(np.float64))
         norms = fit.norms()
-        settled = bool((chosen == inliers).all()) and step < _STEP_TOLERANCE
+        settled = bool((chosen == inliers).all()) and step < tolerance
         inliers = chosen
         if settled:
             break

@@ -8,10 +8,10 @@ from colorsys import rgb_to_hsv
 import cv2
 import msgspec
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, ImageArray
+from bodyschema.robot.rpy import rotation_of
 from bodyschema.sim_backend.config import CameraConfig, SimTag
 from bodyschema.sim_backend.randomness import Stream, generator
 from bodyschema.sim_backend.rendering.raster import EmptyWorld, Grid, Raster
@@ -120,7 +120,7 @@ class TagSheets:
     def __init__(self, tags: Sequence[SimTag], dictionary: int) -> None:
         patterns = cv2.aruco.getPredefinedDictionary(dictionary)
         self._tags = tuple(tags)
-        self._turns = [Rotation.from_euler("xyz", tag.rpy).as_matrix() for tag in tags]
+        self._turns = [rotation_of(np.array(tag.rpy)) for tag in tags]
         # One pixel a square, from the top left; True where it is black.
         self._black = [patterns.generateImageMarker(tag.id, _SQUARES, borderBits=1) < 128 for tag in tags]
 
@@ -308,14 +308,14 @@ def portraits(calibration: StereoCalibration, config: CameraConfig) -> Iterator[
     eyes = StereoEyes(EmptyWorld(), calibration, msgspec.structs.replace(config, clutter=0, noise=0.0), seed=0)
     width, height = calibration.image_size_px
     middle_px = np.array([width - 1, height - 1]) / 2 - calibration.principal_point_px
-    faced = Rotation.from_euler("xyz", config.tags[0].rpy).inv() if config.tags else Rotation.identity()
+    faced = rotation_of(np.array(config.tags[0].rpy)).T if config.tags else np.eye(3)
     for radius_px, turn_deg in _PORTRAITS:
         # Limit the size so that the marker stays inside both images.
         z = calibration.focal_px * max(config.marker_radius_m / radius_px, 2.0 * calibration.baseline_m / width)
         x, y = middle_px * z / calibration.focal_px
         left = np.array([x + calibration.baseline_m / 2, y, z])
-        turn = Rotation.from_euler("x", 180.0 - turn_deg, degrees=True) * faced
+        turn = rotation_of(np.array([np.radians(180.0 - turn_deg), 0.0, 0.0])) @ faced
         x_eyes = left - calibration.eyes_m
         images = tuple(np.zeros((height, width, 3), np.uint8) for _ in x_eyes)
-        eyes.paint(0, np.eye(4), x_eyes, turn.as_matrix(), images)
+        eyes.paint(0, np.eye(4), x_eyes, turn, images)
         yield images

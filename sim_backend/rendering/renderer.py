@@ -13,12 +13,12 @@ import sys
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.records import FloatArray, ImageArray
 from bodyschema.sim_backend.bullet import Body
 
 from .eye import TO_LIGHT, StereoEyes
+from .geometry import quaternion_of, turn_of_z
 from .raster import Raster
 from .render_messages import SLOTS, Frame, Message, Setup, Tool, frame_bytes, receive, slot_images
 
@@ -33,7 +33,7 @@ class Stick:
     def __init__(self, body: Body, link: str) -> None:
         self._body, self._link = body, link
         self._id = -1
-        self._T_link_stick: tuple[FloatArray, Rotation] = (np.zeros(3), Rotation.identity())
+        self._T_link_stick: tuple[FloatArray, FloatArray] = (np.zeros(3), np.eye(3))
 
     def change(self, tip: FloatArray) -> None:
         """Take a rod to `tip` (3,) [m] in the link."""
@@ -53,8 +53,7 @@ class Stick:
             physicsClientId=client,
         )
         self._id = bullet.createMultiBody(0, -1, shape, physicsClientId=client)
-        turn = Rotation.align_vectors(tip[None] / length, [[0.0, 0.0, 1.0]])[0]
-        self._T_link_stick = (tip / 2, turn)
+        self._T_link_stick = (tip / 2, turn_of_z(tip / length))
 
     def follow(self) -> None:
         """Move the rod to where the link is now."""
@@ -62,11 +61,10 @@ class Stick:
             return
         T = self._body.link_pose(self._link)
         middle, turn = self._T_link_stick
-        orientation = Rotation.from_matrix(T[:3, :3]) * turn
         self._body.bullet.resetBasePositionAndOrientation(
             self._id,
             (T[:3, :3] @ middle + T[:3, 3]).tolist(),
-            orientation.as_quat().tolist(),
+            quaternion_of(T[:3, :3] @ turn),
             physicsClientId=self._body.client,
         )
 

@@ -32,7 +32,7 @@ from .kinds import KINDS
 from .meaning import meant
 from .sealed import encoded, read
 
-PAIRS = 150
+PAIRS = 80
 ELBOW = "joint_offset@elbow"
 Hide = Callable[..., Truth]
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import select
 import subprocess
 import sys
 import threading
@@ -95,6 +96,38 @@ def test_a_subscriber_with_a_bug_goes_on_receiving(server, asking, quick: bool) 
     publish(b"1")
     publish(b"2")
     assert [received.get(timeout=LIMIT_S), received.get(timeout=LIMIT_S)] == [b"1", b"2"]
+
+
+STOPPED = """
+import os, signal, sys, time
+from bodyschema.daemon.transport.bus import ZenohSession
+with ZenohSession(connect=sys.argv[1]) as bus:
+    bus.subscribe(sys.argv[2], lambda payload: (print("heard", flush=True), os.kill(os.getpid(), signal.SIGSTOP)))
+    time.sleep(3600)
+"""
+
+
+FOR_EVER = {"transport/link/tx/queue/congestion_control/block/wait_before_close": 10**12}
+
+
+def test_a_stopped_subscriber_holds_up_no_publication(endpoint) -> None:
+    last = threading.Event()
+    with (
+        ZenohSession(listen=endpoint, settings=FOR_EVER) as bus,
+        client(endpoint) as well,
+        subprocess.Popen([sys.executable, "-c", STOPPED, endpoint, KEY], stdout=subprocess.PIPE) as stopped,
+    ):
+        publish = bus.publisher(KEY, cache=1)
+        try:
+            while not select.select([stopped.stdout], [], [], 0.05)[0]:
+                publish(b"first")
+            well.subscribe(KEY, lambda payload: last.set() if payload == b"last" else None, quick=True)
+            for _ in range(100):
+                publish(bytes(100_000))  # more than all buffers on the way hold
+            while not last.wait(0.05):
+                publish(b"last")
+        finally:
+            stopped.kill()
 
 
 def test_where_nobody_answers_the_process_to_start_is_named(asking) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from fitted_once import fitted_once as fitted_once
 
 from bodyschema.calibration.plausibility.check import Plausibility
 from bodyschema.calibration.report import CalibrationReport

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fitted_once import fitted_once as fitted_once
 from scipy.spatial.transform import Rotation
 
 from bodyschema.calibration.chain_figures import HALF_WIDTH_95

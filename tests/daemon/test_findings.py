@@ -81,7 +81,7 @@ class Planted:
         x = self.parameters.positions(self.change, q) + SIGMA_M * rng.normal(size=(pairs, 3))
         for k in range(pairs):
             self.learning.learn(make_pair(first + k, q[k], x[k], SIGMA_M), 0.0)
-            if k < 20 and k % 5 == 4:
+            if k == 9:
                 self.solve()
         self.solve()
         self.learning.learn(make_pair(first + pairs, q[0], x[0], SIGMA_M), 0.0)
@@ -227,6 +227,7 @@ def test_the_expected_error_is_the_claimed_one(after_60) -> None:
         assert outlook.error_m == pytest.approx(learning.claimed_error_m(), rel=1e-12)
 
 
+@pytest.mark.soak  # of the forecast alone: tests/kbmaps/test_expected_gain.py
 def test_what_is_foreseen_of_further_pairs_comes(after_60) -> None:
     ratios = []
     for learning, scene, outlook in after_60:
@@ -235,6 +236,7 @@ def test_what_is_foreseen_of_further_pairs_comes(after_60) -> None:
     assert 0.5 < np.exp(np.mean(np.log(ratios))) < 2.0
 
 
+@pytest.mark.soak  # of the forecast alone: tests/kbmaps/test_expected_gain.py
 def test_after_few_pairs_there_is_not_enough_data_and_after_many_there_is() -> None:
     learning, _ = guided(1, 30)
     assert not outlook_of(learning).enough

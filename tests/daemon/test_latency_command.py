@@ -64,8 +64,8 @@ def test_the_simulated_robot_has_no_latency(tmp_path, monkeypatch, capsys) -> No
         # Cheaper images, and fewer.
         file.write("[sim.camera]\nclutter = 0\nscene_step = 4\nsupersampling = 1\nrate_hz = 20\n")
     capsys.readouterr()
-    words = ["calibrate", "latency", "--sim", "--json", "--seconds", "3.5"]
+    words = ["calibrate", "latency", "--sim", "--json", "--seconds", "3"]
     app(words, exit_on_error=False, result_action="return_value")
     found = json.loads(capsys.readouterr().out)
     assert np.abs(found["latency_s"]) < 3 * found["sigma_s"] + 1e-3
-    assert found["sigma_s"] < 2.5e-3
+    assert found["sigma_s"] < 3e-3

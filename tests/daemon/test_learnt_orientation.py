@@ -42,13 +42,13 @@ def errors_rad(learning: OnlineLearner, chain: RigidChain, q: FloatArray) -> Flo
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return Scene.draw(3, 200)
+    return Scene.draw(3, 120)
 
 
 @pytest.fixture(scope="module")
 def taught(scene: Scene) -> OnlineLearner:
     learning = new_learning()
-    teach(learning, turned(scene.pairs, scene.chain))
+    teach(learning, turned(scene.pairs, scene.chain), every=NOW_AND_THEN)
     return learning
 
 
@@ -70,7 +70,7 @@ def test_the_claimed_angle_is_about_the_true_one(scene, taught) -> None:
 def test_the_status_says_how_well_models_predict_orientations(taught) -> None:
     status = taught.orientation_status()
     assert status is not None
-    assert (status.pairs, status.answering) == (200, "rigid")
+    assert (status.pairs, status.answering) == (120, "rigid")
     assert set(status.prequential_rad) == {"prior", "rigid", "exact"}
     assert status.prequential_rad["rigid"] < status.prequential_rad["prior"]
 

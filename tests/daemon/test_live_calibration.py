@@ -259,6 +259,7 @@ def called(*arguments: object) -> None:
     app([*map(str, arguments)], exit_on_error=False, result_action="return_value")
 
 
+@pytest.mark.soak  # of images in files: test_cameras_command; of views: the tests above
 def test_the_robots_own_cameras_are_calibrated_and_checked(robot, capsys) -> None:
     called("calibrate", "cameras", "--robot", robot, "--lens", "pinhole", "--save", robot.parent / "views")
     said = capsys.readouterr()

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -217,14 +217,15 @@ def processes_naming(text: str) -> list[str]:
 
 def test_ending_the_replay_ends_its_two_processes(tmp_path: Path, robot: Path) -> None:
     guided(robot).write_csv(tmp_path / "a.csv")
-    kept = str(tmp_path / "kept")
-    command = [sys.executable, "-m", "bodyschema", "replay", str(tmp_path / "a.csv"), "--keep", kept]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL) as process:
-        assert process.stderr is not None
-        process.stderr.readline()
-        assert len(processes_naming(f"--state-dir {kept}")) >= 2
-        process.terminate()
-        assert process.wait(LIMIT_S) == 143
+    kept, log = str(tmp_path / "kept"), tmp_path / "log"
+    with log.open("wb") as stderr:
+        replay = warm.Child("-m", "bodyschema", "replay", tmp_path / "a.csv", "--keep", kept, stderr=stderr)
+    while not log.read_bytes().endswith(b"\n"):
+        assert replay.poll() is None
+        time.sleep(0.02)
+    assert len(processes_naming(f"--state-dir {kept}")) >= 2
+    replay.terminate()
+    assert replay.wait(LIMIT_S) == 143
     assert processes_naming(f"--state-dir {kept}") == []
 
 

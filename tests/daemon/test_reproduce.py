@@ -35,7 +35,7 @@ from kbmaps import ChainTolerances, NonFiniteError, RigidChain
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "paper.md"
 # Small variants, so that every curve and table is made in seconds.
 SMALL = {
-    "fig4": lambda run: fig4(run, samples=1_000, tests=200),
+    "fig4": lambda run: fig4(run, samples=1_000, tests=100),
     "fig5": lambda run: fig5(run, train=300, test=30),
     "fig6": lambda run: fig6(run, online=32, cycles=64),
     "fig7": lambda run: fig7(run, online=32, cycles=64),
@@ -155,14 +155,17 @@ def test_a_contender_that_fails_is_not_passed_over() -> None:
         learn_all(WITH_DRAWING, known, (q, np.full((2, 3), np.nan)), [2], {"test": (q, chain.positions(q))})
 
 
-@pytest.mark.parametrize("name", SMALL)
+NAMES = [pytest.param(name, marks=pytest.mark.soak if name == "fig6" else ()) for name in SMALL]  # fig7 is its like
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_every_experiment_has_readings_and_curves_without_gaps(name: str) -> None:
     curves = [curve for panel in small(name).panels for curve in panel.curves]
     assert all(np.isfinite(curve.mean).all() and len(curve.mean) == len(curve.count) > 0 for curve in curves)
     assert small(name).readings
 
 
-@pytest.mark.parametrize("name", ["fig4", "fig5", "fig6", "fig7"])
+@pytest.mark.parametrize("name", NAMES[:4])
 def test_every_figure_has_the_new_models_beside_the_papers_method(name: str) -> None:
     table = small(name).comparison
     assert table is not None

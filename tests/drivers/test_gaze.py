@@ -18,7 +18,7 @@ from bodyschema.interfaces.errors import RequestError
 from bodyschema.robot.description import RobotDescription
 
 TORQUE = 64
-PATH_S = 8.0
+PATH_S = 4.0
 
 
 def torque(robot: GazingRobot) -> list[int]:
@@ -64,7 +64,7 @@ def test_the_head_turns_no_faster_than_allowed() -> None:
     with (robot := GazingRobot(max_speed_deg_s=5.0)).joints:
         robot.switch_on()
         angles = []
-        for _ in range(60):
+        for _ in range(30):
             robot.run(0.05)
             angles.append(robot.q()[:2])
         speeds = np.abs(np.diff(angles, axis=0)).max() / 0.05
@@ -75,7 +75,7 @@ def test_the_head_stays_within_its_limits() -> None:
     with (robot := GazingRobot(limits_deg={"neck_pitch": (15.0, 22.0), "neck_yaw": (-5.0, 5.0)})).joints:
         robot.switch_on()
         robot.run(1.0)
-        for _ in range(30):
+        for _ in range(12):
             robot.run(0.1)
             yaw, pitch = np.degrees(robot.q()[:2])
             assert -5.2 <= yaw <= 5.2
@@ -120,7 +120,7 @@ def off_middle(robot: GazingRobot) -> float:
     with robot.joints:
         robot.switch_on()
         robot.run(1.0)
-        return float(np.abs(robot.run(4.0) - [340.0, 239.5]).mean())
+        return float(np.abs(robot.run(2.0) - [340.0, 239.5]).mean())
 
 
 @pytest.fixture(scope="module")

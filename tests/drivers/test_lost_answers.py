@@ -12,7 +12,7 @@ from statistics import median
 import pytest
 from bench_arm import Arm
 from feetech_arm import FeetechArm
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from virtual_port import VirtualClock, VirtualPort
 
@@ -112,7 +112,6 @@ def late_by(seconds: float):
 
 @pytest.mark.parametrize("model", BUSES)
 @given(late_s=st.floats(3e-3, 0.05), pause_s=st.sampled_from([0.0, 1e-3]))
-@settings(max_examples=20)
 def test_a_late_answer_is_never_that_to_the_next_question(model, late_s, pause_s) -> None:
     angles = [0.5]
     bus, clock, faults, servo = rig(model, angles)

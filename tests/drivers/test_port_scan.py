@@ -84,8 +84,9 @@ def test_both_protocols_are_found_on_one_bus() -> None:
 
 @pytest.mark.parametrize(
     ("model", "baud"),
-    [(model, baud) for model in ("XM430-W350", "PH42-020-S300") for baud in LIKELY_FIRST]
-    + [("AX-12A", baud) for baud in LIKELY_FIRST if baud <= 2_000_000],
+    [("XM430-W350", baud) for baud in LIKELY_FIRST]
+    + [pytest.param("PH42-020-S300", baud, marks=pytest.mark.soak) for baud in LIKELY_FIRST]
+    + [pytest.param("AX-12A", baud, marks=pytest.mark.soak) for baud in LIKELY_FIRST if baud <= 2_000_000],
 )
 def test_a_servo_is_found_at_every_rate(model, baud) -> None:
     told = found(servo(model, 7, baud), servo(model, 8, baud))

@@ -44,9 +44,9 @@ def test_the_arm_floats_where_it_is_left() -> None:
     with (arm := FloatingArm((0.3, -0.4, 1.2))).joints:
         arm.float()
         before = arm.q
-        arm.run(5.0)
+        arm.run(2.0)
         assert arm.force.state == "on"
-        assert np.abs(np.subtract(arm.q, before)).max() < DRIFT_RAD / 2
+        assert np.abs(np.subtract(arm.q, before)).max() < DRIFT_RAD / 5
 
 
 def test_the_arm_falls_without_zero_force() -> None:
@@ -64,9 +64,9 @@ def test_a_hand_moves_it_and_it_stays_there() -> None:
         arm.pendulums[0].pushed = 0.04
         arm.run(1.0)
         arm.pendulums[0].pushed = 0.0
-        arm.run(3.0)
+        arm.run(1.0)
         moved = arm.q[0]
-        arm.run(3.0)
+        arm.run(1.0)
         assert moved > 0.4
         assert abs(arm.q[0] - moved) < DRIFT_RAD
 
@@ -76,7 +76,7 @@ def test_a_joint_that_counts_against_its_servo_floats_too(directions) -> None:
     with (arm := FloatingArm(directions=directions)).joints:
         arm.float()
         before = arm.q
-        arm.run(3.0)
+        arm.run(1.0)
         assert np.abs(np.subtract(arm.q, before)).max() < DRIFT_RAD
 
 
@@ -87,7 +87,7 @@ def test_a_servo_that_is_reversed_by_its_drive_mode_floats_too() -> None:
     with arm.joints:
         arm.float()
         before = arm.q
-        arm.run(3.0)
+        arm.run(1.0)
         assert arm.force.state == "on"
         assert np.abs(np.subtract(arm.q, before)).max() < DRIFT_RAD
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from effect_arms import SLIDE, STEREO, arm, everywhere, sized, walk
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from bodyschema.effects import Effect, Simulation, Unexplained, load_simulation, write_extended
@@ -55,7 +55,6 @@ def kernel() -> KernelLearner:
     return learner
 
 
-@settings(max_examples=40)
 @given(st.data(), st.floats(0.0, 1.0), st.integers(0, 100))
 def test_effects_come_back_from_the_file_to_the_last_bit(robot, tmp_path_factory, data, share, seed) -> None:
     places = data.draw(st.lists(st.sampled_from(everywhere(robot)), max_size=6))

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from effect_arms import ALL, LINKS, arm, walk
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from bodyschema.effects import GravityLoad
@@ -30,7 +30,6 @@ def body(robot):
         yield body
 
 
-@settings(max_examples=50)
 @given(st.lists(st.floats(-2.0, 2.0), min_size=len(ALL), max_size=len(ALL)).map(np.array))
 def test_torques_are_those_that_pybullet_needs_to_hold_the_arm_turned_round(robot, body, q) -> None:
     torques = GravityLoad(robot).torques(q[None])[0]

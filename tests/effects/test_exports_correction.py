@@ -31,9 +31,7 @@ def commands(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
     if compiler := shutil.which("g++"):
         built = str(tmp_path_factory.mktemp("built") / "correct")
         warnings = ["-Wall", "-Wextra", "-Werror"]
-        subprocess.run(
-            [compiler, "-std=c++17", "-O2", *warnings, str(READERS / "correct.cpp"), "-o", built], check=True
-        )
+        subprocess.run([compiler, "-std=c++17", *warnings, str(READERS / "correct.cpp"), "-o", built], check=True)
         found["c++"] = [built]
     return found
 

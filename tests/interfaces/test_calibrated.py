@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from random_robots import random_robot
 from scipy.spatial.transform import Rotation
@@ -52,7 +52,6 @@ def some_q(robot: RobotDescription) -> np.ndarray:
 # --- the same positions
 
 
-@settings(deadline=None, max_examples=60)
 @given(st.integers(0, 10**6), HEADS, ARMS)
 def test_our_own_loader_reads_the_learnt_positions(seed, head, arm) -> None:
     with tempfile.TemporaryDirectory() as folder:
@@ -63,7 +62,6 @@ def test_our_own_loader_reads_the_learnt_positions(seed, head, arm) -> None:
     np.testing.assert_allclose(read.chain.positions(q), chain.positions(q), rtol=0, atol=CLOSE_M)
 
 
-@settings(deadline=None, max_examples=20)
 @given(st.integers(0, 10**6), HEADS, ARMS)
 def test_pybullet_reads_the_learnt_positions(seed, head, arm) -> None:
     pybullet = pytest.importorskip("pybullet")
@@ -109,7 +107,6 @@ def bullet_position(pybullet, client: int, body: int, robot: RobotDescription, q
     return Rotation.from_quat(turn).inv().apply(np.subtract(x_marker, x_camera))
 
 
-@settings(deadline=None, max_examples=30)
 @given(st.integers(0, 10**6), HEADS, ARMS)
 def test_pinocchio_reads_the_learnt_positions(seed, head, arm) -> None:
     pinocchio = pytest.importorskip("pinocchio")
@@ -218,7 +215,6 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path) -> None:
 # --- meshes stay on the parts that they show
 
 
-@settings(deadline=None, max_examples=30)
 @given(st.integers(0, 10**6), st.text("RP", max_size=2), st.text("RP", min_size=1, max_size=4))
 def test_a_wrong_zero_turns_no_link_but_the_joint_s_own(seed, head, arm) -> None:
     rng = np.random.default_rng(seed)
@@ -244,7 +240,6 @@ def test_a_wrong_zero_turns_no_link_but_the_joint_s_own(seed, head, arm) -> None
 # --- the texts
 
 
-@settings(deadline=None)
 @given(st.tuples(*[st.floats(-3.1, 3.1)] * 3), st.sampled_from([None, np.pi / 2, -np.pi / 2]))
 def test_roll_pitch_and_yaw_give_the_rotation_again(angles, pitch) -> None:
     roll, free, yaw = angles
@@ -258,7 +253,6 @@ PLAIN = st.one_of(st.booleans(), st.integers(-(2**63), 2**63 - 1), st.floats(all
 VALUES = st.recursive(PLAIN, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(KEYS, inner, max_size=3))
 
 
-@settings(deadline=None, max_examples=40)
 @given(st.dictionaries(KEYS, VALUES, max_size=4))
 def test_toml_text_reads_as_what_was_written(tables) -> None:
     assert tomllib.loads(toml_text(tables)) == tables

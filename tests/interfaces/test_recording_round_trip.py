@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from bodyschema.interfaces.errors import RecordingError
@@ -97,7 +97,6 @@ def test_a_mutated_csv_is_refused_or_still_a_recording(recording: Recording, dat
             assert np.isfinite(read.q).all()
 
 
-@settings(max_examples=60, deadline=None)
 @given(recordings(), st.data())
 def test_a_mutated_parquet_is_refused_or_still_a_recording(recording: Recording, data: st.DataObject) -> None:
     pytest.importorskip("pyarrow")

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from rough_arms import ROUGH, rough_arm
 
@@ -23,7 +23,6 @@ SLIGHT = ChainTolerances(axes=1e-4, points=1e-4, zeros=1e-4, tool=1e-4, base_rot
 
 
 @given(seed=seeds, first=st.integers(1, 39))
-@settings(max_examples=15)
 def test_what_was_believed_before_and_new_pairs_give_what_all_pairs_give(seed, first):
     rng = np.random.default_rng(seed)
     arm = rough_arm(rng, "RRRR", SLIGHT)
@@ -40,7 +39,6 @@ def test_what_was_believed_before_and_new_pairs_give_what_all_pairs_give(seed, f
 
 
 @given(seed=seeds)
-@settings(max_examples=10)
 def test_another_tool_is_learnt_from_three_exact_pairs_without_losing_the_arm(seed):
     rng = np.random.default_rng(seed)
     arm = rough_arm(rng)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from planted_chains import random_chain, random_q
 from scipy.spatial.transform import Rotation
@@ -19,7 +19,6 @@ def random_change(rng: np.random.Generator, parameters: ChainParameters, size: f
 
 
 @given(seed=seeds, kinds=kinds, size=st.sampled_from([0.0, 1e-5, 0.02, 0.5]))
-@settings(max_examples=30)
 def test_the_jacobian_is_the_derivative_of_the_positions(seed, kinds, size):
     rng = np.random.default_rng(seed)
     parameters = ChainParameters(random_chain(rng, kinds))
@@ -35,7 +34,6 @@ def test_the_jacobian_is_the_derivative_of_the_positions(seed, kinds, size):
 
 
 @given(seed=seeds, kinds=kinds, size=st.sampled_from([0.0, 0.02, 0.5]))
-@settings(max_examples=30)
 def test_the_chain_of_a_change_has_the_positions_of_the_change(seed, kinds, size):
     rng = np.random.default_rng(seed)
     parameters = ChainParameters(random_chain(rng, kinds))
@@ -51,7 +49,6 @@ def test_no_change_gives_the_reference_back():
 
 
 @given(seed=seeds, joints=st.integers(2, 7))
-@settings(max_examples=15)
 def test_four_numbers_a_revolute_joint_and_three_for_the_tool_are_all_that_positions_show(seed, joints):
     rng = np.random.default_rng(seed)
     parameters = ChainParameters(random_chain(rng, "R" * joints))
@@ -62,7 +59,6 @@ def test_four_numbers_a_revolute_joint_and_three_for_the_tool_are_all_that_posit
 
 
 @given(seed=seeds, angle=st.floats(0.0, np.pi))
-@settings(max_examples=30)
 def test_the_rotation_vector_gives_its_rotation_back(seed, angle):
     axis = np.random.default_rng(seed).normal(size=3)
     rotation = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from planted_chains import bases_for, literal_weights, random_chain, random_q
 
@@ -16,7 +16,6 @@ alphas = st.floats(math.radians(20), math.radians(79)) | st.floats(math.radians(
 
 
 @given(joint_kinds=kinds, seed=seeds, alpha=alphas, orientation=st.booleans())
-@settings(max_examples=20)
 def test_another_alpha_afterwards_leaves_the_map(joint_kinds, seed, alpha, orientation):
     rng = np.random.default_rng(seed)
     kbmap = random_chain(rng, joint_kinds).to_kbmap(bases_for(joint_kinds), orientation=orientation)
@@ -28,7 +27,6 @@ def test_another_alpha_afterwards_leaves_the_map(joint_kinds, seed, alpha, orien
 
 
 @given(seed=seeds, alpha=st.floats(0.4, 1.35))
-@settings(max_examples=15)
 def test_a_new_alpha_has_the_papers_weights(seed, alpha):
     """The control points for the new α, weighted as eq. (15) prints it, give the positions."""
     rng = np.random.default_rng(seed)
@@ -39,7 +37,6 @@ def test_a_new_alpha_has_the_papers_weights(seed, alpha):
 
 
 @given(joint_kinds=kinds, seed=seeds, one=st.floats(0.4, 1.35), other=st.floats(0.4, 1.35))
-@settings(max_examples=15)
 def test_there_and_back_gives_the_same_control_points(joint_kinds, seed, one, other):
     kbmap = random_chain(np.random.default_rng(seed), joint_kinds).to_kbmap(bases_for(joint_kinds)).with_alpha(one)
     back = kbmap.with_alpha(other).with_alpha(one)
@@ -47,7 +44,6 @@ def test_there_and_back_gives_the_same_control_points(joint_kinds, seed, one, ot
 
 
 @given(joint_kinds=kinds, seed=seeds)
-@settings(max_examples=15)
 def test_control_points_taken_out_and_put_in_again_are_the_same_map(joint_kinds, seed):
     rng = np.random.default_rng(seed)
     kbmap = random_chain(rng, joint_kinds).to_kbmap(bases_for(joint_kinds)).with_alpha(1.0)

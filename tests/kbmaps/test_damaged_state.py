@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from planted_chains import bases_for
 from rough_arms import ROUGH, rough_arm
@@ -147,7 +147,6 @@ def refused_or_the_same(name: str, data: bytes) -> bool:
 
 @pytest.mark.parametrize("name", NAMES)
 @given(data=st.data())
-@settings(max_examples=30)
 def test_fields_that_are_missing_or_wrong_are_refused(name, data):
     kind, fields, arrays = opened(stored()[name][1])
     fields = copy.deepcopy(fields)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from planted_chains import bases_for, random_q
 
@@ -32,7 +32,6 @@ def planted(rng: np.random.Generator, joint_kinds: str, pairs: int) -> tuple[Des
 
 
 @given(seed=seeds, joint_kinds=kinds, times=st.sampled_from([0.5, 1.0, 1.5, 12.0]))
-@settings(max_examples=25)
 def test_the_gram_matrix_is_that_of_the_rows(seed, joint_kinds, times):
     rng = np.random.default_rng(seed)
     unknowns = int(np.prod([3 if kind == "R" else 2 for kind in joint_kinds]))
@@ -44,7 +43,6 @@ def test_the_gram_matrix_is_that_of_the_rows(seed, joint_kinds, times):
 
 
 @given(seed=seeds, joint_kinds=kinds, pairs=st.integers(1, 700))
-@settings(max_examples=15)
 def test_products_are_those_of_the_rows(seed, joint_kinds, pairs):
     rng = np.random.default_rng(seed)
     design, rows, targets = planted(rng, joint_kinds, pairs)

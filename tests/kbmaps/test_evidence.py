@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from kbmaps.maps.evidence import most_evident
@@ -25,7 +25,6 @@ def peaked(at: float, asked: list[float]) -> Callable[[float], float]:
 
 
 @given(at=st.floats(1e-6, 1e6), start=st.floats(1e-6, 1e6))
-@settings(max_examples=50)
 def test_a_peak_is_found_to_a_tenth_of_a_step(at, start):
     found = most_evident(peaked(at, []), start, LOW, HIGH)
     assert abs(math.log(found / at)) <= 0.1 * math.log(8.0) + 1e-9

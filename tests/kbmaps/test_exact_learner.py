@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from planted_chains import bases_for, control_points_needed, random_chain, random_map, random_q
 
@@ -60,7 +60,6 @@ def test_exactness_holds_for_fifty_random_chains(joints):
 
 
 @given(seed=seeds, joint_kinds=kinds, share=st.floats(0.1, 1.0))
-@settings(max_examples=20)
 def test_too_few_pairs_give_the_solution_nearest_to_the_prior(seed, joint_kinds, share):
     rng = np.random.default_rng(seed)
     prior = random_map(rng, bases_for(joint_kinds))
@@ -77,7 +76,6 @@ def test_too_few_pairs_give_the_solution_nearest_to_the_prior(seed, joint_kinds,
 
 
 @given(seed=seeds, copies=st.integers(2, 40))
-@settings(max_examples=15)
 def test_repeated_pairs_leave_the_solution_nearest_to_the_prior(seed, copies):
     rng = np.random.default_rng(seed)
     prior = random_map(rng, bases_for("RR"))
@@ -90,7 +88,6 @@ def test_repeated_pairs_leave_the_solution_nearest_to_the_prior(seed, copies):
 
 
 @given(seed=seeds, cuts=st.lists(st.integers(1, 400), max_size=6), precision=st.sampled_from([None, 1e-2, "evidence"]))
-@settings(max_examples=15)
 def test_learning_in_pieces_equals_learning_at_once(seed, cuts, precision):
     rng = np.random.default_rng(seed)
     prior = random_map(rng, bases_for("RRR"))
@@ -104,7 +101,6 @@ def test_learning_in_pieces_equals_learning_at_once(seed, cuts, precision):
 
 
 @given(seed=seeds, precision=st.sampled_from([None, 1e-2, "evidence"]), pairs=st.sampled_from([10, 27, 300]))
-@settings(max_examples=15)
 def test_the_order_of_the_pairs_does_not_matter(seed, precision, pairs):
     rng = np.random.default_rng(seed)
     chain = random_chain(rng, "RRR")
@@ -131,7 +127,6 @@ def test_pairs_one_at_a_time_equal_a_batch():
 
 
 @given(seed=seeds, precision=st.floats(1e-4, 10.0), pairs=st.sampled_from([5, 27, 200]))
-@settings(max_examples=15)
 def test_the_ridge_is_the_posterior_mean_around_the_prior(seed, precision, pairs):
     rng = np.random.default_rng(seed)
     prior = random_map(rng, bases_for("RRR"))

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from planted_chains import random_q
 from rough_arms import ROUGH, rough_arm
@@ -55,7 +55,6 @@ def planted(seed, floor=0.0):
 
 
 @given(seed=seeds, floor=st.sampled_from([0.0, 0.2]))
-@settings(max_examples=15)
 def test_the_error_foretold_is_that_of_the_posterior_with_those_pairs(seed, floor):
     model, region, q = planted(seed, floor)
     design = ExperimentDesign(model, region)
@@ -66,7 +65,6 @@ def test_the_error_foretold_is_that_of_the_posterior_with_those_pairs(seed, floo
 
 
 @given(seed=seeds)
-@settings(max_examples=15)
 def test_beginning_with_some_pairs_forgets_all_others(seed):
     model, region, q = planted(seed)
     design, fresh = ExperimentDesign(model, region), ExperimentDesign(model, region)
@@ -77,7 +75,6 @@ def test_beginning_with_some_pairs_forgets_all_others(seed):
 
 
 @given(seed=seeds, floor=st.sampled_from([0.0, 0.2]))
-@settings(max_examples=15)
 def test_the_rms_errors_fall_by_at_least_the_gain(seed, floor):
     model, region, q = planted(seed, floor)
 
@@ -92,7 +89,6 @@ def test_the_rms_errors_fall_by_at_least_the_gain(seed, floor):
 
 
 @given(seed=seeds)
-@settings(max_examples=15)
 def test_gains_are_those_of_the_textbook_to_first_order(seed):
     """With large noise a pair changes little and the linearisation is exact; with more, rounding dominates."""
     model, region, q = planted(seed)
@@ -138,7 +134,6 @@ def test_no_candidate_is_taken_twice():
 
 
 @given(seed=seeds)
-@settings(max_examples=10)
 def test_a_plan_stays_within_the_limits_and_is_no_worse_than_the_candidates(seed):
     rng = np.random.default_rng(seed)
     arm = rough_arm(rng)
@@ -154,7 +149,6 @@ def test_a_plan_stays_within_the_limits_and_is_no_worse_than_the_candidates(seed
 
 
 @given(seed=seeds)
-@settings(max_examples=10)
 def test_mean_distances_are_within_a_few_percent_of_sampled_ones(seed):
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(3, 3)) * 10.0 ** rng.uniform(-2, 2, 3)

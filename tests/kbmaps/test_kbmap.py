@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from planted_chains import bases_for, literal_weights, random_chain, random_map, random_q
 
@@ -21,7 +21,6 @@ def bernstein_bases(joint_kinds: str, alpha: float = 1.0) -> list[JointBasis]:
 
 
 @given(joint_kinds=kinds, seed=seeds)
-@settings(max_examples=20)
 def test_prediction_is_the_weight_vector_times_the_net(joint_kinds, seed):
     rng = np.random.default_rng(seed)
     kbmap = random_map(rng, bases_for(joint_kinds))
@@ -31,7 +30,6 @@ def test_prediction_is_the_weight_vector_times_the_net(joint_kinds, seed):
 
 
 @given(joint_kinds=kinds, seed=seeds)
-@settings(max_examples=20)
 def test_one_configuration_is_predicted_as_in_a_batch(joint_kinds, seed):
     rng = np.random.default_rng(seed)
     kbmap = random_map(rng, bases_for(joint_kinds))
@@ -54,7 +52,6 @@ def test_an_empty_batch_gives_an_empty_answer():
 
 
 @given(seed=seeds, alpha=st.floats(0.3, 1.35), joints=st.integers(1, 4))
-@settings(max_examples=20)
 def test_the_weight_vector_is_that_of_equation_15(seed, alpha, joints):
     q = np.random.default_rng(seed).uniform(-2.5, 2.5, joints)
     kbmap = random_map(np.random.default_rng(seed), [JointBasis.bernstein(alpha)] * joints)
@@ -63,7 +60,6 @@ def test_the_weight_vector_is_that_of_equation_15(seed, alpha, joints):
 
 
 @given(seed=seeds, joint=st.integers(0, 2), alpha=st.floats(0.3, 1.35))
-@settings(max_examples=20)
 def test_isoparametric_curves_are_ellipses_with_the_papers_weights(seed, joint, alpha):
     """One joint moving traces (Σ γ_i b_i B_i²)/(Σ γ_i B_i²) with γ = (1, cos α, 1): an ellipse, eq. (8)."""
     rng = np.random.default_rng(seed)
@@ -79,7 +75,6 @@ def test_isoparametric_curves_are_ellipses_with_the_papers_weights(seed, joint, 
 
 
 @given(seed=seeds)
-@settings(max_examples=15)
 def test_prediction_at_plus_and_minus_half_a_turn_is_the_same(seed):
     rng = np.random.default_rng(seed)
     kbmap = random_chain(rng, "RRRRR").to_kbmap(bernstein_bases("RRRRR"))
@@ -93,7 +88,6 @@ def test_ten_joints_at_half_a_turn_do_not_overflow():
 
 
 @given(joint_kinds=kinds, seed=seeds)
-@settings(max_examples=15)
 def test_the_jacobian_agrees_with_finite_differences(joint_kinds, seed):
     rng = np.random.default_rng(seed)
     chain = random_chain(rng, joint_kinds)
@@ -106,7 +100,6 @@ def test_the_jacobian_agrees_with_finite_differences(joint_kinds, seed):
 
 
 @given(joint_kinds=kinds, seed=seeds, alpha=st.floats(0.5, 1.3))
-@settings(max_examples=15)
 def test_a_change_of_basis_leaves_predictions(joint_kinds, seed, alpha):
     rng = np.random.default_rng(seed)
     kbmap = random_chain(rng, joint_kinds).to_kbmap(bases_for(joint_kinds))

@@ -6,7 +6,7 @@ import struct
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from planted_chains import bases_for, random_map
 
@@ -24,7 +24,6 @@ def forged(header: bytes, net: bytes = b"") -> bytes:
 
 
 @given(kinds=st.text("RP", min_size=1, max_size=5), seed=st.integers(0, 1000), text=st.text(max_size=20))
-@settings(max_examples=12)
 def test_a_map_survives_the_round_trip_bit_by_bit(kinds, seed, text):
     kbmap = random_map(np.random.default_rng(seed), bases_for(kinds)).with_metadata({"note": text})
     back = KBMap.from_bytes(kbmap.to_bytes())
@@ -40,7 +39,6 @@ def test_a_map_with_orientation_survives_the_round_trip():
 
 
 @given(position=st.integers(0, len(STORED) - 1), flip=st.integers(1, 255))
-@settings(max_examples=100)
 def test_a_single_changed_byte_is_noticed(position, flip):
     damaged = bytearray(STORED)
     damaged[position] ^= flip
@@ -74,7 +72,6 @@ json_values = st.recursive(
 
 
 @given(bases=json_values, outputs=json_values, metadata=json_values, net=st.binary(max_size=80))
-@settings(max_examples=100)
 def test_a_header_of_arbitrary_values_is_refused(bases, outputs, metadata, net):
     header = json.dumps({"bases": bases, "outputs": outputs, "metadata": metadata}).encode()
     with pytest.raises(ModelFormatError):

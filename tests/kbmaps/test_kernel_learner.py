@@ -5,7 +5,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from planted_chains import bases_for, control_points_needed, random_chain, random_map, random_q
 from rough_arms import rough_arm
@@ -33,7 +33,6 @@ def noisy_pairs(rng: np.random.Generator, joint_kinds: str, n: int) -> tuple[np.
 
 
 @given(seed=seeds, joint_kinds=kinds)
-@settings(max_examples=20)
 def test_the_kernel_is_the_inner_product_of_the_weight_vectors(seed, joint_kinds):
     rng = np.random.default_rng(seed)
     bases = bases_for(joint_kinds)
@@ -46,7 +45,6 @@ def test_the_kernel_is_the_inner_product_of_the_weight_vectors(seed, joint_kinds
 
 
 @given(seed=seeds, joint_kinds=kinds, pairs=st.integers(1, 120), precision=st.floats(1e-6, 1e3))
-@settings(max_examples=25)
 def test_it_equals_the_exact_learner_at_the_same_precision(seed, joint_kinds, pairs, precision):
     rng = np.random.default_rng(seed)
     q, x = noisy_pairs(rng, joint_kinds, pairs)
@@ -62,7 +60,6 @@ def test_it_equals_the_exact_learner_at_the_same_precision(seed, joint_kinds, pa
 
 
 @given(seed=seeds, joint_kinds=kinds, pairs=st.integers(2, 120), precision=st.floats(1e-3, 1e3))
-@settings(max_examples=20)
 def test_noise_and_evidence_are_those_of_the_exact_learner(seed, joint_kinds, pairs, precision):
     rng = np.random.default_rng(seed)
     q, x = noisy_pairs(rng, joint_kinds, pairs)
@@ -77,7 +74,6 @@ def test_noise_and_evidence_are_those_of_the_exact_learner(seed, joint_kinds, pa
 
 
 @given(seed=seeds, joint_kinds=kinds, pairs=st.integers(1, 60), precision=st.floats(1e-3, 10.0))
-@settings(max_examples=20)
 def test_the_claimed_variance_is_that_of_the_control_points_posterior(seed, joint_kinds, pairs, precision):
     rng = np.random.default_rng(seed)
     q, x = noisy_pairs(rng, joint_kinds, pairs)
@@ -103,7 +99,6 @@ def test_as_many_noise_free_pairs_as_control_points_give_the_chain_back(joint_ki
 
 
 @given(seed=seeds, joint_kinds=st.text("RP", min_size=2, max_size=4), share=st.floats(0.1, 0.5))
-@settings(max_examples=20)
 def test_without_precision_it_is_the_solution_nearest_to_the_prior(seed, joint_kinds, share):
     rng = np.random.default_rng(seed)
     prior = random_map(rng, bases_for(joint_kinds))
@@ -119,7 +114,6 @@ def test_without_precision_it_is_the_solution_nearest_to_the_prior(seed, joint_k
 
 
 @given(seed=seeds, joint_kinds=kinds, precision=st.sampled_from([1e-2, "evidence"]))
-@settings(max_examples=15)
 def test_the_order_of_the_pairs_does_not_matter(seed, joint_kinds, precision):
     rng = np.random.default_rng(seed)
     q, x = noisy_pairs(rng, joint_kinds, 60)
@@ -237,7 +231,6 @@ def test_its_derivative_is_that_of_its_control_points(joint_kinds):
     precision=st.sampled_from([0.1, "evidence", None]),
     told=st.booleans(),
 )
-@settings(max_examples=15)
 def test_its_bytes_predict_the_same_to_the_last_bit(seed, prior, precision, told):
     rng = np.random.default_rng(seed)
     behind = {"none": None, "chain": random_chain(rng, "RRP"), "map": random_map(rng, bases_for("RRP"))}[prior]
@@ -284,7 +277,6 @@ def test_a_prior_that_is_off_by_a_micrometre_is_another_one():
 
 
 @given(where=st.integers(0, 2000), bit=st.integers(0, 7))
-@settings(max_examples=20)
 def test_damaged_bytes_are_refused(where, bit):
     learner = KernelLearner(bases_for("RR"))
     learner.learn(*noisy_pairs(np.random.default_rng(1), "RR", 5))

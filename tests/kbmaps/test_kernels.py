@@ -12,7 +12,7 @@ from importlib import import_module
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from planted_chains import bases_for, random_map, random_q
 from rough_arms import ROUGH, rough_arm
@@ -43,7 +43,6 @@ def pose_map(rng: np.random.Generator, joint_kinds: str) -> KBMap:
 
 @needs_both
 @given(seed=seeds, joint_kinds=kinds, rows=st.sampled_from([None, 0, 1, 4, 5, 16, 39]))
-@settings(max_examples=25)
 def test_predictions_and_derivatives_agree_to_rounding(seed, joint_kinds, rows):
     rng = np.random.default_rng(seed)
     given_map = pose_map(rng, joint_kinds)
@@ -58,7 +57,6 @@ def test_predictions_and_derivatives_agree_to_rounding(seed, joint_kinds, rows):
 
 @needs_both
 @given(seed=seeds, joint_kinds=kinds, mu0=st.floats(0.05, 1.95))
-@settings(max_examples=20)
 def test_learning_and_replaying_agree_to_rounding(seed, joint_kinds, mu0):
     rng = np.random.default_rng(seed)
     start = random_map(rng, bases_for(joint_kinds))
@@ -73,7 +71,6 @@ def test_learning_and_replaying_agree_to_rounding(seed, joint_kinds, mu0):
 
 @needs_both
 @given(seed=seeds, joint_kinds=kinds, sigma=st.sampled_from([None, 0.004]), jump=st.sampled_from([0.0, 0.3]))
-@settings(max_examples=10)
 def test_recursive_rigid_learners_agree_to_rounding(seed, joint_kinds, sigma, jump):
     rng = np.random.default_rng(seed)
     arm = rough_arm(rng, joint_kinds)

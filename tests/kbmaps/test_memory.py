@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from planted_chains import bases_for, random_chain, random_map, random_q
 
@@ -21,7 +21,6 @@ def stream(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @given(seed=seeds, window=st.integers(1, 40), pieces=st.lists(st.integers(1, 25), min_size=1, max_size=6))
-@settings(max_examples=15)
 def test_a_window_is_a_fresh_learner_on_the_last_pairs(seed, window, pieces):
     rng = np.random.default_rng(seed)
     q, x = stream(rng, sum(pieces))
@@ -37,7 +36,6 @@ def test_a_window_is_a_fresh_learner_on_the_last_pairs(seed, window, pieces):
 
 
 @given(seed=seeds, window=st.integers(1, 40), pieces=st.lists(st.integers(1, 60), min_size=1, max_size=8))
-@settings(max_examples=15)
 def test_a_window_of_the_exact_learner_is_a_fresh_one_on_the_last_pairs(seed, window, pieces):
     rng = np.random.default_rng(seed)
     prior = random_map(rng, bases_for(KINDS))
@@ -76,7 +74,6 @@ def test_a_window_stays_exact_over_a_long_run():
 
 
 @given(seed=seeds, window=st.integers(5, 30))
-@settings(max_examples=10)
 def test_a_window_of_the_structured_learner_is_a_fresh_one_on_the_last_pairs(seed, window):
     rng = np.random.default_rng(seed)
     nominal = random_chain(rng, KINDS)
@@ -89,7 +86,6 @@ def test_a_window_of_the_structured_learner_is_a_fresh_one_on_the_last_pairs(see
 
 
 @given(seed=seeds, forgetting=st.floats(0.8, 1.0), n=st.integers(1, 150), precision=st.floats(1e-2, 10.0))
-@settings(max_examples=15)
 def test_forgetting_is_least_squares_weighted_by_age(seed, forgetting, n, precision):
     rng = np.random.default_rng(seed)
     prior = random_map(rng, bases_for(KINDS))
@@ -107,7 +103,6 @@ def test_forgetting_is_least_squares_weighted_by_age(seed, forgetting, n, precis
 
 
 @given(seed=seeds, forgetting=st.floats(0.9, 1.0))
-@settings(max_examples=15)
 def test_both_learners_see_the_same_noise_and_evidence_in_pairs_half_forgotten(seed, forgetting):
     rng = np.random.default_rng(seed)
     prior = random_map(rng, bases_for(KINDS))

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from planted_chains import bases_for, literal_weights, random_chain, random_map, random_q
 
@@ -25,7 +25,6 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 @given(seed=seeds, joints=st.integers(1, 4), mu0=st.floats(0.05, 1.95))
-@settings(max_examples=20)
 def test_a_step_is_that_of_equation_20(seed, joints, mu0):
     rng = np.random.default_rng(seed)
     alpha = 1.0
@@ -43,7 +42,6 @@ def test_a_step_is_that_of_equation_20(seed, joints, mu0):
 
 
 @given(seed=seeds, mu0=st.floats(0.05, 1.95), kinds=st.text("RP", min_size=1, max_size=4))
-@settings(max_examples=20)
 def test_a_step_mends_the_share_mu0_of_the_error(seed, mu0, kinds):
     rng = np.random.default_rng(seed)
     kbmap = random_map(rng, bases_for(kinds))
@@ -55,7 +53,6 @@ def test_a_step_mends_the_share_mu0_of_the_error(seed, mu0, kinds):
 
 
 @given(seed=seeds, kinds=st.text("RP", min_size=1, max_size=4), pairs=st.integers(0, 200))
-@settings(max_examples=15)
 def test_replay_equals_one_step_after_the_other(seed, kinds, pairs):
     rng = np.random.default_rng(seed)
     kbmap = random_map(rng, bases_for(kinds))
@@ -138,7 +135,6 @@ def test_an_unstable_rate_is_refused(mu0):
 
 
 @given(seed=seeds, decay=st.floats(0.5, 100.0), floor=st.floats(0.0, 0.5), pairs=st.integers(1, 150))
-@settings(max_examples=15)
 def test_replay_goes_through_a_schedule_as_single_steps_do(seed, decay, floor, pairs):
     rng = np.random.default_rng(seed)
     kbmap = random_map(rng, bases_for("RRP"))
@@ -184,7 +180,6 @@ def test_a_falling_step_leaves_less_noise_than_a_constant_one():
 
 
 @given(seed=seeds, decay=st.sampled_from([math.inf, 10.0]))
-@settings(max_examples=15)
 def test_bytes_learn_on_to_the_last_bit(seed, decay):
     rng = np.random.default_rng(seed)
     learner = NLMS(random_map(rng, bases_for("RPR")), StepSize(0.8, decay, 0.1))

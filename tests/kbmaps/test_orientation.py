@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from planted_chains import bases_for, control_points_needed, random_chain, random_q
 from scipy.spatial.transform import Rotation
@@ -17,7 +17,6 @@ kinds = st.text("RP", min_size=1, max_size=5)
 
 
 @given(joint_kinds=kinds, seed=seeds)
-@settings(max_examples=15)
 def test_the_maps_of_a_chain_s_unit_vectors_are_its_orientation(joint_kinds, seed):
     rng = np.random.default_rng(seed)
     chain = random_chain(rng, joint_kinds)
@@ -33,7 +32,6 @@ def disturbed_map(rng: np.random.Generator, joint_kinds: str, size: float) -> KB
 
 
 @given(joint_kinds=kinds, seed=seeds)
-@settings(max_examples=15)
 def test_the_orthonormal_orientation_is_a_proper_rotation(joint_kinds, seed):
     rng = np.random.default_rng(seed)
     kbmap = disturbed_map(rng, joint_kinds, 0.05)
@@ -43,7 +41,6 @@ def test_the_orthonormal_orientation_is_a_proper_rotation(joint_kinds, seed):
 
 
 @given(joint_kinds=kinds, seed=seeds)
-@settings(max_examples=15)
 def test_the_angular_jacobian_is_how_the_orthonormal_orientation_turns(joint_kinds, seed):
     rng = np.random.default_rng(seed)
     kbmap = disturbed_map(rng, joint_kinds, 0.02)
@@ -56,7 +53,6 @@ def test_the_angular_jacobian_is_how_the_orthonormal_orientation_turns(joint_kin
 
 
 @given(seed=seeds)
-@settings(max_examples=25)
 def test_no_rotation_is_nearer_than_the_nearest(seed):
     rng = np.random.default_rng(seed)
     matrix = rng.normal(size=(3, 3))
@@ -116,7 +112,6 @@ def test_as_many_poses_as_control_points_give_orientations_everywhere(joint_kind
 
 
 @given(seed=seeds, precision=st.floats(1e-3, 10.0))
-@settings(max_examples=15)
 def test_positions_are_learnt_as_without_orientations(seed, precision):
     rng = np.random.default_rng(seed)
     prior = rough_prior(rng, "RRR")
@@ -157,7 +152,6 @@ def test_re_orthonormalised_orientations_are_nearer_to_the_truth_than_those_lear
 
 
 @given(seed=seeds, joint_kinds=st.text("RP", min_size=1, max_size=4))
-@settings(max_examples=15)
 def test_replaying_poses_in_blocks_equals_learning_them_one_by_one(seed, joint_kinds):
     rng = np.random.default_rng(seed)
     _, q, poses = shown(rng, joint_kinds, 80)

@@ -46,7 +46,7 @@ def test_pair_by_pair_is_all_at_once_where_the_problem_is_linear(seed, kinds):
 
 def test_thirty_exact_pairs_leave_less_than_a_hundredth_of_a_millimetre_of_a_rough_drawing():
     errors = []
-    for seed in range(8):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         arm = rough_arm(rng)
         learner = RecursiveRigidLearner(arm.nominal, ROUGH)
@@ -57,7 +57,7 @@ def test_thirty_exact_pairs_leave_less_than_a_hundredth_of_a_millimetre_of_a_rou
 
 def test_claimed_intervals_cover_as_they_say_at_every_stage():
     inside: dict[int, list[float]] = {3: [], 30: [], 100: []}
-    for seed in range(16):
+    for seed in range(8):
         rng = np.random.default_rng(seed)
         arm = rough_arm(rng)
         learner = RecursiveRigidLearner(arm.nominal, ROUGH)
@@ -66,7 +66,7 @@ def test_claimed_intervals_cover_as_they_say_at_every_stage():
             learner.learn(*arm.pairs(rng, stage - learner.pairs, 0.01), 0.01)
             estimate = learner.estimate(test)
             shares.append((np.abs(estimate.x - arm.real.positions(test)) < estimate.sigma).mean())
-    # 16 arms with some 27 directions each: 2.2 % is the standard error of a mean.
+    # 8 arms with some 27 directions each: 3 % is the standard error of a mean.
     assert all(0.60 < np.mean(shares) < 0.77 for shares in inside.values())
 
 
@@ -120,7 +120,7 @@ def test_an_outlier_moves_the_chain_no_further_than_a_pair_at_the_gate():
 @pytest.mark.parametrize(("told", "pairs"), [(True, 30), (False, 100)])
 def test_outliers_from_the_first_pair_on_cost_no_more_than_their_share_of_the_pairs(told, pairs):
     spoilt, clean = [], []
-    for seed in range(6):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         arm = rough_arm(rng)
         q, x = arm.pairs(rng, pairs, 0.01)
@@ -179,7 +179,7 @@ def most_apart_from_a_batch(seed: int) -> float:
 
 
 def test_between_refits_it_stays_where_a_batch_is():
-    assert max(most_apart_from_a_batch(seed) for seed in range(2)) < 0.3
+    assert most_apart_from_a_batch(0) < 0.3
 
 
 @pytest.mark.soak
@@ -244,7 +244,7 @@ def test_its_memory_is_bounded_by_the_window():
 def test_folded_pairs_count_as_much_as_kept_ones():
     rng = np.random.default_rng(15)
     arm = rough_arm(rng)
-    q, x = arm.pairs(rng, 400, 0.01)
+    q, x = arm.pairs(rng, 200, 0.01)
     batch, learner = RigidLearner(arm.nominal, ROUGH), RecursiveRigidLearner(arm.nominal, ROUGH, window=60)
     batch.learn(q, x)
     learner.learn(q, x)

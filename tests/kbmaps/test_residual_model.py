@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from planted_chains import random_q
 from rough_arms import ROUGH, Arm, rough_arm
@@ -218,7 +218,6 @@ def test_a_belief_alone_is_a_rigid_model(arm):
 
 
 @given(seed=st.integers(0, 1000), correlation=st.floats(0.0, 0.97))
-@settings(max_examples=15)
 def test_innovations_of_an_autoregression_are_its_fresh_part(seed, correlation):
     fresh = np.random.default_rng(seed).normal(size=(30, 3))
     series = fresh.copy()

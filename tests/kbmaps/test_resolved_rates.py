@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
@@ -12,7 +12,6 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 @given(seed=seeds, joints=st.integers(1, 8), tasks=st.sampled_from([3, 6]), damping=st.floats(1e-3, 1.0))
-@settings(max_examples=25)
 def test_rates_without_limits_are_the_damped_least_squares_solution(seed, joints, tasks, damping):
     rng = np.random.default_rng(seed)
     J, v, preferred, scale = (
@@ -25,7 +24,6 @@ def test_rates_without_limits_are_the_damped_least_squares_solution(seed, joints
 
 
 @given(seed=seeds)
-@settings(max_examples=25)
 def test_a_preferred_rate_of_a_redundant_arm_does_not_disturb_the_velocity(seed):
     rng = np.random.default_rng(seed)
     J, v = rng.normal(size=(3, 7)), rng.normal(size=3)
@@ -34,7 +32,6 @@ def test_a_preferred_rate_of_a_redundant_arm_does_not_disturb_the_velocity(seed)
 
 
 @given(seed=seeds, joints=st.integers(1, 12), damping=st.floats(0.01, 1.0))
-@settings(max_examples=50)
 def test_rates_within_limits_are_the_best_there_are(seed, joints, damping):
     """Compare with an independent solver."""
     rng = np.random.default_rng(seed)

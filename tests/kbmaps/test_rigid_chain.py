@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from planted_chains import bases_for, random_chain, random_q
 from scipy.spatial.transform import Rotation
@@ -37,7 +37,6 @@ def composed_pose(chain: RigidChain, q: np.ndarray) -> np.ndarray:
 
 
 @given(joint_kinds=kinds, seed=seeds)
-@settings(max_examples=20)
 def test_poses_are_the_product_of_the_transforms(joint_kinds, seed):
     rng = np.random.default_rng(seed)
     chain = random_chain(rng, joint_kinds)
@@ -47,7 +46,6 @@ def test_poses_are_the_product_of_the_transforms(joint_kinds, seed):
 
 
 @given(joint_kinds=kinds, seed=seeds)
-@settings(max_examples=15)
 def test_the_frames_of_many_rows_are_those_of_each(joint_kinds, seed):
     rng = np.random.default_rng(seed)
     chain = random_chain(rng, joint_kinds)
@@ -58,7 +56,6 @@ def test_the_frames_of_many_rows_are_those_of_each(joint_kinds, seed):
 
 
 @given(joint_kinds=kinds, seed=seeds)
-@settings(max_examples=15)
 def test_the_jacobian_agrees_with_finite_differences(joint_kinds, seed):
     rng = np.random.default_rng(seed)
     chain = random_chain(rng, joint_kinds)
@@ -69,7 +66,6 @@ def test_the_jacobian_agrees_with_finite_differences(joint_kinds, seed):
 
 
 @given(joint_kinds=kinds, seed=seeds)
-@settings(max_examples=15)
 def test_the_net_of_a_chain_is_exact_all_the_way_round(joint_kinds, seed):
     rng = np.random.default_rng(seed)
     chain = random_chain(rng, joint_kinds)
@@ -88,7 +84,6 @@ def test_the_net_of_seven_joints_is_exact_to_two_picometres_in_the_papers_basis(
 
 
 @given(joint_kinds=kinds, seed=seeds)
-@settings(max_examples=15)
 def test_the_orientation_planes_give_the_rotation_matrix(joint_kinds, seed):
     rng = np.random.default_rng(seed)
     chain = random_chain(rng, joint_kinds)
@@ -99,7 +94,6 @@ def test_the_orientation_planes_give_the_rotation_matrix(joint_kinds, seed):
 
 
 @given(joint_kinds=kinds, seed=seeds)
-@settings(max_examples=15)
 def test_moving_the_tool_adds_the_orientation_planes_to_the_net(joint_kinds, seed):
     rng = np.random.default_rng(seed)
     chain, shift = random_chain(rng, joint_kinds), rng.normal(size=3)
@@ -159,7 +153,6 @@ def test_a_map_of_twenty_joints_is_refused_with_its_size_and_a_way_out(orientati
 
 
 @given(seed=seeds, joint_kinds=kinds)
-@settings(max_examples=15)
 def test_the_angular_jacobian_is_how_the_marker_frame_turns(seed, joint_kinds):
     rng = np.random.default_rng(seed)
     chain, step = random_chain(rng, joint_kinds), 1e-6

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from planted_chains import random_chain, random_q
 from rough_arms import ROUGH, rough_arm
@@ -30,7 +30,6 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 @given(seed=seeds, kinds=st.sampled_from(["RRRRRRR", "RPRRRR", "PPPRRR", "RRP"]))
-@settings(max_examples=15)
 def test_fifteen_exact_pairs_make_a_rough_drawing_exact(seed, kinds):
     rng = np.random.default_rng(seed)
     arm = rough_arm(rng, kinds, replace(ROUGH, slide_zeros=0.01))
@@ -40,7 +39,6 @@ def test_fifteen_exact_pairs_make_a_rough_drawing_exact(seed, kinds):
 
 
 @given(seed=seeds)
-@settings(max_examples=15)
 def test_the_order_of_the_pairs_does_not_matter(seed):
     rng = np.random.default_rng(seed)
     arm = rough_arm(rng)
@@ -344,7 +342,6 @@ def test_bytes_give_the_same_learner_back(sigma):
 
 
 @given(position=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
-@settings(max_examples=20)
 def test_damaged_bytes_are_refused(position, bit):
     arm = rough_arm(np.random.default_rng(1), "RR")
     data = bytearray(RigidLearner(arm.nominal, ROUGH).to_bytes())

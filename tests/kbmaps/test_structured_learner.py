@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from planted_chains import bases_for, half_ranges, random_chain, random_q
 from rough_arms import ROUGH, rough_arm
@@ -29,7 +29,6 @@ kinds = st.text("RP", min_size=2, max_size=4)
 
 
 @given(seed=seeds, joint_kinds=kinds, pairs=st.integers(1, 40))
-@settings(max_examples=15)
 def test_it_is_the_gaussian_posterior_with_the_covariance_of_its_definition(seed, joint_kinds, pairs):
     rng = np.random.default_rng(seed)
     arm = rough_arm(rng, joint_kinds)
@@ -55,7 +54,6 @@ def test_it_is_the_gaussian_posterior_with_the_covariance_of_its_definition(seed
 
 
 @given(seed=seeds, joint_kinds=kinds)
-@settings(max_examples=15)
 def test_without_tolerances_it_is_the_kernel_learner(seed, joint_kinds):
     rng = np.random.default_rng(seed)
     arm = rough_arm(rng, joint_kinds)
@@ -68,7 +66,6 @@ def test_without_tolerances_it_is_the_kernel_learner(seed, joint_kinds):
 
 
 @given(seed=seeds, joint_kinds=kinds)
-@settings(max_examples=15)
 def test_the_order_of_the_pairs_does_not_matter(seed, joint_kinds):
     rng = np.random.default_rng(seed)
     arm = rough_arm(rng, joint_kinds)
@@ -100,7 +97,6 @@ def test_thirty_noisy_pairs_are_enough_where_a_plain_net_needs_hundreds():
 
 
 @given(seed=seeds, joint_kinds=st.text("RP", min_size=4, max_size=6), pairs=st.integers(20, 60))
-@settings(max_examples=15)
 def test_tolerances_without_bounds_beside_narrow_ones_leave_the_noise_as_it_is(seed, joint_kinds, pairs):
     rng = np.random.default_rng(seed)
     narrow = ChainTolerances(axes=math.radians(1.0), points=0.005, zeros=math.radians(1.0))
@@ -184,7 +180,6 @@ def test_support_is_where_pairs_were():
 
 
 @given(seed=seeds, told=st.booleans())
-@settings(max_examples=10)
 def test_its_bytes_predict_the_same_to_the_last_bit(seed, told):
     rng = np.random.default_rng(seed)
     arm = rough_arm(rng, "RPR")

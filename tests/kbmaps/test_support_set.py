@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from planted_chains import bases_for, random_map, random_q
 
@@ -21,7 +21,6 @@ def filled(kinds: str, q: np.ndarray, **settings_) -> SupportSet:
 
 
 @given(seed=seeds, kinds=st.text("RP", min_size=1, max_size=5))
-@settings(max_examples=15)
 def test_learnt_configurations_are_explained_up_to_threshold_and_noise(seed, kinds):
     q = random_q(np.random.default_rng(seed), kinds, 40, 80)
     support = filled(kinds, q)
@@ -43,7 +42,6 @@ def test_an_empty_set_explains_nothing():
 
 
 @given(seed=seeds, kinds=st.text("RP", min_size=1, max_size=4))
-@settings(max_examples=15)
 def test_the_fraction_is_the_gaussian_process_variance(seed, kinds):
     rng = np.random.default_rng(seed)
     support = filled(kinds, random_q(rng, kinds, 20, 80), noise=0.01, threshold=0.02)
@@ -57,7 +55,6 @@ def test_the_fraction_is_the_gaussian_process_variance(seed, kinds):
 
 
 @given(seed=seeds)
-@settings(max_examples=15)
 def test_one_configuration_is_judged_as_in_a_batch(seed):
     rng = np.random.default_rng(seed)
     support = filled("RPR", random_q(rng, "RPR", 30, 80))

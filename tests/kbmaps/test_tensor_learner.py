@@ -4,7 +4,7 @@ import functools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from planted_chains import bases_for, random_chain, random_q
 
@@ -377,7 +377,6 @@ def test_a_restored_learner_claims_the_same_sigma():
 
 
 @given(position=st.floats(0.0, 1.0, exclude_max=True), flip=st.integers(1, 255))
-@settings(max_examples=30)
 def test_a_single_changed_byte_is_noticed(position, flip):
     damaged = bytearray(stored_learner())
     damaged[int(position * len(damaged))] ^= flip

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from planted_chains import bases_for, random_chain, random_q
 
@@ -25,7 +25,6 @@ STORED = random_train("RPR", 7).to_bytes()
 
 
 @given(chains)
-@settings(max_examples=20)
 def test_the_train_of_a_chain_is_the_chain(case):
     kinds, seed = case
     rng = np.random.default_rng(seed)
@@ -34,7 +33,6 @@ def test_the_train_of_a_chain_is_the_chain(case):
 
 
 @given(small_chains)
-@settings(max_examples=15)
 def test_its_control_net_gives_the_same_positions(case):
     kinds, seed = case
     train, q = random_train(kinds, seed), random_q(np.random.default_rng(seed), kinds, 20, 150)
@@ -42,7 +40,6 @@ def test_its_control_net_gives_the_same_positions(case):
 
 
 @given(small_chains)
-@settings(max_examples=15)
 def test_the_net_of_a_chain_by_way_of_its_train_is_the_net_made_directly(case):
     kinds, seed = case
     chain, bases = random_chain(np.random.default_rng(seed), kinds), bases_for(kinds)
@@ -50,7 +47,6 @@ def test_the_net_of_a_chain_by_way_of_its_train_is_the_net_made_directly(case):
 
 
 @given(small_chains)
-@settings(max_examples=15)
 def test_the_jacobian_is_that_of_finite_differences(case):
     kinds, seed = case
     train, q = random_train(kinds, seed), random_q(np.random.default_rng(seed), kinds, 1, 80)[0]
@@ -60,7 +56,6 @@ def test_the_jacobian_is_that_of_finite_differences(case):
 
 
 @given(small_chains)
-@settings(max_examples=15)
 def test_an_affine_change_of_the_frame_between_two_cores_moves_nothing(case):
     kinds, seed = case
     kinds += "R"
@@ -105,7 +100,6 @@ def test_thirty_joints_need_no_more_than_their_cores():
 
 
 @given(chains)
-@settings(max_examples=15)
 def test_a_train_survives_the_round_trip_bit_by_bit(case):
     train = random_train(*case)
     back = TensorTrain.from_bytes(train.to_bytes())
@@ -114,7 +108,6 @@ def test_a_train_survives_the_round_trip_bit_by_bit(case):
 
 
 @given(position=st.integers(0, len(STORED) - 1), flip=st.integers(1, 255))
-@settings(max_examples=100)
 def test_a_single_changed_byte_is_noticed(position, flip):
     damaged = bytearray(STORED)
     damaged[position] ^= flip
@@ -123,7 +116,6 @@ def test_a_single_changed_byte_is_noticed(position, flip):
 
 
 @given(length=st.integers(0, len(STORED) - 1))
-@settings(max_examples=30)
 def test_truncated_bytes_are_noticed(length):
     with pytest.raises(ModelFormatError):
         TensorTrain.from_bytes(STORED[:length])

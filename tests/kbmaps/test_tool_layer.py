@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from planted_chains import bases_for, random_chain, random_map, random_q
 from rough_arms import ROUGH, rough_arm
@@ -36,7 +36,6 @@ def seen(
 
 
 @given(seed=seeds, joint_kinds=kinds, pairs=st.integers(1, 60), spread=st.floats(0.01, 10.0))
-@settings(max_examples=20)
 def test_it_is_batch_least_squares_with_a_prior(seed, joint_kinds, pairs, spread):
     rng = np.random.default_rng(seed)
     chain = random_chain(rng, joint_kinds)
@@ -54,7 +53,6 @@ def test_it_is_batch_least_squares_with_a_prior(seed, joint_kinds, pairs, spread
 
 
 @given(seed=seeds, joint_kinds=kinds, pairs=st.integers(1, 60), outliers=st.booleans(), told=st.booleans())
-@settings(max_examples=20)
 def test_the_order_of_the_pairs_does_not_matter(seed, joint_kinds, pairs, outliers, told):
     rng = np.random.default_rng(seed)
     chain = random_chain(rng, joint_kinds)
@@ -164,7 +162,6 @@ def test_the_noise_stays_known_over_a_tool_change():
 
 
 @given(seed=seeds, joint_kinds=st.text("RP", min_size=1, max_size=4))
-@settings(max_examples=15)
 def test_the_baked_map_predicts_what_the_layer_predicts(seed, joint_kinds):
     rng = np.random.default_rng(seed)
     bases = bases_for(joint_kinds)
@@ -238,7 +235,6 @@ def test_without_pairs_the_arm_is_predicted_and_nothing_supported():
 
 
 @given(seed=seeds, pairs=st.sampled_from([0, 7, 300]), told=st.booleans(), of_map=st.booleans())
-@settings(max_examples=12)
 def test_its_bytes_predict_the_same_to_the_last_bit(seed, pairs, told, of_map):
     rng = np.random.default_rng(seed)
     chain = random_chain(rng, "RPR")

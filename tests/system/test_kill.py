@@ -157,7 +157,7 @@ def kill_again_and_again(config: Config, kills: int, seed: int) -> Aftermath:
 
 @pytest.fixture(scope="module")
 def aftermath(tmp_path_factory: pytest.TempPathFactory, free_endpoint: Callable[[], str]) -> Aftermath:
-    return kill_again_and_again(write_robot(tmp_path_factory.mktemp("kill"), free_endpoint), kills=12, seed=0)
+    return kill_again_and_again(write_robot(tmp_path_factory.mktemp("kill"), free_endpoint), kills=8, seed=0)
 
 
 def numbers(pairs: list[PairMessage]) -> list[int]:
@@ -165,7 +165,7 @@ def numbers(pairs: list[PairMessage]) -> list[int]:
 
 
 def test_every_kill_comes_where_it_was_planned(aftermath: Aftermath) -> None:
-    assert len(aftermath.deaths) == 12
+    assert len(aftermath.deaths) == 8
     assert aftermath.deaths == aftermath.planned
     assert set(aftermath.deaths) == {*SAMPLER_POINTS, *LEARNER_POINTS, NOWHERE}
 

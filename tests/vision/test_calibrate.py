@@ -56,23 +56,15 @@ def planted() -> tuple:
 # --- results
 
 
-def test_rendered_images_give_the_planted_rig() -> None:
-    rig, pairs, _ = photographed()
-    found = calibrate(gathered(pairs, BOARD).views, BOARD, ASKED)
-    assert abs(found.rig.baseline_m - rig.baseline_m) < 2e-4
-    assert np.abs((found.rig.vector - true_vector(rig)) / found.rig.sigma).max() < 5.0
-    assert found.rig.model == "pinhole"
-
-
 def test_intervals_cover_over_many_rigs() -> None:
     misses = []
-    for seed in range(6):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
         rig = webcams(rng, fisheye=seed % 2 == 1)
         found = fit(corner_views(rig, rng, 14), BOARD.corners_m, SIZE, "fisheye" if seed % 2 else "pinhole")
         misses.append((found.bundle.vector - true_vector(rig)) / sigmas(found))
     z = np.abs(np.concatenate(misses))
-    # Parameters of one rig are not independent: 6 rigs are worth about forty.
+    # Parameters of one rig are not independent: 4 rigs are worth about thirty.
     assert 0.55 < np.mean(z < 1.0) < 0.81
     assert np.mean(z < 2.0) > 0.88
 
@@ -99,7 +91,7 @@ def test_views_of_one_eye_alone_count_too(planted) -> None:
     assert all_of_them[0] < pairs_alone[0]
 
 
-@pytest.mark.parametrize("fisheye", [False, True])
+@pytest.mark.parametrize("fisheye", [pytest.param(False, marks=pytest.mark.soak), True])
 def test_the_lens_model_is_chosen_that_foretells_views_better(fisheye) -> None:
     rng = np.random.default_rng(4)
     rig = webcams(rng, fisheye=fisheye)
@@ -268,6 +260,7 @@ def test_an_eye_that_never_sees_the_board_is_named_with_the_reason() -> None:
         require_both(found)
 
 
+@pytest.mark.soak  # of the command: tests/daemon/test_cameras_command.py
 def test_three_pairs_of_another_board_are_enough_to_say_so() -> None:
     _, pairs, _ = photographed()
     taken: list[str] = []
