@@ -15,7 +15,7 @@ from scipy.fft import dct
 from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
 
 from .config import TagConfig
-from .edge import LONGEST_REACH_PX, MODULES, SHARPEST_PX, Edge, Light, find_edge
+from .edge import LONGEST_REACH_PX, MODULES, SHARPEST_PX, Edges, Light, find_edges
 
 # Most iterations; converged when no corner moved by more than this [px] and the blur by no more than this share.
 _ROUNDS, _SETTLED_PX, _SETTLED_BLUR = 8, 0.01, 0.02
@@ -56,16 +56,13 @@ class TagImage:
 
 def measure_tag(grey: ImageArray, id: int, corners_px: FloatArray, config: TagConfig) -> TagImage | Reason:
     """Measure the tag whose corners are near `corners_px` (4, 2) in a grey image, or return why it is doubtful."""
-    edges: list[Edge] = []
     blur_px = _USUAL_BLUR_PX
     light: Light | None = None
     for number in range(_ROUNDS):
-        found = [find_edge(grey, corners_px, side, blur_px, light, config) for side in range(4)]
-        reasons = [edge for edge in found if isinstance(edge, Reason)]
-        if reasons:
-            return reasons[0]
-        edges = [edge for edge in found if isinstance(edge, Edge)]
-        moved = np.array([_meeting(edges[side - 1], edges[side]) for side in range(4)])
+        edges = find_edges(grey, corners_px, blur_px, light, config)
+        if isinstance(edges, Reason):
+            return edges
+        moved = _meetings(edges)
         moved_px, before_px = float(np.abs(moved - corners_px).max()), blur_px
         if moved_px > LONGEST_REACH_PX:
             return Reason.OCCLUDED
@@ -77,7 +74,7 @@ def measure_tag(grey: ImageArray, id: int, corners_px: FloatArray, config: TagCo
         corners_px, blur_px = moved, blur_px if rough else _blur(edges, blur_px)
         if not rough and moved_px < _SETTLED_PX and abs(blur_px - before_px) < _SETTLED_BLUR * blur_px:
             break
-    shortest_px = min(2.0 * edge.half_length for edge in edges)
+    shortest_px = 2.0 * float(edges.half_lengths.min())
     if shortest_px < config.min_side_px:
         return Reason.NO_MARKER
     cov_px = _corner_covariance(edges)
@@ -86,28 +83,27 @@ def measure_tag(grey: ImageArray, id: int, corners_px: FloatArray, config: TagCo
     return TagImage(id, corners_px, cov_px)
 
 
-def _blur(edges: list[Edge], before_px: float) -> float:
+def _blur(edges: Edges, before_px: float) -> float:
     """Estimate the blur (1-sigma) [px] of all edges, from the previous estimate `before_px`."""
     usual = _USUAL_SIGMA_PX**-2
-    wider = sum(edge.widening for edge in edges) + usual * (_USUAL_BLUR_PX - before_px)
-    factor = 1.0 + wider / (usual + sum(edge.information for edge in edges)) / before_px
+    wider = edges.widening + usual * (_USUAL_BLUR_PX - before_px)
+    factor = 1.0 + wider / (usual + edges.information) / before_px
     factor = min(max(factor, 1.0 / _LARGEST_WIDENING), _LARGEST_WIDENING)
     return min(max(factor * before_px, SHARPEST_PX), _WIDEST_PX)
 
 
-def _light(edges: list[Edge]) -> Light:
+def _light(edges: Edges) -> Light:
     """Return the light that the levels along the edges show."""
-    places = np.concatenate([edge.places for edge in edges])
-    levels = np.concatenate([edge.levels for edge in edges])
-    design = places - places.mean(axis=0)
+    spots, levels = edges.spots.reshape(-1, 2), edges.levels.reshape(-1, 2)
+    design = spots - spots.mean(axis=0)
     inverse = np.linalg.inv(design.T @ design)
     gradients = inverse @ design.T @ levels
     left = levels - levels.mean(axis=0) - design @ gradients
-    variance = np.square(left).sum(axis=0) / (len(places) - 3)
+    variance = np.square(left).sum(axis=0) / (len(spots) - 3)
     return Light(np.asarray(gradients.T, np.float64), variance[:, None, None] * inverse)
 
 
-def _likeness(edges: list[Edge]) -> float:
+def _likeness(edges: Edges) -> float:
     """Return the variance of neighbouring points' mean relative to that of independent points.
 
     Interpolation and blur spread a pixel's noise to its neighbours, and neither a print nor a lens is straight. So slow
@@ -115,9 +111,9 @@ def _likeness(edges: list[Edge]) -> float:
     the more, tell their noise.
     """
     power, count = _SMOOTHED_WAVES * _SMOOTHED, float(_SMOOTHED_WAVES)
-    for edge in edges:
-        quickest = max(len(edge.residuals) // _SLOW, _LEAST_QUICKEST)
-        slow = np.square(np.asarray(dct(edge.residuals, norm="ortho"))[2:quickest])
+    for residuals in edges.residuals:
+        quickest = max(len(residuals) // _SLOW, _LEAST_QUICKEST)
+        slow = np.square(np.asarray(dct(residuals, norm="ortho"))[2:quickest])
         weight = np.arange(2, 2 + len(slow)) ** -_STEEPNESS
         share = weight / weight.sum()
         told = 1.0 / float(share @ share)
@@ -125,34 +121,29 @@ def _likeness(edges: list[Edge]) -> float:
     return power / count
 
 
-def _meeting(one: Edge, other: Edge) -> FloatArray:
-    """Return the intersection (2,) [px] of two edges' lines."""
-    steps = np.linalg.solve(np.column_stack([one.direction, -other.direction]), other.point - one.point)
-    return one.point + steps[0] * one.direction
+def _meetings(edges: Edges) -> FloatArray:
+    """Return the intersections (4, 2) [px] of each edge's line with that of the edge before it."""
+    points, directions = edges.points, edges.directions
+    before = np.roll(directions, 1, axis=0)
+    steps = np.linalg.solve(np.stack([before, -directions], axis=2), (points - np.roll(points, 1, axis=0))[..., None])
+    return np.roll(points, 1, axis=0) + steps[:, 0] * before
 
 
-def _corner_covariance(edges: list[Edge]) -> FloatArray:
+def _corner_covariance(edges: Edges) -> FloatArray:
     """Return the covariance (8, 8) of the corners; each lies on the edge before it and on its own edge.
 
     A corner x on both lines n·x = place moves by dx with n₁·dx = dp₁ and n₂·dx = dp₂, where dp is the line's shift
     there: that of its place, and of its slope times s.
     """
-    likeness = _likeness(edges)
-    by_edge = np.zeros((8, 8))
+    directions = edges.directions / np.linalg.norm(edges.directions, axis=1)[:, None]
+    normals = np.column_stack([directions[:, 1], -directions[:, 0]])
+    by_edge = np.zeros((4, 2, 4, 2))
+    cov = np.zeros((4, 2, 4, 2))
+    cov[range(4), :, range(4)] = _likeness(edges) * edges.scatter + edges.shared
     for corner in range(4):
-        before, after = edges[corner - 1], edges[corner]
-        solve = np.linalg.inv(np.array([_unit_normal(before), _unit_normal(after)]))
-        rows = slice(2 * corner, 2 * corner + 2)
+        solve = np.linalg.inv(normals[[corner - 1, corner]])
         # The corner is the end (s = 1) of the edge before it, and the beginning (s = −1) of its own.
-        for column, edge_number, s in ((0, (corner - 1) % 4, 1.0), (1, corner, -1.0)):
-            by_edge[rows, 2 * edge_number] += solve[:, column]
-            by_edge[rows, 2 * edge_number + 1] += s * solve[:, column]
-    cov = np.zeros((8, 8))
-    for number, edge in enumerate(edges):
-        cov[2 * number : 2 * number + 2, 2 * number : 2 * number + 2] = likeness * edge.scatter + edge.shared
-    return by_edge @ cov @ by_edge.T
-
-
-def _unit_normal(edge: Edge) -> FloatArray:
-    direction = edge.direction / np.linalg.norm(edge.direction)
-    return np.array([direction[1], -direction[0]])
+        for column, edge, s in ((0, corner - 1, 1.0), (1, corner, -1.0)):
+            by_edge[corner, :, edge] = np.outer(solve[:, column], (1.0, s))
+    rows = by_edge.reshape(8, 8)
+    return rows @ cov.reshape(8, 8) @ rows.T
