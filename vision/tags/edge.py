@@ -188,7 +188,7 @@ def find_edges(
         return Reason.AT_BORDER
     profiles = _sampled(grey, rays.spots)
     if light is None:
-        points = _rough_points(profiles, rays, config.min_contrast)
+        points = _rough_points(profiles, rays, blur_px, config.min_contrast)
     else:
         ways = np.stack([0.5 * lengths[:, None] * along, normals], axis=2)
         unlit = np.einsum("eiw,kij,ejw->ekw", ways, light.cov, ways)
@@ -320,7 +320,7 @@ def _interpolated(pixels: list[FloatArray], parts: FloatArray) -> FloatArray:
     return top * (1.0 - down) + bottom * down
 
 
-def _rough_points(profiles: FloatArray, rays: _Rays, min_contrast: float) -> _Points | Reason:
+def _rough_points(profiles: FloatArray, rays: _Rays, blur_px: float, min_contrast: float) -> _Points | Reason:
     """Return the points from the share of black on each line (4, n, m): rough, but from anywhere on the lines."""
     samples = rays.weights.sum(axis=1)[:, None]
     plain = np.maximum(1.0, np.rint(0.5 * _PLAIN * samples))
@@ -331,9 +331,14 @@ def _rough_points(profiles: FloatArray, rays: _Rays, min_contrast: float) -> _Po
         return Reason.LOW_CONTRAST
     step = rays.steps[:, 1] - rays.steps[:, 0]
     shares = (white[:, None, None] - profiles) / (white - black)[:, None, None]
-    places = (shares @ rays.weights[..., None])[..., 0] * step[:, None] - 0.5 * step[:, None] * samples
+    lengths = step[:, None] * rays.weights
+    places = (shares @ lengths[..., None])[..., 0] - 0.5 * step[:, None] * samples
+    # The integral of share times rest is that of a Gaussian blur.
+    blurs = math.sqrt(math.pi) * rays.mean(((shares * (1.0 - shares)) @ lengths[..., None])[..., 0])
+    information = float(np.square(white - black) @ rays.counts)
+    widening = (float(np.median(blurs)) - blur_px) * information
     nothing = np.zeros_like(places)
-    return _Points(places, places, rays.used, nothing, np.zeros((4, 2)), 0.0, 0.0, np.zeros((4, 2, 2)))
+    return _Points(places, places, rays.used, nothing, np.zeros((4, 2)), widening, information, np.zeros((4, 2, 2)))
 
 
 def _points(

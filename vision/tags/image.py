@@ -19,8 +19,8 @@ from .edge import LONGEST_REACH_PX, MODULES, SHARPEST_PX, Edges, Light, find_edg
 
 # Most iterations; converged when no corner moved by more than this [px] and the blur by no more than this share.
 _ROUNDS, _SETTLED_PX, _SETTLED_BLUR = 8, 0.01, 0.02
-# Corners are rough until they move by less than this [px], for at most these rounds more than one.
-_ROUGH_PX, _ROUGH_ROUNDS = 0.7, 2
+# Corners are rough until they move by less than this share of a module, for at most these rounds more than one.
+_ROUGH_SHARE, _ROUGH_ROUNDS = 0.3, 2
 # Usual blur of lens and interpolation (1-sigma); its prior spread, in an image with a noise of one grey level; the
 # largest blur [px].
 _USUAL_BLUR_PX, _USUAL_SIGMA_PX, _WIDEST_PX = 0.85, 0.1, 3.0
@@ -69,9 +69,9 @@ def measure_tag(grey: ImageArray, id: int, corners_px: FloatArray, config: TagCo
         rough = light is None
         if not rough:
             light = _light(edges)
-        elif moved_px < _ROUGH_PX or number == _ROUGH_ROUNDS:
+        elif moved_px < _ROUGH_SHARE * 2.0 * edges.half_lengths.min() / MODULES or number == _ROUGH_ROUNDS:
             light = _EVEN
-        corners_px, blur_px = moved, blur_px if rough else _blur(edges, blur_px)
+        corners_px, blur_px = moved, _blur(edges, blur_px)
         if not rough and moved_px < _SETTLED_PX and abs(blur_px - before_px) < _SETTLED_BLUR * blur_px:
             break
     shortest_px = 2.0 * float(edges.half_lengths.min())
