@@ -43,9 +43,9 @@ PIXEL_CUMULANT = -1.0 / 40.0
 _BEYOND_SHARE = 0.2
 # Systematic error of an edge's position on long lines [px]; larger on short ones.
 _FLOOR_PX = 0.002
-# Points farther from their line than this, in robust standard deviations, are outliers.
-_STRAY = 3.5
-_MAD_TO_SIGMA = 1.4826
+# Points farther from their line than this, in medians of all points' distances, are outliers. So much [px] paper that
+# is not flat and a camera's sharpening may bring.
+_STRAY_MEDIANS, _WAVY_PX = 5.2, 0.15
 # What is added to the blur of the filter for an edge's shift [px].
 _WIDER_PX = 1.5
 # Prior variances in units of the noise: of the levels, and of their gradients across the edge [1/px²].
@@ -168,11 +168,13 @@ class _Points:
 
 
 def find_edges(
-    grey: ImageArray, corners_px: FloatArray, blur_px: float, light: Light | None, config: TagConfig
+    grey: ImageArray, corners_px: FloatArray, blur_px: float, light: Light | None, shorter: float, config: TagConfig
 ) -> Edges | Reason:
     """Measure the edges from each corner to the next one, or return the reason why one cannot be measured.
 
-    `light` is None if the corners may be wrong by pixels.
+    Args:
+        light: None if the corners may be wrong by pixels.
+        shorter: share of their usual length that the lines across the edges have.
     """
     begin, end = corners_px, np.roll(corners_px, -1, axis=0)
     lengths = np.linalg.norm(end - begin, axis=1)
@@ -181,7 +183,7 @@ def find_edges(
     along = (end - begin) / lengths[:, None]
     normals = np.column_stack([along[:, 1], -along[:, 0]])  # corners go round clockwise: out of the tag
     origins = (begin + end) / 2.0
-    rays = _rays(corners_px, origins, along, normals, lengths, blur_px)
+    rays = _rays(corners_px, origins, along, normals, lengths, blur_px, shorter)
     if isinstance(rays, Reason):
         return rays
     if _leave(grey, rays.spots):
@@ -224,6 +226,7 @@ def _rays(
     normals: FloatArray,
     lengths: FloatArray,
     blur_px: float,
+    shorter: float,
 ) -> _Rays | Reason:
     """Return the lines across the edges; the reason if an edge is too short for them."""
     to_px = np.asarray(cv2.getPerspectiveTransform(MODULES * _SQUARE, corners_px.astype(np.float32)), np.float64)
@@ -231,7 +234,8 @@ def _rays(
     to_modules = np.linalg.inv(to_px)
     quads = corners_px[(np.arange(4)[:, None] + np.arange(4)) % 4]
     modules = np.abs(_module_ends(to_modules, quads[:, :2], normals)).min(axis=(1, 2))
-    reaches = np.minimum(np.maximum(modules - _CLEAR_BLURS * blur_px, _CLEAR_SHARE * modules), LONGEST_REACH_PX)
+    clear = np.maximum(modules - _CLEAR_BLURS * blur_px, _CLEAR_SHARE * modules)
+    reaches = shorter * np.minimum(clear, LONGEST_REACH_PX)
     if not (reaches >= _SHORTEST_REACH_PX).all():
         return Reason.NO_MARKER
     # At an acute corner, nearby lines leave the tag through its other side.
@@ -466,8 +470,8 @@ def _fitted(
             return Reason.OCCLUDED
         line = _line_filters(rays.s, kept) @ points.steady[..., None]
         far = np.abs(points.steady - line[:, 0] - line[:, 1] * rays.s)
-        spread = np.maximum(_MAD_TO_SIGMA * _medians(far, kept), _FLOOR_PX)
-        agreeing = points.clear & (far <= _STRAY * spread[:, None])
+        most = np.maximum(_STRAY_MEDIANS * _medians(far, kept), _WAVY_PX)
+        agreeing = points.clear & (far <= most[:, None])
         if (agreeing == kept).all():
             break
         kept = agreeing

@@ -30,6 +30,7 @@ class TagFinder:
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE  # `measure_tag` does better
         # Else a tag's paper, one module wider all around, is taken for the same square, and the tag is not found.
         parameters.minMarkerDistanceRate = _APART_SHARE
+        parameters.perspectiveRemovePixelPerCell = 8  # with OpenCV's 4, small and oblique tags are missed
         self._detector = cv2.aruco.ArucoDetector(tags_of(config.dictionary), parameters)
 
     def find(self, grey: ImageArray, region: Region | None = None) -> Seen:

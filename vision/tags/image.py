@@ -34,7 +34,8 @@ _SMOOTHED, _SMOOTHED_WAVES = 1.5, 10
 _SLOW, _LEAST_QUICKEST = 4, 4
 # Power of the wave number with which the waves' weights fall.
 _STEEPNESS = 1.0
-
+# Share of their length that lines across edges keep where the usual ones leave the margin.
+_SHORTER = 0.5
 
 _EVEN = Light(np.zeros((2, 2)), np.zeros((2, 2, 2)))
 
@@ -56,20 +57,33 @@ class TagImage:
 
 def measure_tag(grey: ImageArray, id: int, corners_px: FloatArray, config: TagConfig) -> TagImage | Reason:
     """Measure the tag whose corners are near `corners_px` (4, 2) in a grey image, or return why it is doubtful."""
+    found = _measured(grey, id, corners_px, 1.0, config)
+    if found in (Reason.OCCLUDED, Reason.LOW_CONTRAST):
+        # The margin may be narrower than a module.
+        again = _measured(grey, id, corners_px, _SHORTER, config)
+        return again if isinstance(again, TagImage) else found
+    return found
+
+
+def _measured(
+    grey: ImageArray, id: int, corners_px: FloatArray, shorter: float, config: TagConfig
+) -> TagImage | Reason:
+    """Measure the tag with lines across its edges that are so much shorter than usual."""
     blur_px = _USUAL_BLUR_PX
     light: Light | None = None
     for number in range(_ROUNDS):
-        edges = find_edges(grey, corners_px, blur_px, light, config)
+        edges = find_edges(grey, corners_px, blur_px, light, shorter, config)
         if isinstance(edges, Reason):
             return edges
         moved = _meetings(edges)
         moved_px, before_px = float(np.abs(moved - corners_px).max()), blur_px
+        module_px = 2.0 * float(edges.half_lengths.min()) / MODULES
         if moved_px > LONGEST_REACH_PX:
             return Reason.OCCLUDED
         rough = light is None
         if not rough:
             light = _light(edges)
-        elif moved_px < _ROUGH_SHARE * 2.0 * edges.half_lengths.min() / MODULES or number == _ROUGH_ROUNDS:
+        elif moved_px < _ROUGH_SHARE * module_px or number == _ROUGH_ROUNDS:
             light = _EVEN
         corners_px, blur_px = moved, _blur(edges, blur_px)
         if not rough and moved_px < _SETTLED_PX and abs(blur_px - before_px) < _SETTLED_BLUR * blur_px:
