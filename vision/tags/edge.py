@@ -183,7 +183,7 @@ def find_edges(
     along = (end - begin) / lengths[:, None]
     normals = np.column_stack([along[:, 1], -along[:, 0]])  # corners go round clockwise: out of the tag
     origins = (begin + end) / 2.0
-    rays = _rays(corners_px, origins, along, normals, lengths, blur_px, shorter)
+    rays = _rays(corners_px, origins, along, normals, lengths, blur_px, shorter, rough=light is None)
     if isinstance(rays, Reason):
         return rays
     if _leave(grey, rays.spots):
@@ -227,6 +227,8 @@ def _rays(
     lengths: FloatArray,
     blur_px: float,
     shorter: float,
+    *,
+    rough: bool,
 ) -> _Rays | Reason:
     """Return the lines across the edges; the reason if an edge is too short for them."""
     to_px = np.asarray(cv2.getPerspectiveTransform(MODULES * _SQUARE, corners_px.astype(np.float32)), np.float64)
@@ -234,8 +236,9 @@ def _rays(
     to_modules = np.linalg.inv(to_px)
     quads = corners_px[(np.arange(4)[:, None] + np.arange(4)) % 4]
     modules = np.abs(_module_ends(to_modules, quads[:, :2], normals)).min(axis=(1, 2))
-    clear = np.maximum(modules - _CLEAR_BLURS * blur_px, _CLEAR_SHARE * modules)
-    reaches = shorter * np.minimum(clear, LONGEST_REACH_PX)
+    share = _CLEAR_SHARE * modules
+    clear = np.minimum(np.maximum(modules - _CLEAR_BLURS * blur_px, share), LONGEST_REACH_PX)
+    reaches = shorter * (np.maximum(clear, share) if rough else clear)
     if not (reaches >= _SHORTEST_REACH_PX).all():
         return Reason.NO_MARKER
     # At an acute corner, nearby lines leave the tag through its other side.

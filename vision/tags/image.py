@@ -78,7 +78,7 @@ def _measured(
         moved = _meetings(edges)
         moved_px, before_px = float(np.abs(moved - corners_px).max()), blur_px
         module_px = 2.0 * float(edges.half_lengths.min()) / MODULES
-        if moved_px > LONGEST_REACH_PX:
+        if moved_px > max(LONGEST_REACH_PX, module_px):
             return Reason.OCCLUDED
         rough = light is None
         if not rough:
