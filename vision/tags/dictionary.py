@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import cv2
-import numpy as np
 
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray, frozen_array
 
 from .config import Dictionary
 from .edge import MODULES
@@ -36,6 +36,7 @@ def require_tag(name: Dictionary, id: int) -> None:
         raise ConfigError(f"there is no tag {id} in {name}", remedy=f"Its numbers go from 0 to {most - 1}")
 
 
+@cache
 def tag_modules(name: Dictionary, id: int) -> FloatArray:
     """Return a tag's modules with its black border, rows from the top, shape (8, 8), 1 white and 0 black.
 
@@ -43,4 +44,4 @@ def tag_modules(name: Dictionary, id: int) -> FloatArray:
         ConfigError: there is no such tag.
     """
     require_tag(name, id)
-    return np.asarray(cv2.aruco.generateImageMarker(tags_of(name), id, int(MODULES)) > 127, dtype=np.float64)
+    return frozen_array(cv2.aruco.generateImageMarker(tags_of(name), id, int(MODULES)) > 127)

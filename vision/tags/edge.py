@@ -54,7 +54,7 @@ _FREE, _LEVEL, _GRADIENT = 1e4, 0.5, 0.01
 # reach.
 _PLAIN = 0.35
 # Corners as they go round, in parts of the side.
-_SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
 # A tag's modules from those of the frame of each edge, in which the edge goes from (0, 0) to (8, 0).
 _QUARTER = np.array([[0.0, -1.0, MODULES], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 _TURNS = np.stack([np.linalg.matrix_power(_QUARTER, side) for side in range(4)])
@@ -186,15 +186,15 @@ def find_edges(
     rays = _rays(corners_px, origins, along, normals, lengths, blur_px, shorter, rough=light is None)
     if isinstance(rays, Reason):
         return rays
-    if _leave(grey, rays.spots):
+    if leave(grey, rays.spots):
         return Reason.AT_BORDER
-    profiles = _sampled(grey, rays.spots)
+    profiles = sampled(grey, rays.spots)
     if light is None:
         points = _rough_points(profiles, rays, blur_px, config.min_contrast)
     else:
         ways = np.stack([0.5 * lengths[:, None] * along, normals], axis=2)
         unlit = np.einsum("eiw,kij,ejw->ekw", ways, light.cov, ways)
-        beyond = _sampled(grey, _within(grey, rays.beyond))
+        beyond = sampled(grey, _within(grey, rays.beyond))
         ideal = _ideal(rays.spots, origins, normals, blur_px)
         cumulants = PIXEL_CUMULANT * (normals**4).sum(axis=1) / blur_px**4
         lit = light.gradients @ ways
@@ -231,7 +231,7 @@ def _rays(
     rough: bool,
 ) -> _Rays | Reason:
     """Return the lines across the edges; the reason if an edge is too short for them."""
-    to_px = np.asarray(cv2.getPerspectiveTransform(MODULES * _SQUARE, corners_px.astype(np.float32)), np.float64)
+    to_px = np.asarray(cv2.getPerspectiveTransform(MODULES * SQUARE, corners_px.astype(np.float32)), np.float64)
     to_px = to_px @ _TURNS
     to_modules = np.linalg.inv(to_px)
     quads = corners_px[(np.arange(4)[:, None] + np.arange(4)) % 4]
@@ -287,7 +287,7 @@ def _beyond(to_px: FloatArray, to_modules: FloatArray, places: FloatArray) -> Fl
     return np.asarray(there[..., :2] / there[..., 2:], dtype=np.float64)
 
 
-def _leave(grey: ImageArray, places: FloatArray) -> bool:
+def leave(grey: ImageArray, places: FloatArray) -> bool:
     """Return True if some places (..., 2) are too near to the image's border to be sampled."""
     height, width = grey.shape
     return bool((places < 1.0).any() or (places > (width - 2.0, height - 2.0)).any())
@@ -299,7 +299,7 @@ def _within(grey: ImageArray, places: FloatArray) -> FloatArray:
     return np.clip(places, 1.0, (width - 2.0, height - 2.0))
 
 
-def _sampled(grey: ImageArray, places: FloatArray) -> FloatArray:
+def sampled(grey: ImageArray, places: FloatArray) -> FloatArray:
     """Return the grey levels at places (..., 2)."""
     # By hand: cv2.remap would round places to 1/32 px.
     whole = places.astype(np.intp)

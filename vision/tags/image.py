@@ -7,14 +7,16 @@ is estimated from the edges themselves. The corners are the intersections of the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.fft import dct
 
 from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
 
+from .bleed import bleed
 from .config import TagConfig
+from .dictionary import tag_modules
 from .edge import LONGEST_REACH_PX, MODULES, SHARPEST_PX, Edges, Light, find_edges
 
 # Most iterations; converged when no corner moved by more than this [px] and the blur by no more than this share.
@@ -91,10 +93,12 @@ def _measured(
     shortest_px = 2.0 * float(edges.half_lengths.min())
     if shortest_px < config.min_side_px:
         return Reason.NO_MARKER
-    cov_px = _corner_covariance(edges)
+    bled_px, bled_var = bleed(grey, corners_px, blur_px, tag_modules(config.dictionary, id))
+    edges = replace(edges, places=edges.places + bled_px)
+    cov_px = _corner_covariance(edges, bled_var)
     if math.sqrt(float(np.diag(cov_px).max())) > config.max_corner_sigma * shortest_px:
         return Reason.BLURRED if blur_px * MODULES > _MOST_BLUR * shortest_px else Reason.NOT_STRAIGHT
-    return TagImage(id, corners_px, cov_px)
+    return TagImage(id, _meetings(edges), cov_px)
 
 
 def _blur(edges: Edges, before_px: float) -> float:
@@ -143,17 +147,18 @@ def _meetings(edges: Edges) -> FloatArray:
     return np.roll(points, 1, axis=0) + steps[:, 0] * before
 
 
-def _corner_covariance(edges: Edges) -> FloatArray:
+def _corner_covariance(edges: Edges, together: float) -> FloatArray:
     """Return the covariance (8, 8) of the corners; each lies on the edge before it and on its own edge.
 
     A corner x on both lines n·x = place moves by dx with n₁·dx = dp₁ and n₂·dx = dp₂, where dp is the line's shift
-    there: that of its place, and of its slope times s.
+    there: that of its place, and of its slope times s. `together` is the variance [px²] of the shift of all edges.
     """
     directions = edges.directions / np.linalg.norm(edges.directions, axis=1)[:, None]
     normals = np.column_stack([directions[:, 1], -directions[:, 0]])
     by_edge = np.zeros((4, 2, 4, 2))
     cov = np.zeros((4, 2, 4, 2))
-    cov[range(4), :, range(4)] = _likeness(edges) * edges.scatter + edges.shared
+    cov[:, 0, :, 0] = together
+    cov[range(4), :, range(4)] += _likeness(edges) * edges.scatter + edges.shared
     for corner in range(4):
         solve = np.linalg.inv(normals[[corner - 1, corner]])
         # The corner is the end (s = 1) of the edge before it, and the beginning (s = −1) of its own.
