@@ -34,8 +34,8 @@ _LARGEST_WIDENING = 1.5
 _SMOOTHED, _SMOOTHED_WAVES = 1.5, 10
 # Slow waves have half-periods of at least this many points; least upper bound of their indices.
 _SLOW, _LEAST_QUICKEST = 4, 4
-# Power of the wave number with which the waves' weights fall.
-_STEEPNESS = 1.0
+# Standard deviations of chance that a random walk along the edges has to exceed; rounds of its fit.
+_CHANCE, _FITTED = 2.5, 4
 # Share of their length that lines across edges keep where the usual ones leave the margin.
 _SHORTER = 0.5
 
@@ -121,22 +121,31 @@ def _light(edges: Edges) -> Light:
     return Light(np.asarray(gradients.T, np.float64), variance[:, None, None] * inverse)
 
 
-def _likeness(edges: Edges) -> float:
-    """Return the variance of neighbouring points' mean relative to that of independent points.
+def _likeness(edges: Edges) -> FloatArray:
+    """Return the variances (2,) of an edge's place and slope relative to those that independent points would have.
 
     Interpolation and blur spread a pixel's noise to its neighbours, and neither a print nor a lens is straight. So slow
-    waves along the edges have more noise than quick ones. Place and slope are the slowest; the next ones, the slower
-    the more, tell their noise.
+    waves along the edges have more noise than quick ones. The power of waves of index k from 2 on is that of a random
+    walk, b/k², on top of the noise a. Place and slope are the waves of index 1/2 and 1.
     """
-    power, count = _SMOOTHED_WAVES * _SMOOTHED, float(_SMOOTHED_WAVES)
-    for residuals in edges.residuals:
-        quickest = max(len(residuals) // _SLOW, _LEAST_QUICKEST)
-        slow = np.square(np.asarray(dct(residuals, norm="ortho"))[2:quickest])
-        weight = np.arange(2, 2 + len(slow)) ** -_STEEPNESS
-        share = weight / weight.sum()
-        told = 1.0 / float(share @ share)
-        power, count = power + told * float(share @ slow), count + told
-    return power / count
+    slow = [np.square(np.asarray(dct(points, norm="ortho"))) for points in edges.residuals]
+    quickest = [max(len(power) // _SLOW, _LEAST_QUICKEST) for power in slow]
+    power = np.concatenate([power[2:last] for power, last in zip(slow, quickest, strict=True)])
+    index = np.concatenate([np.arange(2.0, min(last, len(all_))) for last, all_ in zip(quickest, slow, strict=True)])
+    # The prior counts as waves that are quick enough to show no walk.
+    power = np.append(power, _SMOOTHED)
+    design = np.stack([np.ones_like(power), np.append(index**-2.0, 0.0)])
+    count = np.append(np.ones_like(index), _SMOOTHED_WAVES)
+    even = np.append(index**-1.0, 1.0) * count
+    level = np.array([float(even @ power / even.sum()), 0.0])
+    alone = level[0]
+    for _ in range(_FITTED):
+        weighed = design * (count / np.maximum(level @ design, 0.1 * alone) ** 2)
+        level = np.maximum(np.linalg.solve(weighed @ design.T, weighed @ power), (0.1 * alone, 0.0))
+    chance = math.sqrt(2.0 * float(np.linalg.inv(design * count @ design.T)[1, 1])) * float(level[0])
+    # Walks that chance may show are left out, larger ones are taken for a little smaller (James and Stein).
+    walk = float(level[1]) * max(1.0 - (_CHANCE * chance / max(float(level[1]), 1e-9)) ** 2, 0.0)
+    return (float(level[0]) if walk else alone) + walk * np.array([4.0, 1.0])
 
 
 def _meetings(edges: Edges) -> FloatArray:
@@ -158,7 +167,7 @@ def _corner_covariance(edges: Edges, together: float) -> FloatArray:
     by_edge = np.zeros((4, 2, 4, 2))
     cov = np.zeros((4, 2, 4, 2))
     cov[:, 0, :, 0] = together
-    cov[range(4), :, range(4)] += _likeness(edges) * edges.scatter + edges.shared
+    cov[range(4), :, range(4)] += np.sqrt(np.multiply.outer(*[_likeness(edges)] * 2)) * edges.scatter + edges.shared
     for corner in range(4):
         solve = np.linalg.inv(normals[[corner - 1, corner]])
         # The corner is the end (s = 1) of the edge before it, and the beginning (s = −1) of its own.
