@@ -168,16 +168,16 @@ def test_a_covered_pattern_leaves_bleeding_unknown() -> None:
     assert np.trace(covered.cov_px) > 10.0 * np.trace(plain.cov_px)
 
 
-def test_wavy_edges_are_claimed_to_be_less_sure() -> None:
-    # Waves of 40 and 60 px along the paper's edges, 0.3 px high, as a moiré or curled paper makes them.
+def test_bent_edges_are_claimed_to_be_less_sure() -> None:
+    # Less than half a wave along each edge, 0.1 px high, as a lens or curled paper bends them.
     grey = np.asarray(cv2.cvtColor(seen(sheet()).left, cv2.COLOR_BGR2GRAY), np.uint8)
     v, u = np.indices(grey.shape, dtype=np.float32)
-    wavy = cv2.remap(grey, u + 0.3 * np.sin(v / 6.4), v + 0.3 * np.sin(u / 9.5), cv2.INTER_CUBIC)
+    bent = cv2.remap(grey, u + 0.1 * np.sin(v / 20.0), v + 0.1 * np.sin(u / 26.0), cv2.INTER_CUBIC)
     true = corners_in_the_left_eye(FACING)
-    straight, waved = (measure_tag(image, 0, true, CONFIG) for image in (grey, wavy))
+    straight, curved = (measure_tag(image, 0, true, CONFIG) for image in (grey, bent))
     assert isinstance(straight, TagImage)
-    assert isinstance(waved, TagImage)
-    assert np.trace(waved.cov_px) > 10.0 * np.trace(straight.cov_px)
+    assert isinstance(curved, TagImage)
+    assert np.trace(curved.cov_px) > 5.0 * np.trace(straight.cov_px)
 
 
 def test_a_tag_with_half_a_margin_is_measured() -> None:
@@ -191,7 +191,7 @@ def test_a_large_tag_is_found_from_rough_corners() -> None:
     corners = MIDDLE + side_m * TAG_CORNERS @ FACING.T
     true = SMALL.focal_px * corners[:, :2] / corners[:, 2:] + SMALL.principal_point_px
     grey = cv2.cvtColor(seen(sheet(side_m=side_m), look=replace(WALL, samples=2)).left, cv2.COLOR_BGR2GRAY)
-    inside = true + 0.09 * (true.mean(axis=0) - true)  # 6 px an edge: the detector's polygon cuts corners off
+    inside = true + 0.11 * (true.mean(axis=0) - true)  # 7 px an edge: the detector's polygon cuts corners off
     tag = measure_tag(grey, 0, inside, CONFIG)
     assert isinstance(tag, TagImage)
     assert np.abs(tag.corners_px - true).max() < 0.1

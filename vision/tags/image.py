@@ -34,8 +34,8 @@ _LARGEST_WIDENING = 1.5
 _SMOOTHED, _SMOOTHED_WAVES = 1.5, 10
 # Slow waves have half-periods of at least this many points; least upper bound of their indices.
 _SLOW, _LEAST_QUICKEST = 4, 4
-# Standard deviations of chance that a random walk along the edges has to exceed; rounds of its fit.
-_CHANCE, _FITTED = 2.5, 4
+# Standard deviations of chance that a random walk along the edges has to exceed.
+_CHANCE = 2.5
 # Share of their length that lines across edges keep where the usual ones leave the margin.
 _SHORTER = 0.5
 
@@ -137,15 +137,14 @@ def _likeness(edges: Edges) -> FloatArray:
     design = np.stack([np.ones_like(power), np.append(index**-2.0, 0.0)])
     count = np.append(np.ones_like(index), _SMOOTHED_WAVES)
     even = np.append(index**-1.0, 1.0) * count
-    level = np.array([float(even @ power / even.sum()), 0.0])
-    alone = level[0]
-    for _ in range(_FITTED):
-        weighed = design * (count / np.maximum(level @ design, 0.1 * alone) ** 2)
-        level = np.maximum(np.linalg.solve(weighed @ design.T, weighed @ power), (0.1 * alone, 0.0))
-    chance = math.sqrt(2.0 * float(np.linalg.inv(design * count @ design.T)[1, 1])) * float(level[0])
+    alone = float(even @ power / even.sum())
+    cov = np.linalg.inv(design * count @ design.T)
+    level = cov @ (design * count) @ power
+    noise, steep = max(float(level[0]), 0.0), max(float(level[1]), 1e-9)
+    chance = math.sqrt(2.0 * float(cov[1, 1])) * max(noise, _SMOOTHED)
     # Walks that chance may show are left out, larger ones are taken for a little smaller (James and Stein).
-    walk = float(level[1]) * max(1.0 - (_CHANCE * chance / max(float(level[1]), 1e-9)) ** 2, 0.0)
-    return (float(level[0]) if walk else alone) + walk * np.array([4.0, 1.0])
+    walk = steep * max(1.0 - (_CHANCE * chance / steep) ** 2, 0.0)
+    return (noise if walk else alone) + walk * np.array([4.0, 1.0])
 
 
 def _meetings(edges: Edges) -> FloatArray:
