@@ -66,15 +66,13 @@ def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: Flo
     bled = np.hypot(slope_x, slope_y) - right * slope_x - below * slope_y
     lit = np.stack([np.ones_like(right), right, below])
     design = np.concatenate([lit, lit * pattern, [wider, bled]]).reshape(8, -1).T
-    kept = np.ones(len(levels), dtype=bool)
-    for _ in range(2):
-        cov = np.linalg.inv(design[kept].T @ design[kept])
-        found = cov @ (design[kept].T @ levels[kept])
-        residuals = levels - design @ found
-        spread = float(np.square(residuals[kept]).mean())
-        kept = np.abs(residuals) < 0.5 * found[3]  # the rest show the other colour
-        if found[3] <= 0.0 or kept.mean() < _FITS:
-            return unseen
+    found = np.linalg.solve(design.T @ design, design.T @ levels)
+    kept = np.abs(levels - design @ found) < 0.5 * found[3]  # the rest show the other colour
+    if found[3] <= 0.0 or kept.mean() < _FITS:
+        return unseen
+    cov = np.linalg.inv(design[kept].T @ design[kept])
+    found = cov @ (design[kept].T @ levels[kept])
+    spread = float(np.square(levels[kept] - design[kept] @ found).mean())
     moved = float(found[7] / found[3])
     return moved, spread * float(cov[7, 7] / found[3] ** 2) * _SHARED**2 + (_DIFFERENT * moved) ** 2
 

@@ -23,6 +23,16 @@ DICTIONARIES: dict[Dictionary, int] = {
     "aruco_mip_36h12": cv2.aruco.DICT_ARUCO_MIP_36h12,
 }
 
+# Dictionaries that are common elsewhere, and are printed by mistake.
+OTHER_DICTIONARIES: dict[str, int] = {
+    "apriltag_25h9": cv2.aruco.DICT_APRILTAG_25h9,
+    "apriltag_16h5": cv2.aruco.DICT_APRILTAG_16h5,
+    "aruco_4x4": cv2.aruco.DICT_4X4_1000,
+    "aruco_5x5": cv2.aruco.DICT_5X5_1000,
+    "aruco_7x7": cv2.aruco.DICT_7X7_1000,
+    "aruco_original": cv2.aruco.DICT_ARUCO_ORIGINAL,
+}
+
 
 def tags_of(name: Dictionary) -> Any:
     """Return the OpenCV dictionary with that name."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -233,7 +234,7 @@ def _rays(
     """Return the lines across the edges; the reason if an edge is too short for them."""
     to_px = np.asarray(cv2.getPerspectiveTransform(MODULES * SQUARE, corners_px.astype(np.float32)), np.float64)
     to_px = to_px @ _TURNS
-    to_modules = np.linalg.inv(to_px)
+    to_modules = np.asarray(np.linalg.inv(to_px), np.float64)
     quads = corners_px[(np.arange(4)[:, None] + np.arange(4)) % 4]
     modules = np.abs(_module_ends(to_modules, quads[:, :2], normals)).min(axis=(1, 2))
     share = _CLEAR_SHARE * modules
@@ -319,7 +320,7 @@ def _ideal(places: FloatArray, origins: FloatArray, normals: FloatArray, blur_px
     return _interpolated([ndtr(level), ndtr(level + u), ndtr(level + v), ndtr(level + u + v)], places - whole)
 
 
-def _interpolated(pixels: list[FloatArray], parts: FloatArray) -> FloatArray:
+def _interpolated(pixels: list[Any], parts: FloatArray) -> FloatArray:
     """Interpolate bilinearly, at parts (..., 2) of a pixel, the values of four neighbouring pixels."""
     right, down = parts[..., 0], parts[..., 1]
     top = pixels[0] * (1.0 - right) + pixels[1] * right
@@ -447,7 +448,8 @@ def _filters(steps: FloatArray, weights: FloatArray, blur_px: float) -> tuple[Fl
     cov = np.linalg.inv(basis @ basis.mT + (priors[:, :, None] * np.eye(6))[:, None])
     narrow, *shifts = cov[:, :, :4] @ basis
     free, steady = (-shift[:, 2] / (shift[:, 2] * slope[0]).sum(axis=1)[:, None] for shift in shifts)
-    return np.stack([narrow[:, 0], narrow[:, 1], free, narrow[:, 3]], axis=1), steady, 1.0 / cov[0, :, 3, 3]
+    filters = np.stack([narrow[:, 0], narrow[:, 1], free, narrow[:, 3]], axis=1)
+    return filters, np.asarray(steady, np.float64), np.asarray(1.0 / cov[0, :, 3, 3], np.float64)
 
 
 def _line_filters(s: FloatArray, kept: Mask) -> FloatArray:

@@ -73,22 +73,24 @@ def _measured(
     """Measure the tag with lines across its edges that are so much shorter than usual."""
     blur_px = _USUAL_BLUR_PX
     light: Light | None = None
-    for number in range(_ROUNDS):
+    number = 0
+    while True:
         edges = find_edges(grey, corners_px, blur_px, light, shorter, config)
         if isinstance(edges, Reason):
             return edges
+        number += 1
         moved = _meetings(edges)
         moved_px, before_px = float(np.abs(moved - corners_px).max()), blur_px
         module_px = 2.0 * float(edges.half_lengths.min()) / MODULES
         if moved_px > max(LONGEST_REACH_PX, module_px):
             return Reason.OCCLUDED
-        rough = light is None
-        if not rough:
-            light = _light(edges)
-        elif moved_px < _ROUGH_SHARE * module_px or number == _ROUGH_ROUNDS:
-            light = _EVEN
         corners_px, blur_px = moved, _blur(edges, blur_px)
-        if not rough and moved_px < _SETTLED_PX and abs(blur_px - before_px) < _SETTLED_BLUR * blur_px:
+        if light is None:
+            light = _EVEN if moved_px < _ROUGH_SHARE * module_px or number > _ROUGH_ROUNDS else None
+            continue
+        light = _light(edges)
+        settled = moved_px < _SETTLED_PX and abs(blur_px - before_px) < _SETTLED_BLUR * blur_px
+        if settled or number >= _ROUNDS:
             break
     shortest_px = 2.0 * float(edges.half_lengths.min())
     if shortest_px < config.min_side_px:
