@@ -32,6 +32,8 @@ class Reason(StrEnum):
     OCCLUDED = "occluded"  # something covers a part of it
     NOT_ROUND = "not_round"  # the ball's outline is whole but no ellipse
     NOT_STRAIGHT = "not_straight"  # a tag's edges scatter or are bent
+    MIRRORED = "mirrored"  # the tag, printed or seen as in a mirror
+    OTHER_FAMILY = "other_family"  # a tag of another dictionary
     LOW_CONTRAST = "low_contrast"  # too little difference from what surrounds it
     BLURRED = "blurred"  # too little detail is left
     SATURATED = "saturated"  # too much of it is over-exposed

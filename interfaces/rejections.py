@@ -12,6 +12,8 @@ WORDS: Mapping[Reason, str] = {
     Reason.OCCLUDED: "not all to be seen",
     Reason.NOT_ROUND: "not round",
     Reason.NOT_STRAIGHT: "edges not straight",
+    Reason.MIRRORED: "mirrored",
+    Reason.OTHER_FAMILY: "a tag of another dictionary",
     Reason.LOW_CONTRAST: "too little contrast",
     Reason.BLURRED: "too blurred",
     Reason.SATURATED: "over-exposed",
@@ -40,6 +42,10 @@ REMEDIES: Mapping[Reason, str] = {
     Reason.NOT_ROUND: "Is a finger or a cable before its edge, or does it move too fast for the exposure? Light its "
     "dark side, and take a plain, matt ball.",
     Reason.NOT_STRAIGHT: "Glue the paper flat, and take away what covers an edge.",
+    Reason.MIRRORED: "Print the tag without mirroring (a transfer film's setting), and switch off mirroring of "
+    "the camera.",
+    Reason.OTHER_FAMILY: "Set [vision.tag] dictionary to what is printed: the log names it. Or print a tag of that "
+    "dictionary: `bodyschema marker print`.",
     Reason.LOW_CONTRAST: "More light, and a background that is neither black nor of its colour. A tag needs its white "
     "margin.",
     Reason.BLURRED: "Focus the lens, expose for a shorter time, or take a larger tag.",

@@ -14,7 +14,7 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
 
 _STEPS = 25
-_CONVERGED = 1e-10
+_CONVERGED = 1e-6
 # Levenberg's damping, relative to the diagonal of the normal equations.
 _FIRST_DAMPING, _MOST_DAMPING = 1e-4, 1e6
 

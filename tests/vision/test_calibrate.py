@@ -69,6 +69,29 @@ def test_intervals_cover_over_many_rigs() -> None:
     assert np.mean(z < 2.0) > 0.88
 
 
+def test_intervals_cover_where_corners_of_a_view_move_together() -> None:
+    misses = []
+    for seed in range(2):
+        rng = np.random.default_rng(40 + seed)
+        rig = webcams(rng)
+        found = fit([curved(view, rng) for view in corner_views(rig, rng, 20)], BOARD.corners_m, SIZE, "pinhole")
+        misses.append((found.bundle.vector - true_vector(rig)) / sigmas(found))
+    assert np.mean(np.abs(np.concatenate(misses)) < 2.0) > 0.85
+
+
+def curved(view: View, rng: np.random.Generator) -> View:
+    """Return a view whose corners are moved together, 0.3 px at the ends, as by paper that curls."""
+    bends = 0.3 * rng.standard_normal((2, 2))
+
+    def moved(corners: Corners | None) -> Corners | None:
+        if corners is None:
+            return None
+        away = BOARD.corners_m[corners.numbers, :2] / np.abs(BOARD.corners_m[:, :2]).max()
+        return replace(corners, px=corners.px + (away**2 - (away**2).mean(axis=0)) @ bends)
+
+    return View(view.name, moved(view.left), moved(view.right))
+
+
 def test_opencvs_stereo_calibration_agrees(planted) -> None:
     _, views = planted
     views = [view for view in views if len(view.left) == len(view.right) == len(BOARD.corners_m)]

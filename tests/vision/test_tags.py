@@ -13,7 +13,7 @@ from tag_renderer import Card, Sheet, photograph
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import ConfigError, SourceError
-from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, StereoFrame
+from bodyschema.interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame
 from bodyschema.vision.config import VisionConfig
 from bodyschema.vision.pose import PoseEstimator, Sighting, mirrored
 from bodyschema.vision.tags.body import TAG_CORNERS, TagBody
@@ -119,7 +119,7 @@ def test_what_blur_brings_from_the_modules_beyond_pulls_no_edge(blur_px) -> None
     )
     corners = MIDDLE + side_m * TAG_CORNERS @ rotation.T
     true = SMALL.focal_px * corners[:, :2] / corners[:, 2:] + SMALL.principal_point_px
-    tag = measure_tag(cv2.cvtColor(frame.left, cv2.COLOR_BGR2GRAY), 0, true + 0.4, CONFIG)
+    tag = measure_tag(grey_of(frame), 0, true + 0.4, CONFIG)
     assert isinstance(tag, TagImage)
     assert np.abs(tag.corners_px - true).max() < 0.06
 
@@ -132,13 +132,17 @@ PHOTOGRAPHED = {
 }
 
 
+def grey_of(frame: StereoFrame) -> ImageArray:
+    return np.asarray(cv2.cvtColor(frame.left, cv2.COLOR_BGR2GRAY), np.uint8)
+
+
 def corners_in_the_left_eye(rotation: FloatArray) -> FloatArray:
     corners = MIDDLE + SIDE_M * TAG_CORNERS @ rotation.T
     return SMALL.focal_px * corners[:, :2] / corners[:, 2:] + SMALL.principal_point_px
 
 
 def measured(thing: Sheet, look: Look = WALL) -> TagImage | Reason:
-    grey = np.asarray(cv2.cvtColor(seen(thing, look=look).left, cv2.COLOR_BGR2GRAY), np.uint8)
+    grey = grey_of(seen(thing, look=look))
     return measure_tag(grey, 0, corners_in_the_left_eye(thing.rotation) + 0.4, CONFIG)
 
 
@@ -147,8 +151,56 @@ def test_no_camera_moves_a_corner_far(look) -> None:
     rotation = tilted([1.0, 1.0, 0.3], 12.0)
     tag = measured(sheet(rotation=rotation), look)
     assert isinstance(tag, TagImage)
-    # A tone curve makes all that is black narrower, by a third of the lens blur.
-    assert np.abs(tag.corners_px - corners_in_the_left_eye(rotation)).max() < (0.1 if look.tone == 1.0 else 0.35)
+    assert np.abs(tag.corners_px - corners_in_the_left_eye(rotation)).max() < 0.1
+
+
+@pytest.mark.parametrize("look", [replace(WALL, tone=1 / 2.2), replace(WALL, exposure=2.2)], ids=["tone", "exposure"])
+def test_white_that_bleeds_into_black_makes_no_tag_smaller(look) -> None:
+    rotation = tilted([1.0, -0.5, 0.0], 15.0)
+    tag, true = measured(sheet(rotation=rotation), look), corners_in_the_left_eye(rotation)
+    assert isinstance(tag, TagImage)
+    outward = (true - true.mean(axis=0)) / np.linalg.norm(true - true.mean(axis=0), axis=1)[:, None]
+    assert abs(float(((tag.corners_px - true) * outward).sum(axis=1).mean())) < 0.06
+
+
+def test_a_covered_pattern_leaves_bleeding_unknown() -> None:
+    plain = measured(sheet())
+    frame = seen(sheet(), Card(FACING, MIDDLE - [0.0, 0.0, 0.01], 0.008, grey=0.9))
+    covered = measure_tag(grey_of(frame), 0, corners_in_the_left_eye(FACING), CONFIG)
+    assert isinstance(plain, TagImage)
+    assert isinstance(covered, TagImage)
+    assert np.trace(covered.cov_px) > 10.0 * np.trace(plain.cov_px)
+
+
+def test_bent_edges_are_claimed_to_be_less_sure() -> None:
+    # Less than half a wave along each edge, 0.1 px high, as a lens or curled paper bends them.
+    grey = grey_of(seen(sheet()))
+    v, u = np.indices(grey.shape, dtype=np.float32)
+    bent = np.asarray(
+        cv2.remap(grey, u + 0.1 * np.sin(v / 20.0), v + 0.1 * np.sin(u / 26.0), cv2.INTER_CUBIC), np.uint8
+    )
+    true = corners_in_the_left_eye(FACING)
+    straight, curved = (measure_tag(image, 0, true, CONFIG) for image in (grey, bent))
+    assert isinstance(straight, TagImage)
+    assert isinstance(curved, TagImage)
+    assert np.trace(curved.cov_px) > 5.0 * np.trace(straight.cov_px)
+
+
+def test_a_tag_with_half_a_margin_is_measured() -> None:
+    tag = measured(replace(sheet(rotation=tilted([0.0, 1.0, 0.3], 20.0)), margin=0.45), replace(WALL, wall=0.05))
+    assert isinstance(tag, TagImage)
+    assert np.abs(tag.corners_px - corners_in_the_left_eye(tilted([0.0, 1.0, 0.3], 20.0))).max() < 0.3
+
+
+def test_a_large_tag_is_found_from_rough_corners() -> None:
+    side_m = 0.09
+    corners = MIDDLE + side_m * TAG_CORNERS @ FACING.T
+    true = SMALL.focal_px * corners[:, :2] / corners[:, 2:] + SMALL.principal_point_px
+    grey = grey_of(seen(sheet(side_m=side_m), look=replace(WALL, samples=2)))
+    inside = true + 0.11 * (true.mean(axis=0) - true)  # 7 px an edge: the detector's polygon cuts corners off
+    tag = measure_tag(grey, 0, inside, CONFIG)
+    assert isinstance(tag, TagImage)
+    assert np.abs(tag.corners_px - true).max() < 0.1
 
 
 def test_a_curled_sheet_is_measured_with_less_certainty() -> None:
@@ -170,6 +222,29 @@ def test_an_empty_picture_has_no_marker() -> None:
 
 def test_a_tag_of_another_number_is_no_marker() -> None:
     assert reason(tracker().track(seen(sheet(id=7)))) is Reason.NO_MARKER
+
+
+def reasons(frame: StereoFrame, frames: int = 10) -> set[Reason | None]:
+    """Return the reasons why one frame after another is rejected."""
+    found = tracker()
+    return {reason(found.track(replace(frame, t=0.1 * number))) for number in range(frames)}
+
+
+def test_a_mirrored_tag_is_named() -> None:
+    right, left = (eye[:, ::-1].copy() for eye in seen(sheet()).images)
+    assert reasons(StereoFrame(0.0, left, right), 2) == {Reason.MIRRORED}
+
+
+@pytest.mark.parametrize("dictionary", [cv2.aruco.DICT_6X6_50, cv2.aruco.DICT_4X4_50, cv2.aruco.DICT_APRILTAG_25h9])
+def test_a_tag_of_another_dictionary_is_named(dictionary, caplog) -> None:
+    drawn = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(dictionary), 3, 80)
+    frame = seen()
+    for eye in frame.images:
+        eye[60:180, 100:220] = 220
+        eye[80:160, 120:200] = drawn[..., None]
+    assert Reason.OTHER_FAMILY in reasons(frame)
+    assert len(caplog.messages) == 1
+    assert "not one of apriltag_36h11" in caplog.text
 
 
 def test_a_tag_too_small_to_measure_is_no_marker() -> None:

@@ -29,7 +29,7 @@ def test_the_page_s_cluster_is_one() -> None:
 def test_the_page_lists_every_reason_of_the_tag_tracker() -> None:
     files = (
         ROOT / "vision" / name
-        for name in ("tags/edge.py", "tags/image.py", "tags/finder.py", "tags/tracker.py", "pose.py")
+        for name in ("tags/edge.py", "tags/image.py", "tags/bleed.py", "tags/finder.py", "tags/tracker.py", "pose.py")
     )
     given = {Reason[name].value for file in files for name in re.findall(r"\bReason\.([A-Z_]+)", file.read_text())}
     assert given == set(re.findall(r"^\| `(\w+)` \|", PAGE, re.MULTILINE))

@@ -22,12 +22,14 @@ class Influence:
     Attributes:
         residual: measured minus predicted, shape (corners, 2) [px].
         scores: pull of each coordinate on the rig, with its pose adapted, shape (2 corners, p).
+        normal: part of the view in the rig's normal equations, with its pose adapted, shape (p, p).
         by_pose: Jacobian of the prediction by the board's pose, shape (2 corners, 6).
         free: share of its variance that the fit leaves each corner, shape (corners,).
     """
 
     residual: FloatArray
     scores: FloatArray
+    normal: FloatArray
     by_pose: FloatArray
     free: FloatArray
 
@@ -43,22 +45,23 @@ def influences(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> 
         # The diagonal of the hat matrix (Huber & Ronchetti 2009, section 7.1).
         taken = w[:, 0] * (np.einsum("ij,jk,ik->i", J, rig, J) + np.einsum("ij,jk,ik->i", K, of_pose, K))
         free = np.maximum(1.0 - taken.reshape(-1, 2).mean(axis=1), _LEAST_FREE)
-        yield Influence(residual, w * J, K, free)
+        yield Influence(residual, w * J, J.T @ (w * J), K, free)
 
 
 def covariance(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> FloatArray:
-    """Return the covariance of the rig's parameters, shape (p, p), without assuming equal noise of all corners.
+    """Return the covariance of the rig's parameters, shape (p, p), without assuming independent corners of one view.
 
-    Each corner's own residuals stand for its variance (HC3 of MacKinnon & White 1985), so that corners with much noise
-    and much influence, such as those at a fisheye's border, are weighted correctly.
+    A board that is not flat and a lens that no model describes move the corners of a view together. So each view as a
+    whole stands for its own variance: the delete-one jackknife over the views (Efron 1982), linearised.
     """
-    middle = np.diag(bundle.prior) * bundle.sigma_px**2
+    count = len(views)
+    middle = np.zeros_like(bundle.normal)
     for each in influences(views, corners_m, bundle):
-        pulls = each.scores * (each.residual / each.free[:, None]).reshape(-1, 1)
-        pulls = pulls.reshape(len(each.free), 2, -1).sum(axis=1)
-        middle += pulls.T @ pulls
+        pull = each.scores.T @ each.residual.ravel()
+        moved = np.linalg.solve(bundle.normal - each.normal, pull)
+        middle += np.outer(moved, moved)
     inverse = _inverse(bundle.normal)
-    return inverse @ middle @ inverse
+    return middle * (count - 1) / count + inverse @ np.diag(bundle.prior) @ inverse * bundle.sigma_px**2
 
 
 def _inverse(normal: FloatArray) -> FloatArray:

@@ -36,10 +36,10 @@ class TagConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     dictionary: Dictionary = "apriltag_36h11"
     id: Annotated[int, Meta(ge=0)] = 0
     side_m: Positive = 0.04
-    min_side_px: Annotated[float, Meta(ge=12)] = 20.0
-    min_contrast: Annotated[float, Meta(ge=10)] = 40.0
+    min_side_px: Annotated[float, Meta(ge=12)] = 16.0
+    min_contrast: Annotated[float, Meta(ge=10)] = 20.0
     min_visible: Annotated[float, Meta(ge=0.5, le=1)] = 0.7
-    max_corner_sigma: Positive = 0.02
+    max_corner_sigma: Positive = 0.05
     epipolar_px: Annotated[float, Meta(ge=0)] = 0.5
     epipolar_sigmas: Annotated[float, Meta(ge=0)] = 4.0
     size_tolerance: Annotated[float, Meta(ge=0)] = 0.03

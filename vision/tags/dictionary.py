@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import cv2
-import numpy as np
 
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray, frozen_array
 
 from .config import Dictionary
 from .edge import MODULES
@@ -21,6 +21,16 @@ DICTIONARIES: dict[Dictionary, int] = {
     "aruco_6x6_250": cv2.aruco.DICT_6X6_250,
     "aruco_6x6_1000": cv2.aruco.DICT_6X6_1000,
     "aruco_mip_36h12": cv2.aruco.DICT_ARUCO_MIP_36h12,
+}
+
+# Dictionaries that are common elsewhere, and are printed by mistake.
+OTHER_DICTIONARIES: dict[str, int] = {
+    "apriltag_25h9": cv2.aruco.DICT_APRILTAG_25h9,
+    "apriltag_16h5": cv2.aruco.DICT_APRILTAG_16h5,
+    "aruco_4x4": cv2.aruco.DICT_4X4_1000,
+    "aruco_5x5": cv2.aruco.DICT_5X5_1000,
+    "aruco_7x7": cv2.aruco.DICT_7X7_1000,
+    "aruco_original": cv2.aruco.DICT_ARUCO_ORIGINAL,
 }
 
 
@@ -36,6 +46,7 @@ def require_tag(name: Dictionary, id: int) -> None:
         raise ConfigError(f"there is no tag {id} in {name}", remedy=f"Its numbers go from 0 to {most - 1}")
 
 
+@cache
 def tag_modules(name: Dictionary, id: int) -> FloatArray:
     """Return a tag's modules with its black border, rows from the top, shape (8, 8), 1 white and 0 black.
 
@@ -43,4 +54,4 @@ def tag_modules(name: Dictionary, id: int) -> FloatArray:
         ConfigError: there is no such tag.
     """
     require_tag(name, id)
-    return np.asarray(cv2.aruco.generateImageMarker(tags_of(name), id, int(MODULES)) > 127, dtype=np.float64)
+    return frozen_array(cv2.aruco.generateImageMarker(tags_of(name), id, int(MODULES)) > 127)

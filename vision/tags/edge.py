@@ -1,16 +1,18 @@
-"""Measure one straight edge of a tag's black square to hundredths of a pixel, with its uncertainty.
+"""Measure the four straight edges of a tag's black square to hundredths of a pixel, with their uncertainty.
 
 A matched filter on each line across the edge finds where black becomes white. Each line has levels and gradients of its
 own on both sides, so uneven light and glare move no edge. The blur is estimated by a second filter. Two errors are
 subtracted: the light that blur brings from the modules beyond and from the end of the paper, and the apparent shift of
 an ideal edge of that blur on the same pixels.
+
+All four edges are measured at once, in arrays that are padded to the longest edge and the widest reach.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -42,9 +44,9 @@ PIXEL_CUMULANT = -1.0 / 40.0
 _BEYOND_SHARE = 0.2
 # Systematic error of an edge's position on long lines [px]; larger on short ones.
 _FLOOR_PX = 0.002
-# Points farther from their line than this, in robust standard deviations, are outliers.
-_STRAY = 3.5
-_MAD_TO_SIGMA = 1.4826
+# Points farther from their line than this, in medians of all points' distances, are outliers. So much [px] paper that
+# is not flat and a camera's sharpening may bring.
+_STRAY_MEDIANS, _WAVY_PX = 5.2, 0.15
 # What is added to the blur of the filter for an edge's shift [px].
 _WIDER_PX = 1.5
 # Prior variances in units of the noise: of the levels, and of their gradients across the edge [1/px²].
@@ -52,46 +54,53 @@ _FREE, _LEVEL, _GRADIENT = 1e4, 0.5, 0.01
 # Ends of the lines across that show plain black and plain white where an edge may be pixels off, as a share of their
 # reach.
 _PLAIN = 0.35
-Pixels = NDArray[np.intp]
 # Corners as they go round, in parts of the side.
-_SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+# A tag's modules from those of the frame of each edge, in which the edge goes from (0, 0) to (8, 0).
+_QUARTER = np.array([[0.0, -1.0, MODULES], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+_TURNS = np.stack([np.linalg.matrix_power(_QUARTER, side) for side in range(4)])
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
-class Edge:
-    """A line u·normal = place + slope·s, s from −1 to 1 between the edge's ends.
+class Edges:
+    """The four lines u·normal = place + slope·s of a tag, s from −1 to 1 between the ends of an edge.
 
     Attributes:
-        scatter: covariance (2, 2) of place and slope [px²] from the points' scatter, if they were independent.
-        shared: covariance (2, 2) of the error common to all points [px²].
-        residuals: residuals of the points (n,) in units of their scatter; 0 where a point was left out.
+        origins, along, normals: middles of the edges (4, 2) [px], and their directions along and outward.
+        half_lengths, places, slopes: (4,) [px].
+        scatter: covariance (4, 2, 2) of place and slope [px²] from the points' scatter, if they were independent.
+        shared: covariance (4, 2, 2) of the error common to all points of an edge [px²].
+        residuals: residuals of each edge's points in units of their scatter; 0 where a point was left out.
         widening: error of the assumed blur [px] times its information,
         information: inverse of its variance [1/px²], for a noise of one grey level.
-        places: two places (2, 2) on the edge [px], whose
-        levels: levels of black and white are these (2, 2) [grey levels].
+        spots: two places on each edge (4, 2, 2) [px], whose
+        levels: levels of black and white are these (4, 2, 2) [grey levels].
     """
 
-    origin: FloatArray
+    origins: FloatArray
     along: FloatArray
-    normal: FloatArray
-    half_length: float
-    place: float
-    slope: float
+    normals: FloatArray
+    half_lengths: FloatArray
+    places: FloatArray
+    slopes: FloatArray
     scatter: FloatArray
     shared: FloatArray
-    residuals: FloatArray
+    residuals: tuple[FloatArray, ...]
     widening: float
     information: float
-    places: FloatArray
+    spots: FloatArray
     levels: FloatArray
 
     @property
-    def point(self) -> FloatArray:
-        return self.origin + self.place * self.normal
+    def points(self) -> FloatArray:
+        """The middle of each measured edge (4, 2) [px]."""
+        return self.origins + self.places[:, None] * self.normals
 
     @property
-    def direction(self) -> FloatArray:
-        return self.along * self.half_length + self.slope * self.normal
+    def directions(self) -> FloatArray:
+        """From the middle of each measured edge to its end (4, 2) [px]."""
+        return self.along * self.half_lengths[:, None] + self.slopes[:, None] * self.normals
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,21 +117,50 @@ class Light:
 
 
 @dataclass(frozen=True, slots=True)
-class _Points:
-    """Points of an edge on the lines across it.
+class _Rays:
+    """Lines across the four edges, and the samples on them.
 
     Attributes:
-        places: position of the edge on each line, outward (n,) [px], as the place of all together needs it,
+        s: places of the lines along their edge (4, n), from −1 to 1.
+        used: mask (4, n) of the lines; the rest pads.
+        counts: number of lines of each edge (4,).
+        steps: places of the samples along the lines (4, m) [px], outward.
+        weights: 1 for samples (4, m), 0 for those that pad.
+        spots: places (4, n, m, 2) [px] of the samples.
+        ends: distance (4, n, 2) [px] to the inner end of the black border and the outer end of a white margin.
+        beyond: centres (4, n, 2, 2) [px] of the modules beyond these ends.
+    """
+
+    s: FloatArray
+    used: Mask
+    counts: NDArray[np.intp]
+    steps: FloatArray
+    weights: FloatArray
+    spots: FloatArray
+    ends: FloatArray
+    beyond: FloatArray
+
+    def mean(self, values: FloatArray) -> FloatArray:
+        """Return the means (4,) of values (4, n) over the lines of each edge."""
+        return np.asarray((values * self.used).sum(axis=1) / self.counts, np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class _Points:
+    """Points of the edges on the lines across them.
+
+    Attributes:
+        places: position of the edge on each line, outward (4, n) [px], as the place of all together needs it,
         steady: the same, as their slope needs it.
-        clear: mask (n,) of the lines that show black and white.
-        beyond: correction for the modules beyond (n,) [px].
-        unlit: variances (2,) of place and slope of all together that the light's uncertainty leaves [px²].
-        widening, information, levels: see `Edge`.
+        clear: mask (4, n) of the lines that show black and white.
+        beyond: correction for the modules beyond (4, n) [px].
+        unlit: variances (4, 2) of place and slope of all together that the light's uncertainty leaves [px²].
+        widening, information, levels: see `Edges`.
     """
 
     places: FloatArray
     steady: FloatArray
-    clear: NDArray[np.bool_]
+    clear: Mask
     beyond: FloatArray
     unlit: FloatArray
     widening: float
@@ -130,95 +168,127 @@ class _Points:
     levels: FloatArray
 
 
-def find_edge(
-    grey: ImageArray, corners_px: FloatArray, side: int, blur_px: float, light: Light | None, config: TagConfig
-) -> Edge | Reason:
-    """Measure the edge from corner `side` to the next one, or return the reason why it cannot be measured.
+def find_edges(
+    grey: ImageArray, corners_px: FloatArray, blur_px: float, light: Light | None, shorter: float, config: TagConfig
+) -> Edges | Reason:
+    """Measure the edges from each corner to the next one, or return the reason why one cannot be measured.
 
-    `light` is None if the corners may be wrong by pixels.
+    Args:
+        light: None if the corners may be wrong by pixels.
+        shorter: share of their usual length that the lines across the edges have.
     """
-    quad = np.roll(corners_px, -side, axis=0)
-    begin, end = quad[:2]
-    length = float(np.linalg.norm(end - begin))
-    if length < _FEWEST_POINTS:
+    begin, end = corners_px, np.roll(corners_px, -1, axis=0)
+    lengths = np.linalg.norm(end - begin, axis=1)
+    if lengths.min() < _FEWEST_POINTS:
         return Reason.NO_MARKER
-    along = (end - begin) / length
-    normal = np.array([along[1], -along[0]])  # corners go round clockwise: out of the tag
-    to_px = np.asarray(cv2.getPerspectiveTransform(MODULES * _SQUARE, quad.astype(np.float32)), np.float64)
-    module = float(np.abs(_module_ends(to_px, quad[:2], normal)).min())
-    reach = min(max(module - _CLEAR_BLURS * blur_px, _CLEAR_SHARE * module), LONGEST_REACH_PX)
-    if not reach >= _SHORTEST_REACH_PX:
-        return Reason.NO_MARKER
-    # At an acute corner, nearby lines leave the tag through its other side.
-    sides = quad[[3, 2]] - quad[:2]
-    leaning = (sides @ along) / (sides @ normal) * (-reach, reach)
-    rounded = min(max(_CORNER_BLURS * blur_px, _CORNER_SHARE * length), _MOST_CORNER * length)
-    free = rounded + np.maximum(leaning, 0.0)
-    count = min(int(length - free.sum()), _MOST_POINTS)
-    if count < _FEWEST_POINTS:
-        return Reason.NO_MARKER
-    s = np.linspace(2.0 * free[0] / length - 1.0, 1.0 - 2.0 * free[1] / length, count)
-    origin = (begin + end) / 2.0
-    points = origin + 0.5 * length * s[:, None] * along
-    ends = _module_ends(to_px, points, normal)
-    steps = _steps(reach)
-    places = points[:, None] + steps[:, None] * normal
-    if _leave(grey, places):
+    along = (end - begin) / lengths[:, None]
+    normals = np.column_stack([along[:, 1], -along[:, 0]])  # corners go round clockwise: out of the tag
+    origins = (begin + end) / 2.0
+    rays = _rays(corners_px, origins, along, normals, lengths, blur_px, shorter, rough=light is None)
+    if isinstance(rays, Reason):
+        return rays
+    if leave(grey, rays.spots):
         return Reason.AT_BORDER
-    beyond = _sampled(grey, _within(grey, _beyond(to_px, points[:, None] + ends[..., None] * normal)))
-    ideal = _ideal(places, origin, normal, blur_px)
+    profiles = sampled(grey, rays.spots)
     if light is None:
-        rough = _rough_points(_sampled(grey, places), steps, config.min_contrast)
-        line = rough if isinstance(rough, Reason) else _line(s, rough, config)
-        if isinstance(line, Reason):
-            return line
-        return Edge(origin, along, normal, 0.5 * length, *line, 0.0, 0.0, points[[0, -1]], np.zeros((2, 2)))
-    ways = np.column_stack([0.5 * length * along, normal])
-    gradients, unlit = light.gradients @ ways, np.einsum("iw,kij,jw->kw", ways, light.cov, ways)
-    profiles = _sampled(grey, places)
-    cumulant = PIXEL_CUMULANT * float((normal**4).sum()) / blur_px**4
-    found = _points(profiles, ideal, s, steps, beyond, ends, blur_px, cumulant, gradients, unlit, config.min_contrast)
-    if isinstance(found, Reason):
-        return found
-    line = _line(s, found, config)
-    if isinstance(line, Reason):
-        return line
-    return Edge(
-        origin, along, normal, 0.5 * length, *line, found.widening, found.information, points[[0, -1]], found.levels
+        points = _rough_points(profiles, rays, blur_px, config.min_contrast)
+    else:
+        ways = np.stack([0.5 * lengths[:, None] * along, normals], axis=2)
+        unlit = np.einsum("eiw,kij,ejw->ekw", ways, light.cov, ways)
+        beyond = sampled(grey, _within(grey, rays.beyond))
+        ideal = _ideal(rays.spots, origins, normals, blur_px)
+        cumulants = PIXEL_CUMULANT * (normals**4).sum(axis=1) / blur_px**4
+        lit = light.gradients @ ways
+        points = _points(profiles, ideal, rays, beyond, blur_px, cumulants, lit, unlit, config.min_contrast)
+    if isinstance(points, Reason):
+        return points
+    fitted = _fitted(rays, points, config)
+    if isinstance(fitted, Reason):
+        return fitted
+    ends = np.stack([rays.s[:, 0], rays.s.max(axis=1)], axis=1)[..., None]
+    spots = origins[:, None] + 0.5 * lengths[:, None, None] * ends * along[:, None]
+    return Edges(
+        origins,
+        along,
+        normals,
+        0.5 * lengths,
+        *fitted,
+        points.widening,
+        points.information,
+        spots,
+        points.levels,
     )
 
 
-def _module_ends(to_px: FloatArray, points: FloatArray, normal: FloatArray) -> FloatArray:
-    """Return the distances (n, 2) [px] along `normal` from points (n, 2) of a tag's first edge to two lines.
+def _rays(
+    corners_px: FloatArray,
+    origins: FloatArray,
+    along: FloatArray,
+    normals: FloatArray,
+    lengths: FloatArray,
+    blur_px: float,
+    shorter: float,
+    *,
+    rough: bool,
+) -> _Rays | Reason:
+    """Return the lines across the edges; the reason if an edge is too short for them."""
+    to_px = np.asarray(cv2.getPerspectiveTransform(MODULES * SQUARE, corners_px.astype(np.float32)), np.float64)
+    to_px = to_px @ _TURNS
+    to_modules = np.asarray(np.linalg.inv(to_px), np.float64)
+    quads = corners_px[(np.arange(4)[:, None] + np.arange(4)) % 4]
+    modules = np.abs(_module_ends(to_modules, quads[:, :2], normals)).min(axis=(1, 2))
+    share = _CLEAR_SHARE * modules
+    clear = np.minimum(np.maximum(modules - _CLEAR_BLURS * blur_px, share), LONGEST_REACH_PX)
+    reaches = shorter * (np.maximum(clear, share) if rough else clear)
+    if not (reaches >= _SHORTEST_REACH_PX).all():
+        return Reason.NO_MARKER
+    # At an acute corner, nearby lines leave the tag through its other side.
+    sides = quads[:, [3, 2]] - quads[:, :2]
+    leaning = (sides * along[:, None]).sum(axis=2) / (sides * normals[:, None]).sum(axis=2)
+    rounded = np.minimum(np.maximum(_CORNER_BLURS * blur_px, _CORNER_SHARE * lengths), _MOST_CORNER * lengths)
+    free = rounded[:, None] + np.maximum(leaning * np.outer(reaches, (-1.0, 1.0)), 0.0)
+    counts = np.minimum((lengths - free.sum(axis=1)).astype(np.intp), _MOST_POINTS)
+    if counts.min() < _FEWEST_POINTS:
+        return Reason.NO_MARKER
+    number = np.arange(counts.max())
+    first, last = (2.0 * free / lengths[:, None] - 1.0).T * np.array([[1.0], [-1.0]])
+    share = np.minimum(number / (counts[:, None] - 1.0), 1.0)
+    s = first[:, None] + (last - first)[:, None] * share
+    samples = 2 * np.ceil(reaches / _SAMPLE_PX).astype(np.intp)[:, None]
+    sample = np.arange(samples.max())
+    steps = (np.minimum(sample, samples - 1) + 0.5) * (2.0 * reaches[:, None] / samples) - reaches[:, None]
+    points = origins[:, None] + (0.5 * lengths[:, None] * s)[..., None] * along[:, None]
+    ends = _module_ends(to_modules, points, normals)
+    across = normals[:, None, None]
+    spots = points[:, :, None] + steps[:, None, :, None] * across
+    beyond = _beyond(to_px, to_modules, points[:, :, None] + ends[..., None] * across)
+    weights = (sample < samples).astype(np.float64)
+    return _Rays(s, number < counts[:, None], counts, steps, weights, spots, ends, beyond)
+
+
+def _module_ends(to_modules: FloatArray, points: FloatArray, normals: FloatArray) -> FloatArray:
+    """Return the distances (4, n, 2) [px] along `normals` from points (4, n, 2) on the edges to two lines.
 
     They are the inner end of the black border and the outer end of a margin of one module.
-
-    `to_px` (3, 3) is the homography from modules, the edge from (0, 0) to (8, 0), to pixels.
     """
-    ends = np.zeros((len(points), 2))
-    for number, depth in enumerate((1.0, -1.0)):
-        first, last = (to_px @ (column, depth, 1.0) for column in (0.0, MODULES))
-        line = np.cross(first, last)
-        ends[:, number] = -(points @ line[:2] + line[2]) / (normal @ line[:2])
-    return ends
+    depths = np.array([[1.0], [-1.0]])
+    lines = to_modules[:, None, 1] - depths * to_modules[:, None, 2]  # (4, 2, 3)
+    there = points @ lines[..., :2].mT + lines[:, None, :, 2]
+    return np.asarray(-there / (lines[..., :2] @ normals[..., None]).mT, np.float64)
 
 
-def _beyond(to_px: FloatArray, places: FloatArray) -> FloatArray:
-    """Return the centres (n, 2, 2) [px] of the modules beyond the ends (n, 2, 2) [px] of black border and margin."""
-    homogeneous = np.concatenate([places, np.ones((*places.shape[:2], 1))], axis=2)
-    modules = homogeneous @ np.linalg.inv(to_px).T
-    columns = np.clip(modules[..., 0] / modules[..., 2], 0.5, MODULES - 0.5)
-    there = np.stack([columns, np.broadcast_to([1.5, -1.5], columns.shape), np.ones_like(columns)], axis=2) @ to_px.T
+def _beyond(to_px: FloatArray, to_modules: FloatArray, places: FloatArray) -> FloatArray:
+    """Return the centres (4, n, 2, 2) [px] of the modules beyond the ends of black border and margin, at `places`."""
+    row, weight = (
+        (places * to_modules[:, k, None, None, :2]).sum(axis=3) + to_modules[:, k, None, None, 2] for k in (0, 2)
+    )
+    columns = np.clip(row / weight, 0.5, MODULES - 0.5)
+    there = np.stack([columns, np.broadcast_to([1.5, -1.5], columns.shape), np.ones_like(columns)], axis=3)
+    there = there @ to_px[:, None].mT
     return np.asarray(there[..., :2] / there[..., 2:], dtype=np.float64)
 
 
-def _steps(reach: float) -> FloatArray:
-    """Return the sample positions along a line across an edge, shape (m,) [px], outward."""
-    count = 2 * math.ceil(reach / _SAMPLE_PX)
-    return np.asarray((np.arange(count) + 0.5) * (2.0 * reach / count) - reach, dtype=np.float64)
-
-
-def _leave(grey: ImageArray, places: FloatArray) -> bool:
+def leave(grey: ImageArray, places: FloatArray) -> bool:
     """Return True if some places (..., 2) are too near to the image's border to be sampled."""
     height, width = grey.shape
     return bool((places < 1.0).any() or (places > (width - 2.0, height - 2.0)).any())
@@ -230,172 +300,209 @@ def _within(grey: ImageArray, places: FloatArray) -> FloatArray:
     return np.clip(places, 1.0, (width - 2.0, height - 2.0))
 
 
-def _sampled(grey: ImageArray, places: FloatArray) -> FloatArray:
+def sampled(grey: ImageArray, places: FloatArray) -> FloatArray:
     """Return the grey levels at places (..., 2)."""
     # By hand: cv2.remap would round places to 1/32 px.
-    return _interpolated(lambda u, v: grey[v, u].astype(np.float64), places)
+    whole = places.astype(np.intp)
+    width = grey.shape[1]
+    first = whole[..., 1] * width + whole[..., 0]
+    pixels = np.ravel(grey)
+    return _interpolated([pixels[first + more] for more in (0, 1, width, width + 1)], places - whole)
 
 
-def _ideal(places: FloatArray, origin: FloatArray, normal: FloatArray, blur_px: float) -> FloatArray:
-    """Return the shares of white of an edge through `origin` (2,) at places (..., 2), interpolated from pixels."""
+def _ideal(places: FloatArray, origins: FloatArray, normals: FloatArray, blur_px: float) -> FloatArray:
+    """Return the shares of white of edges through `origins` at places (4, n, m, 2), interpolated from pixels."""
     # Interpolation adds to the pixels' own blur.
-    sigma = math.sqrt(max(blur_px**2 - _INTERPOLATION, SHARPEST_PX**2 - _INTERPOLATION))
-    first = float(origin @ normal)
-    return _interpolated(lambda u, v: ndtr((u * normal[0] + v * normal[1] - first) / sigma), places)
+    normals = normals / math.sqrt(max(blur_px**2, SHARPEST_PX**2) - _INTERPOLATION)
+    whole = np.floor(places)
+    u, v = normals.T[:, :, None, None]
+    level = whole[..., 0] * u + whole[..., 1] * v - (origins * normals).sum(axis=1)[:, None, None]
+    return _interpolated([ndtr(level), ndtr(level + u), ndtr(level + v), ndtr(level + u + v)], places - whole)
 
 
-def _interpolated(pixel: Callable[[Pixels, Pixels], FloatArray], places: FloatArray) -> FloatArray:
-    """Interpolate bilinearly at places (..., 2), given the values at columns and rows."""
-    whole = np.floor(places).astype(np.intp)
-    part = places - whole
-    u, v = whole[..., 0], whole[..., 1]
-    top = pixel(u, v) * (1.0 - part[..., 0]) + pixel(u + 1, v) * part[..., 0]
-    bottom = pixel(u, v + 1) * (1.0 - part[..., 0]) + pixel(u + 1, v + 1) * part[..., 0]
-    return top * (1.0 - part[..., 1]) + bottom * part[..., 1]
+def _interpolated(pixels: list[Any], parts: FloatArray) -> FloatArray:
+    """Interpolate bilinearly, at parts (..., 2) of a pixel, the values of four neighbouring pixels."""
+    right, down = parts[..., 0], parts[..., 1]
+    top = pixels[0] * (1.0 - right) + pixels[1] * right
+    bottom = pixels[2] * (1.0 - right) + pixels[3] * right
+    return top * (1.0 - down) + bottom * down
 
 
-def _rough_points(profiles: FloatArray, steps: FloatArray, min_contrast: float) -> _Points | Reason:
-    """Return an edge's points from the share of black on each line (n, m): rough, but from anywhere on the lines."""
-    plain = max(1, round(_PLAIN * len(steps) / 2.0))
-    black, white = float(profiles[:, :plain].mean()), float(profiles[:, -plain:].mean())
-    if white - black < 0.5 * min_contrast:
+def _rough_points(profiles: FloatArray, rays: _Rays, blur_px: float, min_contrast: float) -> _Points | Reason:
+    """Return the points from the share of black on each line (4, n, m): rough, but from anywhere on the lines."""
+    samples = rays.weights.sum(axis=1)[:, None]
+    plain = np.maximum(1.0, np.rint(0.5 * _PLAIN * samples))
+    number = np.arange(rays.weights.shape[1])
+    ends = np.stack([number < plain, (number >= samples - plain) & (number < samples)], axis=1) / plain[..., None]
+    black, white = np.einsum("enm,ekm,en->ke", profiles, ends, rays.used) / rays.counts
+    if (white - black).min() < 0.5 * min_contrast:
         return Reason.LOW_CONTRAST
-    step = float(steps[1] - steps[0])
-    places = ((white - profiles) / (white - black)).sum(axis=1) * step - 0.5 * step * len(steps)
-    all_clear, nothing = np.ones(len(places), dtype=bool), np.zeros(len(places))
-    return _Points(places, places, all_clear, nothing, np.zeros(2), 0.0, 0.0, np.zeros((2, 2)))
+    step = rays.steps[:, 1] - rays.steps[:, 0]
+    shares = (white[:, None, None] - profiles) / (white - black)[:, None, None]
+    lengths = step[:, None] * rays.weights
+    places = (shares @ lengths[..., None])[..., 0] - 0.5 * step[:, None] * samples
+    # The integral of share times rest is that of a Gaussian blur.
+    blurs = math.sqrt(math.pi) * rays.mean(((shares * (1.0 - shares)) @ lengths[..., None])[..., 0])
+    information = float(np.square(white - black) @ rays.counts)
+    widening = (float(np.median(blurs)) - blur_px) * information
+    nothing = np.zeros_like(places)
+    return _Points(places, places, rays.used, nothing, np.zeros((4, 2)), widening, information, np.zeros((4, 2, 2)))
 
 
 def _points(
     profiles: FloatArray,
     ideal: FloatArray,
-    s: FloatArray,
-    steps: FloatArray,
+    rays: _Rays,
     beyond: FloatArray,
-    ends: FloatArray,
     blur_px: float,
-    cumulant: float,
+    cumulants: FloatArray,
     gradients: FloatArray,
     unlit: FloatArray,
     min_contrast: float,
 ) -> _Points | Reason:
-    """Return the edge's points on the lines across it, or the reason why there are none: too little contrast.
+    """Return the edges' points on the lines across them, or the reason why there are none: too little contrast.
 
     Args:
-        profiles: grey levels (n, m) at s (n,) along the edge and `steps` (m,) [px] across it.
+        profiles: grey levels (4, n, m) on the lines.
         ideal: levels of an ideal edge at 0 there, 0 black and 1 white.
-        beyond: grey levels (n, 2) beyond `ends` (n, 2) [px], inside and outside.
-        cumulant: the fourth one of the blur across the edge, in units of `blur_px`.
-        gradients: change of black and white (2, 2) per unit of s [grey levels] and of `steps` [grey levels/px].
-        unlit: their variances (2, 2).
+        beyond: grey levels (4, n, 2) beyond the ends of black border and margin.
+        cumulants: the fourth one (4,) of the blur across each edge, in units of `blur_px`.
+        gradients: change of black and white (4, 2, 2) per unit of s [grey levels] and of `steps` [grey levels/px].
+        unlit: their variances (4, 2, 2).
     """
-    filters, information = _filters(steps, blur_px, _FREE)
-    free, steady = (_shift_filter(steps, blur_px, level) for level in (_FREE, _LEVEL))
-    filters[2] = free
-    along = np.column_stack([np.ones_like(s), s])
+    filters, steady, information = _filters(rays.steps, rays.weights, blur_px)
+    s = rays.s[..., None]
+    projection = _line_filters(rays.s, rays.used)
 
     def levels(at: FloatArray) -> FloatArray:
         # Light changes slowly along an edge.
-        return np.asarray(along @ np.linalg.lstsq(along, at @ filters[:2].T, rcond=None)[0], np.float64)
+        constant, slope = (projection @ (at @ filters[:, :2].mT)).transpose(1, 0, 2)[:, :, None]
+        return np.asarray(constant + slope * s, np.float64)
 
-    side = ndtr(steps / blur_px)
-    lit = [change[0] * s[:, None] + change[1] * steps for change in gradients]
-    profiles = profiles - lit[0] * (1.0 - side) - lit[1] * side
-    black, white = levels(profiles).T
-    if (white - black).mean() < min_contrast:
+    side = ndtr(rays.steps / blur_px)[:, None]
+    lit = gradients[:, None, :, 0] * s
+    slopes = gradients[:, None, :, 1:] * rays.steps[:, None, None]
+    profiles = profiles - (lit[..., :1] + slopes[:, :, 0]) * (1.0 - side) - (lit[..., 1:] + slopes[:, :, 1]) * side
+    black, white = np.moveaxis(levels(profiles), 2, 0)
+    if rays.mean(white - black).min() < min_contrast:
         return Reason.LOW_CONTRAST
-    shown = (beyond[:, :1] - black[:, None]) * blurred_step((ends[:, :1] - steps) / blur_px, cumulant)
-    shown += (beyond[:, 1:] - white[:, None]) * blurred_step((steps - ends[:, 1:]) / blur_px, cumulant)
+    around = rays.steps[:, None]
+    cumulant = cumulants[:, None, None]
+    shown = (beyond[..., :1] - black[..., None]) * blurred_step((rays.ends[..., :1] - around) / blur_px, cumulant)
+    shown += (beyond[..., 1:] - white[..., None]) * blurred_step((around - rays.ends[..., 1:]) / blur_px, cumulant)
     cleared = profiles - shown
-    black, white = levels(cleared).T
-    contrast = white - black
-    usual = float(contrast.mean())
-    if usual < min_contrast:
+    fitted = levels(cleared)
+    contrast = fitted[..., 1] - fitted[..., 0]
+    usual = rays.mean(contrast)[:, None]
+    if usual.min() < min_contrast:
         return Reason.LOW_CONTRAST
     contrast = np.maximum(contrast, 0.5 * usual)
-    own = cleared @ filters.T
-    ideal_held = (ideal - side) @ steady
+    own = cleared @ filters.mT
     # Pixels shift and widen an ideal edge, too.
-    shift, wider = (own[:, 2:] / contrast[:, None] - ideal @ filters[2:].T).T
-    level = np.outer(1.0 - side, own[:, 0].mean()).T + np.outer(side, own[:, 1].mean()).T
-    held = (cleared - level) @ steady / contrast - ideal_held
-    clear = own[:, 1] - own[:, 0] > 0.5 * contrast
-    told = float(np.square(contrast) @ clear) * information
-    correction = -(shown @ filters[2]) / contrast
+    shift, wider = np.moveaxis(own[..., 2:] / contrast[..., None] - ideal @ filters[:, 2:].mT, 2, 0)
+    level = rays.mean(own[..., 0])[:, None, None] * (1.0 - side) + rays.mean(own[..., 1])[:, None, None] * side
+    across = steady[..., None]
+    held = ((cleared - level) @ across)[..., 0] / contrast - ((ideal - side) @ across)[..., 0]
+    clear = rays.used & (own[..., 1] - own[..., 0] > 0.5 * contrast)
+    squared = np.square(contrast) * clear * information[:, None]
+    correction = -(shown @ filters[:, 2, :, None])[..., 0] / contrast
     # Both edges across a gradient are moved the same way: their errors add, which the factor allows for.
-    sides = np.column_stack([1.0 - side, side])
-    pulls = np.square(np.column_stack([filters[2] @ (sides * steps[:, None]), steady @ sides]) / usual)
-    doubt = 2.0 * (pulls * unlit[:, ::-1]).sum(axis=0)
-    widening = float((wider * np.square(contrast)) @ clear) * information
-    light = (np.column_stack([black, white]) + np.outer(s, gradients[:, 0]))[[0, -1]]
-    return _Points(shift, held, clear, correction, doubt, widening, told, light)
+    sides = np.concatenate([1.0 - side, side], axis=1)
+    pulls = np.stack(
+        [((sides * around) @ filters[:, 2, :, None])[..., 0], (sides @ across)[..., 0]], axis=2
+    )  # (4, 2, 2)
+    doubt = 2.0 * (np.square(pulls / usual[..., None]) * unlit[..., ::-1]).sum(axis=1)
+    shown_levels = fitted + lit
+    ends = np.stack([shown_levels[:, 0], shown_levels[np.arange(4), rays.counts - 1]], axis=1)
+    return _Points(shift, held, clear, correction, doubt, float((wider * squared).sum()), float(squared.sum()), ends)
 
 
-def blurred_step(places: FloatArray, cumulant: float) -> FloatArray:
+def blurred_step(places: FloatArray, cumulant: float | FloatArray) -> FloatArray:
     """Return the levels of a step from 0 to 1 at 0, at places in units of its blur.
 
     Edgeworth's series of a Gaussian blur and its fourth cumulant.
     """
-    density = np.exp(-0.5 * places**2) / math.sqrt(2.0 * math.pi)
-    return np.asarray(ndtr(places) - cumulant / 24.0 * (places**3 - 3.0 * places) * density, dtype=np.float64)
+    squares = places * places
+    density = np.exp(-0.5 * squares) / math.sqrt(2.0 * math.pi)
+    return np.asarray(ndtr(places) - cumulant / 24.0 * places * (squares - 3.0) * density, dtype=np.float64)
 
 
-def _shift_filter(steps: FloatArray, blur_px: float, level: float) -> FloatArray:
-    """Return the filter (m,) for the contrast times the shift of an edge, wider than the edge itself.
+def _filters(steps: FloatArray, weights: FloatArray, blur_px: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return filters (4, 4, m) over samples at `steps` (4, m) [px], one (4, m) more, and the blur's information (4,).
+
+    The first give the levels of black and white at the edge, and the contrast times its shift and times the error of
+    the blur; the one more is for the shift too, with levels that have a prior. What the light's gradients leave across
+    the edge has a prior in all.
 
     An edge along the rows or columns has the same place within the pixels all along, so that what a pixel makes of its
-    shape does not average out. A wider filter hardly depends on that shape.
+    shape does not average out. Filters for the shift are wider than the edge: they hardly depend on that shape.
     """
-    shift = _filters(steps, math.hypot(blur_px, _WIDER_PX), level)[0][2]
-    slope = np.exp(-0.5 * (steps / blur_px) ** 2) / (blur_px * math.sqrt(2.0 * math.pi))
-    return np.asarray(-shift / (shift @ slope), np.float64)
+    wide = math.hypot(blur_px, _WIDER_PX)
+    blurs = np.array([blur_px, wide, wide])[:, None, None]
+    places = steps / blurs
+    white, slope = ndtr(places), np.exp(-0.5 * places**2) / (blurs * math.sqrt(2.0 * math.pi))
+    sides = np.stack([1.0 - white, white], axis=2)
+    basis = np.concatenate([sides, np.stack([-slope, -slope * places], axis=2), sides * steps[:, None]], axis=2)
+    basis *= weights[:, None]
+    priors = 1.0 / np.array([[level, level, np.inf, _FREE, _GRADIENT, _GRADIENT] for level in (_FREE, _FREE, _LEVEL)])
+    cov = np.linalg.inv(basis @ basis.mT + (priors[:, :, None] * np.eye(6))[:, None])
+    narrow, *shifts = cov[:, :, :4] @ basis
+    free, steady = (-shift[:, 2] / (shift[:, 2] * slope[0]).sum(axis=1)[:, None] for shift in shifts)
+    filters = np.stack([narrow[:, 0], narrow[:, 1], free, narrow[:, 3]], axis=1)
+    return filters, np.asarray(steady, np.float64), np.asarray(1.0 / cov[0, :, 3, 3], np.float64)
 
 
-def _filters(steps: FloatArray, blur_px: float, level: float) -> tuple[FloatArray, float]:
-    """Return filters (4, m) over samples at `steps` (m,) [px], and the information in the last one's result.
+def _line_filters(s: FloatArray, kept: Mask) -> FloatArray:
+    """Return the filters (4, 2, n) for constant and slope of the line through values that are kept, at s (4, n)."""
+    count, first, second = kept.sum(axis=1), (s * kept).sum(axis=1), (s * s * kept).sum(axis=1)
+    scale = kept / (count * second - first**2)[:, None]
+    return np.stack(
+        [scale * (second[:, None] - first[:, None] * s), scale * (count[:, None] * s - first[:, None])], axis=1
+    )
 
-    They give the levels of black and white at the edge, and the contrast times its shift and times the error of the
-    blur. The last two are unbiased; what the light's gradients leave across the edge has a prior.
+
+def _fitted(
+    rays: _Rays, points: _Points, config: TagConfig
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, tuple[FloatArray, ...]] | Reason:
+    """Fit lines through the points; return the reason if there is none.
+
+    The result is `places`, `slopes`, `scatter`, `shared` and `residuals`, see `Edges`.
     """
-    white, slope = ndtr(steps / blur_px), np.exp(-0.5 * (steps / blur_px) ** 2) / (blur_px * math.sqrt(2.0 * math.pi))
-    sides = np.column_stack([1.0 - white, white])
-    basis = np.column_stack([sides, -slope, -slope * steps / blur_px, sides * steps[:, None]])
-    prior = np.diag([1.0 / level, 1.0 / level, 0.0, 1.0 / _FREE, 1.0 / _GRADIENT, 1.0 / _GRADIENT])
-    cov = np.linalg.inv(basis.T @ basis + prior)
-    return np.asarray((cov @ basis.T)[:4], np.float64), 1.0 / float(cov[3, 3])
-
-
-def _line(
-    s: FloatArray, points: _Points, config: TagConfig
-) -> tuple[float, float, FloatArray, FloatArray, FloatArray] | Reason:
-    """Fit a line through the points at s (n,); return the reason if there is none.
-
-    The result is place, slope, `scatter`, `shared` and `residuals`, see `Edge`.
-    """
-    design, places = np.column_stack([np.ones_like(s), s]), points.steady
-    kept, solution = points.clear, np.zeros(2)
+    kept = points.clear
+    fewest = np.maximum(config.min_visible * rays.counts, _FEWEST_POINTS - 1)
     for _ in range(3):
-        if kept.sum() < max(config.min_visible * len(s), _FEWEST_POINTS - 1):
+        if (kept.sum(axis=1) < fewest).any():
             return Reason.OCCLUDED
-        solution = np.linalg.lstsq(design[kept], places[kept], rcond=None)[0]
-        residuals = places - design @ solution
-        spread = max(_MAD_TO_SIGMA * float(np.median(np.abs(residuals[kept]))), _FLOOR_PX)
-        agreeing = points.clear & (np.abs(residuals) <= _STRAY * spread)
+        line = _line_filters(rays.s, kept) @ points.steady[..., None]
+        far = np.abs(points.steady - line[:, 0] - line[:, 1] * rays.s)
+        most = np.maximum(_STRAY_MEDIANS * _medians(far, kept), _WAVY_PX)
+        agreeing = points.clear & (far <= most[:, None])
         if (agreeing == kept).all():
             break
         kept = agreeing
-    line = np.linalg.pinv(design[kept])
-    both = np.column_stack([points.places, points.steady])[kept]
-    place, slope = float(line[0] @ both[:, 0]), float(line[1] @ both[:, 1])
-    residuals = both - design[kept] @ (line @ both)
-    freedom = int(kept.sum()) - 2
-    squares = np.maximum(np.square(residuals).sum(axis=0), freedom * _FLOOR_PX**2)
+    filters = _line_filters(rays.s, kept)
+    both = np.stack([points.places, points.steady], axis=2)
+    lines = filters @ both  # (4, 2, 2)
+    residuals = (both - lines[:, None, 0] - lines[:, None, 1] * rays.s[..., None]) * kept[..., None]
+    freedom = kept.sum(axis=1) - 2.0
+    squares = np.maximum(np.square(residuals).sum(axis=1), freedom[:, None] * _FLOOR_PX**2)
     # With few points the scatter may be larger than it seems: Student's t has this variance.
-    sigmas = np.diag(np.sqrt(squares / max(freedom - 2.0, 1.0)))
-    scatter = sigmas @ (line @ line.T) @ sigmas
-    beyond = line @ points.beyond[kept]
-    shared = _FLOOR_PX**2 * np.eye(2) + _BEYOND_SHARE**2 * np.outer(beyond, beyond)
-    shared += np.diag(points.unlit)
-    waves = np.zeros(len(s))
-    waves[kept] = residuals[:, 1] * math.sqrt(freedom / squares[1])
-    return place, slope, scatter, shared, waves
+    sigmas = np.sqrt(squares / np.maximum(freedom - 2.0, 1.0)[:, None])
+    scatter = sigmas[:, :, None] * (filters @ filters.mT) * sigmas[:, None]
+    beyond = filters @ points.beyond[..., None]
+    shared = _FLOOR_PX**2 * np.eye(2) + _BEYOND_SHARE**2 * beyond @ beyond.mT + points.unlit[..., None] * np.eye(2)
+    waves = residuals[..., 1] * np.sqrt(freedom / squares[:, 1])[:, None]
+    return (
+        lines[:, 0, 0],
+        lines[:, 1, 1],
+        scatter,
+        shared,
+        tuple(w[:k] for w, k in zip(waves, rays.counts, strict=True)),
+    )
+
+
+def _medians(values: FloatArray, kept: Mask) -> FloatArray:
+    """Return the medians (4,) of the values (4, n) that are kept."""
+    ordered = np.sort(np.where(kept, values, np.inf), axis=1)
+    count = kept.sum(axis=1)
+    return 0.5 * (ordered[np.arange(4), (count - 1) // 2] + ordered[np.arange(4), count // 2])

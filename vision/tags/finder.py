@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Collection
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,8 +12,10 @@ import numpy as np
 from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
 
 from .config import TagConfig
-from .dictionary import tags_of
+from .dictionary import DICTIONARIES, OTHER_DICTIONARIES, tags_of
 from .image import TagImage, measure_tag
+
+_log = logging.getLogger(__name__)
 
 # Squares are two where their corners are on the mean so far apart, as a share of the perimeter.
 _APART_SHARE = 0.03
@@ -26,11 +30,36 @@ class TagFinder:
     def __init__(self, config: TagConfig, ids: Collection[int]) -> None:
         """Prepare OpenCV's detector of the dictionary."""
         self._config, self._ids = config, ids
-        parameters = cv2.aruco.DetectorParameters()
-        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE  # `measure_tag` does better
-        # Else a tag's paper, one module wider all around, is taken for the same square, and the tag is not found.
-        parameters.minMarkerDistanceRate = _APART_SHARE
-        self._detector = cv2.aruco.ArucoDetector(tags_of(config.dictionary), parameters)
+        self._detector = _detector(tags_of(config.dictionary))
+        self._suspect, self._warned = 0, False
+        # Of the six by six dictionaries of ArUco, one is the beginning of the next.
+        kinds = {"apriltag_36h11", "aruco_6x6_1000", "aruco_mip_36h12"} - {config.dictionary}
+        self._others = {name: number for name, number in DICTIONARIES.items() if name in kinds} | OTHER_DICTIONARIES
+        if config.dictionary.startswith("aruco_6x6"):
+            del self._others["aruco_6x6_1000"]
+
+    def suspicion(self, grey: ImageArray) -> Reason | None:
+        """Return what is seen instead of the tags: one mirrored, or one of another dictionary.
+
+        Each call looks for one of these, in turn, and stays with what it finds.
+        """
+        names = ["", *self._others]
+        name = names[self._suspect]
+        if not name:
+            wanted = {id for id, _ in _seen(self._detector, np.ascontiguousarray(grey[:, ::-1]))} & set(self._ids)
+            reason = Reason.MIRRORED if wanted else None
+        else:
+            detector = _detector(cv2.aruco.getPredefinedDictionary(self._others[name]), exact=True)
+            large = [
+                quad for _, quad in _seen(detector, grey) if cv2.arcLength(quad, True) > 4.0 * self._config.min_side_px
+            ]
+            reason = Reason.OTHER_FAMILY if large else None
+        if reason is None:
+            self._suspect, self._warned = (self._suspect + 1) % len(names), False
+        elif not self._warned:
+            self._warned = True
+            _log.warning("%s, not one of %s", name or "a mirrored tag", self._config.dictionary)
+        return reason
 
     def find(self, grey: ImageArray, region: Region | None = None) -> Seen:
         """Find the tags in a region (left, top, right, bottom) of a grey image; a refused tag has its reason."""
@@ -43,11 +72,28 @@ class TagFinder:
     def squares(self, grey: ImageArray, region: Region | None = None) -> list[tuple[int, FloatArray]]:
         """Return numbers and rough corners (4, 2) [px] of all tags of the dictionary in a region."""
         x0, y0, x1, y1 = region or (0, 0, grey.shape[1], grey.shape[0])
-        corners, ids, _ = self._detector.detectMarkers(np.ascontiguousarray(grey[y0:y1, x0:x1]))
-        rough = [np.asarray(quad, dtype=np.float64).reshape(4, 2) + np.array([x0, y0]) for quad in corners]
-        return list(zip(_numbers(ids), rough, strict=True))
+        found = _seen(self._detector, np.ascontiguousarray(grey[y0:y1, x0:x1]))
+        return [(id, np.asarray(quad, dtype=np.float64) + np.array([x0, y0])) for id, quad in found]
 
 
-def _numbers(ids: object) -> list[int]:
-    """Return the tag numbers from OpenCV's array (n, 1) or None."""
-    return [] if ids is None else [int(id) for id in np.ravel(np.asarray(ids))]
+def _detector(dictionary: Any, *, exact: bool = False) -> cv2.aruco.ArucoDetector:
+    """Return a detector of a dictionary; `exact`, of tags without a wrong module alone."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE  # `measure_tag` does better
+    # Else a tag's paper, one module wider all around, is taken for the same square, and the tag is not found.
+    parameters.minMarkerDistanceRate = _APART_SHARE
+    parameters.perspectiveRemovePixelPerCell = 8  # with OpenCV's 4, small and oblique tags are missed
+    if exact:
+        parameters.errorCorrectionRate = parameters.maxErroneousBitsInBorderRate = 0.0
+    return cv2.aruco.ArucoDetector(dictionary, parameters)
+
+
+def _seen(detector: cv2.aruco.ArucoDetector, grey: ImageArray) -> list[tuple[int, Any]]:
+    """Return numbers and corners (4, 2) [px] of the tags in an image."""
+    corners, ids, _ = detector.detectMarkers(grey)
+    # OpenCV's array is (n, 1) or None.
+    return (
+        []
+        if ids is None
+        else [(int(id), np.reshape(quad, (4, 2))) for id, quad in zip(np.ravel(np.asarray(ids)), corners, strict=True)]
+    )

@@ -7,20 +7,22 @@ is estimated from the edges themselves. The corners are the intersections of the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.fft import dct
 
 from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
 
+from .bleed import bleed
 from .config import TagConfig
-from .edge import LONGEST_REACH_PX, MODULES, SHARPEST_PX, Edge, Light, find_edge
+from .dictionary import tag_modules
+from .edge import LONGEST_REACH_PX, MODULES, SHARPEST_PX, Edges, Light, find_edges
 
 # Most iterations; converged when no corner moved by more than this [px] and the blur by no more than this share.
 _ROUNDS, _SETTLED_PX, _SETTLED_BLUR = 8, 0.01, 0.02
-# Corners are rough until they move by less than this [px], for at most these rounds more than one.
-_ROUGH_PX, _ROUGH_ROUNDS = 0.7, 2
+# Corners are rough until they move by less than this share of a module, for at most these rounds more than one.
+_ROUGH_SHARE, _ROUGH_ROUNDS = 0.3, 2
 # Usual blur of lens and interpolation (1-sigma); its prior spread, in an image with a noise of one grey level; the
 # largest blur [px].
 _USUAL_BLUR_PX, _USUAL_SIGMA_PX, _WIDEST_PX = 0.85, 0.1, 3.0
@@ -32,9 +34,10 @@ _LARGEST_WIDENING = 1.5
 _SMOOTHED, _SMOOTHED_WAVES = 1.5, 10
 # Slow waves have half-periods of at least this many points; least upper bound of their indices.
 _SLOW, _LEAST_QUICKEST = 4, 4
-# Power of the wave number with which the waves' weights fall.
-_STEEPNESS = 1.0
-
+# Standard deviations of chance that a random walk along the edges has to exceed.
+_CHANCE = 2.5
+# Share of their length that lines across edges keep where the usual ones leave the margin.
+_SHORTER = 0.5
 
 _EVEN = Light(np.zeros((2, 2)), np.zeros((2, 2, 2)))
 
@@ -56,103 +59,120 @@ class TagImage:
 
 def measure_tag(grey: ImageArray, id: int, corners_px: FloatArray, config: TagConfig) -> TagImage | Reason:
     """Measure the tag whose corners are near `corners_px` (4, 2) in a grey image, or return why it is doubtful."""
-    edges: list[Edge] = []
+    found = _measured(grey, id, corners_px, 1.0, config)
+    if found in (Reason.OCCLUDED, Reason.LOW_CONTRAST):
+        # The margin may be narrower than a module.
+        again = _measured(grey, id, corners_px, _SHORTER, config)
+        return again if isinstance(again, TagImage) else found
+    return found
+
+
+def _measured(
+    grey: ImageArray, id: int, corners_px: FloatArray, shorter: float, config: TagConfig
+) -> TagImage | Reason:
+    """Measure the tag with lines across its edges that are so much shorter than usual."""
     blur_px = _USUAL_BLUR_PX
     light: Light | None = None
-    for number in range(_ROUNDS):
-        found = [find_edge(grey, corners_px, side, blur_px, light, config) for side in range(4)]
-        reasons = [edge for edge in found if isinstance(edge, Reason)]
-        if reasons:
-            return reasons[0]
-        edges = [edge for edge in found if isinstance(edge, Edge)]
-        moved = np.array([_meeting(edges[side - 1], edges[side]) for side in range(4)])
+    number = 0
+    while True:
+        edges = find_edges(grey, corners_px, blur_px, light, shorter, config)
+        if isinstance(edges, Reason):
+            return edges
+        number += 1
+        moved = _meetings(edges)
         moved_px, before_px = float(np.abs(moved - corners_px).max()), blur_px
-        if moved_px > LONGEST_REACH_PX:
+        module_px = 2.0 * float(edges.half_lengths.min()) / MODULES
+        if moved_px > max(LONGEST_REACH_PX, module_px):
             return Reason.OCCLUDED
-        rough = light is None
-        if not rough:
-            light = _light(edges)
-        elif moved_px < _ROUGH_PX or number == _ROUGH_ROUNDS:
-            light = _EVEN
-        corners_px, blur_px = moved, blur_px if rough else _blur(edges, blur_px)
-        if not rough and moved_px < _SETTLED_PX and abs(blur_px - before_px) < _SETTLED_BLUR * blur_px:
+        corners_px, blur_px = moved, _blur(edges, blur_px)
+        if light is None:
+            light = _EVEN if moved_px < _ROUGH_SHARE * module_px or number > _ROUGH_ROUNDS else None
+            continue
+        light = _light(edges)
+        settled = moved_px < _SETTLED_PX and abs(blur_px - before_px) < _SETTLED_BLUR * blur_px
+        if settled or number >= _ROUNDS:
             break
-    shortest_px = min(2.0 * edge.half_length for edge in edges)
+    shortest_px = 2.0 * float(edges.half_lengths.min())
     if shortest_px < config.min_side_px:
         return Reason.NO_MARKER
-    cov_px = _corner_covariance(edges)
+    bled_px, bled_var = bleed(grey, corners_px, blur_px, tag_modules(config.dictionary, id))
+    edges = replace(edges, places=edges.places + bled_px)
+    cov_px = _corner_covariance(edges, bled_var)
     if math.sqrt(float(np.diag(cov_px).max())) > config.max_corner_sigma * shortest_px:
         return Reason.BLURRED if blur_px * MODULES > _MOST_BLUR * shortest_px else Reason.NOT_STRAIGHT
-    return TagImage(id, corners_px, cov_px)
+    return TagImage(id, _meetings(edges), cov_px)
 
 
-def _blur(edges: list[Edge], before_px: float) -> float:
+def _blur(edges: Edges, before_px: float) -> float:
     """Estimate the blur (1-sigma) [px] of all edges, from the previous estimate `before_px`."""
     usual = _USUAL_SIGMA_PX**-2
-    wider = sum(edge.widening for edge in edges) + usual * (_USUAL_BLUR_PX - before_px)
-    factor = 1.0 + wider / (usual + sum(edge.information for edge in edges)) / before_px
+    wider = edges.widening + usual * (_USUAL_BLUR_PX - before_px)
+    factor = 1.0 + wider / (usual + edges.information) / before_px
     factor = min(max(factor, 1.0 / _LARGEST_WIDENING), _LARGEST_WIDENING)
     return min(max(factor * before_px, SHARPEST_PX), _WIDEST_PX)
 
 
-def _light(edges: list[Edge]) -> Light:
+def _light(edges: Edges) -> Light:
     """Return the light that the levels along the edges show."""
-    places = np.concatenate([edge.places for edge in edges])
-    levels = np.concatenate([edge.levels for edge in edges])
-    design = places - places.mean(axis=0)
+    spots, levels = edges.spots.reshape(-1, 2), edges.levels.reshape(-1, 2)
+    design = spots - spots.mean(axis=0)
     inverse = np.linalg.inv(design.T @ design)
     gradients = inverse @ design.T @ levels
     left = levels - levels.mean(axis=0) - design @ gradients
-    variance = np.square(left).sum(axis=0) / (len(places) - 3)
+    variance = np.square(left).sum(axis=0) / (len(spots) - 3)
     return Light(np.asarray(gradients.T, np.float64), variance[:, None, None] * inverse)
 
 
-def _likeness(edges: list[Edge]) -> float:
-    """Return the variance of neighbouring points' mean relative to that of independent points.
+def _likeness(edges: Edges) -> FloatArray:
+    """Return the variances (2,) of an edge's place and slope relative to those that independent points would have.
 
     Interpolation and blur spread a pixel's noise to its neighbours, and neither a print nor a lens is straight. So slow
-    waves along the edges have more noise than quick ones. Place and slope are the slowest; the next ones, the slower
-    the more, tell their noise.
+    waves along the edges have more noise than quick ones. The power of waves of index k from 2 on is that of a random
+    walk, b/k², on top of the noise a. Place and slope are the waves of index 1/2 and 1.
     """
-    power, count = _SMOOTHED_WAVES * _SMOOTHED, float(_SMOOTHED_WAVES)
-    for edge in edges:
-        quickest = max(len(edge.residuals) // _SLOW, _LEAST_QUICKEST)
-        slow = np.square(np.asarray(dct(edge.residuals, norm="ortho"))[2:quickest])
-        weight = np.arange(2, 2 + len(slow)) ** -_STEEPNESS
-        share = weight / weight.sum()
-        told = 1.0 / float(share @ share)
-        power, count = power + told * float(share @ slow), count + told
-    return power / count
+    slow = [np.square(np.asarray(dct(points, norm="ortho"))) for points in edges.residuals]
+    quickest = [max(len(power) // _SLOW, _LEAST_QUICKEST) for power in slow]
+    power = np.concatenate([power[2:last] for power, last in zip(slow, quickest, strict=True)])
+    index = np.concatenate([np.arange(2.0, min(last, len(all_))) for last, all_ in zip(quickest, slow, strict=True)])
+    # The prior counts as waves that are quick enough to show no walk.
+    power = np.append(power, _SMOOTHED)
+    design = np.stack([np.ones_like(power), np.append(index**-2.0, 0.0)])
+    count = np.append(np.ones_like(index), _SMOOTHED_WAVES)
+    even = np.append(index**-1.0, 1.0) * count
+    alone = float(even @ power / even.sum())
+    cov = np.linalg.inv(design * count @ design.T)
+    level = cov @ (design * count) @ power
+    noise, steep = max(float(level[0]), 0.0), max(float(level[1]), 1e-9)
+    chance = math.sqrt(2.0 * float(cov[1, 1])) * max(noise, _SMOOTHED)
+    # Walks that chance may show are left out, larger ones are taken for a little smaller (James and Stein).
+    walk = steep * max(1.0 - (_CHANCE * chance / steep) ** 2, 0.0)
+    return (noise if walk else alone) + walk * np.array([4.0, 1.0])
 
 
-def _meeting(one: Edge, other: Edge) -> FloatArray:
-    """Return the intersection (2,) [px] of two edges' lines."""
-    steps = np.linalg.solve(np.column_stack([one.direction, -other.direction]), other.point - one.point)
-    return one.point + steps[0] * one.direction
+def _meetings(edges: Edges) -> FloatArray:
+    """Return the intersections (4, 2) [px] of each edge's line with that of the edge before it."""
+    points, directions = edges.points, edges.directions
+    before = np.roll(directions, 1, axis=0)
+    steps = np.linalg.solve(np.stack([before, -directions], axis=2), (points - np.roll(points, 1, axis=0))[..., None])
+    return np.roll(points, 1, axis=0) + steps[:, 0] * before
 
 
-def _corner_covariance(edges: list[Edge]) -> FloatArray:
+def _corner_covariance(edges: Edges, together: float) -> FloatArray:
     """Return the covariance (8, 8) of the corners; each lies on the edge before it and on its own edge.
 
     A corner x on both lines n·x = place moves by dx with n₁·dx = dp₁ and n₂·dx = dp₂, where dp is the line's shift
-    there: that of its place, and of its slope times s.
+    there: that of its place, and of its slope times s. `together` is the variance [px²] of the shift of all edges.
     """
-    likeness = _likeness(edges)
-    by_edge = np.zeros((8, 8))
+    directions = edges.directions / np.linalg.norm(edges.directions, axis=1)[:, None]
+    normals = np.column_stack([directions[:, 1], -directions[:, 0]])
+    by_edge = np.zeros((4, 2, 4, 2))
+    cov = np.zeros((4, 2, 4, 2))
+    cov[:, 0, :, 0] = together
+    cov[range(4), :, range(4)] += np.sqrt(np.multiply.outer(*[_likeness(edges)] * 2)) * edges.scatter + edges.shared
     for corner in range(4):
-        before, after = edges[corner - 1], edges[corner]
-        solve = np.linalg.inv(np.array([_unit_normal(before), _unit_normal(after)]))
-        rows = slice(2 * corner, 2 * corner + 2)
+        solve = np.linalg.inv(normals[[corner - 1, corner]])
         # The corner is the end (s = 1) of the edge before it, and the beginning (s = −1) of its own.
-        for column, edge_number, s in ((0, (corner - 1) % 4, 1.0), (1, corner, -1.0)):
-            by_edge[rows, 2 * edge_number] += solve[:, column]
-            by_edge[rows, 2 * edge_number + 1] += s * solve[:, column]
-    cov = np.zeros((8, 8))
-    for number, edge in enumerate(edges):
-        cov[2 * number : 2 * number + 2, 2 * number : 2 * number + 2] = likeness * edge.scatter + edge.shared
-    return by_edge @ cov @ by_edge.T
-
-
-def _unit_normal(edge: Edge) -> FloatArray:
-    direction = edge.direction / np.linalg.norm(edge.direction)
-    return np.array([direction[1], -direction[0]])
+        for column, edge, s in ((0, corner - 1, 1.0), (1, corner, -1.0)):
+            by_edge[corner, :, edge] = np.outer(solve[:, column], (1.0, s))
+    rows = by_edge.reshape(8, 8)
+    return rows @ cov.reshape(8, 8) @ rows.T

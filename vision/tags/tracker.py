@@ -78,6 +78,7 @@ class TagTracker:
         self._finder = TagFinder(self.config, body.corners)
         self._whole = (0, 0, *calibration.image_size_px)
         self._last: tuple[float, list[FloatArray], FloatArray] | None = None
+        self._met = False  # a marker that has been found is neither mirrored nor of another dictionary
 
     def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
         """Return the marker in `frame`, in the left optical frame, or the reason for a miss.
@@ -93,6 +94,8 @@ class TagTracker:
             found = self._look(frame.t, greys, regions)
         if not isinstance(found, Pose):
             found = self._look(frame.t, greys, [self._whole] * len(greys))
+        if found is Reason.NO_MARKER and not self._met:
+            found = self._finder.suspicion(greys[0]) or found
         if isinstance(found, Reason):
             if self._last is not None:
                 _log.debug("marker lost at %.3f s: %s", frame.t, found)
@@ -125,7 +128,7 @@ class TagTracker:
         pose = self._pose(t, seen)
         if isinstance(pose, Pose):
             corners = [np.concatenate([tag.corners_px for tag in eye.values()]) for eye in seen]
-            self._last = t, corners, pose.rotation
+            self._last, self._met = (t, corners, pose.rotation), True
         return pose
 
     def _agreeing(self, left: dict[int, TagImage], right: dict[int, TagImage]) -> list[dict[int, TagImage]] | Reason:
