@@ -17,6 +17,7 @@ from bodyschema.diagnosis.assess.explanation import (
 )
 from bodyschema.diagnosis.assess.leftover import Leftover, leftover
 from bodyschema.diagnosis.assess.rivals import Standing, standings
+from bodyschema.diagnosis.assess.shares import Shares, shares
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.background import Scales
 from bodyschema.diagnosis.fit.contact import doubtful
@@ -174,6 +175,12 @@ class Diagnosis:
         """Held-out distances (n,) [m] without each of the causes."""
         errors = {c.identity: self._extended_errors(self.extended.without(c)) for c in self.causes}
         return {key: np.linalg.norm(error, axis=1) for key, error in errors.items()}
+
+    @cached_property
+    def shares(self) -> Shares:
+        """Shares of the explained squared error."""
+        unnamed = None if self.left.model is None else self.left.model.explained
+        return shares(self.aligned, self.extended, self.markers, unnamed)
 
     @cached_property
     def noise(self) -> FloatArray:

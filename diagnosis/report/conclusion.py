@@ -29,7 +29,7 @@ from .result import (
     Unexplained,
     Verdict,
 )
-from .text import advice, evidence, is_unsure, sentence
+from .text import advice, evidence, sentence
 
 _HALF_WIDTH_95 = 1.959964
 # Below this p-value, the report explains why a hypothesis is not a cause.
@@ -42,14 +42,14 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
     causes = _causes(diagnosis)
     rms = _rms_mm(diagnosis)
     verdict = _verdict(diagnosis, causes)
-    gain = Gain(percent, interval)
+    gain, tolerances = Gain(percent, interval), _tolerances(diagnosis)
     timed = diagnosis.aligned.observations.motion.t is not None
     # A tracker or a scanner has no intrinsics in robot.toml.
     seen_by = "instrument" if diagnosis.aligned.simulation.robot.calibration is None else "camera"
     return DiagnosisFile(
         verdict=verdict,
         sentence=sentence(
-            verdict, causes, rms, gain, _named_mm(diagnosis), _tolerated_mm(diagnosis), seen_by, timed=timed
+            verdict, causes, rms, gain, tolerances, _named_mm(diagnosis), _tolerated_mm(diagnosis), seen_by, timed=timed
         ),
         pairs=Pairs(len(diagnosis.markers), len(diagnosis.markers), diagnosis.outliers),
         rms_mm=rms,
@@ -62,7 +62,7 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
         advice=advice(diagnosis),
         limitations=_limitations(diagnosis),
         alike=_alike(diagnosis),
-        tolerances=_tolerances(diagnosis),
+        tolerances=tolerances,
         seen_by=seen_by,
     )
 
@@ -74,7 +74,8 @@ def _tolerances(diagnosis: Diagnosis) -> Tolerances:
     wide = np.exp(_HALF_WIDTH_95 * found.unsure)
     lowest = np.where(found.seen, sizes / wide, 0.0)
     ends = zip(sizes.tolist(), lowest.tolist(), (sizes * wide).tolist(), strict=True)
-    return Tolerances(*(Interval(size, (low, high)) for size, low, high in ends))
+    intervals = [Interval(size, (low, high)) for size, low, high in ends]
+    return Tolerances(*intervals, 100.0 * diagnosis.shares.links, 100.0 * diagnosis.shares.drives)
 
 
 def _verdict(diagnosis: Diagnosis, causes: tuple[Cause, ...]) -> Verdict:
@@ -83,7 +84,7 @@ def _verdict(diagnosis: Diagnosis, causes: tuple[Cause, ...]) -> Verdict:
         return "unexplained"
     if not causes:
         return "nothing_found"
-    return "undecided" if any(map(is_unsure, causes)) else "explained"
+    return "undecided" if any(cause.leaves_open for cause in causes) else "explained"
 
 
 def _rms_mm(diagnosis: Diagnosis) -> Errors:
@@ -120,7 +121,8 @@ def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:
     full = float(np.square(diagnosis.held_out["extended"][kept]).sum())
     losses = [max(float(np.square(diagnosis.without[c.identity][kept]).sum()) - full, 0.0) for c in fit.causes]
     causes = []
-    for cause, standing, loss in zip(fit.causes, diagnosis.standings, losses, strict=True):
+    parts = zip(fit.causes, diagnosis.standings, diagnosis.shares.causes, losses, strict=True)
+    for cause, standing, share, loss in parts:
         causes.append(
             Cause(
                 effect=cause.name,
@@ -128,7 +130,7 @@ def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:
                 source=cause.source,
                 parameters=_parameters(diagnosis, cause, standing),
                 probability=standing.probability,
-                share_of_gain_percent=100.0 * loss / max(sum(losses), 1e-300),
+                share_of_gain_percent=100.0 * share,
                 held_out_gain_percent=100.0 * (1.0 - float(np.sqrt(full / max(full + loss, 1e-300)))),
                 stability_percent=100.0 * float(standing.again.mean()),
                 indistinguishable_from=tuple(_named(r) for r in standing.rivals if r.is_same_here),

@@ -384,8 +384,8 @@ class Search:
             if candidate.gain < _COMES_NEAR * beside.itself.gain:
                 continue
             simpler = simplicity(candidate.effect) < simplicity(cause)
-            tried, worth = self._exchanged(fit, beside, candidate, -_EQUAL if simpler else 1.0)
-            better = worth > 1.0 or (abs(worth) < _EQUAL and simpler)
+            tried, worth = self._exchanged(fit, beside, candidate, -_EQUAL if simpler else _EQUAL)
+            better = worth > _EQUAL or (abs(worth) < _EQUAL and simpler)
             if better and tried.causes[-1].is_possible:
                 self._tell(f"exchanged {describe(cause)} for {describe(candidate.effect)}")
                 return tried
