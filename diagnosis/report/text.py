@@ -12,7 +12,6 @@ from bodyschema.diagnosis.diagnosis import Diagnosis
 from bodyschema.diagnosis.report.presenters.presenter import Found, Workshop
 from bodyschema.diagnosis.report.presenters.registry import presenter_of
 from bodyschema.diagnosis.search.search import describe
-from bodyschema.effects import Effect
 from bodyschema.effects.unexplained import PLACE
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
@@ -26,6 +25,8 @@ _BY_TOLERANCES = 0.95
 _UNTOLD = 10.0
 # A headline names this many causes and counts the others, to fit two lines.
 _TOLD = 2
+# Number of pairs of causes named with the motion that tells them apart.
+_PAIRS = 3
 # Smallest Δχ² between two causes at which a motion is worth advising.
 _TELLS = 25.0
 # Measurements that reveal an unnamed cause.
@@ -234,11 +235,13 @@ def evidence(standing: Standing) -> str:
 
 def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
     """Return sentences of advice: motions that would separate confounded causes, and steps against unnamed causes."""
-    told = []
+    told: list[str] = []
+    pairs: dict[str, list[str]] = {}
     for cause, standing in zip(diagnosis.causes, diagnosis.standings, strict=True):
         for rival in standing.rivals:
             if not rival.is_same_anywhere:
-                told.append(_motion(diagnosis, cause, rival))
+                pair = f"{describe(cause)} from {rival.described}"
+                pairs.setdefault(_motion(diagnosis, rival), []).append(pair)
             elif not rival.is_one:
                 told.append(
                     f"{rival.described} can do all that {describe(cause)} does, and more: "
@@ -248,6 +251,7 @@ def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
                 told.append(f"No motion tells {describe(cause)} from {rival.described}: fix whichever is easier.")
             if isinstance(rival.instead, Nameless):
                 told.append(f"Watch whether {rival.described}: {_WATCH[rival.instead.kind]}.")
+    told = [f"To tell {_some(told_apart)}, {motion}." for motion, told_apart in pairs.items()] + told
     if diagnosis.left.rattle is not None:
         told.append(f"Fasten the marker: {diagnosis.left.rattle.what}.")
     if what := diagnosis.left.nameless:
@@ -262,19 +266,24 @@ def _of_the_model(diagnosis: Diagnosis) -> str:
     return " The extended simulation is right about it only where the recording has been." if stored else ""
 
 
-def _motion(diagnosis: Diagnosis, cause: Effect, rival: Rival) -> str:
-    """Return advice on the joint that, moved through its whole range, best separates two causes."""
+def _some(pairs: Sequence[str]) -> str:
+    """Return the first of some pairs of causes, and the number of the others."""
+    more = len(pairs) - _PAIRS
+    return ", ".join(pairs[:_PAIRS]) + (f" and {more} more" if more > 0 else "")
+
+
+def _motion(diagnosis: Diagnosis, rival: Rival) -> str:
+    """Return a clause on the joint that, moved through its whole range, best separates a cause from a rival."""
     robot, fit = diagnosis.extended.simulation.robot, diagnosis.extended
-    pair = f"{describe(cause)} from {rival.described}"
     apart = [apart_on(fit, rival.instead, widened(fit, [k])) for k in range(len(robot.joints))]
     best = int(np.argmax(apart))
     if apart[best] >= _TELLS:
         low, high = whole_range(fit, best)
         unit, scale = ("mm", 1e3) if robot.chain.prismatic[best] else ("°", 180.0 / np.pi)
         span = f"{low * scale:.0f}{unit} to {high * scale:.0f}{unit}"
-        return f"To tell {pair}, move joint {robot.joints[best]} through its whole range ({span}) in another recording."
-    poses = f"To tell {pair}, record poses over the whole range of all joints, with stops and at different speeds"
+        return f"move joint {robot.joints[best]} through its whole range ({span}) in another recording"
+    poses = "record poses over the whole range of all joints, with stops and at different speeds"
     if rival.anywhere >= _TELLS:
-        return f"{poses}."
+        return poses
     pairs = len(fit.observations) * _TELLS / rival.anywhere
-    return f"{poses}: about {float(f'{pairs:.1g}'):,.0f} of them, since the effect is small beside the noise."
+    return f"{poses}: about {float(f'{pairs:.1g}'):,.0f} of them, since the effect is small beside the noise"
