@@ -21,6 +21,7 @@ OUTCOMES: tuple[Outcome, ...] = ("right", "honest", "vague", "wrong", "crashed")
 LARGE_SHARE = 15.0  # percent of the gain, from which a false cause counts
 SURE = 0.9
 NO_WORSE = 1.02  # times the error of the placed nominal model
+ROUNDED_MM = 1e-6
 ROUNDS = 30
 Json = Mapping[str, Any]
 
@@ -69,7 +70,7 @@ class DenseJudgement(msgspec.Struct, frozen=True):
     @property
     def no_worse(self) -> bool | None:
         """True if extended.toml predicts other poses at least as well as the placed nominal model."""
-        return None if self.extended_mm is None else self.extended_mm <= NO_WORSE * self.placed_mm
+        return None if self.extended_mm is None else self.extended_mm <= NO_WORSE * self.placed_mm + ROUNDED_MM
 
 
 def name(entry: Json) -> str:

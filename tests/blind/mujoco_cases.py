@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from .arrays import FloatArray
 from .dense import HERE, LIMIT_S, Checkout, Ran
-from .dense_judge import LARGE_SHARE, NO_WORSE, OUTCOMES, SURE, Outcome, name, rms_mm, shares_of_causes
+from .dense_judge import LARGE_SHARE, NO_WORSE, OUTCOMES, ROUNDED_MM, SURE, Outcome, name, rms_mm, shares_of_causes
 from .mujoco_hide import KINDS, STYLES, Case, Style, Truth, hide
 
 # Cycles a turn by which a strain wave may be missed.
@@ -67,7 +67,7 @@ class Judgement(msgspec.Struct, frozen=True):
     @property
     def no_worse(self) -> bool | None:
         """True if extended.toml predicts a later recording at least as well as the placed nominal model."""
-        return None if self.extended_mm is None else self.extended_mm <= NO_WORSE * self.placed_mm
+        return None if self.extended_mm is None else self.extended_mm <= NO_WORSE * self.placed_mm + ROUNDED_MM
 
 
 def outcome(truth: Sequence[Truth], also: Sequence[str], told: dict[str, Any]) -> tuple[Outcome, list[str]]:
