@@ -75,7 +75,8 @@ def _tolerances(diagnosis: Diagnosis) -> Tolerances:
     lowest = np.where(found.seen, sizes / wide, 0.0)
     ends = zip(sizes.tolist(), lowest.tolist(), (sizes * wide).tolist(), strict=True)
     intervals = [Interval(size, (low, high)) for size, low, high in ends]
-    return Tolerances(*intervals, 100.0 * diagnosis.shares.links, 100.0 * diagnosis.shares.drives)
+    shares = diagnosis.shares
+    return Tolerances(*intervals, links_share_percent=100.0 * shares.links, drives_share_percent=100.0 * shares.drives)
 
 
 def _verdict(diagnosis: Diagnosis, causes: tuple[Cause, ...]) -> Verdict:
