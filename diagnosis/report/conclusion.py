@@ -11,6 +11,7 @@ from bodyschema.diagnosis.fit.contact import doubtful
 from bodyschema.diagnosis.fit.worth import NAMED, nats
 from bodyschema.diagnosis.search.aliases import alias_sentences
 from bodyschema.diagnosis.search.scan import Candidate
+from bodyschema.diagnosis.search.together import is_at_limit
 from bodyschema.effects import Effect
 from bodyschema.interfaces.records import FloatArray
 
@@ -80,8 +81,8 @@ def _tolerances(diagnosis: Diagnosis) -> Tolerances:
 
 
 def _verdict(diagnosis: Diagnosis, causes: tuple[Cause, ...]) -> Verdict:
-    # A search that ends at its limit has described the error and not explained it.
-    if diagnosis.left.is_there or diagnosis.ended_early:
+    # A search that ends at its limit has described the error and not explained it; so have tolerances of no workshop.
+    if diagnosis.left.is_there or diagnosis.ended_early or is_at_limit(diagnosis.extended.background.scales):
         return "unexplained"
     if not causes:
         return "nothing_found"
@@ -251,6 +252,11 @@ def _limitations(diagnosis: Diagnosis) -> tuple[str, ...]:
             "and move the joint to and fro in each."
         )
     told += alias_sentences(diagnosis.extended)
+    if is_at_limit(diagnosis.extended.background.scales):
+        told.append(
+            "Small errors everywhere would have to be larger than any workshop makes them: there may be several causes "
+            "behind them that this recording does not separate. Move one joint at a time in another recording."
+        )
     if diagnosis.ended_early:
         told.append(f"The search ended at its longest, with {len(diagnosis.causes)} causes: there may be more of them.")
     return tuple(told)

@@ -453,14 +453,14 @@ def is_at_limit(scales: Scales | None) -> bool:
     return scales is not None and max(scales.lengths, scales.angles) > (1.0 - _STILL) * MOST
 
 
-def beyond_tolerances(fit: Fit, cause: Effect, doubt: float) -> bool:
-    """Return True if a cause that tolerances can stand for is more probable than larger tolerances.
+def beyond_tolerances(fit: Fit, cause: Effect, doubt: float) -> bool | None:
+    """Return True if a cause is more probable than larger tolerances; None if tolerances cannot stand for it.
 
     Args:
         doubt: minimum cost of naming it [nats].
     """
     if fit.background.scales is None or _beside_tolerances(fit, cause) > _FOLLOWED:
-        return False
+        return None
     sets = Sets(fit, [Candidate(one, 0.0, 1) for one in fit.causes], doubt)
     all_causes = tuple(range(len(fit.causes)))
     whole = sets.of(all_causes)
