@@ -17,11 +17,12 @@ from bodyschema.diagnosis.assess.explanation import (
 )
 from bodyschema.diagnosis.assess.leftover import Leftover, leftover
 from bodyschema.diagnosis.assess.rivals import Standing, standings
+from bodyschema.diagnosis.assess.shares import Shares, shares
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.background import Scales
 from bodyschema.diagnosis.fit.contact import doubtful
 from bodyschema.diagnosis.fit.fit import Fit, fitted
-from bodyschema.diagnosis.fit.instrument import instrument_factor
+from bodyschema.diagnosis.fit.instrument import instrument_factor, reshaped
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.search.alike import Alike, alike
 from bodyschema.diagnosis.search.drives import with_small_ripples
@@ -176,6 +177,12 @@ class Diagnosis:
         return {key: np.linalg.norm(error, axis=1) for key, error in errors.items()}
 
     @cached_property
+    def shares(self) -> Shares:
+        """Shares of the explained squared error."""
+        unnamed = None if self.left.model is None else self.left.model.explained
+        return shares(self.aligned, self.extended, self.markers, unnamed)
+
+    @cached_property
     def noise(self) -> FloatArray:
         """Noise covariances (n, 3, 3) [m²], from the residuals of the complete model."""
         fit, kept = self.extended, self.markers
@@ -244,9 +251,13 @@ def diagnose(
     extended = search.run(begun, enough) if start.is_exact else _searched(begun, search, enough)
     factor, rows = instrument_factor(extended), doubtful(extended)
     left_out = rows if rows.mean() <= MOST_DOUBTFUL else np.zeros_like(rows)
-    is_other = abs(np.log(factor)) > _SAME_NOISE or left_out.any()
+    other_shape = None if start.is_exact else reshaped(extended)
+    if other_shape is not None and (rattle(extended) or explain(extended, search.path, unknowns, search, told).unknown):
+        # What is left is not noise alone.
+        other_shape = None
+    is_other = abs(np.log(factor)) > _SAME_NOISE or left_out.any() or other_shape is not None
     if not start.is_exact and is_other and not search.ended_early:
-        observations = observations.with_factor(factor).without(left_out)
+        observations = (other_shape or observations).with_factor(factor).without(left_out)
         start = aligned(observations, simulation)
         unknowns = Unknowns(start)
         enough = partial(needs_no_more_names, unknowns=unknowns, search=search)

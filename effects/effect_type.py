@@ -62,7 +62,6 @@ class EffectType(ABC):
         moves_joints: True if the true joint angles differ from the readings.
         is_zero: True for the zero of a joint, which is often wrong at several joints.
         of_drive: True for a periodic error, of which every drive has a little.
-        absorbed_by: names of the effects that can stand for it.
         stays_as: name of its permanent form, for an effect that begins at a moment.
         drifts: True if it grows with time.
         remembers: True if it depends on earlier readings.
@@ -90,7 +89,6 @@ class EffectType(ABC):
     moves_joints: ClassVar[bool] = False
     is_zero: ClassVar[bool] = False
     of_drive: ClassVar[bool] = False
-    absorbed_by: ClassVar[tuple[str, ...]] = ()
     stays_as: ClassVar[str | None] = None
     drifts: ClassVar[bool] = False
     remembers: ClassVar[bool] = False

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import msgspec
 
 from bodyschema.diagnosis.report.numbers import numbers_of, place, telling
-from bodyschema.diagnosis.report.result import Cause, DiagnosisFile
+from bodyschema.diagnosis.report.result import Cause
+from bodyschema.diagnosis.report.text import in_order
 
 from .diagnosing import Diagnosed
 
@@ -98,17 +99,13 @@ def row(result: Diagnosed) -> Row:
         recording=str(result.job.recording),
         robot=result.robot,
         verdict=None if file is None else file.verdict,
-        causes=() if file is None else tuple(_told(cause, result.timed) for cause in _by_share(file)),
+        causes=() if file is None else tuple(_told(cause, result.timed) for cause in in_order(file.causes)),
         gain_percent=None if file is None else file.gain.held_out_percent,
         aligned_mm=None if file is None else file.rms_mm.aligned,
         extended_mm=None if file is None else file.rms_mm.extended,
         sentence=None if file is None else file.sentence,
         error=result.error,
     )
-
-
-def _by_share(file: DiagnosisFile) -> list[Cause]:
-    return sorted(file.causes, key=lambda cause: -cause.share_of_gain_percent)
 
 
 def _told(cause: Cause, timed: bool) -> str:
@@ -128,7 +125,7 @@ def _type(joints: tuple[str, ...], units: Sequence[Diagnosed]) -> Type:
     for unit in units:
         if unit.file is None or unit.file.verdict == "nothing_found":
             continue
-        own = [_told(cause, unit.timed) for cause in _by_share(unit.file) if place(cause) not in common]
+        own = [_told(cause, unit.timed) for cause in in_order(unit.file.causes) if place(cause) not in common]
         if unit.file.unexplained.depends_on:
             own.append(f"something unexplained that depends on {', '.join(unit.file.unexplained.depends_on)}")
         if own:

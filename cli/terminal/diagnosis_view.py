@@ -10,9 +10,19 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from bodyschema.diagnosis.report.numbers import chance, mm, numbers_of, percent, place, rival_named, share, telling
-from bodyschema.diagnosis.report.result import Cause, DiagnosisFile, Errors, Indistinguishable, Verdict
-from bodyschema.diagnosis.report.text import beside_geometry, made_to, modelled
+from bodyschema.diagnosis.report.numbers import (
+    chance,
+    mm,
+    numbers_of,
+    percent,
+    place,
+    rival_named,
+    share,
+    telling,
+    tolerance_shares,
+)
+from bodyschema.diagnosis.report.result import SMALL, Cause, DiagnosisFile, Errors, Indistinguishable, Verdict
+from bodyschema.diagnosis.report.text import beside_geometry, in_order, made_to, modelled, to_do
 
 # Number of rejected hypotheses shown.
 NEAREST = 6
@@ -56,7 +66,7 @@ def view(diagnosis: DiagnosisFile, remedies: Sequence[str], *, timed: bool) -> G
         parts.append(Text(unexplained(diagnosis)))
     parts.append(_errors(diagnosis))
     if diagnosis.causes:
-        parts.append(_causes(diagnosis.causes, timed))
+        parts.append(_causes(diagnosis, timed))
     if diagnosis.tolerances is not None:
         parts.append(Text(made_to(diagnosis.tolerances)))
     if rivals := [line for cause in diagnosis.causes for line in rival_lines(cause)]:
@@ -65,8 +75,11 @@ def view(diagnosis: DiagnosisFile, remedies: Sequence[str], *, timed: bool) -> G
         parts.append(_rejected(diagnosis))
     if alike := beside_geometry(diagnosis.rms_mm, diagnosis.alike):
         parts.append(_list("Beside the best geometry", alike))
-    if remedies:
-        parts.append(_list("What to do", remedies, numbered=True))
+    first, small = to_do(diagnosis, remedies)
+    if first:
+        parts.append(_list("What to do", first, numbered=True))
+    if small:
+        parts.append(_list(f"Small causes, each less than {SMALL:.0f} % of the gain", small))
     if diagnosis.advice:
         parts.append(_list("What to measure next", diagnosis.advice))
     if diagnosis.limitations:
@@ -132,7 +145,7 @@ def _of(errors: Errors, name: str) -> float | None:
     return getattr(errors, name)
 
 
-def _causes(causes: Sequence[Cause], timed: bool) -> Table:
+def _causes(diagnosis: DiagnosisFile, timed: bool) -> Table:
     table = _table("Causes")
     table.padding = (0, 1, 0, 0)
     table.add_column("effect", overflow="fold", min_width=18)
@@ -140,11 +153,14 @@ def _causes(causes: Sequence[Cause], timed: bool) -> Table:
     table.add_column("± for 95 %", overflow="fold")
     for name in ("sure", "share", "gain"):
         table.add_column(name, justify="right", no_wrap=True)
-    for cause in sorted(causes, key=lambda c: -c.share_of_gain_percent):
+    for cause in in_order(diagnosis.causes):
         numbers = telling(numbers_of(cause, timed=timed))
         figures = (percent(cause.probability), share(cause.share_of_gain_percent), share(cause.held_out_gain_percent))
         labels, values = ("\n".join(lines) for lines in ([n.label for n in numbers], [str(n) for n in numbers]))
         table.add_row(Text(place(cause).replace(" ", "\n", 1)), labels, values, *figures)
+    if diagnosis.tolerances is not None:
+        for told, of in tolerance_shares(diagnosis.tolerances):
+            table.add_row(told, "", "", "", share(of), "")
     return table
 
 

@@ -125,8 +125,8 @@ def explain(
 def useful(explanation: Explanation, search: Search, blocks: Blocks, tell: Callable[[str], None]) -> Explanation:
     """Drop causes that are not worth naming, do not reduce the error on data not used in the fit, or cannot be.
 
-    Larger tolerances may take the place of a link or a joint offset without any loss on such data. Such a cause stays
-    if it is more probable than these tolerances.
+    Larger tolerances may take the place of a link or a joint offset without any loss on such data, and with a slight
+    one by chance. Such a cause stays if it is more probable than these tolerances.
     """
     fit = explanation.fit
     if explanation.unknown or fit.is_exact:
@@ -139,16 +139,27 @@ def useful(explanation: Explanation, search: Search, blocks: Blocks, tell: Calla
             # Negative backlash or compliance is no cause, whatever it gains.
             cause.is_possible
             and search.worth(fit, cause) >= 0.0
-            and (loss > 0.0 or beyond_tolerances(fit, cause, search.multiplicity))
+            and _is_told(cause, beyond_tolerances(fit, cause, search.multiplicity), loss)
             for cause, loss in zip(fit.causes, losses, strict=True)
         ]
         if all(told):
             break
         least = min((k for k, is_told in enumerate(told) if not is_told), key=losses.__getitem__)
-        why = "no gain on data not used in the fit" if losses[least] <= 0.0 else "nothing in its place is more probable"
+        why = (
+            "no gain on data not used in the fit" if losses[least] <= 0.0 else "something in its place is more probable"
+        )
         tell(f"dropped {describe(fit.causes[least])}: {why}")
-        fit = fewer[least]
+        # Tolerances grow by what the cause no longer explains.
+        fit = fewer[least].tolerating(tolerated(fewer[least]).scales)
     return replace(explanation, fit=fit)
+
+
+def _is_told(cause: Effect, beyond: bool | None, loss: float) -> bool:
+    """Return True if a cause is worth telling, whose absence adds `loss` to the held-out squares [m²]."""
+    if cause.kind.rigid and beyond is not None:
+        # Every link is a little off, so a slight gain of one is chance.
+        return beyond
+    return loss > 0.0 or bool(beyond)
 
 
 def _missed(fit: Fit, blocks: Blocks) -> FloatArray:

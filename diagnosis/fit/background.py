@@ -110,11 +110,6 @@ class Background:
         usual = self.scales.lengths * _DRIVE_M if effect.prismatic else self.scales.drives * DRIVE_RAD
         return float(np.linalg.norm(effect.values[effect.amounts])) < _LIKE_OTHERS * usual
 
-    def resembles(self, effect: Effect) -> bool:
-        """Return True if large tolerances could stand for an effect: a joint's zero is a turn of its link."""
-        names = {own.name for own in self.effects}
-        return not names.isdisjoint({effect.name, *effect.kind.absorbed_by})
-
     @cached_property
     def precision(self) -> FloatArray:
         """Prior precision of the amounts (p,)."""

@@ -27,6 +27,7 @@ _SLACK, _LITTLE = 2.0, 5.0
 # A step that promises a smaller rise is not tried [nats].
 _NOT_TRIED = 1e-3
 # Largest share of a step's squares that kept derivatives may leave to the next: the square of their relative error.
+# With 0.3 to 3 times this, four recordings had the same causes, probabilities to 0.001 and RMS to 0.01 %.
 _LEFT_OVER = 3e-3
 # Uncertainty, in steps that are still valid, of a period or a time constant that is not identifiable.
 _UNTOLD = 10.0
@@ -35,6 +36,7 @@ _FEWEST_OUTLIERS = 1e-4
 _BLOCKS = 60
 _EM_ROUNDS = 6
 # Scales of the tolerances over which intervals are integrated, in standard deviations of their logarithm.
+# 0.3 to 3 times the span, and 5 to 39 of them, changed intervals of four recordings by less than 5 %.
 _NODES = np.linspace(-3.0, 3.0, 13)
 # Relative rounding of products, and of logarithms.
 _ROUNDED_OFF, _STILL = 1e-12, 1e-6

@@ -11,6 +11,7 @@ from bodyschema.diagnosis.fit.contact import doubtful
 from bodyschema.diagnosis.fit.worth import NAMED, nats
 from bodyschema.diagnosis.search.aliases import alias_sentences
 from bodyschema.diagnosis.search.scan import Candidate
+from bodyschema.diagnosis.search.together import is_at_limit
 from bodyschema.effects import Effect
 from bodyschema.interfaces.records import FloatArray
 
@@ -29,7 +30,7 @@ from .result import (
     Unexplained,
     Verdict,
 )
-from .text import advice, evidence, is_unsure, sentence
+from .text import advice, evidence, sentence
 
 _HALF_WIDTH_95 = 1.959964
 # Below this p-value, the report explains why a hypothesis is not a cause.
@@ -42,14 +43,14 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
     causes = _causes(diagnosis)
     rms = _rms_mm(diagnosis)
     verdict = _verdict(diagnosis, causes)
-    gain = Gain(percent, interval)
+    gain, tolerances = Gain(percent, interval), _tolerances(diagnosis)
     timed = diagnosis.aligned.observations.motion.t is not None
     # A tracker or a scanner has no intrinsics in robot.toml.
     seen_by = "instrument" if diagnosis.aligned.simulation.robot.calibration is None else "camera"
     return DiagnosisFile(
         verdict=verdict,
         sentence=sentence(
-            verdict, causes, rms, gain, _named_mm(diagnosis), _tolerated_mm(diagnosis), seen_by, timed=timed
+            verdict, causes, rms, gain, tolerances, _named_mm(diagnosis), _tolerated_mm(diagnosis), seen_by, timed=timed
         ),
         pairs=Pairs(len(diagnosis.markers), len(diagnosis.markers), diagnosis.outliers),
         rms_mm=rms,
@@ -62,7 +63,7 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
         advice=advice(diagnosis),
         limitations=_limitations(diagnosis),
         alike=_alike(diagnosis),
-        tolerances=_tolerances(diagnosis),
+        tolerances=tolerances,
         seen_by=seen_by,
     )
 
@@ -74,16 +75,18 @@ def _tolerances(diagnosis: Diagnosis) -> Tolerances:
     wide = np.exp(_HALF_WIDTH_95 * found.unsure)
     lowest = np.where(found.seen, sizes / wide, 0.0)
     ends = zip(sizes.tolist(), lowest.tolist(), (sizes * wide).tolist(), strict=True)
-    return Tolerances(*(Interval(size, (low, high)) for size, low, high in ends))
+    intervals = [Interval(size, (low, high)) for size, low, high in ends]
+    shares = diagnosis.shares
+    return Tolerances(*intervals, links_share_percent=100.0 * shares.links, drives_share_percent=100.0 * shares.drives)
 
 
 def _verdict(diagnosis: Diagnosis, causes: tuple[Cause, ...]) -> Verdict:
-    # A search that ends at its limit has described the error and not explained it.
-    if diagnosis.left.is_there or diagnosis.ended_early:
+    # A search that ends at its limit has described the error and not explained it; so have tolerances of no workshop.
+    if diagnosis.left.is_there or diagnosis.ended_early or is_at_limit(diagnosis.extended.background.scales):
         return "unexplained"
     if not causes:
         return "nothing_found"
-    return "undecided" if any(map(is_unsure, causes)) else "explained"
+    return "undecided" if any(cause.leaves_open for cause in causes) else "explained"
 
 
 def _rms_mm(diagnosis: Diagnosis) -> Errors:
@@ -120,7 +123,8 @@ def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:
     full = float(np.square(diagnosis.held_out["extended"][kept]).sum())
     losses = [max(float(np.square(diagnosis.without[c.identity][kept]).sum()) - full, 0.0) for c in fit.causes]
     causes = []
-    for cause, standing, loss in zip(fit.causes, diagnosis.standings, losses, strict=True):
+    parts = zip(fit.causes, diagnosis.standings, diagnosis.shares.causes, losses, strict=True)
+    for cause, standing, share, loss in parts:
         causes.append(
             Cause(
                 effect=cause.name,
@@ -128,7 +132,7 @@ def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:
                 source=cause.source,
                 parameters=_parameters(diagnosis, cause, standing),
                 probability=standing.probability,
-                share_of_gain_percent=100.0 * loss / max(sum(losses), 1e-300),
+                share_of_gain_percent=100.0 * share,
                 held_out_gain_percent=100.0 * (1.0 - float(np.sqrt(full / max(full + loss, 1e-300)))),
                 stability_percent=100.0 * float(standing.again.mean()),
                 indistinguishable_from=tuple(_named(r) for r in standing.rivals if r.is_same_here),
@@ -248,6 +252,11 @@ def _limitations(diagnosis: Diagnosis) -> tuple[str, ...]:
             "and move the joint to and fro in each."
         )
     told += alias_sentences(diagnosis.extended)
+    if is_at_limit(diagnosis.extended.background.scales):
+        told.append(
+            "Small errors everywhere would have to be larger than any workshop makes them: there may be several causes "
+            "behind them that this recording does not separate. Move one joint at a time in another recording."
+        )
     if diagnosis.ended_early:
         told.append(f"The search ended at its longest, with {len(diagnosis.causes)} causes: there may be more of them.")
     return tuple(told)

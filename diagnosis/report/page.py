@@ -15,7 +15,7 @@ from bodyschema.diagnosis.report.numbers import chance, mm, share, told_values
 from bodyschema.diagnosis.report.presenters.outliers import outlier_panel
 from bodyschema.diagnosis.report.presenters.registry import presenter_of
 from bodyschema.diagnosis.report.result import Cause, DiagnosisFile, Verdict
-from bodyschema.diagnosis.report.text import beside_geometry, finding, made_to, modelled
+from bodyschema.diagnosis.report.text import beside_geometry, finding, in_order, made_to, modelled, to_do
 from bodyschema.effects import Effect
 
 from . import tables
@@ -40,7 +40,7 @@ _VERDICTS: dict[Verdict, tuple[str, str]] = {
 }
 # Maximum of outlier rows listed by number.
 _NAMED_ROWS = 40
-# Number of causes shown with their plots; further ones are in a collapsed list.
+# Number of causes shown with their plots; further and small ones are collapsed.
 _OPEN = 4
 
 
@@ -130,11 +130,11 @@ def _causes(residuals: Residuals, file: DiagnosisFile, remedies: Sequence[str]) 
     if not file.causes:
         return ""
     # Outliers come last and have no effect.
-    fitted = zip_longest(file.causes, residuals.diagnosis.causes)
-    ordered = sorted(fitted, key=lambda pair: -pair[0].share_of_gain_percent)
+    effects = {id(cause): effect for cause, effect in zip_longest(file.causes, residuals.diagnosis.causes)}
+    ordered = in_order(file.causes)
     articles = [
-        _cause(residuals, cause, effect, remedy, file.seen_by, opened=k < _OPEN)
-        for k, ((cause, effect), remedy) in enumerate(zip(ordered, remedies, strict=True))
+        _cause(residuals, cause, effects[id(cause)], remedy, file.seen_by, opened=k < _OPEN and not cause.is_small)
+        for k, (cause, remedy) in enumerate(zip(ordered, remedies, strict=True))
     ]
     return (
         f'<section id="causes"><h2>Causes</h2>{tables.causes(file, timed=residuals.timed)}'
@@ -159,7 +159,9 @@ def _cause(
 def _tolerances(file: DiagnosisFile) -> str:
     if file.tolerances is None:
         return ""
-    return f'<section id="tolerances"><p>{escape(made_to(file.tolerances))}</p></section>'
+    use = to_do(file, [])[0]
+    told = " ".join([made_to(file.tolerances), *use])
+    return f'<section id="tolerances"><p>{escape(told)}</p></section>'
 
 
 def _alike(file: DiagnosisFile) -> str:

@@ -6,6 +6,10 @@ from typing import Literal
 
 import msgspec
 
+# A cause with less weight [%] is told last and leaves the verdict as it is.
+SMALL = 5.0
+# A less probable cause leaves the verdict open, and is to be confirmed first.
+SURE = 0.9
 Verdict = Literal["explained", "nothing_found", "undecided", "unexplained"]
 
 
@@ -46,6 +50,8 @@ class Cause(msgspec.Struct, frozen=True):
     """One cause with its numbers.
 
     Attributes:
+        share_of_gain_percent: share of the explained squared error, tolerances included.
+        held_out_gain_percent: rise of the held-out RMS without it, all else refitted.
         stability_percent: share of block resamplings in which it is named again.
     """
 
@@ -60,6 +66,21 @@ class Cause(msgspec.Struct, frozen=True):
     indistinguishable_from: tuple[Indistinguishable, ...]
     rivals: tuple[Indistinguishable, ...]
     evidence: str
+
+    @property
+    def weight_percent(self) -> float:
+        """The larger of its share of the gain, which others might take over, and of what is lost without it."""
+        return max(self.share_of_gain_percent, self.held_out_gain_percent)
+
+    @property
+    def is_small(self) -> bool:
+        """True for an effect of little weight; fixes that are not the marker have none."""
+        return self.stability_percent is not None and self.weight_percent < SMALL
+
+    @property
+    def leaves_open(self) -> bool:
+        """True where a rival is not much less probable, and the cause is not small."""
+        return self.probability < SURE and bool(self.rivals) and not self.is_small
 
 
 class Rejected(msgspec.Struct, frozen=True):
@@ -125,11 +146,19 @@ class Tolerances(msgspec.Struct, frozen=True):
         length_mm: tolerance of the positions of links.
         angle_deg: tolerance of axes and joint offsets.
         drive_deg: size of the periodic errors of drives.
+        links_share_percent, drives_share_percent: shares of the gain of links and axes, and of drives.
     """
 
     length_mm: Interval
     angle_deg: Interval
     drive_deg: Interval
+    links_share_percent: float = 0.0
+    drives_share_percent: float = 0.0
+
+    @property
+    def share_percent(self) -> float:
+        """Share of the gain of all tolerances together."""
+        return self.links_share_percent + self.drives_share_percent
 
 
 class Pairs(msgspec.Struct, frozen=True):

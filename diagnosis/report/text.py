@@ -12,13 +12,12 @@ from bodyschema.diagnosis.diagnosis import Diagnosis
 from bodyschema.diagnosis.report.presenters.presenter import Found, Workshop
 from bodyschema.diagnosis.report.presenters.registry import presenter_of
 from bodyschema.diagnosis.search.search import describe
-from bodyschema.effects import Effect
 from bodyschema.effects.unexplained import PLACE
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 
 from .numbers import named, rival_named, told_values
-from .result import Alike, Cause, DiagnosisFile, Errors, Gain, Interval, Tolerances, Unexplained, Verdict
+from .result import SMALL, SURE, Alike, Cause, DiagnosisFile, Errors, Gain, Interval, Tolerances, Unexplained, Verdict
 
 # Tolerances that leave at most this share of the error are mentioned.
 _BY_TOLERANCES = 0.95
@@ -26,8 +25,8 @@ _BY_TOLERANCES = 0.95
 _UNTOLD = 10.0
 # A headline names this many causes and counts the others, to fit two lines.
 _TOLD = 2
-# A less probable cause leaves the verdict open, and is to be confirmed first.
-SURE = 0.9
+# Number of pairs of causes named with the motion that tells them apart.
+_PAIRS = 3
 # Smallest Δχ² between two causes at which a motion is worth advising.
 _TELLS = 25.0
 # Measurements that reveal an unnamed cause.
@@ -36,6 +35,11 @@ _WATCH = {
     "body": "press on it, or record with a second marker on what carries it",
     "place": "calibrate the cameras again, where they stand to each other too",
 }
+
+
+def in_order(causes: Sequence[Cause]) -> list[Cause]:
+    """Return causes in the order in which to act: small ones last, the heaviest first."""
+    return sorted(causes, key=lambda cause: (cause.is_small, -cause.weight_percent))
 
 
 def finding(
@@ -66,7 +70,7 @@ def remedies(
         torques: the largest torque of gravity on each joint (d,) [N·m, N]; None where masses are unknown.
     """
     workshop = Workshop(robot, steps, torques, {cause.effect: cause for cause in diagnosis.causes})
-    causes = sorted(diagnosis.causes, key=lambda cause: -cause.share_of_gain_percent)
+    causes = in_order(diagnosis.causes)
     told = [presenter_of(cause.effect).remedy(workshop, Found.of(cause)) for cause in causes]
     return [_if_sure(cause, remedy) for cause, remedy in zip(causes, told, strict=True)]
 
@@ -87,6 +91,7 @@ def sentence(
     causes: Sequence[Cause],
     rms: Errors,
     gain: Gain,
+    tolerances: Tolerances | None = None,
     named_mm: float | None = None,
     tolerated_mm: float | None = None,
     seen_by: str = "camera",
@@ -108,13 +113,7 @@ def sentence(
     if not causes:
         told = "What is measured differs from the simulation in a way that none of the known effects explains"
         return told if named_mm is None else f"{told}; a smooth model of it explains {_share(gain)} ({figures})"
-    largest = sorted(causes, key=lambda cause: -cause.share_of_gain_percent)
-    told = [finding(c.effect, c.where, c.source, told_values(c), seen_by, timed=timed) for c in largest[:_TOLD]]
-    head = told[0][0].upper() + told[0][1:]
-    if more := len(largest) - len(told):
-        head += f"; {', '.join(told[1:])}; {more} smaller cause{'s' * (more > 1)}"
-    elif len(told) > 1:
-        head += f", and {told[1]}"
+    head = _head(causes, tolerances, seen_by, timed=timed)
     if gain.held_out_percent <= 0.0:
         return f"{head}: this explains the pairs that were fitted and no others ({figures})"
     if named_mm is not None:
@@ -124,20 +123,33 @@ def sentence(
     return f"{head}. RMS error {figures}{_open(verdict, causes)}"
 
 
+def _head(causes: Sequence[Cause], tolerances: Tolerances | None, seen_by: str, *, timed: bool) -> str:
+    """Return the largest causes as a sentence without its full stop."""
+    ordered = in_order(causes)
+    everywhere = ["small errors everywhere"] if tolerances is not None and tolerances.share_percent >= SMALL else []
+    first = [cause for cause in ordered if not (everywhere and cause.is_small)][:_TOLD]
+    told = [finding(c.effect, c.where, c.source, told_values(c), seen_by, timed=timed) + _or(c) for c in first]
+    if more := len(ordered) - len(first):
+        everywhere.append(f"{more} {'smaller' if first else 'small'} cause{'s' * (more > 1)}")
+    parts = [*told, *everywhere]
+    head = f"{', '.join(parts[:-1])} and {parts[-1]}" if len(parts) > 1 else parts[0]
+    return head[0].upper() + head[1:]
+
+
+def _or(cause: Cause) -> str:
+    """Return the most probable alternative of a cause that is not sure, in parentheses."""
+    return f" (or {rival_named(cause.rivals[0])})" if cause.leaves_open else ""
+
+
 def _open(verdict: Verdict, causes: Sequence[Cause]) -> str:
     """Return the part of a verdict's sentence on what remains open."""
     if verdict == "unexplained":
         return ". Part of the error remains unexplained"
-    unsure = [cause for cause in causes if is_unsure(cause)]
+    unsure = [cause for cause in causes if cause.leaves_open]
     if verdict != "undecided" or not unsure:
         return ""
     named = [f"{c.effect}{'' if c.where is None else f' at {c.where}'}" for c in unsure]
     return f". Not sure: {', '.join(named)}; other causes explain as much"
-
-
-def is_unsure(cause: Cause) -> bool:
-    """Return True for a cause with a rival that is not much less probable."""
-    return cause.probability < SURE and bool(cause.rivals)
 
 
 def _share(gain: Gain) -> str:
@@ -157,6 +169,23 @@ def made_to(tolerances: Tolerances) -> str:
     length, angle = told(tolerances.length_mm, " mm"), told(tolerances.angle_deg, "°")
     drives = told(tolerances.drive_deg, "°", "±")
     return f"The arm is made to {length} and {angle}; its drives run true to {drives}."
+
+
+def to_do(diagnosis: DiagnosisFile, remedies: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return what to do in its order, and what to do about small causes.
+
+    Args:
+        remedies: of each cause, as returned by `remedies`.
+    """
+    first = sum(not cause.is_small for cause in diagnosis.causes)
+    told = list(remedies[:first])
+    of = diagnosis.tolerances
+    if of is not None and of.share_percent >= SMALL:
+        told.append(
+            f"Use extended.toml: small errors of all links and drives are {of.share_percent:.0f} % of the gain, and no "
+            "single one is worth mending."
+        )
+    return told, list(remedies[first:])
 
 
 def beside_geometry(rms: Errors, alike: Sequence[Alike]) -> list[str]:
@@ -206,11 +235,13 @@ def evidence(standing: Standing) -> str:
 
 def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
     """Return sentences of advice: motions that would separate confounded causes, and steps against unnamed causes."""
-    told = []
+    told: list[str] = []
+    pairs: dict[str, list[str]] = {}
     for cause, standing in zip(diagnosis.causes, diagnosis.standings, strict=True):
         for rival in standing.rivals:
             if not rival.is_same_anywhere:
-                told.append(_motion(diagnosis, cause, rival))
+                pair = f"{describe(cause)} from {rival.described}"
+                pairs.setdefault(_motion(diagnosis, rival), []).append(pair)
             elif not rival.is_one:
                 told.append(
                     f"{rival.described} can do all that {describe(cause)} does, and more: "
@@ -220,6 +251,7 @@ def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
                 told.append(f"No motion tells {describe(cause)} from {rival.described}: fix whichever is easier.")
             if isinstance(rival.instead, Nameless):
                 told.append(f"Watch whether {rival.described}: {_WATCH[rival.instead.kind]}.")
+    told = [f"To tell {_some(told_apart)}, {motion}." for motion, told_apart in pairs.items()] + told
     if diagnosis.left.rattle is not None:
         told.append(f"Fasten the marker: {diagnosis.left.rattle.what}.")
     if what := diagnosis.left.nameless:
@@ -234,19 +266,24 @@ def _of_the_model(diagnosis: Diagnosis) -> str:
     return " The extended simulation is right about it only where the recording has been." if stored else ""
 
 
-def _motion(diagnosis: Diagnosis, cause: Effect, rival: Rival) -> str:
-    """Return advice on the joint that, moved through its whole range, best separates two causes."""
+def _some(pairs: Sequence[str]) -> str:
+    """Return the first of some pairs of causes, and the number of the others."""
+    more = len(pairs) - _PAIRS
+    return ", ".join(pairs[:_PAIRS]) + (f" and {more} more" if more > 0 else "")
+
+
+def _motion(diagnosis: Diagnosis, rival: Rival) -> str:
+    """Return a clause on the joint that, moved through its whole range, best separates a cause from a rival."""
     robot, fit = diagnosis.extended.simulation.robot, diagnosis.extended
-    pair = f"{describe(cause)} from {rival.described}"
     apart = [apart_on(fit, rival.instead, widened(fit, [k])) for k in range(len(robot.joints))]
     best = int(np.argmax(apart))
     if apart[best] >= _TELLS:
         low, high = whole_range(fit, best)
         unit, scale = ("mm", 1e3) if robot.chain.prismatic[best] else ("°", 180.0 / np.pi)
         span = f"{low * scale:.0f}{unit} to {high * scale:.0f}{unit}"
-        return f"To tell {pair}, move joint {robot.joints[best]} through its whole range ({span}) in another recording."
-    poses = f"To tell {pair}, record poses over the whole range of all joints, with stops and at different speeds"
+        return f"move joint {robot.joints[best]} through its whole range ({span}) in another recording"
+    poses = "record poses over the whole range of all joints, with stops and at different speeds"
     if rival.anywhere >= _TELLS:
-        return f"{poses}."
+        return poses
     pairs = len(fit.observations) * _TELLS / rival.anywhere
-    return f"{poses}: about {float(f'{pairs:.1g}'):,.0f} of them, since the effect is small beside the noise."
+    return f"{poses}: about {float(f'{pairs:.1g}'):,.0f} of them, since the effect is small beside the noise"

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_solve, get_lapack_funcs
 
 from bodyschema.diagnosis.fit.background import MOST, SPREAD, Scales
-from bodyschema.diagnosis.fit.fit import Fit
+from bodyschema.diagnosis.fit.fit import Fit, solved
 from bodyschema.diagnosis.fit.worth import ANOTHER, NAMED, ways_to_choose
 from bodyschema.effects import Effect, EffectType, Identity
 from bodyschema.interfaces.records import FloatArray
@@ -46,6 +46,9 @@ _SHOWN = 3.0
 _MOST_MOVES, _MOST_TOGETHER = 60, 8
 # Maximum of refitted sets, and the margin to the best within which a set is refitted [nats].
 _MOST_REFITTED, _COMES_NEAR = 8, 15.0
+
+# Tolerances may stand for a cause of which they leave less than this share of the squares; a third is left of a jump.
+_FOLLOWED = 0.1
 
 dpotrf, dpotri, dpotrs = get_lapack_funcs(("potrf", "potri", "potrs"), dtype=np.float64)
 
@@ -450,18 +453,31 @@ def is_at_limit(scales: Scales | None) -> bool:
     return scales is not None and max(scales.lengths, scales.angles) > (1.0 - _STILL) * MOST
 
 
-def beyond_tolerances(fit: Fit, cause: Effect, doubt: float) -> bool:
-    """Return True if a cause that tolerances can stand for is more probable than larger tolerances.
+def beyond_tolerances(fit: Fit, cause: Effect, doubt: float) -> bool | None:
+    """Return True if a cause is more probable than larger tolerances; None if tolerances cannot stand for it.
 
     Args:
         doubt: minimum cost of naming it [nats].
     """
-    if not fit.background.resembles(cause):
-        return False
+    if fit.background.scales is None or _beside_tolerances(fit, cause) > _FOLLOWED:
+        return None
     sets = Sets(fit, [Candidate(one, 0.0, 1) for one in fit.causes], doubt)
     all_causes = tuple(range(len(fit.causes)))
     whole = sets.of(all_causes)
     return whole.worth > sets.of(_without(all_causes, [fit.causes.index(cause)]), whole).worth
+
+
+def _beside_tolerances(fit: Fit, cause: Effect) -> float:
+    """Return the share of what a cause changes (squares) that other effects and tolerances of any size cannot follow.
+
+    They can follow a joint's zero, which is a turn of its link, and a wrong ratio of a joint that moves little.
+    """
+    places = fit.places(cause)[: len(cause.amounts)]
+    flat = fit.columns.reshape(fit.left.size, -1)
+    change = flat[:, places] @ cause.values[cause.amounts]
+    others = np.delete(flat, places, axis=1)
+    left = change - others @ solved(others.T @ others, others.T @ change)
+    return float(left @ left) / max(float(change @ change), 1e-300)
 
 
 class _Place:

@@ -23,7 +23,6 @@ class JointOffset(EncoderEffect):
     rank = 0
     rigid = True
     is_zero = True
-    absorbed_by = ("link_geometry",)
 
     def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
         return (Parameter("offset_m", 0.005) if prismatic else Parameter("offset_rad", 0.05),)

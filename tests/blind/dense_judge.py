@@ -21,6 +21,7 @@ OUTCOMES: tuple[Outcome, ...] = ("right", "honest", "vague", "wrong", "crashed")
 LARGE_SHARE = 15.0  # percent of the gain, from which a false cause counts
 SURE = 0.9
 NO_WORSE = 1.02  # times the error of the placed nominal model
+ROUNDED_MM = 1e-6
 ROUNDS = 30
 Json = Mapping[str, Any]
 
@@ -69,7 +70,7 @@ class DenseJudgement(msgspec.Struct, frozen=True):
     @property
     def no_worse(self) -> bool | None:
         """True if extended.toml predicts other poses at least as well as the placed nominal model."""
-        return None if self.extended_mm is None else self.extended_mm <= NO_WORSE * self.placed_mm
+        return None if self.extended_mm is None else self.extended_mm <= NO_WORSE * self.placed_mm + ROUNDED_MM
 
 
 def name(entry: Json) -> str:
@@ -84,7 +85,8 @@ def outcome(sealed: Json, told: Json) -> tuple[Outcome, list[str], list[str]]:
     causes = [cause for cause in told["causes"] if not _is_false_fixes(sealed, cause)]
     found = _found(truth, [name(cause) for cause in causes])
     missed = [cause for cause in truth if cause not in found]
-    false = [c for c in causes if name(c) not in found.values() and c["share_of_gain_percent"] >= LARGE_SHARE]
+    weights = shares_of_causes(causes)
+    false = [c for c, w in zip(causes, weights, strict=True) if name(c) not in found.values() and w >= LARGE_SHARE]
     names = [name(cause) for cause in false]
     if not missed and not false:
         return "right", names, missed
@@ -96,6 +98,12 @@ def outcome(sealed: Json, told: Json) -> tuple[Outcome, list[str], list[str]]:
     shown = set(told["unexplained"]["depends_on"]) if is_open else set()
     left_open = all({hidden, *truth[hidden]} & told_too or _place(hidden) in shown for hidden in missed)
     return ("honest" if left_open and (missed or is_open) else "vague"), names, missed
+
+
+def shares_of_causes(causes: Sequence[Json]) -> list[float]:
+    """Return the share [%] of each cause in the gain of all named ones, whatever tolerances explain beside them."""
+    total = sum(cause["share_of_gain_percent"] for cause in causes) or 100.0
+    return [100.0 * cause["share_of_gain_percent"] / total for cause in causes]
 
 
 def _found(truth: Mapping[str, Sequence[str]], named: Sequence[str]) -> dict[str, str]:

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from .arrays import FloatArray
 from .dense import HERE, LIMIT_S, Checkout, Ran
-from .dense_judge import LARGE_SHARE, NO_WORSE, OUTCOMES, SURE, Outcome, name, rms_mm
+from .dense_judge import LARGE_SHARE, NO_WORSE, OUTCOMES, ROUNDED_MM, SURE, Outcome, name, rms_mm, shares_of_causes
 from .mujoco_hide import KINDS, STYLES, Case, Style, Truth, hide
 
 # Cycles a turn by which a strain wave may be missed.
@@ -67,7 +67,7 @@ class Judgement(msgspec.Struct, frozen=True):
     @property
     def no_worse(self) -> bool | None:
         """True if extended.toml predicts a later recording at least as well as the placed nominal model."""
-        return None if self.extended_mm is None else self.extended_mm <= NO_WORSE * self.placed_mm
+        return None if self.extended_mm is None else self.extended_mm <= NO_WORSE * self.placed_mm + ROUNDED_MM
 
 
 def outcome(truth: Sequence[Truth], also: Sequence[str], told: dict[str, Any]) -> tuple[Outcome, list[str]]:
@@ -81,11 +81,9 @@ def outcome(truth: Sequence[Truth], also: Sequence[str], told: dict[str, Any]) -
     hidden = {other: one for one in truth for other in (one.name, *one.same) if other}
     true = [cause for cause in causes if name(cause) in hidden and _same_wave(hidden[name(cause)], cause)]
     found = {hidden[name(cause)].name for cause in true}
-    false = [
-        cause
-        for cause in causes
-        if cause not in true and name(cause) not in also and cause["share_of_gain_percent"] >= LARGE_SHARE
-    ]
+    weights = shares_of_causes(told["causes"])
+    large = [cause for cause, w in zip(told["causes"], weights, strict=True) if w >= LARGE_SHARE and cause in causes]
+    false = [cause for cause in large if cause not in true and name(cause) not in also]
     names = [name(cause) for cause in false]
     depends_on = set(told["unexplained"]["depends_on"]) if told["verdict"] in ("undecided", "unexplained") else set()
     missed = [one for one in truth if one.name not in found]

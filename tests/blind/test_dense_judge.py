@@ -49,6 +49,10 @@ def test_a_false_cause_of_little_weight_is_forgiven() -> None:
     assert outcome(_sealed(ZERO), _told(_cause(ZERO), _cause(PLAY, share=10.0)))[0] == "right"
 
 
+def test_tolerances_do_not_dilute_a_false_cause() -> None:
+    assert outcome(_sealed(ZERO), _told(_cause(ZERO, share=8.0), _cause(PLAY, share=2.0)))[0] == "wrong"
+
+
 def test_a_sure_false_cause_of_weight_is_wrong() -> None:
     assert outcome(_sealed(ZERO), _told(_cause(ZERO), _cause(PLAY, share=20.0))) == ("wrong", [PLAY], [])
 

@@ -58,6 +58,14 @@ def test_the_headline_of_many_causes_fits_two_lines():
     assert len(said) < 2 * 96
 
 
+def test_tolerances_come_before_causes_of_little_weight():
+    arm = Tolerances(Interval(0.3, (0.2, 0.4)), Interval(0.06, (0.05, 0.07)), Interval(0.01, (0.0, 0.02)), 60.0, 9.0)
+    causes = [_zero("slight", share=0.4), _zero("elbow", share=30.0)]
+    said = sentence("explained", causes, Errors(5.0, 5.0, 1.0, 1.0, 0.9), Gain(80.0, (75.0, 85.0)), arm)
+    assert "joint elbow is off by -1.15°, small errors everywhere and 1 smaller cause." in said.replace("+", "-")
+    assert "slight" not in said
+
+
 def test_an_undecided_headline_names_what_is_unsure():
     causes = [_zero("elbow", 0.6), _zero("wrist")]
     said = sentence("undecided", causes, Errors(5.0, 5.0, 1.0, 1.0, 0.9), Gain(80.0, (75.0, 85.0)))

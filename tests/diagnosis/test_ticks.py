@@ -9,7 +9,7 @@ import pytest
 from planted_cases import SIGMA_M, desk_arm, measured, walk
 
 from bodyschema.diagnosis.fit.alignment import aligned
-from bodyschema.diagnosis.fit.instrument import instrument_factor
+from bodyschema.diagnosis.fit.instrument import instrument_factor, reshaped
 from bodyschema.diagnosis.fit.observations import Observations, ticks
 from bodyschema.effects import Simulation
 from bodyschema.interfaces.records import FloatArray
@@ -85,3 +85,19 @@ def test_the_rounding_of_whole_ticks_is_the_variance_that_the_joints_pass_on(rob
 
 def test_without_ticks_the_stated_noise_is_kept(robot) -> None:
     assert instrument_factor(aligned(noisy(robot, 3.0, 0.0, 1), Simulation(robot))) == 1.0
+
+
+def test_noise_of_another_shape_than_stated_is_seen(robot) -> None:
+    motion = walk(robot, 2, 400)
+    x = Simulation(robot).positions(motion) + SIGMA_M * np.random.default_rng(5).normal(size=(400, 3))
+    recording = dataclasses.replace(measured(robot, motion, x), cov=None)
+    stated = Observations.of(recording, Simulation(robot))
+    found = reshaped(aligned(stated, Simulation(robot)))
+    assert found is not None
+    # A stereo camera is stated to see depth least exactly.
+    longest = [np.sqrt(np.median(np.linalg.cond(one.stated))) for one in (stated, found)]
+    assert longest[0] > 4.0 > 1.5 > longest[1]
+
+
+def test_noise_of_the_stated_shape_is_left_alone(robot) -> None:
+    assert reshaped(aligned(noisy(robot, 3.0, 0.0, 1), Simulation(robot))) is None

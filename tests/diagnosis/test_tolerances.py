@@ -7,14 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planted_cases import ELBOW, SHOULDER, desk_arm, measured, motion_of, scattered, surveyed_arm
+from planted_cases import ELBOW, SHOULDER, desk_arm, measured, motion_of, scattered, start_of, surveyed_arm
 
+from bodyschema.diagnosis.assess.explanation import Explanation, useful
 from bodyschema.diagnosis.diagnosis import diagnose
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.background import Scales
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.diagnosis.report.result import DiagnosisFile
+from bodyschema.diagnosis.search.held_out import Blocks
+from bodyschema.diagnosis.search.search import Search
+from bodyschema.diagnosis.search.together import beyond_tolerances
 from bodyschema.effects import Effect, Simulation, load_simulation, write_extended
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.description import RobotDescription
@@ -131,3 +135,37 @@ def test_a_written_simulation_is_refitted_to_second_order() -> None:
         left += float(np.square(fit.written.positions(motion) - recording.x).sum())
         first_order += float(np.square(fit.settled().predicted - recording.x).sum())
     assert left < 0.7 * first_order
+
+
+def test_a_ratio_is_named_though_large_drive_errors_could_follow_it(robot: RobotDescription) -> None:
+    rng = np.random.default_rng([7, 6])
+    # The elbow moves little, so that its eccentricity can do what its ratio does.
+    reach = np.where(np.array(robot.joints) == ELBOW, 0.15, 0.7)
+    q = rng.uniform(reach * robot.lower, reach * robot.upper, (ROWS, len(robot.joints)))
+    ratio = Effect.at(robot, "joint_scale", ELBOW, values=[0.02])
+    x = Simulation(robot, (ratio,), None, made(robot, rng)).positions(motion_of(q))
+    recording = measured(robot, motion_of(q), x + NOISE_M * rng.normal(size=x.shape))
+    start = aligned(Observations.of(recording, Simulation(robot)), Simulation(robot))
+    fit = start.with_causes([ratio]).tolerating(Scales())
+    assert beyond_tolerances(fit, fit.causes[0], doubt=4.0)
+
+
+def test_tolerances_cannot_stand_for_a_moment(robot: RobotDescription) -> None:
+    jump = Effect.at(robot, "encoder_jump", ELBOW, values={"jump_rad": 0.02, "t0": 12.0})
+    start = start_of(robot, scattered(robot, 3, ROWS), (jump,), 3)
+    fit = start.with_causes([jump]).tolerating(Scales())
+    assert beyond_tolerances(fit, fit.causes[0], doubt=4.0) is None
+
+
+def test_a_link_within_tolerances_is_less_probable_than_they_are(robot: RobotDescription) -> None:
+    rng = np.random.default_rng([7, 8])
+    q = rng.uniform(0.7 * robot.lower, 0.7 * robot.upper, (ROWS, len(robot.joints)))
+    x = Simulation(robot, (), None, made(robot, rng)).positions(motion_of(q))
+    recording = measured(robot, motion_of(q), x + NOISE_M * rng.normal(size=x.shape))
+    start = aligned(Observations.of(recording, Simulation(robot)), Simulation(robot))
+    links = [Effect.at(robot, "link_geometry", joint) for joint in (SHOULDER, ELBOW)]
+    # Links that have taken the place of all tolerances.
+    fit = start.with_causes(links).tolerating(Scales(0.1, 0.1, 0.1))
+    told = useful(Explanation(fit, None, 0.0), Search(links, lambda _: None), Blocks.cut(ROWS), lambda _: None)
+    assert told.fit.causes == ()
+    assert max(told.fit.background.scales or Scales()) > 0.5

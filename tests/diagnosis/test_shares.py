@@ -1,0 +1,52 @@
+"""Each cause has a share of what is explained, even where tolerances could take its place."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from planted_cases import ELBOW, SHOULDER, scattered, start_of, surveyed_arm
+
+from bodyschema.diagnosis.assess.shares import Shares, shares
+from bodyschema.diagnosis.fit.background import Scales
+from bodyschema.diagnosis.report.result import Cause, Indistinguishable
+from bodyschema.diagnosis.report.text import in_order
+from bodyschema.effects import Effect
+
+
+@pytest.fixture(scope="module")
+def divided() -> Shares:
+    robot = surveyed_arm()
+    zero = Effect.at(robot, "joint_offset", SHOULDER, values=[0.03])
+    scale = Effect.at(robot, "joint_scale", ELBOW, values=[0.005])
+    start = start_of(robot, scattered(robot, 5, 120), (zero, scale), 5)
+    fit = start.with_causes([zero, scale]).tolerating(Scales()).settled()
+    return shares(start, fit, np.ones(120, dtype=np.bool_), None)
+
+
+def test_shares_add_up_to_the_whole(divided: Shares) -> None:
+    assert sum(divided.causes) + divided.links + divided.drives == pytest.approx(1.0)
+
+
+def test_a_zero_has_its_share_though_a_link_could_turn(divided: Shares) -> None:
+    zero, scale = divided.causes
+    assert zero > 0.8
+    assert scale > 0.005
+    assert divided.links + divided.drives < 0.05
+
+
+def _cause(joint: str, probability: float, share: float, gain: float) -> Cause:
+    rivals = (Indistinguishable("settling", joint, None, "this_motion", 1.0 - probability),)
+    return Cause("backlash", joint, None, {}, probability, share, gain, 100.0, (), rivals, "")
+
+
+def test_a_cause_of_little_weight_leaves_the_verdict_decided() -> None:
+    assert not _cause("a", 0.6, share=0.5, gain=1.2).leaves_open
+
+
+def test_a_cause_that_nothing_replaces_leaves_it_open() -> None:
+    assert _cause("a", 0.6, share=0.5, gain=18.0).leaves_open
+
+
+def test_what_weighs_most_comes_first() -> None:
+    causes = [_cause("small", 1.0, 1.0, 2.0), _cause("link", 1.0, 80.0, 0.0), _cause("play", 1.0, 4.0, 18.0)]
+    assert [cause.where for cause in in_order(causes)] == ["link", "play", "small"]
