@@ -42,8 +42,7 @@ REMEDIES: Mapping[Reason, str] = {
     Reason.NOT_ROUND: "Is a finger or a cable before its edge, or does it move too fast for the exposure? Light its "
     "dark side, and take a plain, matt ball.",
     Reason.NOT_STRAIGHT: "Glue the paper flat, and take away what covers an edge.",
-    Reason.MIRRORED: "Print the tag without mirroring (a transfer film's setting), and switch off mirroring of "
-    "the camera.",
+    Reason.MIRRORED: "Print the tag without mirroring, and switch off the camera's mirroring.",
     Reason.OTHER_FAMILY: "Set [vision.tag] dictionary to what is printed: the log names it. Or print a tag of that "
     "dictionary: `bodyschema marker print`.",
     Reason.LOW_CONTRAST: "More light, and a background that is neither black nor of its colour. A tag needs its white "

@@ -8,7 +8,7 @@ from pathlib import Path
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.effects import Motion, Simulation, load_simulation
-from bodyschema.effects.exports.geometry import geometry_of
+from bodyschema.effects.exports.arm_errors import geometry_of
 from bodyschema.effects.exports.link_parts import LinkParts
 from bodyschema.recordings.files import RERUN, of_robot
 from bodyschema.recordings.recording import Recording

@@ -16,9 +16,9 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray, ImageArray
 from bodyschema.sim_backend.bullet import Body
+from bodyschema.sim_backend.geometry import quaternion_of, turn_of_z
 
 from .eye import TO_LIGHT, StereoEyes
-from .geometry import quaternion_of, turn_of_z
 from .raster import Raster
 from .render_messages import SLOTS, Frame, Message, Setup, Tool, frame_bytes, receive, slot_images
 
