@@ -32,7 +32,7 @@ RARELY_NEEDED = (
     "bodyschema.dashboard",
     "bodyschema.fleet",
     "bodyschema.reproduce",
-    "bodyschema.recordings.rerun",
+    "bodyschema.recordings.rerun_export",
     "bodyschema.__main__",
 )
 PR_SET_PDEATHSIG = 1
