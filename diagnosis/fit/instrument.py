@@ -23,6 +23,9 @@ def reshaped(fit: Fit) -> Observations | None:
     """
     observations, rows = fit.observations, fit.noise.weights >= 0.5
     variances, axes = np.linalg.eigh(observations.stated)
+    if np.allclose(variances[:, 0], variances[:, 2]):
+        # No shape is stated, and few rows with many parameters do not tell one.
+        return None
     left = np.einsum("nji,nj->ni", axes, observations.x - fit.predicted)[rows]
     rounding = np.einsum("nji,njk,nki->ni", axes, observations.rounding, axes)[rows]
     stated = observations.stated_factor**2 * variances[rows]

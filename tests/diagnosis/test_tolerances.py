@@ -9,15 +9,13 @@ import numpy as np
 import pytest
 from planted_cases import ELBOW, SHOULDER, desk_arm, measured, motion_of, scattered, start_of, surveyed_arm
 
-from bodyschema.diagnosis.assess.explanation import Explanation, useful
+from bodyschema.diagnosis.assess.explanation import _is_told
 from bodyschema.diagnosis.diagnosis import diagnose
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.background import Scales
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.diagnosis.report.result import DiagnosisFile
-from bodyschema.diagnosis.search.held_out import Blocks
-from bodyschema.diagnosis.search.search import Search
 from bodyschema.diagnosis.search.together import beyond_tolerances
 from bodyschema.effects import Effect, Simulation, load_simulation, write_extended
 from bodyschema.interfaces.errors import ConfigError
@@ -157,15 +155,9 @@ def test_tolerances_cannot_stand_for_a_moment(robot: RobotDescription) -> None:
     assert beyond_tolerances(fit, fit.causes[0], doubt=4.0) is None
 
 
-def test_a_link_within_tolerances_is_less_probable_than_they_are(robot: RobotDescription) -> None:
-    rng = np.random.default_rng([7, 8])
-    q = rng.uniform(0.7 * robot.lower, 0.7 * robot.upper, (ROWS, len(robot.joints)))
-    x = Simulation(robot, (), None, made(robot, rng)).positions(motion_of(q))
-    recording = measured(robot, motion_of(q), x + NOISE_M * rng.normal(size=x.shape))
-    start = aligned(Observations.of(recording, Simulation(robot)), Simulation(robot))
-    links = [Effect.at(robot, "link_geometry", joint) for joint in (SHOULDER, ELBOW)]
-    # Links that have taken the place of all tolerances.
-    fit = start.with_causes(links).tolerating(Scales(0.1, 0.1, 0.1))
-    told = useful(Explanation(fit, None, 0.0), Search(links, lambda _: None), Blocks.cut(ROWS), lambda _: None)
-    assert told.fit.causes == ()
-    assert max(told.fit.background.scales or Scales()) > 0.5
+@pytest.mark.parametrize(
+    ("name", "loss", "told"),
+    [("link_geometry", 0.01, False), ("link_geometry", 0.4, True), ("joint_eccentricity", 0.01, True)],
+)
+def test_a_slight_gain_keeps_no_link_that_tolerances_explain(robot: RobotDescription, name, loss, told) -> None:
+    assert _is_told(Effect.at(robot, name, ELBOW), False, loss) is told
