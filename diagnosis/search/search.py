@@ -30,7 +30,7 @@ _ASKED_EACH = 3
 # Maximum of sets of causes to examine; none is examined twice.
 _MOST_SETS = 60
 # Multiple of a limit, and the margin to it [nats], beyond which the first order decides.
-# With 0.3 to 3 times these, four recordings had the same causes, probabilities to 0.001 and RMS to 0.01 %.
+# With 0.3 to 3 times these, three recordings had the same causes, probabilities to 0.001 and RMS to 0.01 %.
 _CLEARLY, _AT_LEAST = 2.0, 10.0
 Key = tuple[str, str | None, str | None]
 Named = frozenset[tuple[Key, int]]
