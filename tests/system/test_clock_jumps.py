@@ -14,7 +14,7 @@ from bodyschema.recordings.store.store import PairReader
 HOUR_S, YEAR_S = 3600, 31_557_600
 # Ahead, back before the start, years ahead as from a dead battery to the time of the network, and right again.
 JUMPS_S = (HOUR_S, -HOUR_S, 20 * YEAR_S, -40 * YEAR_S, 0)
-BETWEEN = 6
+BETWEEN = 12
 
 
 @pytest.mark.parametrize(
