@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 import pytest
-from guided_arm import NOW_AND_THEN, built_chain, make_pair, near, new_learning, nominal_model, path, teach
+from guided_arm import built_chain, make_pair, near, new_learning, nominal_model, path, teach
 
 from bodyschema.daemon.learner.solver_process import SolverProcess
 from bodyschema.interfaces.records import FloatArray, Pair
@@ -51,7 +51,7 @@ def arm() -> SaggingArm:
 @pytest.fixture(scope="module")
 def taught(arm: SaggingArm) -> OnlineLearner:
     learning = new_learning()
-    teach(learning, arm.pairs(slice(0, PAIRS)), every=NOW_AND_THEN)
+    teach(learning, arm.pairs(slice(0, PAIRS)), every=10)
     return learning
 
 
@@ -99,7 +99,7 @@ def test_what_the_arm_yields_stays_known_with_another_tool(arm: SaggingArm, taug
     learning.restore(taught.state())
     learning.tool_changed()
     marker = arm.chain.with_tool(TOOL)
-    teach(learning, arm.pairs(slice(PAIRS, PAIRS + 60), marker), every=NOW_AND_THEN)
+    teach(learning, arm.pairs(slice(PAIRS, PAIRS + 60), marker), every=10)
     assert learning.snapshot.answering == RESIDUAL
     snapshot = learning.snapshot
     assert arm.error_m(snapshot.require_model(), marker) < 0.6 * arm.error_m(snapshot.require_map(), marker)
