@@ -59,7 +59,7 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
         causes=causes,
         rejected=_rejected(diagnosis),
         unexplained=_unexplained(diagnosis),
-        stability=_stability(diagnosis),
+        stability=_stability(diagnosis, causes),
         advice=advice(diagnosis),
         limitations=_limitations(diagnosis),
         alike=_alike(diagnosis),
@@ -277,8 +277,9 @@ def _alike(diagnosis: Diagnosis) -> tuple[Alike, ...]:
     )
 
 
-def _stability(diagnosis: Diagnosis) -> Stability | None:
-    again = [standing.again for standing in diagnosis.standings]
+def _stability(diagnosis: Diagnosis, causes: tuple[Cause, ...]) -> Stability | None:
+    # Outliers come last and have no standing.
+    again = [standing.again for cause, standing in zip(causes, diagnosis.standings, strict=False) if not cause.is_small]
     return Stability(len(again[0]), int(np.all(again, axis=0).sum())) if again else None
 
 

@@ -180,7 +180,7 @@ class Errors(msgspec.Struct, frozen=True):
 
 
 class Stability(msgspec.Struct, frozen=True):
-    """Number of block resamplings that give the same causes."""
+    """Number of block resamplings that give the same causes, small ones aside; None where all are small."""
 
     resampled: int
     same_causes: int
