@@ -47,4 +47,6 @@ def named_again(fit: Fit, nothing: Instead, rivals: Sequence[Instead], blocks: B
 def _worths(fit: Fit, instead: Instead, blocks: Blocks, drawn: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the evidence gain of an alternative over the cause (draws,) [nats]."""
     gains = 2.0 * (drawn @ blocks.sums(instead.fit.row_log_likelihoods - fit.row_log_likelihoods))
+    # Larger tolerances can stand for a cause row by row; what they cost does not depend on the rows drawn.
+    gains += 2.0 * (fit.prior_cost - instead.fit.prior_cost)
     return np.array([nats(float(gain), instead.dof) for gain in gains]) - instead.doubt

@@ -155,9 +155,14 @@ class Fit:
     @property
     def log_likelihood(self) -> float:
         """Log-likelihood of the observations, less the prior cost of large effects and tolerances [nats]."""
+        return self.noise.log_likelihood - self.prior_cost
+
+    @property
+    def prior_cost(self) -> float:
+        """Prior cost of large effects and tolerances [nats]."""
         beyond = 0.5 * float(self.background.precision @ np.square(self.tolerated))
         beyond += self.background.volume(self.noise.sigma)
-        return self.noise.log_likelihood - _cost(self.simulation.effects[self.nuisances :]) - beyond
+        return _cost(self.simulation.effects[self.nuisances :]) + beyond
 
     @cached_property
     def predicted(self) -> FloatArray:
