@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from planted_cases import ELBOW, SHOULDER, scattered, start_of, surveyed_arm
 
 from bodyschema.diagnosis.assess.shares import Shares, shares
@@ -50,3 +51,8 @@ def test_a_cause_that_nothing_replaces_leaves_it_open() -> None:
 def test_what_weighs_most_comes_first() -> None:
     causes = [_cause("small", 1.0, 1.0, 2.0), _cause("link", 1.0, 80.0, 0.0), _cause("play", 1.0, 4.0, 18.0)]
     assert [cause.where for cause in in_order(causes)] == ["link", "play", "small"]
+
+
+def test_fixes_that_are_not_the_marker_come_before_what_may_wait() -> None:
+    outliers = replace(_cause("outliers", 1.0, 0.0, 0.0), stability_percent=None)
+    assert [cause.where for cause in in_order([_cause("small", 1.0, 1.0, 2.0), outliers])] == ["outliers", "small"]
