@@ -16,6 +16,7 @@ from bodyschema.interfaces.errors import ConfigError, SourceError
 from bodyschema.interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame
 from bodyschema.vision.config import VisionConfig
 from bodyschema.vision.pose import PoseEstimator, Sighting, mirrored
+from bodyschema.vision.tags.bleed import bleed
 from bodyschema.vision.tags.body import TAG_CORNERS, TagBody
 from bodyschema.vision.tags.config import ClusterConfig, PlacedTag, TagConfig
 from bodyschema.vision.tags.edge import PIXEL_CUMULANT, blurred_step
@@ -161,6 +162,15 @@ def test_white_that_bleeds_into_black_makes_no_tag_smaller(look) -> None:
     assert isinstance(tag, TagImage)
     outward = (true - true.mean(axis=0)) / np.linalg.norm(true - true.mean(axis=0), axis=1)[:, None]
     assert abs(float(((tag.corners_px - true) * outward).sum(axis=1).mean())) < 0.06
+
+
+@pytest.mark.parametrize("level", [0, 128])
+@pytest.mark.parametrize("blur_px", [0.05, 2.0])
+def test_a_surface_of_one_grey_leaves_bleeding_unknown(level, blur_px) -> None:
+    grey, square = np.full((120, 160), level, np.uint8), 40.0 + 50.0 * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    moved, variance = bleed(grey, square, blur_px, np.zeros((6, 6)))
+    assert moved == 0.0
+    assert 0.0 < variance < np.inf
 
 
 def test_a_covered_pattern_leaves_bleeding_unknown() -> None:

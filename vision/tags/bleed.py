@@ -66,15 +66,19 @@ def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: Flo
     bled = np.hypot(slope_x, slope_y) - right * slope_x - below * slope_y
     lit = np.stack([np.ones_like(right), right, below])
     design = np.concatenate([lit, lit * pattern, [wider, bled]]).reshape(8, -1).T
-    found = np.linalg.solve(design.T @ design, design.T @ levels)
-    kept = np.abs(levels - design @ found) < 0.5 * found[3]  # the rest show the other colour
-    if found[3] <= 0.0 or kept.mean() < _FITS:
+    try:
+        found = np.linalg.solve(design.T @ design, design.T @ levels)
+        kept = np.abs(levels - design @ found) < 0.5 * found[3]  # the rest show the other colour
+        if not found[3] >= 1.0 or kept.mean() < _FITS:  # white is not one grey level brighter than black, or hidden
+            return unseen
+        cov = np.linalg.inv(design[kept].T @ design[kept])
+    except np.linalg.LinAlgError:  # too few modules, or too sharp, to tell shift and blur apart
         return unseen
-    cov = np.linalg.inv(design[kept].T @ design[kept])
     found = cov @ (design[kept].T @ levels[kept])
     spread = float(np.square(levels[kept] - design[kept] @ found).mean())
     moved = float(found[7] / found[3])
-    return moved, spread * float(cov[7, 7] / found[3] ** 2) * _SHARED**2 + (_DIFFERENT * moved) ** 2
+    variance = spread * float(cov[7, 7] / found[3] ** 2) * _SHARED**2 + (_DIFFERENT * moved) ** 2
+    return (moved, variance) if math.isfinite(variance) else unseen
 
 
 def _blurred(
