@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import BoolArray, FloatArray, frozen, rows_or_vector, vector
+from kbmaps.arrays import BoolArray, FloatArray, IntArray, frozen, rows_or_vector, vector
 from kbmaps.chains.chain import RigidChain
 from kbmaps.errors import ModelFormatError, SettingError
+from kbmaps.maps.kernels import FilterKernel, filter_kernel
 from kbmaps.packed import named, or_infinite, unless_infinite
-from kbmaps.rotations import cross_matrix, exponentials
+from kbmaps.rotations import SMALL_ANGLE, cross_matrix, exponentials
 
 # Finite stand-in for an infinite tolerance [rad, m]: far beyond anything real, and still a proper prior.
 WIDE = 10.0
 _FIXED_PARAMETERS = 9
 _JOINT_PARAMETERS = 5
+_CONSTANTS = 7  # that the filter's kernel takes; its linearisation reads the small angle alone
 _EYE = np.eye(3)
 
 
@@ -120,6 +122,7 @@ class ChainParameters:
         self._points = self._frames[:-1, :3, 3]
         self._tangents = tangents(self._axes)
         self._slides = np.flatnonzero(reference.prismatic)
+        self._kernel = self._kernel_of(np.arange(self.size))
 
     @property
     def tables(self) -> tuple[FloatArray, ...]:
@@ -192,9 +195,7 @@ class ChainParameters:
     def positions(self, change: ArrayLike, q: ArrayLike) -> FloatArray:
         """Return marker positions [m] (3,) at q (d,), or (n, 3) at (n, d)."""
         angles = rows_or_vector("q", q, self.reference.joints)
-        geometry = self._geometry(vector("change", change, self.size))
-        placed = self._placed(geometry, np.atleast_2d(angles) + geometry.zeros)
-        x = placed[-1, :, :3, :3] @ geometry.tip + placed[-1, :, :3, 3]
+        x = self._positions(vector("change", change, self.size), np.atleast_2d(angles))
         return x[0] if angles.ndim == 1 else x
 
     def jacobian(self, change: ArrayLike, q: ArrayLike) -> FloatArray:
@@ -215,6 +216,10 @@ class ChainParameters:
         axis to the marker, a tilt of the axis about u moves the marker by (R_k u − R_{k+1} u) × r, a shift by v moves
         it by R_k v − R_{k+1} v.
         """
+        if self._kernel is not None:
+            x, jacobian = np.empty((len(q), 3)), np.empty((len(q), 3, self.size))
+            self._kernel.linearise(np.ascontiguousarray(change), np.ascontiguousarray(q), x, jacobian)
+            return x, jacobian
         geometry = self._geometry(change)
         angles = q + geometry.zeros
         placed = self._placed(geometry, angles)
@@ -240,6 +245,21 @@ class ChainParameters:
         jacobian[:, :, self.tool] = rotations[-1] @ self._frames[-1, :3, :3]
         return x, jacobian
 
+    def lineariser(self, columns: IntArray) -> Callable[[FloatArray, FloatArray, FloatArray, FloatArray], None]:
+        """Return a function of change (size,), q (n, d), x (n, 3) and jacobian (n, 3, p), all contiguous.
+
+        It writes the positions to x, and their derivatives by the p parameters `columns` to jacobian.
+        """
+        kernel = self._kernel_of(columns)
+        if kernel is not None:
+            return kernel.linearise
+
+        def linearise(change: FloatArray, q: FloatArray, x: FloatArray, jacobian: FloatArray) -> None:
+            x[...], every = self.linearised(change, q)
+            jacobian[...] = every[:, :, columns]
+
+        return linearise
+
     def turned(self, change: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return rotations R (n, 3, 3) of the marker frame at q (n, d), and Ω (n, 3, size); inputs are not checked.
 
@@ -257,6 +277,20 @@ class ChainParameters:
         axes[self._slides] = 0.0
         omega[:, :, self.zeros] = axes.transpose(1, 2, 0)
         return rotations[-1] @ self._frames[-1, :3, :3], omega
+
+    def _kernel_of(self, columns: IntArray) -> FilterKernel | None:
+        scales = np.zeros(self.size)
+        scales[columns] = 1.0
+        return filter_kernel(*self.tables, scales, scales, np.full(_CONSTANTS, SMALL_ANGLE))
+
+    def _positions(self, change: FloatArray, q: FloatArray) -> FloatArray:
+        if self._kernel is not None:
+            x = np.empty((len(q), 3))
+            self._kernel.linearise(np.ascontiguousarray(change), np.ascontiguousarray(q), x, None)
+            return x
+        geometry = self._geometry(change)
+        placed = self._placed(geometry, q + geometry.zeros)
+        return placed[-1, :, :3, :3] @ geometry.tip + placed[-1, :, :3, 3]
 
     def _geometry(self, change: FloatArray) -> _Geometry:
         d = self.reference.joints

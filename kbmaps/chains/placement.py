@@ -9,8 +9,9 @@ import numpy as np
 
 from kbmaps.arrays import BoolArray, FloatArray, IntArray
 from kbmaps.chains.chain import RigidChain
+from kbmaps.chains.parameters import ChainParameters
 from kbmaps.robust import MEDIAN_NORM, ROUNDING_M
-from kbmaps.rotations import cross_matrix, exponentials
+from kbmaps.rotations import cross_matrix, exponentials, rotation_vectors
 
 _STEPS = 30
 # Weights start nearly as in least squares; their scale halves with each step down to this many sigma.
@@ -94,7 +95,10 @@ class _Fitter:
     """Minimiser of the weighted sum of squares over sigma² plus the prior's term for joint offsets and marker."""
 
     def __init__(self, chain: RigidChain, q: FloatArray, x: FloatArray, information: FloatArray) -> None:
-        self._chain, self._q, self._x, self._information = chain, q, x, information
+        self._q, self._x, self._information = np.ascontiguousarray(q), x, information
+        self._parameters = p = ChainParameters(chain)
+        self._columns = np.r_[p.base_turn, p.base_shift, p.zeros, p.tool]
+        self._linearise = p.lineariser(self._columns)
         # The rank lies above the median by the number of pairs that the parameters can always explain.
         self._middle = min(q.shape[1] // 2 + len(information) // 6, q.shape[1] - 1)
 
@@ -123,9 +127,10 @@ class _Fitter:
         return Placements(state.rotations, state.shifts, state.zeros, state.tools, state.distances)
 
     def _start(self, every: IntArray, tools: FloatArray) -> _State:
-        count, n, d = self._q.shape
-        poses = self._chain.poses(self._q.reshape(-1, d)).reshape(count, n, 4, 4)
-        drawn = poses[..., :3, 3] + (poses[..., :3, :3] @ tools[:, None, :, None])[..., 0]
+        count, _, d = self._q.shape
+        changes = np.zeros((count, self._parameters.size))
+        changes[:, self._parameters.tool] = tools
+        drawn = np.stack([self._parameters.positions(*reading) for reading in zip(changes, self._q, strict=True)])
         centred = drawn - drawn.mean(axis=1, keepdims=True)
         covariance = centred.swapaxes(1, 2) @ (self._x - self._x.mean(axis=1, keepdims=True))
         u, _, vt = np.linalg.svd(covariance)
@@ -148,23 +153,16 @@ class _Fitter:
     def _at(
         self, rows: IntArray, rotations: FloatArray, shifts: FloatArray, zeros: FloatArray, tools: FloatArray
     ) -> _State:
-        chain, (count, n, d) = self._chain, self._q[rows].shape
-        frames = chain.frames((self._q[rows] + zeros[:, None]).reshape(-1, d)).reshape(count, n, d + 1, 4, 4)
-        turned = rotations[:, None] @ frames[:, :, -1, :3, :3]
-        base = (rotations[:, None] @ frames[:, :, -1, :3, 3, None])[..., 0]
-        marker = base + (turned @ tools[:, None, :, None])[..., 0]
-        places = np.einsum("sij,snkj->snki", rotations, frames[:, :, :-1, :3, 3])
-        axes = np.einsum("sil,snklj,kj->snki", rotations, frames[:, :, :-1, :3, :3], chain.axes, optimize=True)
-        moved = np.where(chain.prismatic[:, None], axes, np.cross(axes, marker[:, :, None] - places))
-        jacobian = np.empty((count, n, 3, 9 + d))
-        jacobian[..., :3] = cross_matrix(-marker)
-        jacobian[..., 3:6] = np.eye(3)
-        jacobian[..., 6:-3] = moved.swapaxes(2, 3)
-        jacobian[..., -3:] = turned
-        residuals = self._x[rows] - marker - shifts[:, None]
-        return _State(
-            rotations, shifts, zeros, tools, residuals.reshape(count, 3 * n), jacobian.reshape(count, 3 * n, 9 + d)
-        )
+        count, n, _ = self._q[rows].shape
+        changes = np.zeros((count, self._parameters.size))
+        changes[:, self._columns] = np.concatenate([rotation_vectors(rotations), shifts, zeros, tools], axis=1)
+        markers, jacobian = np.empty((count, n, 3)), np.empty((count, n, 3, len(self._columns)))
+        for k, row in enumerate(rows):
+            self._linearise(changes[k], self._q[row], markers[k], jacobian[k])
+        # A step turns the frame as it is, and does not add to its rotation vector.
+        jacobian[..., :3] = cross_matrix(shifts[:, None] - markers)
+        residuals = (self._x[rows] - markers).reshape(count, 3 * n)
+        return _State(rotations, shifts, zeros, tools, residuals, jacobian.reshape(count, 3 * n, -1))
 
     def _step(self, state: _State, rows: IntArray, weights: FloatArray, damping: FloatArray) -> FloatArray:
         weighted = state.jacobian[rows] * weights[..., None]

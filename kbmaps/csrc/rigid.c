@@ -1,4 +1,4 @@
-/* kbmaps._kernels.RigidFilter: the loop of kbmaps.chains.rigid_filter. */
+/* kbmaps._kernels.RigidFilter: the loops of kbmaps.chains.rigid_filter and of kbmaps.chains.parameters. */
 #include "chain.h"
 
 typedef struct {
@@ -248,6 +248,48 @@ static PyObject *filter_learn_one(Filter *self, PyObject *const *args, index_t c
     return Py_BuildValue("(dd)", noise_square, coordinates);
 }
 
+/* Positions (n, 3) at q (n, d) and, unless that is NULL, derivatives (n, 3, active). */
+FAST static void linearise_rows(const Filter *self, const double *change, const double *q, index_t n, double *numbers,
+                                double *x, double *jacobian)
+{
+    for (index_t i = 0; i < n; i++, q += self->joints, x += 3)
+        if (jacobian == NULL)
+            locate(self, change, q, x);
+        else
+            linearise(self, change, q, numbers, x, jacobian + 3 * self->active * i);
+}
+
+/* linearise(change, q, x, jacobian) writes positions to x (n, 3), and derivatives to jacobian (n, 3, active) or None. */
+static PyObject *filter_linearise(Filter *self, PyObject *const *args, index_t count)
+{
+    Py_buffer views[4];
+    index_t elements[4] = {self->size, -1, -1, -1};
+    if (count != 4)
+        return PyErr_Format(PyExc_TypeError, "four arguments are needed");
+    int wanted = args[3] != Py_None, given = wanted ? 4 : 3;
+    if (!take_all(args, views, elements, given))
+        return NULL;
+    index_t n = views[2].len / (3 * (index_t)sizeof(double));
+    double *numbers = malloc((size_t)(JOINT_NUMBERS * self->joints) * sizeof(double));
+    int sound = views[2].len == 3 * n * (index_t)sizeof(double) && 3 * views[1].len == self->joints * views[2].len &&
+                !views[2].readonly && (!wanted || (views[3].len == self->active * views[2].len && !views[3].readonly));
+    if (numbers == NULL) {
+        PyErr_NoMemory();
+    } else if (!sound) {
+        PyErr_SetString(PyExc_TypeError, "q, x and jacobian must be of one length, and the last two writable");
+    } else {
+        PyThreadState *thread = n > 1 ? PyEval_SaveThread() : NULL;
+        linearise_rows(self, views[0].buf, views[1].buf, n, numbers, views[2].buf, wanted ? views[3].buf : NULL);
+        if (thread != NULL)
+            PyEval_RestoreThread(thread);
+    }
+    free(numbers);
+    release_all(views, given);
+    if (PyErr_Occurred())
+        return NULL;
+    Py_RETURN_NONE;
+}
+
 static int find_active(Filter *self)
 {
     self->places = malloc((size_t)self->size * sizeof(index_t));
@@ -301,6 +343,7 @@ static void filter_dealloc(Filter *self)
 static PyMethodDef filter_methods[] = {
     {"learn", (PyCFunction)(void (*)(void))filter_learn, METH_FASTCALL, NULL},
     {"learn_one", (PyCFunction)(void (*)(void))filter_learn_one, METH_FASTCALL, NULL},
+    {"linearise", (PyCFunction)(void (*)(void))filter_linearise, METH_FASTCALL, NULL},
     {NULL, NULL, 0, NULL},
 };
 

@@ -35,7 +35,7 @@ class NetKernel(Protocol):
 
 
 class FilterKernel(Protocol):
-    """Compiled update of a `RigidFilter` with pairs.
+    """Compiled update of a `RigidFilter` with pairs, and linearisation of its chain.
 
     `learn` returns the number of learnt pairs, the noise² and the number of coordinates that this rests on. `learn_one`
     checks its pair and writes it to a row (d + 4). It returns None, and changes nothing, if the pair is not float64 of
@@ -68,6 +68,10 @@ class FilterKernel(Protocol):
         noise_coordinates: float,
         /,
     ) -> tuple[float, float] | None: ...
+
+    def linearise(self, change: FloatArray, q: FloatArray, x: FloatArray, jacobian: FloatArray | None, /) -> None:
+        """Write positions to x (n, 3), and derivatives by the active parameters to jacobian (n, 3, p) unless None."""
+        ...
 
 
 class _Compiled(Protocol):
@@ -139,7 +143,7 @@ def net_kernel(stack: BasisStack, planes: FloatArray, check_q: Check, check_x: C
 
 
 def filter_kernel(*arrays: FloatArray) -> FilterKernel | None:
-    """Return the compiled loop of `RigidFilter`, if that is the path."""
+    """Return the compiled loops of `RigidFilter`, if that is the path."""
     compiled = _chosen.get()
     return None if compiled is None else compiled.RigidFilter(*(np.ascontiguousarray(array) for array in arrays))
 

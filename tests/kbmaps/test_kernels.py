@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from planted_chains import bases_for, random_map, random_q
+from planted_chains import bases_for, random_chain, random_map, random_q
 from rough_arms import ROUGH, rough_arm
 
-from kbmaps import NLMS, KBMap, KBMapsError, RecursiveRigidLearner, SettingError, kernels_in_use
+from kbmaps import NLMS, ChainParameters, KBMap, KBMapsError, RecursiveRigidLearner, SettingError, kernels_in_use
 from kbmaps.maps import kernels
 
 seeds = st.integers(0, 2**32 - 1)
@@ -85,6 +85,34 @@ def test_recursive_rigid_learners_agree_to_rounding(seed, joint_kinds, sigma, ju
     expected, got = one.estimate(q), other.estimate(q)
     np.testing.assert_allclose(got.x, expected.x, rtol=0, atol=1e-9)
     np.testing.assert_allclose(got.sigma, expected.sigma, rtol=1e-5, atol=1e-9)
+
+
+@needs_both
+@given(seed=seeds, joint_kinds=kinds, size=st.sampled_from([0.0, 1e-4, 0.5]), rows=st.sampled_from([0, 1, 7]))
+def test_positions_and_derivatives_of_a_changed_chain_agree_to_rounding(seed, joint_kinds, size, rows):
+    rng = np.random.default_rng(seed)
+    chain, q = random_chain(rng, joint_kinds), random_q(rng, joint_kinds, rows, 170)
+    one, other = on_both_paths(lambda: ChainParameters(chain))
+    change = size * rng.normal(size=one.size)
+    for expected, got in zip(one.linearised(change, q), other.linearised(change, q), strict=True):
+        np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(other.positions(change, q), one.positions(change, q), rtol=0, atol=1e-12)
+
+
+@needs_both
+def test_the_derivatives_by_some_parameters_are_those_columns():
+    rng = np.random.default_rng(0)
+    chain, q = random_chain(rng, "RPR"), random_q(rng, "RPR", 5, 170)
+    change, columns = rng.normal(size=ChainParameters(chain).size), np.array([1, 7, 20])
+
+    def chosen() -> np.ndarray:
+        x, jacobian = np.empty((5, 3)), np.empty((5, 3, 3))
+        ChainParameters(chain).lineariser(columns)(change, q, x, jacobian)
+        return jacobian
+
+    every = ChainParameters(chain).linearised(change, q)[1]
+    for jacobian in on_both_paths(chosen):
+        np.testing.assert_allclose(jacobian, every[:, :, columns], rtol=0, atol=1e-12)
 
 
 BAD_VECTORS = [
