@@ -1,4 +1,4 @@
-"""The command `bodyschema`. Commands are imported when they run, so that `--help` is fast."""
+"""The command `bodyschema`. Commands, and what parses them, are imported when they run, so that `--help` is fast."""
 
 from __future__ import annotations
 
@@ -11,56 +11,19 @@ from collections.abc import Sequence
 try:
     import resource
     import shutil
-    from typing import NoReturn
+    from functools import cache
+    from typing import TYPE_CHECKING, NoReturn
 
-    import cyclopts
-
+    from bodyschema.cli.front_page import ASCII, COMMANDS, GROUPS, HELP, UNICODE, front_page
     from bodyschema.daemon.service.remedies import as_typed, printable
     from bodyschema.daemon.service.signals import end_with_parent
     from bodyschema.interfaces.errors import BodyschemaError, ConfigError
-    from bodyschema.interfaces.extras import missing_module
-except KeyboardInterrupt:  # loading takes a quarter of a second, in which no `main` can catch it
+except KeyboardInterrupt:  # loading takes a moment, in which no `main` can catch it
     sys.exit(130)
 
-GROUPS = {
-    "Start": {
-        "demo": "Learn a simulated arm from scratch, in about a minute.",
-        "init": "Write robot.toml: begin here.",
-        "config": "Check or show robot.toml.",
-        "doctor": "Check ports, servos, disk, clock and network.",
-    },
-    "Calibrate and diagnose": {
-        "calibrate": "Calibrate arm, hand-eye and tool, or cameras.",
-        "diagnose": "Find what the simulation gets wrong, and the causes.",
-        "replay": "Learn from a recording; report the held-out error.",
-        "simulate": "Predict the marker for recorded joint angles.",
-        "compare": "Compare two recordings row by row.",
-        "marker": "Print tags; learn a cluster's shape or a ball's colour.",
-        "reproduce": "Run the paper's experiments again.",
-    },
-    "Run": {
-        "run": "Run sampler and learner, or one of them.",
-        "status": "Show the state of sampler and learner.",
-        "view": "Serve a live page: errors, next poses, controls.",
-        "predict": "Predict the marker position at given joint angles.",
-        "ik": "Find joint angles that bring the marker to a position.",
-        "command": "Pause, resume, report a tool change, reset.",
-        "install": "Install systemd services, or udev rules.",
-        "router": "Run the zenoh router that connects several machines.",
-    },
-    "Hardware": {
-        "scan": "Find servos on all ports, rates and protocols.",
-        "watch": "Show joints, cameras or other marker sources live.",
-        "servos": "Read and write servo EEPROM settings, with undo.",
-        "bench": "Emulate the servos of robot.toml on a port.",
-    },
-    "Data and fleet": {
-        "record": "Save the running sampler's pairs to a file.",
-        "export": "Convert pairs or a robot: CSV, Parquet, MCAP, MJCF, URDF.",
-        "backup": "Save pairs, checkpoint and robot.toml, or restore them.",
-        "fleet": "List, compare and diagnose many robots.",
-    },
-}
+if TYPE_CHECKING:
+    import cyclopts
+
 # Names of earlier releases, for one more.
 RENAMED = {
     ("config", "init"): ("init",),
@@ -82,23 +45,19 @@ RENAMED = {
     ("fleet", "compare"): ("fleet", "--compare"),
     ("fleet", "diagnose"): ("fleet",),
 }
-COMMANDS = {name: summary for group in GROUPS.values() for name, summary in group.items()}
 # In cli/commands/, a folder for each group.
 _FOLDERS = dict(zip(GROUPS, ("start", "calibrate", "run", "hardware", "data"), strict=True))
 MODULES = {
     name: f"bodyschema.cli.commands.{_FOLDERS[title]}.{name}" for title, group in GROUPS.items() for name in group
 }
-# One object each: commands that are apps keep theirs, and two of the same name are refused.
-_SECTIONS = {title: cyclopts.Group(title, sort_key=place) for place, title in enumerate(GROUPS)}
 
 
-# Each paragraph is one line: the terminal's width wraps it.
-_HELP = """Calibrate a robot arm by moving it by hand in front of a camera.
+@cache
+def _section(title: str) -> cyclopts.Group:
+    """Return a group of commands: one object each, since two of the same name are refused and commands keep theirs."""
+    import cyclopts
 
-Joint encoders and a stereo camera give samples. A learner turns them into the forward kinematics that the camera \
-sees, hand-eye and tool included.
-
-New here? Type: bodyschema demo. Each command's --help says what it needs and what comes next."""
+    return cyclopts.Group(title, sort_key=list(GROUPS).index(title))
 
 
 def command_line(called: str | None = None) -> cyclopts.App:
@@ -108,15 +67,17 @@ def command_line(called: str | None = None) -> cyclopts.App:
         called: the command whose own help page may be requested. A summary given here would replace that page, so this
             command is registered without one and shows its function's docstring.
     """
+    import cyclopts
+
     line = cyclopts.App(
         name="bodyschema",
-        help=_HELP,
+        help=HELP,
         version=_version,
         help_format="markdown" if called in COMMANDS else "plaintext",  # rendering markdown takes 0.1 s of CPU
     )
     line["--help"].group = line["--version"].group = cyclopts.Group("Options", sort_key=len(GROUPS))
     for title, commands in GROUPS.items():
-        group = _SECTIONS[title]
+        group = _section(title)
         for order, (name, summary) in enumerate(commands.items()):
             own = None if name == called else summary
             line.command(f"{MODULES[name]}:{name}", name=name, help=own, group=group, sort_key=order)
@@ -139,7 +100,13 @@ def _version() -> str:
     return version("bodyschema")
 
 
-app = command_line()
+@cache
+def __getattr__(name: str) -> cyclopts.App:
+    """Return `app`, the command line in which no command is called."""
+    if name != "app":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return command_line()
+
 
 # A learner with two neighbours opens 26 files, one of fifty robots 200. Libraries abort when they cannot open more.
 FEWEST_FILES, ENOUGH_FILES = 64, 1024
@@ -183,6 +150,13 @@ def prepare_streams() -> None:
         os.environ["COLUMNS"] = str(max(columns, NARROWEST))
 
 
+def _print_front_page() -> None:
+    """Print the page of `--help` in colour on a terminal, unless the environment forbids it."""
+    colour = sys.stdout.isatty() and "NO_COLOR" not in os.environ and os.environ.get("TERM") not in ("dumb", "unknown")
+    signs = UNICODE if sys.stdout.encoding.lower().startswith("utf") else ASCII
+    sys.stdout.write(front_page(shutil.get_terminal_size().columns, colour=colour, signs=signs))
+
+
 def _told(error: OSError) -> BodyschemaError:
     """Return an error of the system that no command expects in one line."""
     said = error.strerror or str(error)
@@ -217,12 +191,17 @@ def main() -> None:
         allow_enough_files()
         arguments = present_names(sys.argv[1:])
         try:
-            command_line(arguments[0] if arguments else None)(arguments)
+            if arguments in ([], ["--help"], ["-h"]):
+                _print_front_page()
+            else:
+                command_line(arguments[0])(arguments)
         finally:
             sys.stdout.flush()
     except BodyschemaError as error:
         _fail(error)
     except ModuleNotFoundError as error:
+        from bodyschema.interfaces.extras import missing_module
+
         missing = missing_module(error)
         if missing is None:
             raise

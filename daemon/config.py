@@ -11,13 +11,13 @@ import os
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from bodyschema.drivers.config import MARKER_SOURCE, AnySource, DriversConfig, source_tables
-from bodyschema.effects import Simulation, simulation_of
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.robot.calibrated_files import EXTENSIONS
@@ -30,6 +30,9 @@ from bodyschema.vision.config import VisionConfig
 
 from .transport.identity import Route
 from .transport.zenoh_config import ZenohConfig
+
+if TYPE_CHECKING:
+    from bodyschema.effects import Simulation
 
 ENVIRONMENT = "BODYSCHEMA_"
 # Control points of a map that the learner keeps up with: 12 joints that turn. Learning and replaying a pair take 25 ms
@@ -99,14 +102,14 @@ class Config:
     """Everything that robot.toml says, checked.
 
     Attributes:
-        simulation: the robot with the effects that the file adds to it.
+        extended: the robot with the effects that the file adds to it, if it adds any.
         given_state_dir: the place for store and checkpoint that the command line gave, if it gave one.
     """
 
     file: Path
     robot: RobotDescription
     tables: Tables
-    simulation: Simulation
+    extended: Simulation | None = None
     given_state_dir: Path | None = None
 
     @classmethod
@@ -124,7 +127,11 @@ class Config:
                 raise ConfigError(f"unknown table [{name}]", file=file, line=line, remedy=did_you_mean(name, known))
         overridden = _override(raw, [name for name in known if name not in (*EXTENSIONS, MARKER_SOURCE)], environment)
         robot = RobotDescription.from_tables(overridden, text, file)
-        simulation = simulation_of(robot, overridden, text)
+        extended = None
+        if overridden.keys() & set(EXTENSIONS):
+            from bodyschema.effects import simulation_of
+
+            extended = simulation_of(robot, overridden, text)
         if MARKER_SOURCE in raw:
             overridden[MARKER_SOURCE] = source_tables(raw[MARKER_SOURCE], file, text)
         tables = convert(overridden, Tables, file=file, text=text)
@@ -146,7 +153,14 @@ class Config:
                 remedy="Give metres",
             )
         _require_size(robot, tables, overridden.get("vision", {}), file, text)
-        return cls(file, robot, tables, simulation)
+        return cls(file, robot, tables, extended)
+
+    @cached_property
+    def simulation(self) -> Simulation:
+        """The robot with the effects that the file adds to it, imported late because few commands need them."""
+        from bodyschema.effects import Simulation
+
+        return self.extended or Simulation(self.robot)
 
     def require_learnable(self) -> None:
         """ConfigError when there are more joints than the learner can keep up with."""

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 
-from bodyschema.interfaces import old_names
 from bodyschema.interfaces.errors import ConfigError
 
 from .suggest import did_you_mean
@@ -67,6 +66,8 @@ def installed(group: Group) -> tuple[EntryPoint, ...]:
 
     found = tuple(entry_points(group=group))
     if found:
+        from bodyschema.interfaces import old_names
+
         old_names.allow()
     return found
 

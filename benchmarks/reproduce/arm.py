@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from bodyschema.daemon.config import Config, DaemonConfig, Tables
 from bodyschema.daemon.wiring.wiring import demonstration_model
-from bodyschema.effects import Simulation
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.toml_file import read_toml
@@ -60,7 +59,7 @@ def configuration(joints: Sequence[str], state_dir: Path, rules: DaemonConfig, *
     tables["sim"] = {**tables.get("sim", {}), "seed": sim_seed}
     robot = RobotDescription.from_tables(tables, text, file)
     parsed = msgspec.structs.replace(msgspec.convert(tables, Tables), daemon=rules)
-    return Config(file, robot, parsed, Simulation(robot)).with_state_dir(state_dir)
+    return Config(file, robot, parsed).with_state_dir(state_dir)
 
 
 def arm(joints: int | Sequence[str]) -> RigidChain:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -13,6 +14,7 @@ from cyclopts import CycloptsError
 from small_arm import URDF, write_small_arm
 
 from bodyschema.cli.commands.options import print_json
+from bodyschema.cli.front_page import ASCII, UNICODE, front_page
 from bodyschema.cli.main import COMMANDS, MODULES, RENAMED, app, command_line, present_names
 from bodyschema.cli.terminal.screen import two_digits
 from bodyschema.daemon.config import Config
@@ -37,14 +39,61 @@ def robot(tmp_path: Path, free_endpoint) -> Path:
     )
 
 
-def test_help_loads_nothing_that_takes_long(tmp_path) -> None:
-    shown = subprocess.run(
-        [sys.executable, "-X", "importtime", "-m", "bodyschema", "--help"],
-        capture_output=True, text=True, timeout=LIMIT_S, check=True, cwd=tmp_path,
+def loaded_by(*lines: list[str], cwd: Path) -> set[str]:
+    """Return the modules that a process has imported after running these command lines."""
+    code = """
+import json, sys
+from bodyschema.cli.main import main
+for words in json.loads(sys.argv[1]):
+    sys.argv[1:] = words
+    try:
+        main()
+    except SystemExit:
+        pass
+print(*sys.modules)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code, json.dumps(lines)],
+        capture_output=True, text=True, timeout=LIMIT_S, check=True, cwd=cwd,
     )  # fmt: skip
-    loaded = {line.split("|")[-1].strip().split(".")[0] for line in shown.stderr.splitlines()}
-    assert "cyclopts" in loaded
-    assert not loaded & {"numpy", "scipy", "cv2", "zenoh", "msgspec", "serial", "pybullet", "matplotlib"}
+    return set(done.stdout.splitlines()[-1].split())
+
+
+def test_help_loads_nothing_that_takes_long(tmp_path) -> None:
+    loaded = loaded_by(["--help"], cwd=tmp_path)
+    assert "bodyschema.cli.front_page" in loaded
+    assert loaded & {"cyclopts", "rich", "attr", "numpy", "zenoh", "msgspec", "ctypes", "inspect"} == set()
+    assert len(loaded) < 100
+
+
+def test_status_and_predict_load_neither_effects_nor_solvers(robot) -> None:
+    loaded = loaded_by(["status"], ["predict", "0", "0"], cwd=robot.parent)
+    assert {"bodyschema.cli.commands.run.status", "bodyschema.cli.commands.run.predict", "zenoh"} <= loaded
+    heavy = {
+        "bodyschema.effects",
+        "kbmaps.chains.parameters",
+        "scipy",
+        "cv2",
+        "serial",
+        "rich.live",
+        "importlib.metadata",
+    }
+    assert loaded & heavy == set()
+    assert len(loaded) < 500
+
+
+@pytest.mark.parametrize("width", [40, 80])
+def test_the_front_page_is_the_command_line_s(width, capsys, monkeypatch) -> None:
+    monkeypatch.setenv("COLUMNS", str(width))
+    command_line()(["--help"], exit_on_error=False, result_action="return_value")
+    shown = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
+    assert [line.rstrip() for line in front_page(width).splitlines()] == shown
+
+
+def test_colours_and_ascii_panels_change_no_word_of_the_front_page() -> None:
+    plain = front_page(80)
+    assert re.sub(r"\x1b\[\d+m", "", front_page(80, colour=True)) == plain
+    assert front_page(80, signs=ASCII) == plain.translate(str.maketrans(UNICODE, ASCII))
 
 
 def test_help_names_every_command(tmp_path) -> None:

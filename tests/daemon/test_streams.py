@@ -62,7 +62,8 @@ def test_an_unexpected_error_of_the_system_is_one_line(tmp_path: Path, command: 
     assert said in done.stderr.decode()
 
 
-def test_ctrl_c_while_modules_are_loaded_shows_no_traceback(tmp_path: Path) -> None:
-    (tmp_path / "cyclopts.py").write_text("raise KeyboardInterrupt\n")
-    done = run("$B --help", tmp_path, PYTHONPATH=str(tmp_path))
+@pytest.mark.parametrize(("module", "words"), [("textwrap", "--help"), ("cyclopts", "status")])
+def test_ctrl_c_while_modules_are_loaded_shows_no_traceback(tmp_path: Path, module: str, words: str) -> None:
+    (tmp_path / f"{module}.py").write_text("raise KeyboardInterrupt\n")
+    done = run(f"$B {words}", tmp_path, PYTHONPATH=str(tmp_path))
     assert (done.returncode, done.stdout, done.stderr) == (130, b"", b"")

@@ -23,7 +23,6 @@ def status(
     Next: `bodyschema command` to pause, or to report a tool change; `bodyschema predict`.
     """
     from rich.console import Console
-    from rich.live import Live
 
     from bodyschema.cli.terminal.status_view import Watcher, as_json, screen
     from bodyschema.daemon.config import Config
@@ -32,6 +31,8 @@ def status(
     console = Console(highlight=False)
     with Watcher(config) as watcher:
         if watch and not json:
+            from rich.live import Live
+
             with Live(console=console, auto_refresh=False, screen=console.is_terminal) as live:
                 for seen in watcher.follow():
                     live.update(screen(seen, config), refresh=True)
