@@ -48,16 +48,16 @@ class _Said:
     count: int = 0
 
 
-class JournalHandler(logging.StreamHandler[TextIO]):
+class UnrepeatedHandler(logging.StreamHandler[TextIO]):
     """Suppresses repeats: the same text within `REPEATED_S`, or more than `OFTEN` texts that differ only in numbers.
 
     The number of suppressed messages is logged with the next record after that time, and at the end.
     """
 
-    def __init__(self, stream: TextIO, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, stream: TextIO, formatter: logging.Formatter, now: Callable[[], float] = time.monotonic) -> None:
         """Start without earlier messages."""
         super().__init__(stream)
-        self.setFormatter(JournalFormatter("%(name)s: %(message)s"))
+        self.setFormatter(formatter)
         self._now = now
         self._said: OrderedDict[tuple[str, int, str], _Said] = OrderedDict()
 
@@ -107,12 +107,17 @@ class JournalHandler(logging.StreamHandler[TextIO]):
 def set_up(*, verbose: bool = False, environment: Mapping[str, str] = os.environ, stream: TextIO | None = None) -> None:
     """Send the log to `stream` (stderr): under systemd with priorities and without repeats, otherwise with times."""
     out = sys.stderr if stream is None else stream
+    # Clients of the page, whoever they are, cause its server's messages as often as they like.
+    server = logging.getLogger("uvicorn")
     if is_journal(out, environment):
-        handler = JournalHandler(out)
+        handler = UnrepeatedHandler(out, JournalFormatter("%(name)s: %(message)s"))
+        server.handlers[:], server.propagate = [], True
         faulthandler.enable(out)  # shows what each thread did when the watchdog ends the process
     else:
+        formatter = PlainFormatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s", "%H:%M:%S")
         handler = logging.StreamHandler(out)
-        handler.setFormatter(PlainFormatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s", "%H:%M:%S"))
+        handler.setFormatter(formatter)
+        server.handlers[:], server.propagate = [UnrepeatedHandler(out, formatter)], False
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(logging.DEBUG if verbose else logging.INFO)

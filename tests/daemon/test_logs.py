@@ -17,10 +17,11 @@ from bodyschema.daemon.service.signals import on_termination
 
 @pytest.fixture(autouse=True)
 def root_logger() -> Iterator[None]:
-    root = logging.getLogger()
+    root, server = logging.getLogger(), logging.getLogger("uvicorn")
     handlers, level = root.handlers[:], root.level
     yield
     root.handlers[:], root.level = handlers, level
+    server.handlers[:], server.propagate = [], True
 
 
 def logged(file: Path, environment: Callable[[os.stat_result], dict[str, str]]) -> list[str]:
@@ -55,6 +56,19 @@ def test_a_person_gets_time_and_level_also_in_a_terminal_that_the_journal_s_sess
     )
 
 
+def test_malformed_requests_fill_no_terminal(tmp_path) -> None:
+    stream = io.StringIO()
+    logs.set_up(environment={}, stream=stream)
+    for _ in range(50):
+        logging.getLogger("uvicorn.error").warning("Invalid HTTP request received.")
+        logging.getLogger("bodyschema").warning("ours")
+    logging.getLogger("uvicorn").handlers[0].close()
+    lines = [line.split(": ", 1)[1] for line in stream.getvalue().splitlines()]
+    assert lines.count("ours") == 50
+    first, again = (line for line in lines if line != "ours")
+    assert (first, again[:13]) == ("Invalid HTTP request received.", "49 more times")
+
+
 class HandClock:
     """A clock that is moved by hand."""
 
@@ -69,7 +83,7 @@ class Journal:
 
     def __init__(self) -> None:
         self._stream, self.now = io.StringIO(), HandClock()
-        self.handler = logs.JournalHandler(self._stream, self.now)
+        self.handler = logs.UnrepeatedHandler(self._stream, logs.JournalFormatter("%(name)s: %(message)s"), self.now)
 
     def say(self, text: str, level: int = logging.WARNING) -> None:
         self.handler.handle(logging.LogRecord("bus", level, "", 0, text, None, None))
