@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 import pytest
-from guided_arm import built_chain, make_pair, near, new_learning, nominal_model, path, teach
+from guided_arm import NOW_AND_THEN, built_chain, make_pair, near, new_learning, nominal_model, path, teach
 
 from bodyschema.daemon.learner.solver_process import SolverProcess
 from bodyschema.interfaces.records import FloatArray, Pair
@@ -51,14 +51,14 @@ def arm() -> SaggingArm:
 @pytest.fixture(scope="module")
 def taught(arm: SaggingArm) -> OnlineLearner:
     learning = new_learning()
-    teach(learning, arm.pairs(slice(0, PAIRS)), every=10)
+    teach(learning, arm.pairs(slice(0, PAIRS)), every=NOW_AND_THEN)
     return learning
 
 
 def test_it_answers_for_an_arm_that_sags(arm: SaggingArm, taught: OnlineLearner) -> None:
     assert taught.snapshot.answering == RESIDUAL
     snapshot = taught.snapshot
-    assert arm.error_m(snapshot.require_model()) < 0.6 * arm.error_m(snapshot.require_map())
+    assert arm.error_m(snapshot.require_model()) < 0.7 * arm.error_m(snapshot.require_map())
 
 
 def test_that_it_sags_is_no_change(taught: OnlineLearner) -> None:
