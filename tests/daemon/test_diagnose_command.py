@@ -18,9 +18,7 @@ from rich.console import Console
 from walked import DESK_ARM, walked
 
 from bodyschema.cli.main import main
-from bodyschema.cli.terminal.diagnosis_run import Asked, Source, run
 from bodyschema.cli.terminal.diagnosis_view import view
-from bodyschema.daemon.config import Config
 from bodyschema.daemon.transport.bus import Request, ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.wire import PairsReply, encode, pair_to_wire
@@ -109,9 +107,21 @@ def told(file, out) -> Ended:
 
 
 @pytest.fixture(scope="module")
-def found(recording) -> DiagnosisFile:
-    source = Source(recording, "walk.csv")
-    return run(Config.load(DESK_ARM), source, Asked(("joint_scale", "backlash"), (), 0), lambda _: None).file
+def found(told, out) -> DiagnosisFile:
+    return msgspec.json.decode((out / "diagnosis.json").read_bytes(), type=DiagnosisFile)
+
+
+@pytest.fixture(scope="module")
+def here(tmp_path_factory) -> Path:
+    """Return the empty folder in which the command is typed again."""
+    return tmp_path_factory.mktemp("here")
+
+
+@pytest.fixture(scope="module")
+def again(file, here) -> Ended:
+    """Return the same diagnosis as `told`, typed with the seed that is the default, for JSON and without --out."""
+    with contextlib.chdir(here):
+        return diagnose(file, "--robot", DESK_ARM, *FEW, "--seed", 0, "--json")
 
 
 # --- output
@@ -140,9 +150,8 @@ def test_everything_fits_80_columns(told) -> None:
     assert max(map(len, tables.splitlines())) <= 80
 
 
-def test_json_goes_to_stdout_alone(file) -> None:
-    ended = diagnose(file, "--robot", DESK_ARM, *FEW, "--json")
-    assert json.loads(ended.out)["verdict"] == "explained"
+def test_json_goes_to_stdout_alone(again) -> None:
+    assert json.loads(again.out)["verdict"] == "explained"
 
 
 def test_diagnosis_json_has_the_keys_that_are_promised(told, out) -> None:
@@ -196,10 +205,8 @@ def test_what_fits_no_effect_is_told_with_its_joints(found) -> None:
 # --- files
 
 
-def test_without_out_nothing_is_written(file, tmp_path, monkeypatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    diagnose(file, "--robot", DESK_ARM, *FEW)
-    assert list(tmp_path.iterdir()) == []
+def test_without_out_nothing_is_written(again, here, file) -> None:
+    assert list(here.iterdir()) == []
     assert [other.name for other in file.parent.iterdir()] == [file.name]
 
 
@@ -208,13 +215,12 @@ def test_out_gets_the_three_files(told, out) -> None:
 
 
 def test_nothing_is_found_with_the_extended_simulation_as_the_nominal_one(told, out, file) -> None:
-    again = json.loads(diagnose(file, "--robot", out / "extended.toml", *FEW, "--json").out)
-    assert again["verdict"] == "nothing_found"
+    extended = json.loads(diagnose(file, "--robot", out / "extended.toml", *FEW, "--json").out)
+    assert extended["verdict"] == "nothing_found"
 
 
-def test_the_same_seed_gives_the_same_figures(file) -> None:
-    ended = [diagnose(file, "--robot", DESK_ARM, *FEW, "--seed", 7, "--json").out for _ in range(2)]
-    assert ended[0] == ended[1]
+def test_the_same_seed_gives_the_same_figures(told, out, again) -> None:
+    assert json.loads(again.out) == json.loads((out / "diagnosis.json").read_text())
 
 
 def test_effects_that_are_excluded_are_not_looked_for(file) -> None:
