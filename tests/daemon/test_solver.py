@@ -7,7 +7,7 @@ from guided_arm import Scene, built_chain, near, nominal_model, path
 import bodyschema.learning.solvers.solver as solver_module
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.model_bank import EXACT, RESIDUAL, RIGID, LearntModel
-from bodyschema.learning.solvers.solver import FOLDED, KEPT, DirectSolver, Task, fitted_belief
+from bodyschema.learning.solvers.solver import DirectSolver, Task, fitted_belief
 from kbmaps import ChainTolerances, RigidChain
 
 NOMINAL = nominal_model()
@@ -15,6 +15,8 @@ TOLERANCES = ChainTolerances(axes=0.05, points=0.015, zeros=0.05, tool=0.03)
 BELIEF = NOMINAL.belief(NOMINAL.chain, TOLERANCES)
 TASK = Task(1, NOMINAL.prior(), BELIEF)
 SIGMA_M = 0.002
+# A tenth of the solver's own numbers.
+KEPT, FOLDED = 400, 200
 
 
 def test_a_chain_of_the_first_pairs_is_found_before_that_of_all() -> None:
@@ -41,8 +43,11 @@ def after_a_long_rest(arm: RigidChain, seen_first: FloatArray) -> dict[str, Lear
     rng, solver = np.random.default_rng(2), DirectSolver()
     q = np.vstack([seen_first, seen_first[-1] + rng.normal(0.0, 0.02, (KEPT + 1 - FOLDED, NOMINAL.joints))])
     solver.start(TASK)
-    solver.learn(q, arm.positions(q) + SIGMA_M * rng.normal(size=(len(q), 3)))
-    return {solved.name: solved.model for solved in solver.solutions() if solved.model is not None}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(solver_module, "KEPT", KEPT)
+        patch.setattr(solver_module, "FOLDED", FOLDED)
+        solver.learn(q, arm.positions(q) + SIGMA_M * rng.normal(size=(len(q), 3)))
+        return {solved.name: solved.model for solved in solver.solutions() if solved.model is not None}
 
 
 @pytest.mark.parametrize("name", [RIGID, RESIDUAL])
