@@ -29,19 +29,14 @@ WORDS = re.compile(rf"\b({'|'.join(INSTEAD)})\b", re.IGNORECASE)
 OF_DIAGNOSIS = re.compile(r"diagnosis_(run|view)\.py$")
 
 
-def _docstrings(tree: ast.Module) -> set[int]:
-    found = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-    commands = (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"))
-    return found - {id(node.body[0].value) for node in commands if isinstance(node.body[0], ast.Expr)}
-
-
 def avoided(source: str, *, with_docstrings: bool) -> Iterator[str]:
     """Yield the avoided words in the messages of a module; docstrings are what `--help` prints of a command."""
-    tree = ast.parse(source)
-    skipped = _docstrings(tree)
-    if not with_docstrings:
-        skipped = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-    for node in ast.walk(tree):
+    nodes = list(ast.walk(ast.parse(source)))
+    skipped = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+    if with_docstrings:
+        commands = (node for node in nodes if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"))
+        skipped -= {id(node.body[0].value) for node in commands if isinstance(node.body[0], ast.Expr)}
+    for node in nodes:
         if (
             isinstance(node, ast.Constant)
             and isinstance(node.value, str)
