@@ -35,7 +35,7 @@ from kbmaps import ChainTolerances, NonFiniteError, RigidChain
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "paper.md"
 # Small variants, so that every curve and table is made in seconds.
 SMALL = {
-    "fig4": lambda run: fig4(run, samples=1_000, tests=100),
+    "fig4": lambda run: fig4(run, samples=800, tests=100),
     "fig5": lambda run: fig5(run, train=300, test=30),
     "fig6": lambda run: fig6(run, online=32, cycles=64),
     "fig7": lambda run: fig7(run, online=32, cycles=64),
@@ -84,24 +84,24 @@ class Seldom(OnlineLearner):
 def small(name: str) -> Experiment:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("bodyschema.reproduce.stream.OnlineLearner", Seldom)
-        patch.setattr("bodyschema.reproduce.stream.spread_counts", lambda first, last: [first, last])
+        patch.setattr("bodyschema.reproduce.stream.spread_counts", lambda _first, last: [last])
         return SMALL[name](a_run())
 
 
 def test_a_walk_takes_steps_between_one_and_three_degrees() -> None:
-    q = walk(np.random.default_rng(0), 200, JOINTS[7])
+    q = walk(np.random.default_rng(0), 60, JOINTS[7])
     steps = np.degrees(np.linalg.norm(np.diff(q, axis=0), axis=1))
     assert (steps.min() >= 1.0, steps.max() <= 3.0) == (True, True)
 
 
 def test_a_walk_with_steps_of_each_joint_takes_them_in_the_root_mean_square() -> None:
-    q = walk(np.random.default_rng(0), 200, JOINTS[7], each_joint=True)
+    q = walk(np.random.default_rng(0), 60, JOINTS[7], each_joint=True)
     steps = np.degrees(np.sqrt(np.square(np.diff(q, axis=0)).mean(axis=1)))
     assert (steps.min() >= 1.0, steps.max() <= 3.0) == (True, True)
 
 
 def test_the_same_seed_gives_the_same_walk_although_two_threads_read_it() -> None:
-    walks = [walk(np.random.default_rng(3), 100, JOINTS[5]) for _ in range(2)]
+    walks = [walk(np.random.default_rng(3), 40, JOINTS[5]) for _ in range(2)]
     np.testing.assert_array_equal(*walks)
 
 
@@ -271,14 +271,14 @@ def test_figure_7_tests_on_measured_points_and_on_the_truth(monkeypatch) -> None
 
 def test_a_guided_walk_is_measured_in_the_samplers_steps_as_well_as_the_tracker_can() -> None:
     pytest.importorskip("pybullet")
-    found = guided_walk(6, 12, 0, lambda _said: None)
+    found = guided_walk(6, 5, 0, lambda _said: None)
     steps = np.degrees(np.linalg.norm(np.diff(found.q, axis=0), axis=1))
     assert (steps.min() >= 1.0, steps.max() <= 3.0, found.noise_m < 0.003) == (True, True, True)
 
 
 def test_postures_far_apart_are_measured_as_well_as_the_tracker_can() -> None:
     pytest.importorskip("pybullet")
-    found = postures(5, 10, 0, lambda _said: None)
+    found = postures(5, 5, 0, lambda _said: None)
     steps = np.degrees(np.linalg.norm(np.diff(found.q, axis=0), axis=1))
     assert steps.min() > 3.0
     assert found.noise_m < 0.003

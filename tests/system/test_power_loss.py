@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -112,12 +112,8 @@ class Losses:
             assert state is None or state.header.counters.last_seq <= len(left)
 
 
-def lose_power(
-    folder: Path, endpoint: Callable[[], str], disk_shim: Path, pairs: int, losses: int, seed: int
-) -> Losses:
+def lose_power(config: Config, folder: Path, log: list[Done], losses: int, seed: int) -> Losses:
     """Lose power at random moments, half of them around operations on the checkpoint and the folder."""
-    config = write_robot(folder, endpoint, pairs_per_s=400.0)
-    log = list(read_log(work(config, disk_shim, pairs)))
     rng = np.random.default_rng(seed)
     rare = [
         number
@@ -126,15 +122,27 @@ def lose_power(
     ]
     around = rng.choice(rare, losses // 2) + rng.integers(-1, 3, losses // 2)
     moments = {*rng.integers(len(log), size=losses - losses // 2).tolist(), *around.clip(0, len(log) - 1).tolist()}
-    happened = Losses(config, folder / "after")
+    happened = Losses(config, folder)
     happened.at(moments, log, rng)
     return happened
 
 
+def worked(folder: Path, endpoint: Callable[[], str], disk_shim: Path, pairs: int) -> tuple[Config, list[Done]]:
+    """Return the robot of two processes that handled this many pairs, and the operations of their disk."""
+    config = write_robot(folder, endpoint, pairs_per_s=400.0)
+    return config, list(read_log(work(config, disk_shim, pairs)))
+
+
+@pytest.fixture(scope="module")
+def hundred(tmp_path_factory, free_endpoint, disk_shim) -> tuple[Config, list[Done]]:
+    return worked(tmp_path_factory.mktemp("hundred"), free_endpoint, disk_shim, 100)
+
+
 def test_after_a_power_loss_accepted_pairs_are_there_and_the_checkpoint_is_the_old_or_the_new(
-    tmp_path, free_endpoint, disk_shim
+    tmp_path, hundred
 ) -> None:
-    happened = lose_power(tmp_path, free_endpoint, disk_shim, pairs=100, losses=24, seed=0)
+    config, log = hundred
+    happened = lose_power(config, tmp_path / "after", log, losses=24, seed=0)
     assert happened.torn > 5  # the losses were some
 
 
@@ -144,16 +152,16 @@ def test_after_a_power_loss_accepted_pairs_are_there_and_the_checkpoint_is_the_o
 def test_two_thousand_power_losses_of_a_store_that_is_tidied_up_lose_nothing(
     tmp_path, free_endpoint, disk_shim, seed
 ) -> None:
-    happened = lose_power(tmp_path, free_endpoint, disk_shim, pairs=1500, losses=2000, seed=seed)
+    config, log = worked(tmp_path, free_endpoint, disk_shim, 1500)
+    happened = lose_power(config, tmp_path / "after", log, losses=2000, seed=seed)
     assert happened.torn > 500
 
 
-def without_syncs(log: Iterator[Done]) -> list[Done]:
+def without_syncs(log: list[Done]) -> list[Done]:
     return [done for done in log if done.operation not in (Operation.SYNC, Operation.SYNC_FOLDER)]
 
 
-def test_a_store_that_never_synced_would_lose_pairs(tmp_path, free_endpoint, disk_shim) -> None:
-    config = write_robot(tmp_path, free_endpoint, rows=40)
-    log = without_syncs(read_log(work(config, disk_shim, 40)))
+def test_a_store_that_never_synced_would_lose_pairs(tmp_path, hundred) -> None:
+    config, log = hundred[0], without_syncs(hundred[1])
     with pytest.raises((AssertionError, StoreError)):
         Losses(config, tmp_path / "after").at(set(range(len(log) - 40, len(log))), log, np.random.default_rng(0))
