@@ -11,6 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import msgspec
 import numpy as np
 
 from bodyschema.interfaces.errors import ConfigError
@@ -18,7 +19,19 @@ from bodyschema.interfaces.extras import missing
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.sim_backend.geometry import cross_matrix
 
-from .physics_urdf import PhysicsUrdf
+
+class PhysicsUrdf(msgspec.Struct, frozen=True):
+    """A URDF and its meshes, which lie beside it.
+
+    Attributes:
+        text: the URDF.
+        meshes: files by name.
+        said: what is not as the robot's own URDF has it, in sentences.
+    """
+
+    text: str
+    meshes: dict[str, bytes] = {}
+    said: tuple[str, ...] = ()
 
 
 def load_pybullet() -> Any:

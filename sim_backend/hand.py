@@ -19,6 +19,7 @@ from .truth import TrueRobot
 # Postures of one tour. With few, the nearest is farther away, so the tour covers the joint ranges sooner.
 POSTURES = 50
 _BATCH = 1000
+_AT_ONCE = 100  # of a batch: a tenth holds enough where the marker is in view at most postures
 _MOST_BATCHES = 40
 # Share of a joint's range left free at either end.
 _LIMIT_MARGIN = 0.04
@@ -146,12 +147,13 @@ class GuidePath:
             q[:, self._guided] = self._rng.uniform(
                 self._lower[self._guided], self._upper[self._guided], (_BATCH, len(self._guided))
             )
-            q = self._judge.gazed(q)
-            for posture in q[self._judge.in_images(q)]:
-                if self._judge.clear(posture):
-                    found.append(posture)
-                if len(found) == POSTURES:
-                    return np.array(found)
+            for few in np.split(q, _BATCH // _AT_ONCE):
+                few = self._judge.gazed(few)
+                for posture in few[self._judge.in_images(few)]:
+                    if self._judge.clear(posture):
+                        found.append(posture)
+                    if len(found) == POSTURES:
+                        return np.array(found)
         if len(found) < 2:
             raise ConfigError(
                 "the cameras see the marker in hardly any posture",

@@ -10,7 +10,6 @@ from itertools import chain
 from typing import NamedTuple
 from xml.etree import ElementTree
 
-import msgspec
 import numpy as np
 
 from bodyschema.interfaces.errors import RobotError
@@ -20,6 +19,7 @@ from bodyschema.robot.rpy import rpy_of
 from bodyschema.robot.urdf import MOVING, UrdfJoint, UrdfTree
 from bodyschema.sim_backend.truth import root_link
 
+from .bullet import PhysicsUrdf
 from .geometry import turn_of_z
 from .meshes import LARGEST_M, Meshes
 from .truth import TrueRobot
@@ -35,20 +35,6 @@ _ROD_SHARE, _ROD_RADII_M, _SHORTEST_ROD_M = 0.1, (0.005, 0.04), 0.01
 _ROD_RGBA = "0.55 0.57 0.6 1"
 _SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length"), "capsule": ("radius", "length")}
 _NAMED = 3
-
-
-class PhysicsUrdf(msgspec.Struct, frozen=True):
-    """A URDF and its meshes, which lie beside it.
-
-    Attributes:
-        text: the URDF.
-        meshes: files by name.
-        said: what is not as the robot's own URDF has it, in sentences.
-    """
-
-    text: str
-    meshes: dict[str, bytes] = {}
-    said: tuple[str, ...] = ()
 
 
 def physics_urdf(truth: TrueRobot) -> PhysicsUrdf:

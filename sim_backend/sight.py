@@ -9,6 +9,7 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.pointing import Pointing
 from bodyschema.robot.rpy import rotation_of
+from bodyschema.sim_backend.geometry import cross_matrix
 from bodyschema.sim_backend.truth import JointRoles
 from kbmaps import RigidChain
 
@@ -151,8 +152,9 @@ class Sight:
         starts, ends = [], []
         for eye in self._calibration.eyes_m:
             away = (x - eye) / np.linalg.norm(x - eye)
-            across = np.cross(away, [0.0, 1.0, 0.0])
-            for rim in (np.zeros(3), across, -across, np.cross(away, across), -np.cross(away, across)):
+            across = cross_matrix(away) @ (0.0, 1.0, 0.0)
+            up = cross_matrix(away) @ across
+            for rim in (np.zeros(3), across, -across, up, -up):
                 starts.append(eye + _RAY_START_M * away)
                 ends.append(x + self._radius * (_RIM * rim - away))
         starts, ends = (

@@ -7,6 +7,7 @@ partial answers, and reads past garbage.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any, Literal
 
 import dynamixel_sdk as sdk
@@ -72,7 +73,7 @@ class Packets2:
 
     def sync_read(self, ids: Sequence[int], address: int, size: int, *, fast: bool) -> bytes:
         """Build SYNC_READ or FAST_SYNC_READ."""
-        return self._of(lambda port: self._sdk.syncReadTx(port, address, size, list(ids), len(ids), fast))
+        return _sync_read(tuple(ids), address, size, fast)
 
     def sync_write(self, address: int, size: int, data: Mapping[int, bytes]) -> bytes:
         """Build SYNC_WRITE of `size` bytes to each ID. It is not acknowledged."""
@@ -164,6 +165,12 @@ class Packets1:
 
 
 PACKETS2, PACKETS1 = Packets2(), Packets1()
+
+
+@cache
+def _sync_read(ids: tuple[int, ...], address: int, size: int, fast: bool) -> bytes:
+    """Build the packet once: every reading sends the same."""
+    return PACKETS2._of(lambda port: PACKETS2._sdk.syncReadTx(port, address, size, list(ids), len(ids), fast))
 
 
 def packets_of(protocol: int) -> Packets:

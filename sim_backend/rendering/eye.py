@@ -69,8 +69,8 @@ def cluttered_room(
         ball_hue_deg: hue of the ball [deg].
         gap_deg: smallest difference between the hue of an object and that of the ball [deg].
     """
-    rows = np.linspace(205, 120, _HEIGHT)[:, None, None]
-    picture = np.ascontiguousarray(np.broadcast_to(rows * [0.93, 0.97, 1.0], (_HEIGHT, _WIDTH, 3)).astype(np.uint8))
+    rows = (np.linspace(205, 120, _HEIGHT)[:, None, None] * [0.93, 0.97, 1.0]).astype(np.uint8)
+    picture = np.repeat(rows, _WIDTH, axis=1)
     for _ in range(objects):
         colour = _colour(rng, round(ball_hue_deg / 2), round(gap_deg / 2))
         x, y = int(rng.integers(_WIDTH)), int(rng.integers(_HEIGHT))
@@ -258,7 +258,7 @@ class StereoEyes:
             directions[..., :2] += (rng.random((*depth.shape, 2)) - 0.5) / (fine * self._calibration.focal_px)
             mask, colours = self._sheets.cast(directions, x_eye, R_eye_marker, depth, to_light)
         samples[mask] = colours
-        patch[:] = np.round(samples.reshape(height, fine, width, fine, 3).mean(axis=(1, 3)))
+        patch[:] = np.round(cv2.resize(samples, (width, height), interpolation=cv2.INTER_AREA))
 
     def _lit(self, image: ImageArray) -> ImageArray:
         """Return the image, without the marker, scaled by the configured light."""
@@ -290,7 +290,9 @@ class StereoEyes:
             return np.zeros(0, dtype=np.int16)
         shape = (_NOISE_FIELDS, height + _NOISE_SHIFT_PX, width + _NOISE_SHIFT_PX, 3)
         rng = generator(self._seed, Stream.IMAGE_NOISE)
-        return np.round(self._config.noise * rng.standard_normal(shape, dtype=np.float32)).astype(np.int16)
+        fields = rng.standard_normal(shape, dtype=np.float32)
+        fields *= self._config.noise
+        return np.rint(fields, out=fields).astype(np.int16)
 
     def _add_noise(self, image: ImageArray, rng: np.random.Generator) -> None:
         if self._config.noise == 0:

@@ -16,8 +16,8 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import SourceLost
 from bodyschema.interfaces.interpreter import module_command
 from bodyschema.interfaces.records import ImageArray
+from bodyschema.sim_backend.bullet import PhysicsUrdf
 from bodyschema.sim_backend.config import SimConfig
-from bodyschema.sim_backend.physics_urdf import PhysicsUrdf
 
 from .render_messages import SLOTS, Frame, Setup, Tool, frame_bytes, send, slot_images
 from .scene import Scene

@@ -11,8 +11,8 @@ import numpy as np
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import ImageArray
+from bodyschema.sim_backend.bullet import PhysicsUrdf
 from bodyschema.sim_backend.config import CameraConfig
-from bodyschema.sim_backend.physics_urdf import PhysicsUrdf
 
 _LENGTH = struct.Struct("<I")
 # Frames in the shared memory; more than can be under way at once.

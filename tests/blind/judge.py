@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import msgspec
 import numpy as np
 
 from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
@@ -98,6 +99,14 @@ class Truth:
         return self.scene.replaced(self.target, others, self.effects[index], other).chi2
 
     def judged(self, index: int, found_as: Key | None, among_rivals: bool) -> TruthJudged:
+        """Return what an oracle sees of one of the true effects, and how it was found."""
+        return msgspec.structs.replace(self._seen_by_oracle[index], found_as=found_as, among_rivals=among_rivals)
+
+    @cached_property
+    def _seen_by_oracle(self) -> tuple[TruthJudged, ...]:
+        return tuple(self._told_apart(index) for index in range(len(self.effects)))
+
+    def _told_apart(self, index: int) -> TruthJudged:
         """Judge how well an oracle sees one of the true effects, and distinguishes it from its best alternative."""
         hidden, effect = self.hidden[index], self.effects[index]
         others = self.beside(index)
@@ -113,8 +122,8 @@ class Truth:
             seen_chi2=seen,
             told_chi2=seen if apart is None else min(apart.chi2, seen),
             rival=None if apart is None else apart.effects[-1].key,
-            found_as=found_as,
-            among_rivals=among_rivals,
+            found_as=None,
+            among_rivals=False,
         )
 
     def strange_judged(self, hidden: Hidden) -> TruthJudged:

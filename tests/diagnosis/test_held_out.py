@@ -31,7 +31,7 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 
 CHANCE = 1e-4
-SEEDS, MANY_SEEDS = range(100), range(300)
+SEEDS, MANY_SEEDS = range(50), range(300)
 # Number of poses, and of readings of each, in coarse ticks.
 POSES, ALIKE, TICK_RAD = 120, 5, 2.0 * np.pi / 512
 

@@ -35,7 +35,7 @@ pytestmark = pytest.mark.skipif(find_spec("pybullet") is None, reason="no pybull
 
 ROBOT = Path(__file__).parents[2] / "examples" / "desk_arm" / "robot.toml"
 CONFIG = SimConfig()
-SECONDS, RATE_HZ = 30.0, 60.0
+SECONDS, RATE_HZ = 12.0, 60.0
 BEGIN_S = 101.0  # time of the path on the emulators' clocks, which start at 100: until then drivers open
 LATENCY_S = 1e-3
 

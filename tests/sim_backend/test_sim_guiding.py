@@ -70,20 +70,15 @@ def test_the_gaze_keeps_the_ball_about_the_middle_of_the_image(seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_twenty_seconds_of_guiding_cover_a_third_of_every_arm_joints_range(seed):
+def test_twelve_seconds_of_guiding_cover_a_third_of_every_arm_joints_range(seed):
     run = shipped_run(seed)
     share = np.ptp(run.q, axis=0) / (run.robot.upper - run.robot.lower)
     assert share[2:].min() > 1 / 3
 
 
-def test_the_same_seed_guides_the_same_way():
-    first, second = (guide(shipped(), SimConfig(seed=7), 2.0) for _ in range(2))
-    np.testing.assert_array_equal(first.q, second.q)
-
-
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_ball_stays_visible_with_a_tool_that_is_250_mm_longer(seed):
-    run = guide(shipped(), SimConfig(seed=seed), 8.0, tool=(0.23, 0.0, -0.37), settle=2.0)
+    run = guide(shipped(), SimConfig(seed=seed), 5.0, tool=(0.23, 0.0, -0.37), settle=1.0)
     assert run.visible.mean() > 0.8
 
 
@@ -92,7 +87,7 @@ def test_a_single_tag_is_turned_to_the_eyes_in_nine_frames_of_ten(seed):
     robot = shipped()
     tag = SimTag(id=0, xyz=(0.0, 0.0, 0.0), rpy=(0.0, 0.0, 0.0), side_m=0.06)
     config = SimConfig(seed=seed, camera=CameraConfig(tags=(tag,)))
-    T = true_chain(robot, config).poses(guide(robot, config, 10.0).q)
+    T = true_chain(robot, config).poses(guide(robot, config, 5.0).q)
     normals = T[:, :3, :3] @ TrueRobot.draw(robot, config).tool_turn[:, 2]
     to_eye = -T[:, :3, 3] / np.linalg.norm(T[:, :3, 3], axis=1, keepdims=True)
     oblique_deg = np.degrees(np.arccos(np.sum(normals * to_eye, axis=1)))

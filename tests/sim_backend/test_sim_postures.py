@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("pybullet")
 
-from guided_run import shipped
+from guided_run import NoRenderer, shipped
 
 from bodyschema.interfaces.errors import SourceEnded
 from bodyschema.interfaces.records import FloatArray, StereoFrame
@@ -19,6 +19,12 @@ POSTURES = 3
 @pytest.fixture(scope="module")
 def postures() -> FloatArray:
     return visible_postures(shipped(), SimConfig(), POSTURES)
+
+
+@pytest.fixture
+def unrendered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Open worlds without a renderer."""
+    monkeypatch.setattr("bodyschema.sim_backend.posed.RenderProcess", NoRenderer)
 
 
 def seen(world: PosedWorld) -> list[StereoFrame]:
@@ -40,7 +46,7 @@ def test_other_seeds_give_other_postures(postures: FloatArray) -> None:
     assert not np.allclose(visible_postures(shipped(), SimConfig(seed=3), POSTURES), postures)
 
 
-def test_encoders_report_each_posture_to_the_tick(postures: FloatArray) -> None:
+def test_encoders_report_each_posture_to_the_tick(postures: FloatArray, unrendered) -> None:
     config = SimConfig()
     tick = 2 * np.pi / config.encoders.ticks_per_turn
     with PosedWorld(shipped(), config, postures) as world, world.joints as joints:
@@ -48,14 +54,14 @@ def test_encoders_report_each_posture_to_the_tick(postures: FloatArray) -> None:
     assert np.abs(readings - postures).max() < 3 * tick
 
 
-def test_a_posture_is_read_and_seen_at_the_same_time(postures: FloatArray) -> None:
+def test_a_posture_is_read_and_seen_at_the_same_time(postures: FloatArray, unrendered) -> None:
     with PosedWorld(shipped(), SimConfig(), postures) as world:
         frames = seen(world)
         with world.joints as joints:
             assert [joints.read(LIMIT_S).t for _ in range(POSTURES)] == [frame.t for frame in frames]
 
 
-def test_the_sources_end_after_the_last_posture(postures: FloatArray) -> None:
+def test_the_sources_end_after_the_last_posture(postures: FloatArray, unrendered) -> None:
     with PosedWorld(shipped(), SimConfig(), postures) as world:
         seen(world)
         with world.camera as camera, pytest.raises(SourceEnded):
@@ -70,7 +76,7 @@ def test_the_same_postures_give_the_same_frames_bit_by_bit(postures: FloatArray)
     np.testing.assert_array_equal(*taken)
 
 
-def test_the_posed_robot_is_the_one_that_is_guided(postures: FloatArray) -> None:
+def test_the_posed_robot_is_the_one_that_is_guided(postures: FloatArray, unrendered) -> None:
     with PosedWorld(shipped(), SimConfig(), postures) as world:
         np.testing.assert_array_equal(
             world.true_chain().positions(postures), true_chain(shipped(), SimConfig()).positions(postures)

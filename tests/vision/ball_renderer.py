@@ -162,10 +162,17 @@ def paint_ball(
         u = (np.arange(columns.start, columns.stop)[:, None] + sub).ravel()
         v = (np.arange(rows.start, rows.stop)[:, None] + sub).ravel()
         rays = _rays(u, v, calibration, look.distortion)
-        behind = np.repeat(np.repeat(window, n, axis=0), n, axis=1)
-        shown = sum(_lit(rays, x_eye + at * moved, radius_m, look, behind.copy()) for at in instants) / len(instants)
-        window[:] = shown.reshape(len(v) // n, n, len(u) // n, n, 3).mean(axis=(1, 3))
+        lit = sum(_lit(rays, x_eye + at * moved, radius_m, look) for at in instants) / len(instants)
+        ball = pixel_means(lit, n)
+        window *= 1.0 - ball[..., 3:]
+        window += ball[..., :3]
     return painted
+
+
+def pixel_means(samples: FloatArray, per_pixel: int) -> FloatArray:
+    """Return the means over squares of `per_pixel` by `per_pixel` samples, several times as fast as numpy's."""
+    size = samples.shape[1] // per_pixel, samples.shape[0] // per_pixel
+    return np.asarray(cv2.resize(samples, size, interpolation=cv2.INTER_AREA)).reshape(*size[::-1], *samples.shape[2:])
 
 
 def _reach_px(x_eye: FloatArray, moved: FloatArray, look: Look, calibration: StereoCalibration) -> float:
@@ -189,11 +196,12 @@ def _neighbourhood(
 
 def take(picture: FloatArray, look: Look, rng: np.random.Generator) -> ImageArray:
     """Expose a picture: uneven light, lens blur, shot and sensor noise, the camera's processing, JPEG; BGR."""
-    grey_levels = 255.0 * look.exposure * picture[..., ::-1]
+    grey_levels = np.multiply(picture[..., ::-1], 255.0 * look.exposure, dtype=np.float32)
     if any(look.light_slope):
         rows, columns = (np.arange(size) - 0.5 * size for size in picture.shape[:2])
         slope_u, slope_v = look.light_slope
-        grey_levels = grey_levels * (1.0 + 0.01 * (slope_u * columns + slope_v * rows[:, None]))[..., None]
+        slope = 1.0 + 0.01 * (slope_u * columns + slope_v * rows[:, None])
+        grey_levels *= slope[..., None].astype(np.float32)
     if look.blur_px > 0:
         grey_levels = cv2.GaussianBlur(grey_levels, (0, 0), look.blur_px)
     sigma = np.sqrt(look.noise_sd**2 + look.shot * grey_levels) if look.shot else look.noise_sd
@@ -212,7 +220,8 @@ def take(picture: FloatArray, look: Look, rng: np.random.Generator) -> ImageArra
 
 def processed(grey_levels: FloatArray, look: Look) -> ImageArray:
     """Return a sensor's linear levels (height, width, 3) as its camera gives them, in eight bits."""
-    curved = 255.0 * np.clip(grey_levels / 255.0, 0.0, 1.0) ** look.tone
+    levels = np.clip(grey_levels, 0.0, 255.0)
+    curved = levels if look.tone == 1.0 else 255.0 * (levels / 255.0) ** look.tone
     image = np.rint(curved).astype(np.uint8)
     if look.bayer:
         mosaic = image[..., 1].copy()
@@ -248,7 +257,8 @@ def _rays(u: FloatArray, v: FloatArray, calibration: StereoCalibration, distorti
     return rays / np.sqrt(np.einsum("vuc,vuc->vu", rays, rays))[..., None]
 
 
-def _lit(rays: FloatArray, x_eye: FloatArray, radius_m: float, look: Look, behind: FloatArray) -> FloatArray:
+def _lit(rays: FloatArray, x_eye: FloatArray, radius_m: float, look: Look) -> FloatArray:
+    """Return the ball's RGB and 1 where rays meet it, and zeros elsewhere."""
     along = rays @ x_eye
     discriminant = along**2 - (x_eye @ x_eye - radius_m**2)
     hit = (discriminant > 0) & (along > 0)
@@ -260,5 +270,8 @@ def _lit(rays: FloatArray, x_eye: FloatArray, radius_m: float, look: Look, behin
     mirrored = 2.0 * facing[:, None] * normals - light
     gloss = np.clip(-np.einsum("nc,nc->n", mirrored, rays[hit]), 0.0, None) ** look.shininess * (facing > 0)
     diffuse = look.ambient + look.diffuse * np.clip(facing, 0.0, None)
-    behind[hit] = diffuse[:, None] * np.array(look.ball_rgb) + (look.specular * gloss)[:, None]
-    return behind
+    shown = np.zeros((*hit.shape, 4))
+    shown[hit] = np.column_stack(
+        [diffuse[:, None] * np.array(look.ball_rgb) + (look.specular * gloss)[:, None], np.ones(len(diffuse))]
+    )
+    return shown

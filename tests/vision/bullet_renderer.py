@@ -6,6 +6,7 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
+from ball_renderer import pixel_means
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, ImageArray, StereoFrame
@@ -83,8 +84,8 @@ class BulletScene:
             renderer=self._bullet.ER_TINY_RENDERER,
             physicsClientId=self._client,
         )
-        rgb = np.reshape(np.asarray(rgba, dtype=np.float64), (height, n, width, n, 4))[..., :3].mean(axis=(1, 3))
-        return rgb[..., ::-1].astype(np.uint8)
+        samples = np.reshape(np.asarray(rgba, dtype=np.float32), (height * n, width * n, 4))
+        return pixel_means(samples, n)[..., 2::-1].astype(np.uint8)
 
     def _projection(self) -> list[float]:
         """Return a frustum in which pixel centres have integer image coordinates.

@@ -115,7 +115,7 @@ def measure_errors(
 ) -> Errors:
     """Track `frames` unrelated frames: position, size and light are random in each, rooms and exposures change."""
     rng = np.random.default_rng(seed)
-    rooms = [Room(calibration, look, rng) for _ in range(min(frames, max(16, frames // 8)))]
+    rooms = [Room(calibration, look, rng) for _ in range(max(4, frames // 8))]
     tracker = StereoTracker(calibration)
     answers = []
     for number in range(frames):

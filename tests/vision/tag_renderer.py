@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from ball_renderer import Look, backdrop, take
+from ball_renderer import Look, backdrop, pixel_means, take
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, StereoFrame
@@ -89,25 +89,22 @@ def _painted(
     painted = picture.copy()
     rows, columns = _window(things, eye, calibration)
     n = look.samples
-    # One ray at a random place of each sub-pixel: rays in rows would all miss an edge along the row at once.
-    grid = np.stack(
-        np.meshgrid(np.arange(n * (columns.stop - columns.start)), np.arange(n * (rows.stop - rows.start))), -1
-    )
-    if not grid.size:
+    shape = n * (rows.stop - rows.start), n * (columns.stop - columns.start)
+    if min(shape) <= 0:
         return painted
-    places = (grid + rng.random(grid.shape)) / n - 0.5 + (columns.start, rows.start)
-    rays = np.concatenate(
-        [(places - calibration.principal_point_px) / calibration.focal_px, np.ones((*grid.shape[:2], 1))], axis=-1
-    )
-    shown = painted[rows, columns].mean(axis=2).repeat(n, axis=0).repeat(n, axis=1)
-    nearest = np.full(shown.shape, np.inf)
+    # One ray at a random place of each sub-pixel: rays in rows would all miss an edge along the row at once.
+    places = rng.random((*shape, 2))
+    cx, cy = calibration.principal_point_px
+    rays = np.ones((3, *shape), np.float32)
+    rays[0] = ((np.arange(shape[1]) + places[..., 0]) / n - 0.5 + columns.start - cx) / calibration.focal_px
+    rays[1] = ((np.arange(shape[0])[:, None] + places[..., 1]) / n - 0.5 + rows.start - cy) / calibration.focal_px
+    before = painted[rows, columns]
+    shown = before.mean(axis=2, dtype=np.float32).repeat(n, axis=0).repeat(n, axis=1)
+    nearest = np.full(shape, np.inf, np.float32)
     for thing in things:
         _cover(thing, rays, eye, look, shown, nearest)
-    blocks = (shown.shape[0] // n, n, shown.shape[1] // n, n)
-    hit = np.isfinite(nearest).reshape(blocks).mean(axis=(1, 3))[..., None]
-    grey = shown.reshape(blocks).mean(axis=(1, 3))[..., None]
-    before = painted[rows, columns]
-    painted[rows, columns] = np.where(hit > 0.0, grey, before)
+    hit = pixel_means(np.isfinite(nearest).astype(np.float32), n)[..., None]
+    painted[rows, columns] = np.where(hit > 0.0, pixel_means(shown, n)[..., None], before)
     return painted
 
 
@@ -128,16 +125,14 @@ def _cover(
     thing: Sheet | Card, rays: FloatArray, eye: FloatArray, look: Look, shown: FloatArray, nearest: FloatArray
 ) -> None:
     normal = thing.rotation[:, 2]
-    facing = rays @ normal
-    x = thing.x - eye
-    curl = thing.curl if isinstance(thing, Sheet) else 0.0
+    to_right, to_top, facing = np.tensordot(thing.rotation.T.astype(np.float32), rays, axes=1)
+    right, top, away = ((thing.x - eye) @ thing.rotation).astype(np.float32)
+    curl = np.float32(thing.curl if isinstance(thing, Sheet) else 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        depth = (x @ normal) / facing
-        on_plane = (rays * depth[..., None] - x) @ thing.rotation
+        depth = away / facing
         for _ in range(3 if curl else 0):  # the parabola meets each ray after three steps, to a micrometre
-            depth = (x @ normal + 0.5 * curl * on_plane[..., 0] ** 2) / facing
-            on_plane = (rays * depth[..., None] - x) @ thing.rotation
-    across, up = on_plane[..., 0], on_plane[..., 1]
+            depth = (away + curl * (depth * to_right - right) ** 2 / 2) / facing
+        across, up = depth * to_right - right, depth * to_top - top
     hit = (facing < 0.0) & (depth > 0.0) & (depth < nearest) & (np.maximum(abs(across), abs(up)) < thing.half_m)
     light = np.array(look.light) / np.linalg.norm(look.light)
     level = look.ambient + look.diffuse * max(float(normal @ light), 0.0)

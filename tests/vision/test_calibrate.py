@@ -50,7 +50,7 @@ def refusal(views: list[View], asked: Asked = PINHOLE, board=BOARD) -> str:
 def planted() -> tuple:
     rng = np.random.default_rng(11)
     rig = webcams(rng)
-    return rig, corner_views(rig, rng)
+    return rig, corner_views(rig, rng, 12)
 
 
 # --- results
@@ -74,7 +74,7 @@ def test_intervals_cover_where_corners_of_a_view_move_together() -> None:
     for seed in range(2):
         rng = np.random.default_rng(40 + seed)
         rig = webcams(rng)
-        found = fit([curved(view, rng) for view in corner_views(rig, rng, 20)], BOARD.corners_m, SIZE, "pinhole")
+        found = fit([curved(view, rng) for view in corner_views(rig, rng, 14)], BOARD.corners_m, SIZE, "pinhole")
         misses.append((found.bundle.vector - true_vector(rig)) / sigmas(found))
     assert np.mean(np.abs(np.concatenate(misses)) < 2.0) > 0.85
 
@@ -118,7 +118,7 @@ def test_views_of_one_eye_alone_count_too(planted) -> None:
 def test_the_lens_model_is_chosen_that_foretells_views_better(fisheye) -> None:
     rng = np.random.default_rng(4)
     rig = webcams(rng, fisheye=fisheye)
-    found = calibrate(corner_views(rig, rng), BOARD, ASKED)
+    found = calibrate(corner_views(rig, rng, 12), BOARD, ASKED)
     assert found.rig.model == ("fisheye" if fisheye else "pinhole")
 
 
@@ -250,34 +250,34 @@ def test_a_board_printed_at_97_percent_is_contradicted_by_the_baseline_measured_
     rng = np.random.default_rng(3)
     small = Printed(square_m=0.97 * 0.030)
     photographer = Photographer(rig, small, Taken(), rng)
-    views = [view_of(str(k), photographer, pose, rng) for k, pose in enumerate(poses(rng, rig, small))]
+    views = [view_of(str(k), photographer, pose, rng) for k, pose in enumerate(poses(rng, rig, small, 12))]
     by_hand = replace(PINHOLE, baseline_m=round(rig.baseline_m, 3))
     assert "make the squares 97" in refusal(views, by_hand)
-    assert calibrate(views, replace(BOARD, square_m=0.97 * 0.030), by_hand).rig.made.views == 20
+    assert calibrate(views, replace(BOARD, square_m=0.97 * 0.030), by_hand).rig.made.views == 12
 
 
 def test_noise_of_pixels_is_refused_by_the_held_out_error(planted) -> None:
     rig, _ = planted
-    views = corner_views(rig, np.random.default_rng(5), noise_px=1.5)
+    views = corner_views(rig, np.random.default_rng(5), 12, noise_px=1.5)
     assert re.search(r"views that were not fitted are off by 1\.\d+ px, 0.96 px is the most", refusal(views))
 
 
 def test_eyes_of_different_resolutions_are_named() -> None:
-    _, pairs, _ = photographed()
+    _, pairs, _ = photographed(count=6)
     smaller = ImagePair("00", pairs[0].left, pairs[0].right[::2, ::2])
     with pytest.raises(CalibrationError, match=r"the left image has 640x480 pixels, the right one 320x240"):
         gathered([smaller], BOARD)
 
 
 def test_when_no_image_can_be_used_the_usual_reason_is_said() -> None:
-    black = np.zeros((480, 640, 3), np.uint8)
+    black = np.zeros((120, 160, 3), np.uint8)
     found = gathered([ImagePair(str(k), black, black) for k in range(3)], BOARD)
     with pytest.raises(CalibrationError, match=r"6 of 6: the image is black. Take the lens cap off"):
         require_both(found)
 
 
 def test_an_eye_that_never_sees_the_board_is_named_with_the_reason() -> None:
-    _, pairs, _ = photographed()
+    _, pairs, _ = photographed(count=6)
     found = gathered([ImagePair(pair.name, pair.left, np.zeros_like(pair.right)) for pair in pairs[:3]], BOARD)
     with pytest.raises(CalibrationError, match=r"no right image .*; 3 of 3: the image is black. Take the lens cap off"):
         require_both(found)
@@ -285,7 +285,7 @@ def test_an_eye_that_never_sees_the_board_is_named_with_the_reason() -> None:
 
 @pytest.mark.soak  # of the command: tests/daemon/test_cameras_command.py
 def test_three_pairs_of_another_board_are_enough_to_say_so() -> None:
-    _, pairs, _ = photographed()
+    _, pairs, _ = photographed(count=6)
     taken: list[str] = []
 
     def counted() -> Iterator[ImagePair]:
@@ -300,7 +300,7 @@ def test_three_pairs_of_another_board_are_enough_to_say_so() -> None:
 
 
 def test_how_far_the_search_for_the_board_is_shows_as_it_goes() -> None:
-    black = np.zeros((480, 640), np.uint8)
+    black = np.zeros((120, 160), np.uint8)
     told: list[str] = []
     gathered([ImagePair(str(k), black, black) for k in range(20)], BOARD, told.append)
     assert told[:2] == ["10 pairs looked at; the board is in 0", "20 pairs looked at; the board is in 0"]

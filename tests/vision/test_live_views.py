@@ -81,7 +81,7 @@ def test_views_of_all_kinds_leave_nothing_missing(views) -> None:
 
 
 def test_rendered_images_are_taken_and_an_eye_that_sees_nothing_is_named() -> None:
-    pair = photographed()[1][4]
+    pair = photographed(count=6)[1][4]
     live = LiveViews(BOARD)
     frames = [StereoFrame(0.1 * k, pair.left, pair.right) for k in range(2)]
     assert [live.look(frame).outcome for frame in frames] == [Outcome.MOVING, Outcome.TAKEN]

@@ -96,7 +96,7 @@ def test_an_image_of_another_size_is_an_error_of_the_source() -> None:
 @pytest.fixture(scope="module")
 def calibrated() -> tuple[StereoRig, View]:
     rng = np.random.default_rng(21)
-    views = corner_views(webcams(rng), rng, 21)
+    views = corner_views(webcams(rng), rng, 13)
     asked = Asked(SIZE, ("A1", "B2"), "2026", model="pinhole")
     return calibrate(views[:-1], BOARD, asked).rig, views[-1]
 

@@ -82,15 +82,11 @@ def complaint(told: dict[str, Any], words: str) -> str:
     return next((text for text in told["health"] if words in text), f"nobody complains: {told}")
 
 
-def test_kernel_stamps_are_taken_and_close_to_now(library, camera) -> None:
+def test_kernel_stamps_are_taken_and_both_eyes_come_from_one_image(library, camera) -> None:
     told = probe(library, one(camera("one", WIDE)))
     assert told["stamps"] == ["kernel"]
     assert 0 < np.median(told["behind"]) < 0.1
     assert (np.diff(told["t"]) > 0).all()
-
-
-def test_both_eyes_of_one_camera_come_from_one_image(library, camera) -> None:
-    told = probe(library, one(camera("one", WIDE)))
     assert {right - left for left, right in told["levels"]} <= {39, 40, 41}
 
 
@@ -124,17 +120,12 @@ def test_settings_arrive_at_the_camera(library, camera) -> None:
     assert not any("does not" in text for text in told["health"])
 
 
-def test_a_setting_that_is_not_taken_is_named_with_what_there_is(library, camera) -> None:
+def test_a_setting_that_is_not_taken_and_an_automatic_that_stays_on_are_named(library, camera) -> None:
     device = camera("one", WIDE)
     device.make_deaf("gain")
-    told = probe(library, one(device, gain=100))
-    assert "does not take gain = 100: it has 64" in complaint(told, "gain")
-
-
-def test_an_automatic_that_stays_on_is_named(library, camera) -> None:
-    device = camera("one", WIDE)
     device.make_deaf("autofocus")
-    told = probe(library, one(device, focus=30))
+    told = probe(library, one(device, gain=100, focus=30))
+    assert "does not take gain = 100: it has 64" in complaint(told, "gain")
     assert "does not switch its automatic for focus off" in complaint(told, "focus")
 
 
@@ -153,13 +144,10 @@ def test_a_camera_that_does_not_offer_the_rate_says_so(library, camera) -> None:
     assert "offers 10 frames/s, not 30" in complaint(told, "offers")
 
 
-def test_a_lens_cap_is_named(library, camera) -> None:
-    told = probe(library, two(camera("left", [image // 30 for image in GREY]), camera("right")))
+def test_a_lens_cap_and_over_exposure_are_named_with_their_camera(library, camera) -> None:
+    black, white = [image // 30 for image in GREY], [np.full_like(image, 255) for image in GREY]
+    told = probe(library, two(camera("left", black), camera("right", white)))
     assert "the left camera's image is black: is the lens cap on?" in complaint(told, "black")
-
-
-def test_over_exposure_is_named(library, camera) -> None:
-    told = probe(library, two(camera("left"), camera("right", [np.full_like(image, 255) for image in GREY])))
     assert "the right camera is over-exposed: 100 %" in complaint(told, "over-exposed")
 
 

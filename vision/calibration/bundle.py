@@ -11,9 +11,9 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.vision.rig.lens import Lens, Model
-from bodyschema.vision.rig.stereo_rig import CalibrationError, lens_of_one, split
+from bodyschema.vision.rig.stereo_rig import CalibrationError, lenses_of
 
-from .view import EYES, Eye, View
+from .view import EYES, View
 
 _ITERATIONS = 60
 _CONVERGED = 1e-7  # smallest relative decrease of the sum of squares for another step: thousandths of a sigma
@@ -137,53 +137,52 @@ def view_residuals(
     return linear.residuals[0]
 
 
-def eye_of(
-    eye: Eye, model: Model, vector: FloatArray, pose: FloatArray
-) -> tuple[Lens, FloatArray, FloatArray, tuple[FloatArray, ...]]:
-    """Return an eye's lens, the board's pose in its frame, and the Jacobians of that pose.
+def seen_with_slopes(
+    view: View, corners_m: FloatArray, lenses: Sequence[Lens], right_eye: FloatArray, pose: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return a view's residuals (corners, 2) [px] and the Jacobian of the prediction (2 corners, p + 6).
 
-    The Jacobians are with respect to the right eye's pose and to the board's pose in the left eye's frame.
+    The Jacobian has two rows a corner, u and v. Its columns are those of the rig's vector, then of the board's pose.
 
     Args:
+        lenses: of one eye, or of the left and the right one.
+        right_eye: the end of the rig's vector behind the lenses: the right eye's pose, shape (6,), or nothing.
         pose: the board's pose in the left eye's frame, shape (6,).
     """
-    alone = lens_of_one(model, vector)
-    if alone is not None:
-        return alone, pose[:3], pose[3:], (np.zeros((6, 0)), np.eye(6))
-    left, right, rotation, translation = split(model, vector)
-    if eye == "left":
-        return left, pose[:3], pose[3:], (np.zeros((6, 6)), np.eye(6))
-    composed = cv2.composeRT(pose[:3], pose[3:], rotation, translation)
+    residuals, slopes = [], []
+    for number, eye in enumerate(EYES):
+        corners = view.eye(eye)
+        if corners is None:
+            continue
+        rotation, translation, by_rig, by_pose = pose[:3], pose[3:], None, None
+        if eye == "right":
+            rotation, translation, by_rig, by_pose = _in_right_eye(pose, right_eye)
+        px, J_pose, J_lens = lenses[number].project_posed(corners_m[corners.numbers], rotation, translation)
+        n = J_lens.shape[1]
+        J = np.zeros((len(J_lens), n * len(lenses) + len(right_eye) + _POSE))
+        J[:, number * n : (number + 1) * n] = J_lens
+        if by_rig is not None:
+            J[:, -2 * _POSE : -_POSE] = J_pose @ by_rig
+        J[:, -_POSE:] = J_pose if by_pose is None else J_pose @ by_pose
+        residuals.append(corners.px - px)
+        slopes.append(J)
+    return np.concatenate(residuals), np.concatenate(slopes)
+
+
+def lenses_and_rest(model: Model, vector: FloatArray) -> tuple[tuple[Lens, ...], FloatArray]:
+    """Return the lenses in the rig's vector, and what stands behind them."""
+    lenses = lenses_of(model, vector)
+    return lenses, vector[len(lenses) * len(lenses[0].vector) :]
+
+
+def _in_right_eye(pose: FloatArray, right_eye: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return a pose in the right eye's frame, and its Jacobians by the right eye's pose and by that in the left eye."""
+    composed = cv2.composeRT(pose[:3], pose[3:], right_eye[:3], right_eye[3:])
     r, t, r_r1, r_t1, r_r2, r_t2, t_r1, t_t1, t_r2, t_t2 = (np.asarray(each, dtype=np.float64) for each in composed)
     by_rig, by_pose = np.empty((2, _POSE, _POSE))
     by_rig[:3, :3], by_rig[:3, 3:], by_rig[3:, :3], by_rig[3:, 3:] = r_r2, r_t2, t_r2, t_t2
     by_pose[:3, :3], by_pose[:3, 3:], by_pose[3:, :3], by_pose[3:, 3:] = r_r1, r_t1, t_r1, t_t1
-    return right, r.ravel(), t.ravel(), (by_rig, by_pose)
-
-
-def seen_with_slopes(
-    view: View, corners_m: FloatArray, model: Model, vector: FloatArray, pose: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return a view's residuals (corners, 2) [px] and the Jacobians of the prediction by rig and by board pose.
-
-    The Jacobians have two rows a corner, u and v: shapes (2 corners, p) and (2 corners, 6).
-    """
-    p = len(vector)
-    n = p if lens_of_one(model, vector) is not None else (p - _POSE) // 2
-    residuals, by_rig_and_lens, by_board = [], [], []
-    for eye in EYES:
-        corners = view.eye(eye)
-        if corners is None:
-            continue
-        lens, rotation, translation, (by_rig, by_pose) = eye_of(eye, model, vector, pose)
-        px, J_pose, J_lens = lens.project_posed(corners_m[corners.numbers], rotation, translation)
-        J = np.zeros((len(J_lens), p))
-        J[:, slice(0, n) if eye == "left" else slice(n, 2 * n)] = J_lens
-        J[:, 2 * n :] = J_pose @ by_rig
-        residuals.append(corners.px - px)
-        by_rig_and_lens.append(J)
-        by_board.append(J_pose @ by_pose)
-    return np.concatenate(residuals), np.concatenate(by_rig_and_lens), np.concatenate(by_board)
+    return r.ravel(), t.ravel(), by_rig, by_pose
 
 
 @dataclass
@@ -208,8 +207,8 @@ class _Linear:
         poses = self.pose_normals + damping * self.pose_normals * np.eye(_POSE)
         weighed = np.linalg.solve(poses, np.transpose(self.mixed, (0, 2, 1)))
         normal = self.normal + damping * np.diag(np.diag(self.normal))
-        normal = normal - np.einsum("vij,vjk->ik", self.mixed, weighed)
-        gradient = self.gradient - np.einsum("vji,vj->i", weighed, self.pose_gradients)
+        normal = normal - np.tensordot(self.mixed, weighed, axes=([0, 2], [0, 1]))
+        gradient = self.gradient - np.tensordot(weighed, self.pose_gradients, axes=([0, 1], [0, 1]))
         return normal, gradient, poses
 
     def step(self, damping: float) -> tuple[FloatArray, FloatArray] | None:
@@ -250,14 +249,15 @@ def _linearised(
         np.zeros((m, p, 6)),
         float(known @ vector**2),
     )
+    lenses, right_eye = lenses_and_rest(model, vector)
     for k, (view, pose) in enumerate(zip(views, poses, strict=True)):
-        residual, J, K = seen_with_slopes(view, corners_m, model, vector, pose)
-        w = np.repeat(weights[k], 2)
-        weighed = w * residual.ravel()
-        linear.normal += J.T @ (w[:, None] * J)
-        linear.gradient += J.T @ weighed
-        linear.pose_normals[k] += K.T @ (w[:, None] * K)
-        linear.pose_gradients[k] += K.T @ weighed
-        linear.mixed[k] += J.T @ (w[:, None] * K)
+        residual, J = seen_with_slopes(view, corners_m, lenses, right_eye, pose)
+        rows = np.column_stack([J, residual.ravel()])
+        products = rows.T @ (np.repeat(weights[k], 2)[:, None] * rows)
+        linear.normal += products[:p, :p]
+        linear.gradient += products[:p, -1]
+        linear.mixed[k] = products[:p, p:-1]
+        linear.pose_normals[k] = products[p:-1, p:-1]
+        linear.pose_gradients[k] = products[p:-1, -1]
         linear.residuals.append(residual)
     return linear

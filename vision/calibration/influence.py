@@ -9,7 +9,7 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
 
-from .bundle import Bundle, seen_with_slopes
+from .bundle import Bundle, lenses_and_rest, seen_with_slopes
 from .view import View
 
 _LEAST_FREE = 0.2
@@ -37,13 +37,15 @@ class Influence:
 def influences(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> Iterator[Influence]:
     """Yield the influence of each fitted view."""
     rig = _inverse(bundle.normal)
+    lenses, right_eye = lenses_and_rest(bundle.model, bundle.vector)
     for view, pose, weights in zip(views, bundle.poses, bundle.weights, strict=True):
-        residual, J, K = seen_with_slopes(view, corners_m, bundle.model, bundle.vector, pose)
+        residual, slopes = seen_with_slopes(view, corners_m, lenses, right_eye, pose)
+        J, K = np.split(slopes, [len(rig)], axis=1)
         w = np.repeat(weights, 2)[:, None]
         of_pose = np.linalg.inv(K.T @ (w * K))
         J = J - K @ of_pose @ (K.T @ (w * J))
         # The diagonal of the hat matrix (Huber & Ronchetti 2009, section 7.1).
-        taken = w[:, 0] * (np.einsum("ij,jk,ik->i", J, rig, J) + np.einsum("ij,jk,ik->i", K, of_pose, K))
+        taken = w[:, 0] * (np.sum(J @ rig * J, axis=1) + np.sum(K @ of_pose * K, axis=1))
         free = np.maximum(1.0 - taken.reshape(-1, 2).mean(axis=1), _LEAST_FREE)
         yield Influence(residual, w * J, J.T @ (w * J), K, free)
 
