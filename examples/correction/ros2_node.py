@@ -22,6 +22,7 @@ from bodyschema.drivers.ros2.link import open_session
 from bodyschema.drivers.ros2.messages import JOINT_STATE, JointState, decode_joint_state, encode_joint_state
 
 NODE = "bodyschema_correction"
+SETTLING = 2  # the kind of a memory
 
 
 class CorrectedJoints:
@@ -29,8 +30,8 @@ class CorrectedJoints:
 
     def __init__(self, session, file, domain, topic):
         contents = json.loads(file)
-        contents["effects"] = [effect for effect in contents["effects"] if effect["effect"] != "settling"]
-        self.arm, self.names = Correction(json.dumps(contents)), [joint["name"] for joint in contents["joints"]]
+        self.arm, self.names = Correction(file), contents["joints"]
+        self.arm.file["memories"] = [memory for memory in contents["memories"] if memory[1] != SETTLING]
         self.session, self.sequence = session, 0
         corrected, name = f"{topic}_corrected", str(session.info.zid())
         tokens = rmw.node_token(domain, name, NODE), rmw.publisher_token(domain, name, NODE, corrected, JOINT_STATE)
