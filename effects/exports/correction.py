@@ -74,13 +74,15 @@ def write_correction(simulation: Simulation, file: Path, heading: str) -> list[s
     }
     entries = [f'"{name}": {json.dumps(value, ensure_ascii=False)}' for name, value in head.items()]
     for name, table in _tables(kept).items():
-        rows = ",\n  ".join(map(json.dumps, table))
-        entries.append(f'"{name}": [\n  {rows}\n ]' if table and isinstance(table[0], list) else f'"{name}": {table}')
+        rows = isinstance(table, list) and table and isinstance(table[0], list)
+        entries.append(
+            f'"{name}": ' + ("[\n  " + ",\n  ".join(map(json.dumps, table)) + "\n ]" if rows else f"{table}")
+        )
     file.write_text("{\n " + ",\n ".join(entries) + "\n}\n", encoding="utf-8")
     return told
 
 
-def _tables(simulation: Simulation) -> dict[str, list[Any]]:
+def _tables(simulation: Simulation) -> dict[str, Any]:
     """Return the steps of the program in the order in which they are done."""
     joints = simulation.robot.joints
     added: Rows = {name: [] for name in ("ratios", "waves", "memories", "loose")}
@@ -92,33 +94,43 @@ def _tables(simulation: Simulation) -> dict[str, list[Any]]:
             added[name] += rows
     loose, springs = added.pop("loose"), simulation.springs if simulation.bears_weight else np.zeros(len(joints))
     added["ratios"] = [[k, k, 1.0] for k in range(len(joints))] + added["ratios"]
-    passes = [[0]] * (SPRING_ROUNDS * bool(springs.any())) + [[1]] * bool(loose)
-    bodies = _bodies(simulation, springs, loose) if passes else []
-    return {"zeros": zeros, **added, "passes": passes, "gravity": [0.0, 0.0, -GRAVITY_M_S2], "bodies": bodies} | _chain(
-        simulation
-    )
+    gravity: dict[str, Any] = {"gravity": [0.0, 0.0, -GRAVITY_M_S2]}
+    return {"zeros": zeros, **added} | gravity | _weights(simulation, springs, loose) | _chain(simulation)
 
 
-def _bodies(simulation: Simulation, springs: FloatArray, loose: list[list[Any]]) -> list[list[Any]]:
-    """Return the bodies that joints carry, each after the one that carries its joint."""
+def _weights(simulation: Simulation, springs: FloatArray, loose: list[list[Any]]) -> dict[str, Any]:
+    """Return the bodies that joints carry, and their loads; none where no joint gives.
+
+    Those of `bodies` have joints that give or bear one that does: first those that bear none in turn.
+    """
     robot, gravity, geometry = simulation.robot, simulation.gravity, geometry_without_zeros(simulation)
-    loads = [load.bodies for load in (gravity, *simulation.payloads)]
-    aligned: dict[int | None, FloatArray] = {None: np.eye(4)}
-    numbers: dict[int | None, int] = {None: 0}
-    bodies = []
+    masses = [load.bodies for load in (gravity, *simulation.payloads)]
+    gives = {int(k) for k in np.flatnonzero(springs)} | {joint for joint, *_ in loose}
+    bearers: dict[int | None, set[int]] = {None: set()}
     for k in gravity.outwards:
+        bearers[k] = bearers[gravity.bodies[k].carrier] | {k}
+    inside = [k for k in gravity.outwards if not bearers[k] & gives and any(k in bearers[each] for each in gives)]
+    between = [k for k in gravity.outwards if bearers[k] & gives and any(k in bearers[each] for each in gives)]
+    outside = [k for k in gravity.outwards if bearers[k] & gives and k not in between]
+    numbers: dict[int | None, int] = {None: 0} | {k: n for n, k in enumerate([*inside, *between, *outside], 1)}
+    aligned: dict[int | None, FloatArray] = {None: np.eye(4)}
+    aligned |= {k: _onto_z(robot.tree.joint(name).axis) for k, name in enumerate(robot.joints)}
+    passes = [[0, len(inside)]] * (SPRING_ROUNDS * bool(springs.any())) + [[1, len(inside)]] * bool(loose)
+    found: dict[str, Any] = {"loads": [[0.0] * 4], "carried": [], "passes": passes, "bodies": []}
+    for k in [*inside, *between, *outside]:
         name, body = robot.joints[k], gravity.bodies[k]
         joint = robot.tree.joint(name)
         origin = geometry.T_parent_joint.get(name, joint.T_parent_joint)
-        aligned[k], numbers[k] = _onto_z(joint.axis), len(numbers)
-        pose = inverse(aligned[body.carrier]) @ body.T_carrier_joint @ inverse(joint.T_parent_joint) @ origin
-        moment = aligned[k][:3, :3].T @ sum(each[k].moment for each in loads)
-        load = [*moment.tolist(), float(sum(each[k].mass_kg for each in loads))]
+        T = inverse(aligned[body.carrier]) @ body.T_carrier_joint @ inverse(joint.T_parent_joint) @ origin @ aligned[k]
+        parent, slides, pose = numbers[body.carrier], int(robot.chain.prismatic[k]), _numbers(T)
+        moment = aligned[k][:3, :3].T @ sum(each[k].moment for each in masses)
+        found["loads"].append([*moment.tolist(), float(sum(each[k].mass_kg for each in masses))])
         half, hold = next(((half, hold) for at, half, hold in loose if at == k), (0.0, 0.0))
-        spring = [float(springs[k]), half, hold, 0.0]
-        slides = int(robot.chain.prismatic[k])
-        bodies.append([k, numbers[body.carrier], slides, _numbers(pose @ aligned[k]), load, spring])
-    return bodies
+        if k in outside:
+            found["carried"].insert(0, [k, numbers[k], parent, slides, pose])
+        else:
+            found["bodies"].append([k, parent, slides, pose, [float(springs[k]), half, hold, 0.0]])
+    return found
 
 
 def _chain(simulation: Simulation) -> dict[str, list[Any]]:

