@@ -73,7 +73,7 @@ IN_CPP = """
 #include <iterator>
 int main(int, char** argv) {
   std::ifstream file(argv[1]), numbers(argv[2]);
-  correction::Correction arm(std::string(std::istreambuf_iterator<char>(file), {}));
+  Correction arm(std::string(std::istreambuf_iterator<char>(file), {}));
   std::vector<double> all(std::istream_iterator<double>(numbers), {});
   std::vector<std::vector<double>> rows;
   for (size_t k = 0; k < all.size(); k += 6) rows.emplace_back(all.begin() + k, all.begin() + k + 6);

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.calibrated import CalibratedGeometry
 from bodyschema.robot.description import RobotDescription
-from bodyschema.robot.rpy import rpy_of
+from bodyschema.robot.hand_eye import HandEye, pose_covariance
+from bodyschema.robot.rpy import pose_of, rpy_of
 from bodyschema.robot.urdf import inverse
 from kbmaps import ChainBelief, ChainParameters
 
@@ -78,6 +79,11 @@ class ChainFigures:
             inner = _given(belief.covariance, self._hidden)
             covariance += share * (jacobian @ inner @ jacobian.T + np.outer(apart, apart))
         return covariance
+
+    def hand_eye(self, frame: str) -> HandEye:
+        """Return the camera's pose, in SI with its covariance; `frame` is the ROS name of the measurement frame."""
+        covariance = pose_covariance(lambda v: pose_of(v[:3], v[3:]), self.values[:6], self.covariance[:6, :6])
+        return HandEye.of(self.robot.camera.parent_link, frame, self.geometry.T_parent_camera, covariance)
 
     @property
     def half_widths(self) -> FloatArray:

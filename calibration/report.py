@@ -7,8 +7,6 @@ import math
 import msgspec
 import numpy as np
 
-from bodyschema.calibration.chain_figures import ChainFigures
-from bodyschema.calibration.hand_eye import HandEye, pose_covariance
 from bodyschema.calibration.plausibility.check import Plausibility
 from bodyschema.calibration.rigid_chain import Calibration, Trusted
 from bodyschema.calibration.tool_jump import tool_jump
@@ -17,7 +15,7 @@ from bodyschema.learning.solvers.tolerance_selection import WORKMANSHIP
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.calibrated_files import CAMERA_LINK
 from bodyschema.robot.description import RobotDescription
-from bodyschema.robot.rpy import pose_of
+from bodyschema.robot.hand_eye import HandEye
 
 # A joint that moved less is named [rad, m].
 STILL_RAD, STILL_M = math.radians(10.0), 0.02
@@ -183,17 +181,12 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
             undirected=list(seen.undirected),
             expected_mm=None if expected is None else 1e3 * expected.mean_m,
             expected_p95_mm=None if expected is None else 1e3 * expected.p95_m,
-            hand_eye=_hand_eye(robot, named, frame),
+            hand_eye=named.hand_eye(frame),
             tool_xyz_m=named.geometry.marker_xyz.tolist(),
             tool_covariance=named.covariance[6:9, 6:9].ravel().tolist(),
             trusted=calibration.trusted,
             free_expected_mm=None if free is None or free.expected is None else 1e3 * free.expected.mean_m,
         )
-
-
-def _hand_eye(robot: RobotDescription, figures: ChainFigures, frame: str) -> HandEye:
-    covariance = pose_covariance(lambda v: pose_of(v[:3], v[3:]), figures.values[:6], figures.covariance[:6, :6])
-    return HandEye.of(robot.camera.parent_link, frame, figures.geometry.T_parent_camera, covariance)
 
 
 def _zeros(calibration: Calibration, values: FloatArray, halves: FloatArray) -> list[Zero]:

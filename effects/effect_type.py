@@ -25,7 +25,7 @@ from .parameter import Parameter
 
 if TYPE_CHECKING:
     from .effect import Effect
-    from .encoder import EncoderEffect
+    from .encoder import EncoderEffect, Place, Rows
     from .gravity import GravityLoad
     from .simulation import Simulated
 
@@ -176,8 +176,8 @@ class EffectType(ABC):
         """Return rows (n,) at which its state is not known well enough, as before the first contact of a backlash."""
         return np.zeros(len(run.motion), dtype=np.bool_)
 
-    def correction_values(self, effect: Effect) -> list[float] | None:
-        """Return its values for the readings' corrections in correction.json; None if the format has no such entry."""
+    def correction_rows(self, effect: Effect, place: Place) -> Rows | None:
+        """Return what it adds to the tables of correction.json; None if the format cannot hold it."""
         return None
 
     def add_to(self, joint: JointErrors, effect: Effect) -> str | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from .effect import Effect
     from .simulation import Simulated
 
+# Rows of the tables of correction.json, by the table's name.
+Rows = dict[str, list[list[Any]]]
+# State of a memory in correction.json before the first reading.
+UNKNOWN_STATE = (0, 0.0, 0.0)
 # Share of a past move below which it is ignored.
 _FORGOTTEN = 1e-17
 

@@ -31,7 +31,7 @@ _STEP = 1e-6
 # Relative step by a period or a time constant.
 _SHAPE_STEP = 1e-3
 # A spring's deflection changes its own load; each round adds the next order.
-_SPRING_ROUNDS = 3
+SPRING_ROUNDS = 3
 Staged = TypeVar("Staged", bound=EffectType)
 
 
@@ -237,7 +237,7 @@ class Simulation:
         if not self.bears_weight:
             return given
         if self.springs.any():
-            for _ in range(_SPRING_ROUNDS):
+            for _ in range(SPRING_ROUNDS):
                 given = self.springs * self.torques(q + given)
         loose = [(effect, kind) for effect, kind in self._of(StructureEffect) if kind.has_slack]
         torques, sides = self.torques(q + given) if loose else given, {} if hung is None else hung

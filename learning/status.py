@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import msgspec
 
+from bodyschema.robot.hand_eye import HandEye
+
 
 class CurvePoint(msgspec.Struct, frozen=True, array_like=True):
     """One point of the learning curve: prequential error, before the pair was learnt."""
@@ -39,6 +41,8 @@ class ChainCalibration(msgspec.Struct, frozen=True, kw_only=True):
             pairs do not determine it.
         noise_m: 1-sigma of a measured coordinate.
         outliers: number of outliers among the last 500 pairs: too far from the chain for this noise.
+        hand_eye: the camera's pose as ROS takes it; null from a learner of an earlier version.
+        marker_covariance: of the marker in its link, 3 x 3 row by row [m²]; null likewise.
     """
 
     pairs: int
@@ -52,6 +56,8 @@ class ChainCalibration(msgspec.Struct, frozen=True, kw_only=True):
     points_m: float | None
     noise_m: float
     outliers: int
+    hand_eye: HandEye | None = None
+    marker_covariance: list[float] | None = None
 
 
 class Outlook(msgspec.Struct, frozen=True, kw_only=True):

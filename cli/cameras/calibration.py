@@ -11,11 +11,11 @@ import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bodyschema.calibration.hand_eye import HandEye, pose_covariance
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.interfaces.whole_files import write_whole
+from bodyschema.robot.hand_eye import HandEye, pose_covariance
 from bodyschema.vision.board import Board
 from bodyschema.vision.board.board import Pattern
 from bodyschema.vision.board.page import page as board_page

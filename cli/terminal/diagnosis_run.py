@@ -13,7 +13,6 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from bodyschema.calibration.hand_eye import HandEye, pose_covariance
 from bodyschema.calibration.plausibility.check import plausibility, told_sigma
 from bodyschema.calibration.plausibility.limits import require_units
 from bodyschema.cli.recordings.recorder import History
@@ -37,6 +36,7 @@ from bodyschema.recordings import files as recordings
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.calibrated_files import CAMERA_LINK
 from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.hand_eye import HandEye, pose_covariance
 from bodyschema.robot.suggest import did_you_mean
 
 DIAGNOSIS, REPORT = "diagnosis.json", "report.html"

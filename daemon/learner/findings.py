@@ -19,6 +19,7 @@ from bodyschema.learning.model_bank import SOLVED
 from bodyschema.learning.online_learner import OnlineLearner
 from bodyschema.learning.solvers.tolerance_selection import WORKMANSHIP, probable
 from bodyschema.learning.status import ChainCalibration, JointZero, LearntFigure, Outlook
+from bodyschema.robot.calibrated_files import CAMERA_LINK
 from bodyschema.robot.description import RobotDescription
 from kbmaps import ChainBelief, KBMapsError
 
@@ -160,6 +161,8 @@ def calibrated(robot: RobotDescription, known: LearnerEvidence, scatter: Scatter
         points_m=None if workmanship is None else workmanship[1],
         noise_m=scatter.noise_m,
         outliers=scatter.outliers,
+        hand_eye=found.hand_eye(CAMERA_LINK),
+        marker_covariance=found.covariance[6:9, 6:9].ravel().tolist(),
     )
 
 

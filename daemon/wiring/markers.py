@@ -16,6 +16,8 @@ from bodyschema.daemon.sampler.reconnect import ReconnectingSource
 from bodyschema.interfaces.errors import ConfigError, SourceEnded
 from bodyschema.interfaces.protocols import Clock, StereoEyes
 from bodyschema.interfaces.records import ImageArray, Reason
+from bodyschema.robot.hand_eye import HandEye
+from bodyschema.robot.rpy import pose_of
 from bodyschema.vision.calibration.images import Images, read_pairs
 from bodyschema.vision.cluster.measure import ClusterView, MeasuredCluster, measure_cluster
 from bodyschema.vision.cluster.tables import cluster_tables
@@ -86,7 +88,10 @@ class Wanted:
 
 
 class TagFigures(msgspec.Struct):
-    """A tag, 1-sigma of its place [mm] and of its turn [°], and how many views show it."""
+    """A tag, 1-sigma of its place [mm] and of its turn [°], and how many views show it.
+
+    `pose` is the same in SI, in the frame of the cluster.
+    """
 
     id: int
     xyz_mm: tuple[float, float, float]
@@ -94,6 +99,7 @@ class TagFigures(msgspec.Struct):
     xyz_sigma_mm: tuple[float, float, float]
     turn_sigma_deg: tuple[float, float, float]
     views: int
+    pose: HandEye
 
 
 class ClusterFile(msgspec.Struct):
@@ -205,6 +211,12 @@ def figures(found: MeasuredCluster) -> ClusterFile:
                 xyz_sigma_mm=_scaled(tag.xyz_sigma_m, 1e3),
                 turn_sigma_deg=_scaled(tag.turn_sigma_rad, np.degrees(1.0)),
                 views=tag.views,
+                pose=HandEye.of(
+                    "marker",
+                    f"tag_{tag.placed.id}",
+                    pose_of(np.array(tag.placed.xyz), np.array(tag.placed.rpy)),
+                    np.diag(np.square(np.concatenate([tag.xyz_sigma_m, tag.turn_sigma_rad]))),
+                ),
             )
             for tag in found.tags
         ],

@@ -43,7 +43,9 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
     causes = _causes(diagnosis)
     rms = _rms_mm(diagnosis)
     verdict = _verdict(diagnosis, causes)
-    gain, tolerances = Gain(percent, interval), _tolerances(diagnosis)
+    counted = (None, None) if diagnosis.markers.all() else diagnosis.gain_with_outliers()
+    gain = Gain(percent, interval, with_outliers_percent=counted[0], with_outliers_ci95=counted[1])
+    tolerances = _tolerances(diagnosis)
     timed = diagnosis.aligned.observations.motion.t is not None
     # A tracker or a scanner has no intrinsics in robot.toml.
     seen_by = "instrument" if diagnosis.aligned.simulation.robot.calibration is None else "camera"

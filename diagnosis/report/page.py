@@ -14,7 +14,7 @@ from bodyschema.diagnosis.diagnosis import Diagnosis
 from bodyschema.diagnosis.report.numbers import chance, mm, share, told_values
 from bodyschema.diagnosis.report.presenters.outliers import outlier_panel
 from bodyschema.diagnosis.report.presenters.registry import presenter_of
-from bodyschema.diagnosis.report.result import Cause, DiagnosisFile, Verdict
+from bodyschema.diagnosis.report.result import Cause, DiagnosisFile, Gain, Verdict
 from bodyschema.diagnosis.report.text import beside_geometry, finding, in_order, made_to, modelled, to_do
 from bodyschema.effects import Effect
 
@@ -108,13 +108,20 @@ def _equals(p: float) -> str:
     return text if text.startswith("<") else f"= {text}"
 
 
+def _counted(gain: Gain) -> str:
+    if gain.with_outliers_percent is None or gain.with_outliers_ci95 is None:
+        return ""
+    low, high = map(share, gain.with_outliers_ci95)
+    return f"; with them the gain is {share(gain.with_outliers_percent)} ({low} to {high})"
+
+
 def _glance(residuals: Residuals, file: DiagnosisFile) -> str:
     rms, gain = file.rms_mm, file.gain
     tiles = [
         (f"{mm(rms.aligned)} → {mm(rms.extended)} mm", "RMS before → after"),
         (share(gain.held_out_percent), f"gain, held out ({share(gain.ci95[0])} to {share(gain.ci95[1])})"),
         (f"{mm(rms.noise_floor)} mm", "noise alone (RMS)"),
-        (f"{file.pairs.outliers:,} of {file.pairs.total:,}", "fixes that are not the marker"),
+        (f"{file.pairs.outliers:,} of {file.pairs.total:,}", f"fixes that are not the marker{_counted(gain)}"),
     ]
     if file.stability is not None:
         same = f"{file.stability.same_causes} of {file.stability.resampled}"

@@ -21,11 +21,19 @@ class Interval(msgspec.Struct, frozen=True):
 
 
 class Gain(msgspec.Struct, frozen=True, rename={"from_": "from"}):
-    """Reduction of the RMS on held-out rows, relative to the aligned simulation [%]."""
+    """Reduction of the RMS on held-out rows, relative to the aligned simulation [%].
+
+    Attributes:
+        ci95: its 95 % interval on new poses: of another recording of the same kind, half as long.
+        with_outliers_percent, with_outliers_ci95: the same if the fixes that are not the marker are counted; null where
+            there are none.
+    """
 
     held_out_percent: float
     ci95: tuple[float, float]
     from_: str = "aligned"
+    with_outliers_percent: float | None = None
+    with_outliers_ci95: tuple[float, float] | None = None
 
 
 class Indistinguishable(msgspec.Struct, frozen=True):

@@ -24,6 +24,8 @@ from .scan import Candidate
 _MOST_BLOCKS, _FOLDS = 80, 5
 FEWEST_ROWS_A_BLOCK = 5
 _BOOTSTRAPS = 2000
+# Neighbours in time are alike for long, so a gain's interval rests on this many long parts of a recording.
+_LONG_BLOCKS = 10
 # A fix whose probability of being the marker is lower is left out of all figures.
 _MARKER = 0.5
 
@@ -51,6 +53,11 @@ class Blocks:
         """Fold of each row (n,)."""
         return self.of_row % _FOLDS
 
+    def merged(self, most: int) -> Blocks:
+        """Return at most `most` longer blocks of neighbouring blocks."""
+        count = min(self.count, most)
+        return Blocks(self.of_row * count // self.count, count)
+
     def sums(self, values: FloatArray) -> FloatArray:
         """Return sums (blocks, ...) of values (n, ...)."""
         sums = np.zeros((self.count, *values.shape[1:]))
@@ -72,11 +79,18 @@ def held_out_errors(fit: Fit, blocks: Blocks) -> FloatArray:
 
 
 def gain_percent(before: FloatArray, after: FloatArray, blocks: Blocks, seed: int) -> tuple[float, tuple[float, float]]:
-    """Return the reduction of the RMS of distances (n,) [%], and its 95 % interval from resampled blocks."""
+    """Return the reduction of the RMS of distances (n,) [%], and its 95 % interval on new poses.
+
+    The interval is for another recording of the same kind, half as long: long blocks are resampled, since this
+    recording is a sample, and as many as the other one has are drawn from them.
+    """
+    blocks = blocks.merged(_LONG_BLOCKS)
     rows = blocks.sums(np.stack([np.square(before), np.square(after)], axis=1))
     total = rows.sum(axis=0)
-    drawn = np.random.default_rng(seed).integers(blocks.count, size=(_BOOTSTRAPS, blocks.count))
-    sums = rows[drawn].sum(axis=1)
+    rng = np.random.default_rng(seed)
+    again = rng.integers(blocks.count, size=(_BOOTSTRAPS, blocks.count))
+    other = rng.integers(blocks.count, size=(_BOOTSTRAPS, blocks.count // 2))
+    sums = rows[np.take_along_axis(again, other, axis=1)].sum(axis=1)
 
     def percent(before_after: FloatArray) -> FloatArray:
         return 100.0 * (1.0 - np.sqrt(before_after[..., 1] / np.maximum(before_after[..., 0], 1e-300)))

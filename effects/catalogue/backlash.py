@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyschema.effects.encoder import EncoderEffect, Place
+from bodyschema.effects.encoder import UNKNOWN_STATE, EncoderEffect, Place, Rows
 from bodyschema.effects.joint_errors import JointErrors
 from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter
@@ -60,8 +60,9 @@ class Backlash(EncoderEffect):
         """Return rows (n,) before the joint first crosses its backlash in a run."""
         return run.motion.before_travel(run.simulation.place(effect).joint, float(effect.values[0]))
 
-    def correction_values(self, effect: Effect) -> list[float]:
-        return effect.values.tolist()
+    def correction_rows(self, effect: Effect, place: Place) -> Rows:
+        half = 0.5 * float(effect.values[0])
+        return {"memories": [[place.joint, 0, half, abs(half), list(UNKNOWN_STATE)]] if half else []}
 
     def add_to(self, joint: JointErrors, effect: Effect) -> str | None:
         if joint.play or effect.values[0] < 0.0:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyschema.effects.effect_type import StructureEffect
+from bodyschema.effects.encoder import Place, Rows
 from bodyschema.effects.joint_errors import JointErrors
 from bodyschema.effects.moments import with_moment
 from bodyschema.effects.motion import Motion, flanks
@@ -64,8 +65,9 @@ class GravityBacklash(StructureEffect):
         less, more = hold / _FRICTION_WITHIN, hold * _FRICTION_WITHIN + _UPRIGHT * float(np.abs(torque).max())
         return flanks(torque, less) != flanks(torque, more)
 
-    def correction_values(self, effect: Effect) -> list[float]:
-        return effect.values.tolist()
+    def correction_rows(self, effect: Effect, place: Place) -> Rows:
+        width, hold = effect.values.tolist()
+        return {"loose": [[place.joint, 0.5 * width, hold]]}
 
     def add_to(self, joint: JointErrors, effect: Effect) -> str | None:
         width, hold = effect.values.tolist()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from bodyschema.effects.encoder import EncoderEffect, Place
+from bodyschema.effects.encoder import EncoderEffect, Place, Rows
 from bodyschema.effects.joint_errors import JointErrors
 from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter
@@ -28,8 +28,8 @@ class JointCoupling(EncoderEffect):
         assert place.source is not None
         return motion.q[:, [place.source]]
 
-    def correction_values(self, effect: Effect) -> list[float]:
-        return effect.values.tolist()
+    def correction_rows(self, effect: Effect, place: Place) -> Rows:
+        return {"ratios": [[place.joint, place.source, float(effect.values[0])]]}
 
     def add_to(self, joint: JointErrors, effect: Effect) -> None:
         joint.add_ratio(str(effect.source), float(effect.values[0]))

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bodyschema.effects.encoder import EncoderEffect, Place
+from bodyschema.effects.encoder import EncoderEffect, Place, Rows
 from bodyschema.effects.joint_errors import JointErrors
 from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 # Upper limit of a magnet's eccentricity as a share of its radius; beyond it the encoder cannot be read.
 _FARTHEST_OFF = 0.95
+# Samples of a turn for its Fourier series, and the amplitude [rad] below which a term is rounding.
+_SAMPLES, _NEGLIGIBLE = 256, 1e-15
 
 
 class JointEccentricity(EncoderEffect):
@@ -40,8 +42,18 @@ class JointEccentricity(EncoderEffect):
     def correction(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
         return np.arcsin(self._sine(self._ring(motion, place), values))
 
-    def correction_values(self, effect: Effect) -> list[float]:
-        return effect.values.tolist()
+    def correction_rows(self, effect: Effect, place: Place) -> Rows:
+        """Return its Fourier series; the waves of an eccentric magnet are the odd harmonics."""
+        sine, cosine = effect.values.tolist()
+        phase = float(np.arctan2(cosine, sine))
+        t = np.arange(_SAMPLES) * 2.0 * np.pi / _SAMPLES
+        error = np.arcsin(np.clip(np.hypot(sine, cosine) * np.sin(t), -_FARTHEST_OFF, _FARTHEST_OFF))
+        harmonics = np.arange(1, _SAMPLES // 2, 2)
+        amplitudes = 2.0 / _SAMPLES * np.sin(np.outer(harmonics, t)) @ error
+        series = [
+            (int(n), float(size)) for n, size in zip(harmonics, amplitudes, strict=True) if abs(size) > _NEGLIGIBLE
+        ]
+        return {"waves": [[place.joint, size, n, n * phase] for n, size in series]}
 
     def add_to(self, joint: JointErrors, effect: Effect) -> None:
         joint.add_wave(self.name, effect.values, 1.0)

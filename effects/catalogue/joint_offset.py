@@ -30,8 +30,5 @@ class JointOffset(EncoderEffect):
     def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
         return np.ones((len(motion), 1))
 
-    def correction_values(self, effect: Effect) -> list[float]:
-        return effect.values.tolist()
-
     def add_to(self, joint: JointErrors, effect: Effect) -> None:
         joint.offset += float(effect.values[0])

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bodyschema.effects.encoder import EncoderEffect, Place
+from bodyschema.effects.encoder import EncoderEffect, Place, Rows
 from bodyschema.effects.joint_errors import JointErrors
 from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter
@@ -52,10 +52,11 @@ class JointRipple(EncoderEffect):
     def bounded(self, effect: Effect, k: int, value: float, motion: Motion) -> float:
         return super().bounded(effect, k, value if effect.prismatic else max(value, _FEWEST_CYCLES), motion)
 
-    def correction_values(self, effect: Effect) -> list[float]:
+    def correction_rows(self, effect: Effect, place: Place) -> Rows:
         sine, cosine, cycles = effect.values.tolist()
         # The format has radians per unit of the reading.
-        return [sine, cosine, cycles * (2.0 * np.pi if effect.prismatic else 1.0)]
+        frequency = cycles * (2.0 * np.pi if effect.prismatic else 1.0)
+        return {"waves": [[place.joint, float(np.hypot(sine, cosine)), frequency, float(np.arctan2(cosine, sine))]]}
 
     def add_to(self, joint: JointErrors, effect: Effect) -> None:
         joint.add_wave(self.name, effect.values, float(effect.values[2]) * (2.0 * np.pi if effect.prismatic else 1.0))

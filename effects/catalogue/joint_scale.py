@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from bodyschema.effects.encoder import EncoderEffect, Place
+from bodyschema.effects.encoder import EncoderEffect, Place, Rows
 from bodyschema.effects.joint_errors import JointErrors
 from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter
@@ -26,8 +26,8 @@ class JointScale(EncoderEffect):
     def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
         return motion.q[:, [place.joint]]
 
-    def correction_values(self, effect: Effect) -> list[float]:
-        return effect.values.tolist()
+    def correction_rows(self, effect: Effect, place: Place) -> Rows:
+        return {"ratios": [[place.joint, place.joint, float(effect.values[0])]]}
 
     def add_to(self, joint: JointErrors, effect: Effect) -> None:
         joint.add_ratio(str(effect.where), float(effect.values[0]))

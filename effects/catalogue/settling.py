@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyschema.effects.encoder import EncoderEffect, Place, carried_on
+from bodyschema.effects.encoder import UNKNOWN_STATE, EncoderEffect, Place, Rows, carried_on
 from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter
 from bodyschema.interfaces.records import FloatArray, frozen_array
@@ -66,8 +66,8 @@ class Settling(EncoderEffect):
                 rows[first + 1 : end] = memory ** np.cumsum(motion.pace[first + 1 : end]) > _AT_REST
         return rows
 
-    def correction_values(self, effect: Effect) -> list[float]:
-        return effect.values.tolist()
+    def correction_rows(self, effect: Effect, place: Place) -> Rows:
+        return {"memories": [[place.joint, 2, *effect.values.tolist(), list(UNKNOWN_STATE)]]}
 
 
 @lru_cache(maxsize=_MEMORIES_KEPT)

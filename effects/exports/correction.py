@@ -1,6 +1,7 @@
 """Write correction.json, from which a controller computes true joint angles and the marker's pose.
 
-docs/exporting.md has the format, examples/correction its readers. Every joint's frame is turned so that its axis is z.
+docs/exporting.md has the format, examples/correction its readers. It is a program of a few steps, each a table of
+numbers. Every joint's frame is turned so that its axis is z.
 """
 
 from __future__ import annotations
@@ -12,15 +13,16 @@ from typing import Any
 import numpy as np
 
 from bodyschema.effects.effect import Effect
+from bodyschema.effects.encoder import Rows
 from bodyschema.effects.exports.arm_errors import geometry_without_zeros
-from bodyschema.effects.gravity import GRAVITY_M_S2, carried
-from bodyschema.effects.simulation import Simulation
+from bodyschema.effects.gravity import GRAVITY_M_S2
+from bodyschema.effects.simulation import SPRING_ROUNDS, Simulation
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.urdf import inverse
 
 from .arm_errors import BORNE_BY_HAND, LeftOut, moment_notes, residual_note, sentences
 
-FORMAT, VERSION = "bodyschema correction", 1
+FORMAT, VERSION = "bodyschema correction", 2
 
 
 def held_by_correction(simulation: Simulation) -> Simulation:
@@ -38,8 +40,12 @@ def _why_not(simulation: Simulation, effect: Effect) -> str | None:
     kind = effect.kind
     if kind.needs_weight and not simulation.bears_weight:
         return BORNE_BY_HAND
-    held = kind.rigid or kind.is_spring or kind.is_load or kind.correction_values(effect) is not None
+    held = kind.rigid or kind.is_spring or kind.is_load or _rows(simulation, effect) is not None
     return None if held else kind.no_counterpart
+
+
+def _rows(simulation: Simulation, effect: Effect) -> Rows | None:
+    return None if effect.where is None else effect.kind.correction_rows(effect, simulation.place(effect))
 
 
 def write_correction(simulation: Simulation, file: Path, heading: str) -> list[str]:
@@ -58,78 +64,98 @@ def write_correction(simulation: Simulation, file: Path, heading: str) -> list[s
     reasons = [(effect, _why_not(stayed, effect)) for effect in stayed.all_effects]
     left_out = [LeftOut(effect, why) for effect, why in reasons if why is not None]
     told = [*sentences(left_out), *residual_note(simulation), *moment_notes(simulation)]
-    entries = [(effect, effect.kind.correction_values(effect)) for effect in kept.all_effects]
-    contents = {
+    head = {
         "format": FORMAT,
         "version": VERSION,
         "robot": simulation.robot.name,
         "from": heading,
         "notes": told,
-        "effects": [_entry(kept, effect, values) for effect, values in entries if values is not None],
-        "gravity_m_s2": GRAVITY_M_S2,
-    } | _chain(kept)
-    file.write_text(json.dumps(contents, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        "joints": list(simulation.robot.joints),
+    }
+    entries = [f'"{name}": {json.dumps(value, ensure_ascii=False)}' for name, value in head.items()]
+    for name, table in _tables(kept).items():
+        rows = isinstance(table, list) and table and isinstance(table[0], list)
+        entries.append(
+            f'"{name}": ' + ("[\n  " + ",\n  ".join(map(json.dumps, table)) + "\n ]" if rows else f"{table}")
+        )
+    file.write_text("{\n " + ",\n ".join(entries) + "\n}\n", encoding="utf-8")
     return told
 
 
-def _entry(simulation: Simulation, effect: Effect, values: list[float]) -> dict[str, Any]:
-    place = simulation.place(effect)
-    # Some effects have a state; it is unknown before the first reading.
-    entry = {"effect": effect.name, "joint": place.joint, "values": values, "state": []}
-    return entry if place.source is None else entry | {"source": place.source}
+def _tables(simulation: Simulation) -> dict[str, Any]:
+    """Return the steps of the program in the order in which they are done."""
+    joints = simulation.robot.joints
+    added: Rows = {name: [] for name in ("ratios", "waves", "memories", "loose")}
+    zeros = [0.0] * len(joints)
+    for effect in simulation.all_effects:
+        if effect.kind.is_zero:
+            zeros[simulation.place(effect).joint] += float(effect.values[0])
+        for name, rows in (_rows(simulation, effect) or {}).items():
+            added[name] += rows
+    loose, springs = added.pop("loose"), simulation.springs if simulation.bears_weight else np.zeros(len(joints))
+    added["ratios"] = [[k, k, 1.0] for k in range(len(joints))] + added["ratios"]
+    gravity: dict[str, Any] = {"gravity": [0.0, 0.0, -GRAVITY_M_S2]}
+    return {"zeros": zeros, **added} | gravity | _weights(simulation, springs, loose) | _chain(simulation)
 
 
-def _chain(simulation: Simulation) -> dict[str, Any]:
-    """Return the joints, in the order of the readings, and the frames of camera and marker."""
+def _weights(simulation: Simulation, springs: FloatArray, loose: list[list[Any]]) -> dict[str, Any]:
+    """Return the bodies that joints carry, and their loads; none where no joint gives.
+
+    Those of `bodies` have joints that give or bear one that does: first those that bear none in turn.
+    """
     robot, gravity, geometry = simulation.robot, simulation.gravity, geometry_without_zeros(simulation)
-    loads = [load.bodies for load in (gravity, *simulation.payloads)]
+    masses = [load.bodies for load in (gravity, *simulation.payloads)]
+    gives = {int(k) for k in np.flatnonzero(springs)} | {joint for joint, *_ in loose}
+    bearers: dict[int | None, set[int]] = {None: set()}
+    for k in gravity.outwards:
+        bearers[k] = bearers[gravity.bodies[k].carrier] | {k}
+    inside = [k for k in gravity.outwards if not bearers[k] & gives and any(k in bearers[each] for each in gives)]
+    between = [k for k in gravity.outwards if bearers[k] & gives and any(k in bearers[each] for each in gives)]
+    outside = [k for k in gravity.outwards if bearers[k] & gives and k not in between]
+    numbers: dict[int | None, int] = {None: 0} | {k: n for n, k in enumerate([*inside, *between, *outside], 1)}
     aligned: dict[int | None, FloatArray] = {None: np.eye(4)}
-    for k, name in enumerate(robot.joints):
-        aligned[k] = _onto_z(robot.tree.joint(name).axis)
-    joints = []
-    for k, name in enumerate(robot.joints):
-        joint, body = robot.tree.joint(name), gravity.bodies[k]
+    aligned |= {k: _onto_z(robot.tree.joint(name).axis) for k, name in enumerate(robot.joints)}
+    passes = [[0, len(inside)]] * (SPRING_ROUNDS * bool(springs.any())) + [[1, len(inside)]] * bool(loose)
+    found: dict[str, Any] = {"loads": [[0.0] * 4], "carried": [], "passes": passes, "bodies": []}
+    for k in [*inside, *between, *outside]:
+        name, body = robot.joints[k], gravity.bodies[k]
+        joint = robot.tree.joint(name)
         origin = geometry.T_parent_joint.get(name, joint.T_parent_joint)
-        pose = body.T_carrier_joint @ inverse(joint.T_parent_joint) @ origin
-        joints.append(
-            {
-                "name": name,
-                "slides": bool(robot.chain.prismatic[k]),
-                "parent": _numbered(body.carrier),
-                "pose": _numbers(inverse(aligned[body.carrier]) @ pose @ aligned[k]),
-                "compliance": float(simulation.springs[k]),
-                "mass_kg": float(sum(bodies[k].mass_kg for bodies in loads)),
-                "moment_kg_m": (aligned[k][:3, :3].T @ sum(bodies[k].moment for bodies in loads)).tolist(),
-            }
-        )
-    T_link_marker = np.eye(4)
-    T_link_marker[:3, 3] = geometry.marker_xyz
-    ends = {
-        "camera": (robot.camera.parent_link, geometry.T_parent_camera),
-        "marker": (robot.robot.marker_link, T_link_marker),
-    }
-    found: dict[str, Any] = {"joints": joints, "outwards": list(gravity.outwards)}
-    for name, (link, T) in ends.items():
-        carrier, T_carrier_link = carried(robot.tree, link, robot.joints, robot.robot.held_at)
-        found[name] = {
-            "parent": _numbered(carrier),
-            "pose": _numbers(inverse(aligned[carrier]) @ T_carrier_link @ T),
-        }
+        T = inverse(aligned[body.carrier]) @ body.T_carrier_joint @ inverse(joint.T_parent_joint) @ origin @ aligned[k]
+        parent, slides, pose = numbers[body.carrier], int(robot.chain.prismatic[k]), _numbers(T)
+        moment = aligned[k][:3, :3].T @ sum(each[k].moment for each in masses)
+        found["loads"].append([*moment.tolist(), float(sum(each[k].mass_kg for each in masses))])
+        half, hold = next(((half, hold) for at, half, hold in loose if at == k), (0.0, 0.0))
+        if k in outside:
+            found["carried"].insert(0, [k, numbers[k], parent, slides, pose])
+        else:
+            found["bodies"].append([k, parent, slides, pose, [float(springs[k]), half, hold, 0.0]])
     return found
 
 
+def _chain(simulation: Simulation) -> dict[str, list[Any]]:
+    """Return the joints from camera to marker, each with the pose of its frame in that of the one before."""
+    own, background = (
+        [effect for effect in effects if not effect.kind.is_zero]
+        for effects in (simulation.effects, simulation.background)
+    )
+    chain = simulation.with_effects(own).with_background(background).rigid_chain
+    before, joints = np.eye(4), []
+    for fixed, axis, slides in zip(chain.fixed, chain.axes, chain.prismatic, strict=False):
+        onto_z = _onto_z(axis)
+        joints.append([int(slides), _numbers(before.T @ fixed @ onto_z)])
+        before = onto_z
+    return {"chain": joints, "marker": (before.T @ chain.fixed[-1]).T.tolist()}
+
+
 def _onto_z(axis: FloatArray) -> FloatArray:
-    """Return a pose (4, 4) whose z is `axis`."""
+    """Return a rotation (4, 4) whose z is `axis`."""
     across = np.eye(3)[int(np.argmin(np.abs(axis)))]
     x = np.cross(across, axis)
     x /= np.linalg.norm(x)
     T = np.eye(4)
     T[:3, :3] = np.stack([x, np.cross(axis, x), axis], axis=1)
     return T
-
-
-def _numbered(carrier: int | None) -> int:
-    return -1 if carrier is None else carrier
 
 
 def _numbers(T: FloatArray) -> list[float]:

@@ -10,7 +10,7 @@
 
 int main(int argc, char** argv) {
   std::ifstream file(argc > 1 ? argv[1] : "", std::ios::binary);
-  correction::Correction arm(std::string(std::istreambuf_iterator<char>(file), {}));
+  Correction arm(std::string(std::istreambuf_iterator<char>(file), {}));
   for (std::string line; std::getline(std::cin, line);) {
     std::istringstream words(line);
     arm.read(std::vector<double>(std::istream_iterator<double>(words), {}));

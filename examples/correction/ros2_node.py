@@ -3,9 +3,9 @@
 python ros2_node.py correction.json [--router tcp/127.0.0.1:7447] [--domain 0] [--topic /joint_states]
 
 It publishes sensor_msgs/JointState on /joint_states_corrected, which `ros2 topic echo` shows, and for programs without
-ROS {"t_ns": …, "q": […], "pose": […]} as JSON on bodyschema/<robot>/corrected. A message that does not have all joints
-is passed over. Velocities and efforts stay as they are. What depends on moves between rows of a recording (settling) is
-left out: messages come at another pace.
+ROS {"t_ns": …, "q": […], "marker": {…}} as JSON on bodyschema/<robot>/corrected, the marker's pose in SI as matrix and
+quaternion. A message that does not have all joints is passed over. Velocities and efforts stay as they are. What
+depends on moves between rows of a recording (settling) is left out: messages come at another pace.
 """
 
 import argparse
@@ -13,6 +13,8 @@ import hashlib
 import json
 import time
 
+import msgspec
+import numpy as np
 import zenoh
 from correction import Correction
 
@@ -20,8 +22,11 @@ from bodyschema.drivers.ros2 import rmw
 from bodyschema.drivers.ros2.cdr import Malformed
 from bodyschema.drivers.ros2.link import open_session
 from bodyschema.drivers.ros2.messages import JOINT_STATE, JointState, decode_joint_state, encode_joint_state
+from bodyschema.robot.calibrated_files import CAMERA_LINK, MARKER_LINK
+from bodyschema.robot.hand_eye import HandEye
 
 NODE = "bodyschema_correction"
+SETTLING = 2  # the kind of a memory
 
 
 class CorrectedJoints:
@@ -29,8 +34,8 @@ class CorrectedJoints:
 
     def __init__(self, session, file, domain, topic):
         contents = json.loads(file)
-        contents["effects"] = [effect for effect in contents["effects"] if effect["effect"] != "settling"]
-        self.arm, self.names = Correction(json.dumps(contents)), [joint["name"] for joint in contents["joints"]]
+        self.arm, self.names = Correction(file), contents["joints"]
+        self.arm.file["memories"] = [memory for memory in contents["memories"] if memory[1] != SETTLING]
         self.session, self.sequence = session, 0
         corrected, name = f"{topic}_corrected", str(session.info.zid())
         tokens = rmw.node_token(domain, name, NODE), rmw.publisher_token(domain, name, NODE, corrected, JOINT_STATE)
@@ -57,7 +62,9 @@ class CorrectedJoints:
         self.sequence += 1
         attached = rmw.attachment(self.sequence, time.time_ns(), self.gid)
         self.to_ros.put(encode_joint_state(corrected), attachment=attached)
-        self.to_zenoh.put(json.dumps({"t_ns": message.header.stamp_ns, "q": angles, "pose": pose}))
+        T = np.array([*pose, 0.0, 0.0, 0.0, 1.0]).reshape(4, 4)
+        marker = msgspec.to_builtins(HandEye.of(CAMERA_LINK, MARKER_LINK, T))
+        self.to_zenoh.put(json.dumps({"t_ns": message.header.stamp_ns, "q": angles, "marker": marker}))
 
 
 def main():

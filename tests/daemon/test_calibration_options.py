@@ -13,7 +13,6 @@ from fitted_once import fitted_once as fitted_once
 from scipy.spatial.transform import Rotation
 
 from bodyschema.calibration.chain_figures import HALF_WIDTH_95
-from bodyschema.calibration.hand_eye import HandEye, write_launch_file
 from bodyschema.calibration.plausibility.check import Plausibility
 from bodyschema.calibration.report import CalibrationReport
 from bodyschema.calibration.rigid_chain import Calibration
@@ -21,6 +20,7 @@ from bodyschema.cli.main import command_line
 from bodyschema.cli.terminal.calibration_view import sentences
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.hand_eye import HandEye, write_launch_file
 from kbmaps import ChainParameters, ChainTolerances
 
 DESK_ARM = Path(__file__).parents[2] / "examples" / "desk_arm"

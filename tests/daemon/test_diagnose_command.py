@@ -159,7 +159,8 @@ def test_diagnosis_json_has_the_keys_that_are_promised(told, out) -> None:
     assert set(contents) >= KEYS
     assert set(contents["rms_mm"]) == set(contents["mean_mm"]) == RMS_KEYS
     assert set(contents["pairs"]) == {"total", "held_out", "outliers"}
-    assert set(contents["gain"]) == {"from", "held_out_percent", "ci95"}
+    counted = {"with_outliers_percent", "with_outliers_ci95"}
+    assert set(contents["gain"]) == {"from", "held_out_percent", "ci95", *counted}
     assert set(contents["causes"][0]) >= CAUSE_KEYS
     assert set(contents["causes"][0]["parameters"]["scale_error"]) == {"value", "ci95"}
     assert set(contents["rejected"][0]) >= {"effect", "where", "held_out_gain_percent", "p_value"}

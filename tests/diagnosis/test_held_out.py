@@ -109,6 +109,22 @@ def test_a_gain_is_the_fall_of_the_rms_inside_its_interval() -> None:
     assert low < percent < high
 
 
+def test_the_gain_of_another_recording_is_inside_the_interval() -> None:
+    rng = np.random.default_rng(5)
+
+    def recording(rows: int) -> tuple[FloatArray, FloatArray]:
+        """Return errors before and after, larger in some regions, in which the arm stays for 40 rows."""
+        region = np.repeat(rng.normal(size=(2, rows // 40)), 40, axis=1)
+        return tuple(np.exp(0.5 * region) * np.abs(rng.normal(size=(2, rows))) * [[1.0], [0.3]])
+
+    inside = 0
+    for seed in range(100):
+        _, (low, high) = gain_percent(*recording(400), Blocks.cut(400), seed)
+        before, after = recording(200)
+        inside += low <= 100.0 * (1.0 - np.sqrt(np.square(after).sum() / np.square(before).sum())) <= high
+    assert 90 <= inside <= 99
+
+
 def test_a_gain_of_nothing_is_none() -> None:
     before = np.abs(np.random.default_rng(3).normal(size=400))
     assert gain_percent(before, before, Blocks.cut(400), 0) == (0.0, (0.0, 0.0))

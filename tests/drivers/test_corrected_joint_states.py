@@ -75,4 +75,6 @@ def test_corrected_joint_states_have_the_raw_ones_stamps(endpoint, correction, m
                     seen += 1
                     if seen == 3:
                         break
-            assert len(json.loads(next(as_json).payload.to_string())["pose"]) == 12
+            marker = json.loads(next(as_json).payload.to_string())["marker"]
+            assert [len(row) for row in marker["matrix"]] == [4] * 4
+            assert len(marker["quaternion_xyzw"]) == 4

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -135,10 +136,11 @@ def test_memory_goes_on_from_a_state_in_the_file(commands, robot, tmp_path) -> N
     contents = json.loads(file.read_text())
     whole = corrected(commands["python"], file, q)[0]
     lag = whole[19] - q[19]
-    contents["effects"][0]["state"] = [whole[19, 4], True]
-    contents["effects"][1]["state"] = [q[19, 6], -lag[6]]
-    contents["effects"][2]["state"] = [q[19, 5], -lag[5] / 0.001]
-    contents["effects"][3]["state"] = [lag[3] / 0.01]
+    states = [[2, q[19, 4], -lag[4] / 0.01], [2, q[19, 6], -lag[6] / 0.1], [2, q[19, 5], -lag[5] / 0.001]]
+    for memory, state in zip(contents["memories"], states, strict=True):
+        memory[-1] = state
+    shoulder = next(body for body in contents["bodies"] if body[0] == 3)
+    shoulder[-1][-1] = lag[3] / 0.01
     file.write_text(json.dumps(contents))
     for command in commands.values():
         np.testing.assert_allclose(corrected(command, file, q[20:])[0], whole[20:], rtol=0, atol=1e-14)
@@ -150,3 +152,26 @@ def test_what_is_no_error_of_the_arm_is_listed(name, robot, tmp_path) -> None:
     [told] = write_correction(simulation, tmp_path / "c.json", "")
     assert told.startswith(f"not in the file: {name}")
     assert json.loads((tmp_path / "c.json").read_text())["notes"] == [told]
+
+
+def test_a_file_of_an_older_version_says_what_to_do(commands, robot, tmp_path) -> None:
+    write_correction(Simulation(robot), tmp_path / "c.json", "")
+    old = (tmp_path / "c.json").read_text().replace('"version": 2', '"version": 1').replace('"zeros"', '"effects"')
+    (tmp_path / "c.json").write_text(old)
+    for command in commands.values():
+        run = subprocess.run(
+            [*command, str(tmp_path / "c.json")], input="", capture_output=True, text=True, check=False
+        )
+        assert run.returncode != 0
+        assert "bodyschema export" in run.stderr
+
+
+def test_the_readers_are_short(commands) -> None:
+    """About sixty lines of code each: none of them is worth a package."""
+    lengths = {}
+    for name, comment in (("correction.py", "#"), ("correction.js", "//"), ("correction.hpp", "//")):
+        text = re.sub(r'"""[\s\S]*?"""', "", (READERS / name).read_text())
+        lengths[name] = sum(bool(line.strip()) and not line.strip().startswith(comment) for line in text.splitlines())
+    assert lengths["correction.py"] <= 60
+    assert lengths["correction.js"] <= 60
+    assert lengths["correction.hpp"] <= 92  # 20 of them read JSON

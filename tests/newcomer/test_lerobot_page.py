@@ -22,7 +22,7 @@ ROWS = 300
 TRUST, AGAIN = (f"bodyschema calibrate {name}.csv --trust-urdf" for name in ("so101", "again"))
 INIT, SIMULATE, EXPORT, DIFFERENCE, WRITE = (
     next(command for command in commands_of(PAGE) if re.search(word, command))
-    for word in ("init", "simulate", "--markers", r"\.json$", "--write")
+    for word in ("init", "simulate", "--markers", r"\.json$", r"\.json --write")
 )
 
 

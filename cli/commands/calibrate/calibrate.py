@@ -211,8 +211,8 @@ def _require_writable(report: CalibrationReport, *, force: bool) -> None:
 
 def _written(config: Config, found: Calibration, report: CalibrationReport, out: Path, *, replace: bool) -> list[str]:
     """Write the calibrated robot into `out`; return what to say of it."""
-    from bodyschema.calibration.hand_eye import write_launch_file
     from bodyschema.robot.calibrated_files import write_calibrated
+    from bodyschema.robot.hand_eye import write_launch_file
 
     heading = f"Calibrated by bodyschema from {report.pairs} pairs of {report.source}"
     written = write_calibrated(config.robot, found.figures.geometry, out, heading, replace=replace)
@@ -247,8 +247,8 @@ def _into_servos(config: Config, report: CalibrationReport, lerobot: Path, *, wr
 def _show(report: CalibrationReport, lines: list[str], written: list[str]) -> None:
     from rich.console import Console
 
-    from bodyschema.calibration.hand_eye import in_shell_lines
     from bodyschema.cli.terminal.calibration_view import view
+    from bodyschema.robot.hand_eye import in_shell_lines
 
     console = Console(highlight=False)
     console.print(view(report))

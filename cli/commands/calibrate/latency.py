@@ -29,6 +29,7 @@ def latency(
     ] = SECONDS,
     sim: Annotated[bool, flag("The simulated robot in the place of the hardware: to see it done.")] = False,
     save: Annotated[Path | None, Parameter(help="Keep readings and positions in this CSV file.")] = None,
+    write: Annotated[bool, flag("Put the latency into robot.toml; without it the change is shown.")] = False,
     as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
 ) -> None:
     """Measure the latency of the cameras' time stamps, with its uncertainty. Move the arm by hand for 5 s.
@@ -39,13 +40,15 @@ def latency(
 
     Needs: robot.toml with encoders and cameras, and no running sampler; or a recording; or --sim.
 
-    Next: put the two printed lines into [vision.cameras], or [marker_source].
+    Next: the same with --write, which puts latency_s and latency_sigma_s into [vision.cameras], or [marker_source]. The
+    old file is kept as robot.toml.before.
     """
     from rich.console import Console
 
     from bodyschema.calibration.latency import latency_of
     from bodyschema.cli.hardware.wiggling import write_wiggle
     from bodyschema.daemon.config import Config
+    from bodyschema.robot.toml_edit import difference, with_values, write_edited
 
     config = Config.load(robot)
     is_sent = not sim and config.tables.vision.cameras is None and bool(config.tables.marker_source)
@@ -55,17 +58,24 @@ def latency(
     if save is not None:
         write_wiggle(wiggle, config.robot.joints, save)
     found = latency_of(wiggle, config.robot.chain)
+    values = {"latency_s": round(found.latency_s, 4), "latency_sigma_s": round(found.sigma_s, 4)}
     if as_json:
         print_json(found)
+    else:
+        console.print(
+            f"{found.fixes} fixes at {found.speed_m_s:.2f} m/s, {1e3 * found.residual_m:.1f} mm from where the angles "
+            f"bring the marker: images are taken {1e3 * found.latency_s:.1f} ± {1e3 * found.sigma_s:.1f} ms before "
+            "their time stamps.",
+            markup=False,
+        )
+    if sim or (as_json and not write):
         return
-    console.print(
-        f"{found.fixes} fixes at {found.speed_m_s:.2f} m/s, {1e3 * found.residual_m:.1f} mm from where the angles "
-        f"bring the marker: images are taken {1e3 * found.latency_s:.1f} ± {1e3 * found.sigma_s:.1f} ms before their "
-        f"time stamps. In [{table}] write",
-        markup=False,
-    )
-    console.print(f"latency_s = {found.latency_s:.4f}", markup=False)
-    console.print(f"latency_sigma_s = {found.sigma_s:.4f}", markup=False)
+    edited = with_values(config.robot.file, table, values)
+    changed = difference(config.robot.file, edited)
+    backup = write_edited(config.robot.file, edited) if write else None
+    if not as_json:
+        console.print("\n".join(changed), markup=False)
+        console.print(f"Written; the old file is {backup}" if write else "Nothing is written without --write.")
 
 
 def _wiggle(config: Config, recording: Path | None, seconds: float, *, sim: bool) -> Wiggle:

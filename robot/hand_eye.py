@@ -8,11 +8,11 @@ from typing import Self
 
 import msgspec
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.interfaces.whole_files import write_whole
+from kbmaps.rotations import quaternions, rotation_vector
 
 LAUNCH = "hand_eye.launch.py"
 _STEP = 1e-6  # of the numerical derivative of a pose [m, rad]
@@ -43,7 +43,7 @@ class HandEye(msgspec.Struct, frozen=True):
     @classmethod
     def of(cls, parent: str, child: str, T_parent_child: FloatArray, covariance: FloatArray | None = None) -> Self:
         """Return a pose (4, 4) with its covariance (6, 6) as ROS has them."""
-        quaternion = Rotation.from_matrix(T_parent_child[:3, :3]).as_quat(canonical=True)
+        quaternion = quaternions(T_parent_child[None, :3, :3])[0]
         place = T_parent_child[:3, 3]
         return cls(
             parent,
@@ -74,7 +74,7 @@ def pose_covariance(pose: Callable[[FloatArray], FloatArray], values: FloatArray
     for k in range(len(values)):
         moved = pose(values + _STEP * np.eye(len(values))[k])
         jacobian[:3, k] = (moved[:3, 3] - here[:3, 3]) / _STEP
-        jacobian[3:, k] = Rotation.from_matrix(moved[:3, :3] @ here[:3, :3].T).as_rotvec() / _STEP
+        jacobian[3:, k] = rotation_vector(moved[:3, :3] @ here[:3, :3].T) / _STEP
     return jacobian @ covariance @ jacobian.T
 
 
