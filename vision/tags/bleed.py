@@ -80,8 +80,8 @@ def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: Flo
     by_chance = spread * float(cov[7, 7] / found[3] ** 2) * _SHARED**2
     if not math.isfinite(moved) or not by_chance > 0.0:
         return unseen
-    # Many cameras do not bleed at all. How likely that is follows from two densities of what was found: by chance alone,
-    # and by chance and the usual bleeding.
+    # Many cameras do not bleed at all. How likely that is follows from two densities of what was found: by chance
+    # alone, and by chance and the usual bleeding.
     usual = unseen[1] + by_chance
     odds = math.sqrt(by_chance / usual) * math.exp(min(0.5 * moved * moved * (1.0 / by_chance - 1.0 / usual), 500.0))
     bleeds = odds / (1.0 + odds)
