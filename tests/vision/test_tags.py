@@ -170,7 +170,7 @@ def test_chance_is_not_taken_for_bleeding(seed) -> None:
     grey = grey_of(seen(sheet(), seed=seed, look=replace(WALL, blur_px=0.5)))
     moved, variance = bleed(grey, corners_in_the_left_eye(FACING), 0.7, tag_modules(CONFIG.dictionary, 0))
     assert abs(moved) < 0.002
-    assert 0.0 < variance < 0.002**2
+    assert 0.0 < variance < 0.005**2
 
 
 @pytest.mark.parametrize("level", [0, 128])
