@@ -19,6 +19,7 @@ from bodyschema.vision.pose import PoseEstimator, Sighting, mirrored
 from bodyschema.vision.tags.bleed import bleed
 from bodyschema.vision.tags.body import TAG_CORNERS, TagBody
 from bodyschema.vision.tags.config import ClusterConfig, PlacedTag, TagConfig
+from bodyschema.vision.tags.dictionary import tag_modules
 from bodyschema.vision.tags.edge import PIXEL_CUMULANT, blurred_step
 from bodyschema.vision.tags.image import TagImage, measure_tag
 from bodyschema.vision.tags.tracker import TagTracker
@@ -162,6 +163,14 @@ def test_white_that_bleeds_into_black_makes_no_tag_smaller(look) -> None:
     assert isinstance(tag, TagImage)
     outward = (true - true.mean(axis=0)) / np.linalg.norm(true - true.mean(axis=0), axis=1)[:, None]
     assert abs(float(((tag.corners_px - true) * outward).sum(axis=1).mean())) < 0.06
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_chance_is_not_taken_for_bleeding(seed) -> None:
+    grey = grey_of(seen(sheet(), seed=seed, look=replace(WALL, blur_px=0.5)))
+    moved, variance = bleed(grey, corners_in_the_left_eye(FACING), 0.7, tag_modules(CONFIG.dictionary, 0))
+    assert abs(moved) < 0.002
+    assert 0.0 < variance < 0.005**2
 
 
 @pytest.mark.parametrize("level", [0, 128])

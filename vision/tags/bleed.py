@@ -77,8 +77,16 @@ def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: Flo
     found = cov @ (design[kept].T @ levels[kept])
     spread = float(np.square(levels[kept] - design[kept] @ found).mean())
     moved = float(found[7] / found[3])
-    variance = spread * float(cov[7, 7] / found[3] ** 2) * _SHARED**2 + (_DIFFERENT * moved) ** 2
-    return (moved, variance) if math.isfinite(variance) else unseen
+    by_chance = spread * float(cov[7, 7] / found[3] ** 2) * _SHARED**2
+    if not math.isfinite(moved) or not by_chance > 0.0:
+        return unseen
+    # Many cameras do not bleed at all. How likely that is follows from two densities of what was found: by chance
+    # alone, and by chance and the usual bleeding.
+    usual = unseen[1] + by_chance
+    odds = math.sqrt(by_chance / usual) * math.exp(min(0.5 * moved * moved * (1.0 / by_chance - 1.0 / usual), 500.0))
+    bleeds = odds / (1.0 + odds)
+    variance = bleeds * (by_chance + (_DIFFERENT * moved) ** 2) + bleeds * (1.0 - bleeds) * moved * moved
+    return bleeds * moved, variance
 
 
 def _blurred(
