@@ -21,7 +21,7 @@ from bodyschema.dashboard.course import Course, Series, expected_error_m, expect
 from bodyschema.dashboard.documents import Process, ProcessDocument, RobotDocument
 from bodyschema.dashboard.hub import Hub
 from bodyschema.dashboard.recent import KEPT, RecentPairs, cloud
-from bodyschema.dashboard.scene import arm
+from bodyschema.dashboard.scene import TRAIL, arm
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import BusError, RecordingError, RequestError
 from bodyschema.interfaces.protocols import Clock
@@ -215,9 +215,9 @@ class Watch:
             return
         # The prediction was asked for before newer pairs came.
         seq, reply = self._predicted or (newest.seq, None)
-        pair = self._recent.at(seq) or newest
-        reply = reply if pair.seq == seq and learner is not None else None
-        self._hub.put("arm", arm(self._config.robot, pair, None if learner is None else learner.calibration, reply))
+        pairs = self._recent.upto(seq, TRAIL) or self._recent.upto(newest.seq, TRAIL)
+        reply = reply if pairs[-1].seq == seq and learner is not None else None
+        self._hub.put("arm", arm(self._config.robot, pairs, None if learner is None else learner.calibration, reply))
 
     def _note_figures(self, learner: LearnerStatus | None) -> None:
         sampler = self._sampler.status if self._sampler.answers else None

@@ -49,6 +49,38 @@ export function outlook({ outlook: found }) {
   table.tBodies[0].replaceChildren(...rows);
 }
 
+export function arm({ arm: found }) {
+  if (!found) return;
+  const apart = found.apart_m === null ? "no model answers" : `prediction and measurement are ${mm(found.apart_m)} apart`;
+  const sure = found.radii ? `; ellipsoid: 95 % of the true positions by the model's own account, at most ± ${mm(Math.max(...found.radii))}` : "";
+  caption("arm", `Pair ${found.pair}: ${apart}${sure}.${found.placed ? "" : " The camera's pose is not known yet: the marker is drawn at robot.toml's guess."}`);
+}
+
+export function cloud({ cloud: found }) {
+  const shown = found && found.x.length > 0;
+  text("cloud-stretch", String(shown ? stretchOf(found) : 100));
+  caption("cloud", shown ? `${found.x.length} pairs with this tool, all learnt already: median ${mm(found.median_m)}, 95 % within ${mm(found.p95_m)}.` : "No residuals yet");
+}
+
+function caption(id, said) {
+  text(`${id}-text`, said);
+  byId(id).setAttribute("aria-label", said);
+}
+
+export function box(points) {
+  const low = [0, 1, 2].map((axis) => Math.min(...points.map((point) => point[axis])));
+  const high = [0, 1, 2].map((axis) => Math.max(...points.map((point) => point[axis])));
+  return [low, high];
+}
+
+// 1, 2 or 5 times a power of ten, so that most residuals are a twelfth of the box.
+export function stretchOf({ x, p95_m: residual }) {
+  const [low, high] = box(x);
+  const wanted = Math.hypot(...high.map((value, k) => value - low[k])) / 12 / Math.max(residual, 1e-9);
+  const power = 10 ** Math.floor(Math.log10(Math.max(wanted, 1)));
+  return power * ([5, 2].find((digit) => wanted >= digit * power) ?? 1);
+}
+
 // Nominal and learnt figures with their intervals; what no motion shows is said below.
 export function calibration({ learner, robot }) {
   const found = learner?.status?.calibration;
