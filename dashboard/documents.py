@@ -169,8 +169,8 @@ class ArmDocument(msgspec.Struct, frozen=True):
         measured: the marker as it was measured.
         trail: where it was measured in the pairs before, the newest last.
         predicted: the marker by the answering model; null without one.
-        radii: half axes of the ellipsoid, along the measurement frame's axes, that holds the true position with a
-            probability of 95 % by the model's own account; null without a prediction.
+        radii: half axes of the ellipsoid around it, along the measurement frame's axes, in which 95 % of measurements
+            should lie by the learner's estimate; null without a prediction, or while the noise is unknown.
         apart_m: distance of measurement and prediction. The pair may be learnt already.
         placed: true if the camera's pose is known.
     """

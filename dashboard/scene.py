@@ -56,10 +56,14 @@ def arm(
         measured=_numbers(measured[-1]),
         trail=measured[:-1].round(_DECIMALS).tolist(),
         predicted=None if predicted is None else _numbers(predicted),
-        radii=None if reply is None else (_RADIUS_95 * np.array(reply.sigma[0])).tolist(),
+        radii=None if reply is None or calibration is None else _radii(np.array(reply.sigma[0]), calibration.noise_m),
         apart_m=None if predicted is None else float(np.linalg.norm(predicted - measured[-1])),
         placed=calibration is not None or robot.camera.pose_known,
     )
+
+
+def _radii(sigma: FloatArray, noise_m: float) -> list[float]:
+    return (_RADIUS_95 * np.hypot(sigma, noise_m)).tolist()
 
 
 def _learnt(figures: list[LearntFigure]) -> FloatArray:

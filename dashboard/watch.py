@@ -17,7 +17,7 @@ from bodyschema.daemon.transport.identity import Route
 from bodyschema.daemon.transport.keys import CommandName, Keys
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import CommandReply, CommandRequest, JointsRequest, PredictReply, decode, encode
-from bodyschema.dashboard.course import Course, Series, expected_error_m, expected_outlook
+from bodyschema.dashboard.course import Course, Series, expected_outlook
 from bodyschema.dashboard.documents import Process, ProcessDocument, RobotDocument
 from bodyschema.dashboard.hub import Hub
 from bodyschema.dashboard.recent import KEPT, RecentPairs, cloud
@@ -224,7 +224,7 @@ class Watch:
         self._series.add(
             time.time(),
             error_m=None if learner is None else learner.prequential_m.get(learner.answering),
-            expected_m=None if learner is None else expected_error_m(learner, learner.claimed_error_m),
+            expected_m=None if learner is None else learner.expected_error_m(learner.claimed_error_m),
             pairs_per_s=None if sampler is None else sampler.pairs_per_s,
             predict_s=None if learner is None else self._predict_time(),
         )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import msgspec
 
 from bodyschema.learning.status import ChainCalibration, CurvePoint, OrientationStatus, Outlook
@@ -126,6 +128,10 @@ class Change(msgspec.Struct, frozen=True, kw_only=True):
     can_roll_back: bool
 
 
+# Mean length of a normal vector in three dimensions, in units of its 1-sigma a coordinate.
+_MEAN_LENGTH = math.sqrt(8.0 / math.pi)
+
+
 class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
     """State of the learner.
 
@@ -191,3 +197,18 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
     behind: int = 0
     age_s: float | None = None
     schema: int = SCHEMA
+
+    def expected_error_m(self, claimed_m: float | None) -> float | None:
+        """Return the mean distance [m] to expect between predictions and new measurements, their noise included.
+
+        People are shown this one: they can check it against `prequential_m`.
+
+        Args:
+            claimed_m: mean distance of predictions to the ground truth [m].
+
+        Returns:
+            None while the noise of the measurements is not known.
+        """
+        if claimed_m is None or self.calibration is None:
+            return None
+        return math.hypot(claimed_m, _MEAN_LENGTH * self.calibration.noise_m)

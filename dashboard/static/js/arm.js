@@ -1,5 +1,6 @@
 // The robot at its newest pair: links as the URDF has them, the marker as measured and as predicted, and the cameras.
 import { byId, element } from "./dom.js";
+import { roundDown } from "./format.js";
 import { color, disc, lines, Space, THREE } from "./space.js";
 
 // Shares of the robot's size: radius of rods, of axes, and length of axes and of what the cameras see.
@@ -136,7 +137,7 @@ export class Arm extends Space {
     this.paint();
     byId("arm-said").replaceChildren(...body.said.map((said) => element("span", {}, said)));
     const show = () => {
-      this.fitted = false;
+      this.framed = null;
       if (this.document) this.update(this.document);
     };
     show();
@@ -146,7 +147,8 @@ export class Arm extends Space {
   update(document) {
     this.document = document;
     if (!document || !this.body) return;
-    if (!this.fitted) this.frameBody();
+    const reached = [document.measured, document.predicted ?? document.measured].map(vector);
+    if (!this.framed || reached.some((place) => place.distanceTo(this.center) > 1.05 * this.radius)) this.frameBody();
     this.redraw();
     const { trail, tool, ellipsoid, apart, measured, predicted } = this.marks;
     put(this.cameras, document.camera);
@@ -158,13 +160,13 @@ export class Arm extends Space {
     trail.geometry.setAttribute("color", new THREE.Float32BufferAttribute(fade.flat(), 4));
     measured.position.copy(vector(document.measured));
     measured.visible = trail.visible = tool.visible = true;
-    between(tool, document.links[document.hand], document.tip);
-    predicted.visible = apart.visible = ellipsoid.visible = Boolean(document.predicted);
+    predicted.visible = apart.visible = Boolean(document.predicted);
+    ellipsoid.visible = Boolean(document.predicted && document.radii);
     if (document.predicted) {
       predicted.position.copy(vector(document.predicted));
       between(apart, document.predicted, document.measured);
       put(ellipsoid, [...document.predicted, ...document.camera.slice(3)]);
-      ellipsoid.scale.set(...document.radii.map((value) => Math.max(value, 1e-6)));
+      if (document.radii) ellipsoid.scale.set(...document.radii);
     }
     if (this.marked) this.mark(true);
   }
@@ -184,6 +186,7 @@ export class Arm extends Space {
     });
     if (rest < 1e-3) this.document.links.forEach((pose, k) => put(this.links[k], pose));
     this.placed = true;
+    between(this.marks.tool, this.links[this.document.hand].position.toArray(), this.document.tip);
     for (const { rod, ends } of this.rods) span(rod, ...ends.map((link) => this.links[link].position), ROD * this.size);
     for (const { joint, link } of this.joints) {
       joint.position.copy(this.links[link].position);
@@ -205,8 +208,9 @@ export class Arm extends Space {
     else if (this.document) {
       const { measured, predicted, radii, apart_m: apart } = this.document;
       const size = Math.max(NEAREST_M, 3 * (apart ?? 0), ...(radii ?? []).map((radius) => 3 * radius));
-      this.goal.target.copy(vector(predicted ?? measured));
+      for (const each of [this.goal, this.view]) each.target.copy(vector(predicted ?? measured));
       this.goal.zoom = this.radius / size;
+      this.touched = true;
       this.redraw();
     }
   }
@@ -219,22 +223,21 @@ export class Arm extends Space {
 
   // What depends on the robot's size: the view, light, ground, axes and cameras.
   frameBody() {
-    this.fitted = true;
     this.placed = false;
-    this.size = 1;
+    this.size ??= 1;
     this.move(1);
-    const box = new THREE.Box3().expandByPoint(new THREE.Vector3());
+    const box = this.framed ?? new THREE.Box3().expandByPoint(new THREE.Vector3());
+    this.framed = box;
     for (const link of this.links) box.expandByPoint(link.position).union(new THREE.Box3().setFromObject(link));
-    box.expandByPoint(vector(this.document.measured));
+    for (const place of [...this.document.trail, this.document.measured]) box.expandByPoint(vector(place));
     const ball = box.getBoundingSphere(new THREE.Sphere());
     this.size = 2 * ball.radius;
     const eye = vector(this.document.camera);
     // The camera may be far away: then it does not shrink the arm.
-    if (eye.distanceTo(ball.center) < 2.2 * ball.radius) box.expandByPoint(eye);
-    const shown = box.getBoundingSphere(new THREE.Sphere());
-    this.fit(shown.center, 0.92 * shown.radius);
+    const shown = eye.distanceTo(ball.center) < 3 * ball.radius ? box.clone().expandByPoint(eye).getBoundingSphere(new THREE.Sphere()) : ball;
+    this.fit(shown.center, 0.9 * shown.radius);
     this.low = Math.min(box.min.z, 0);
-    this.sun.position.copy(ball.center).add(new THREE.Vector3(0.9, -0.5, 1.9).multiplyScalar(ball.radius));
+    this.sun.position.copy(ball.center).add(new THREE.Vector3(-0.25, -1, 1.9).multiplyScalar(ball.radius));
     this.sun.target.position.copy(ball.center);
     this.sun.shadow.normalBias = 0.004 * this.size;
     Object.assign(this.sun.shadow.camera, { left: -1.6 * ball.radius, right: 1.6 * ball.radius, top: 1.6 * ball.radius, bottom: -1.6 * ball.radius, near: 0.01, far: 6 * ball.radius });
@@ -249,8 +252,8 @@ export class Arm extends Space {
 
   renewGrid() {
     if (this.grid) this.scene.remove(this.grid);
-    const step = 10 ** Math.floor(Math.log10(this.size / 1.5));
-    const reach = 14;
+    const step = roundDown(this.size / 7);
+    const reach = 16;
     const faded = color("--grid");
     const points = [];
     const colors = [];

@@ -57,11 +57,8 @@ export class Cloud extends Space {
       at.copy(place(corner(0).map((value, k) => (k === axis ? (low[k] + high[k]) / 2 : value))));
     });
     const middle = place(low.map((value, k) => (value + high[k]) / 2));
-    // Readable steps: what grows by a hair with each pair does not move the view.
+    // What grows by a hair with each pair does not move the view.
     const radius = 0.5 * Math.hypot(...high.map((value, k) => value - low[k])) || 1;
-    if (!this.fitted || Math.abs(radius - this.fitted) > 0.1 * this.fitted) {
-      this.fitted = radius;
-      this.fit(middle, 0.95 * radius);
-    }
+    if (!this.fitted || Math.abs(radius - this.radius) > 0.1 * this.radius) this.fit(middle, radius);
   }
 }

@@ -1,6 +1,6 @@
 // Tiles, tables and sentences.
 import { bar, byId, element, row, text } from "./dom.js";
-import { clock, joint, kindOfChange, milliseconds, mm, span, whole, words } from "./format.js";
+import { clock, joint, kindOfChange, milliseconds, mm, roundDown, span, whole, words } from "./format.js";
 
 const last = (values) => values?.findLast((value) => value !== null);
 
@@ -52,7 +52,7 @@ export function outlook({ outlook: found }) {
 export function arm({ arm: found }) {
   if (!found) return;
   const apart = found.apart_m === null ? "no model answers" : `prediction and measurement are ${mm(found.apart_m)} apart`;
-  const sure = found.radii ? `; ellipsoid: 95 % of the true positions by the model's own account, at most ± ${mm(Math.max(...found.radii))}` : "";
+  const sure = found.radii ? `; 95 % of measurements should lie in the ellipsoid around the prediction, at most ${mm(Math.max(...found.radii))} away` : "";
   caption("arm", `Pair ${found.pair}: ${apart}${sure}.${found.placed ? "" : " The camera's pose is not known yet: the marker is drawn at robot.toml's guess."}`);
 }
 
@@ -77,8 +77,7 @@ export function box(points) {
 export function stretchOf({ x, p95_m: residual }) {
   const [low, high] = box(x);
   const wanted = Math.hypot(...high.map((value, k) => value - low[k])) / 12 / Math.max(residual, 1e-9);
-  const power = 10 ** Math.floor(Math.log10(Math.max(wanted, 1)));
-  return power * ([5, 2].find((digit) => wanted >= digit * power) ?? 1);
+  return roundDown(Math.max(wanted, 1));
 }
 
 // Nominal and learnt figures with their intervals; what no motion shows is said below.

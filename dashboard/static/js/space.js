@@ -1,6 +1,7 @@
 // A view in space that is turned by hand, and drawn only when something has changed and it is in sight.
 import * as THREE from "../vendor/three.module.min.js";
 import { byId } from "./dom.js";
+import { roundDown } from "./format.js";
 
 const STEP = 0.12;
 const START = { turn: -0.75, tilt: 0.38, zoom: 1 };
@@ -29,6 +30,9 @@ export class Space {
     this.labels = [];
     this.pointers = new Map();
     this.inSight = false;
+    this.bar = document.createElement("span");
+    this.bar.className = "bar-of-scale";
+    this.canvas.after(this.bar);
     this.listen();
   }
 
@@ -54,6 +58,7 @@ export class Space {
     canvas.addEventListener("wheel", (event) => {
       if (!event.ctrlKey && document.activeElement !== canvas) return; // the page scrolls
       event.preventDefault();
+      this.touched = true;
       this.zoom(Math.exp(-0.002 * event.deltaY));
     }, { passive: false });
     byId(`${canvas.id}-reset`).addEventListener("click", () => this.reset());
@@ -72,6 +77,7 @@ export class Space {
     };
     if (!moves[event.key] || event.ctrlKey || event.metaKey || event.altKey) return;
     event.preventDefault();
+    this.touched = true;
     moves[event.key]();
     this.redraw();
   }
@@ -79,6 +85,7 @@ export class Space {
   drag(event) {
     const last = this.pointers.get(event.pointerId);
     if (!last) return;
+    this.touched = true;
     const now = [event.clientX, event.clientY];
     const [across, down] = [now[0] - last[0], now[1] - last[1]];
     const other = [...this.pointers].find(([id]) => id !== event.pointerId)?.[1];
@@ -105,18 +112,21 @@ export class Space {
   }
 
   reset() {
+    this.touched = false;
     Object.assign(this.goal, this.start);
     this.goal.target.copy(this.center);
     this.redraw();
   }
 
-  // Let the start of the view show this ball.
+  // Let the start of the view show this ball; a view that somebody turned stays.
   fit(center, radius) {
-    const first = this.radius !== radius || !this.center.equals(center);
+    const scale = radius / this.radius;
     this.center.copy(center);
+    for (const each of [this.goal, this.view]) each.zoom *= scale; // the distance stays
     this.radius = radius;
-    if (!first) return;
-    this.reset();
+    if (!this.touched) this.reset();
+    if (this.fitted) return;
+    this.fitted = true;
     Object.assign(this.view, this.goal, { target: this.view.target.copy(center) });
   }
 
@@ -179,6 +189,7 @@ export class Space {
   label(text, place = new THREE.Vector3()) {
     const element = document.createElement("span");
     element.className = "label";
+    element.hidden = true;
     element.textContent = text;
     this.canvas.after(element);
     const label = { element, place };
@@ -188,6 +199,10 @@ export class Space {
 
   place() {
     const { clientWidth: width, clientHeight: height } = this.canvas;
+    const pixel = this.pixel * this.distance(this.view);
+    const length = roundDown(140 * pixel);
+    this.bar.style.width = `${length / pixel}px`;
+    this.bar.textContent = length >= 1 ? `${length} m` : length >= 0.01 ? `${Math.round(100 * length)} cm` : `${Number((1e3 * length).toPrecision(1))} mm`;
     for (const { element, place } of this.labels) {
       const { x, y, z } = place.clone().project(this.eye);
       element.hidden = Math.abs(x) > 0.98 || Math.abs(y) > 0.96 || z > 1;
