@@ -48,6 +48,8 @@ class Guard:
         async def send_guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
+                if scope["path"].startswith("/static/"):
+                    headers.setdefault("Cache-Control", "no-cache")  # a browser keeps them, and asks each time
                 for name, value in _HEADERS.items():
                     headers.setdefault(name, value)
             await send(message)
@@ -201,9 +203,10 @@ def application(hub: Hub, processes: Processes, diagnoses: Diagnosing, shapes: S
         Route("/report", report),
         Mount("/static", StaticFiles(directory=STATIC)),
     ]
-    return Starlette(
-        routes=routes, middleware=[Middleware(Guard), Middleware(GZipMiddleware, compresslevel=_GZIP_LEVEL)]
-    )
+    packed = Middleware(GZipMiddleware, compresslevel=_GZIP_LEVEL)
+    app = Starlette(routes=routes, middleware=[Middleware(Guard), packed])
+    app.router.redirect_slashes = False
+    return app
 
 
 def _explained(endpoint: Endpoint) -> Endpoint:
