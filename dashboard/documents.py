@@ -165,7 +165,6 @@ class ArmDocument(msgspec.Struct, frozen=True):
         links: pose of each link of the body document: x, y, z, and the quaternion's x, y, z, w.
         camera: pose of the measurement frame.
         hand: number of the link that holds the marker.
-        tip: the marker by the description, or as learnt.
         measured: the marker as it was measured.
         trail: where it was measured in the pairs before, the newest last.
         predicted: the marker by the answering model; null without one.
@@ -179,7 +178,6 @@ class ArmDocument(msgspec.Struct, frozen=True):
     links: list[list[float]]
     camera: list[float]
     hand: int
-    tip: list[float]
     measured: list[float]
     trail: list[list[float]]
     predicted: list[float] | None

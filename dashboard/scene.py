@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from bodyschema.daemon.transport.status import LearnerStatus
 from bodyschema.daemon.transport.wire import PredictReply
 from bodyschema.interfaces.records import FloatArray, Pair
-from bodyschema.learning.status import ChainCalibration, LearntFigure
+from bodyschema.learning.status import LearntFigure
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.links import link_poses
 from bodyschema.robot.rpy import pose_of
@@ -24,20 +25,21 @@ TRAIL = 80
 
 
 def arm(
-    robot: RobotDescription, pairs: list[Pair], calibration: ChainCalibration | None, reply: PredictReply | None
+    robot: RobotDescription, pairs: list[Pair], learner: LearnerStatus | None, reply: PredictReply | None
 ) -> ArmDocument:
     """Return the arm at a pair, in the root link's frame.
 
     Args:
         pairs: the pair, which is the last one, and those before it whose markers are its trail.
-        calibration: the learnt camera, marker and joint offsets; None for those of robot.toml.
+        learner: its state, with the learnt camera pose and joint offsets; None for those of robot.toml.
         reply: the learner's prediction at the pair's joint angles; None without one.
     """
-    T_camera, marker = robot.camera.pose, np.array(robot.robot.marker_xyz)
+    calibration = None if learner is None else learner.calibration
+    noise_m = None if learner is None else learner.noise_m()
+    T_camera = robot.camera.pose
     q, x = np.array([pair.q for pair in pairs]), np.array([pair.x for pair in pairs])
     if calibration is not None:
         T_camera = pose_of(_learnt(calibration.camera_xyz), _learnt(calibration.camera_rpy))
-        marker = _learnt(calibration.marker_xyz)
         for k, name in enumerate(robot.joints):
             zero = calibration.zeros.get(name)
             q[:, k] += 0.0 if zero is None else zero.value
@@ -45,18 +47,16 @@ def arm(
     T_root_cameras = poses[robot.camera.parent_link] @ T_camera
     measured = np.einsum("nij,nj->ni", T_root_cameras[:, :3, :3], x) + T_root_cameras[:, :3, 3]
     newest = np.array([poses[link][-1] for link in robot.tree.links])
-    hand = robot.tree.links.index(robot.robot.marker_link)
     predicted = None if reply is None else _moved(T_root_cameras[-1], np.array(reply.x[0]))
     return ArmDocument(
         pair=pairs[-1].seq,
         links=_pose_numbers(newest),
         camera=_pose_numbers(T_root_cameras[-1:])[0],
-        hand=hand,
-        tip=_numbers(_moved(newest[hand], marker)),
+        hand=robot.tree.links.index(robot.robot.marker_link),
         measured=_numbers(measured[-1]),
         trail=measured[:-1].round(_DECIMALS).tolist(),
         predicted=None if predicted is None else _numbers(predicted),
-        radii=None if reply is None or calibration is None else _radii(np.array(reply.sigma[0]), calibration.noise_m),
+        radii=None if reply is None or noise_m is None else _radii(np.array(reply.sigma[0]), noise_m),
         apart_m=None if predicted is None else float(np.linalg.norm(predicted - measured[-1])),
         placed=calibration is not None or robot.camera.pose_known,
     )

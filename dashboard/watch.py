@@ -217,7 +217,7 @@ class Watch:
         seq, reply = self._predicted or (newest.seq, None)
         pairs = self._recent.upto(seq, TRAIL) or self._recent.upto(newest.seq, TRAIL)
         reply = reply if pairs[-1].seq == seq and learner is not None else None
-        self._hub.put("arm", arm(self._config.robot, pairs, None if learner is None else learner.calibration, reply))
+        self._hub.put("arm", arm(self._config.robot, pairs, learner, reply))
 
     def _note_figures(self, learner: LearnerStatus | None) -> None:
         sampler = self._sampler.status if self._sampler.answers else None

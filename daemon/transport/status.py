@@ -209,6 +209,15 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
         Returns:
             None while the noise of the measurements is not known.
         """
-        if claimed_m is None or self.calibration is None:
+        noise_m = self.noise_m()
+        return None if claimed_m is None or noise_m is None else math.hypot(claimed_m, _MEAN_LENGTH * noise_m)
+
+    def noise_m(self) -> float | None:
+        """Return the noise of the measurements, 1-sigma per coordinate [m]; None while it is not known.
+
+        The calibration's contains what its chain cannot explain. Errors on new pairs contain the noise, so it is at
+        most what the best model has.
+        """
+        if self.calibration is None:
             return None
-        return math.hypot(claimed_m, _MEAN_LENGTH * self.calibration.noise_m)
+        return min(self.calibration.noise_m, *(error_m / _MEAN_LENGTH for error_m in self.prequential_m.values()))

@@ -30,6 +30,9 @@ expect = playwright.expect
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 QUIET = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
 QUIET += ["--disable-component-update", "--disable-sync"]
+# Software graphics: only tests of the views in space pay for them, the others see the page of a browser without WebGL.
+DRAWING = [*QUIET, "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+DRAWING.remove("--disable-gpu")
 # On a busy machine everything takes longer, and passes.
 LIMIT_MS = 500_000
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no browser; to run it: apt-get install chromium")
@@ -104,11 +107,25 @@ def address(server: PageServer) -> str:
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
+def chromium() -> Iterator[Any]:
     with playwright.sync_playwright() as running:
-        browser = running.chromium.launch(executable_path=CHROMIUM, args=QUIET)
-        yield browser
-        browser.close()
+        yield running.chromium
+
+
+@pytest.fixture(scope="module")
+def browser(chromium) -> Iterator[Any]:
+    browser = chromium.launch(executable_path=CHROMIUM, args=QUIET)
+    yield browser
+    browser.close()
+
+
+@pytest.fixture
+def drawn(chromium, address: str) -> Iterator[Any]:
+    """Yield the page in a browser with WebGL."""
+    browser = chromium.launch(executable_path=CHROMIUM, args=DRAWING)
+    with opened(browser, address) as page:
+        yield page
+    browser.close()
 
 
 @pytest.fixture
@@ -218,19 +235,31 @@ def test_a_learner_that_is_silent_is_named_and_the_page_goes_on_when_it_is_back(
     expect(page.locator("#tool")).to_be_enabled()
 
 
-def test_everything_is_reached_with_the_keyboard_alone(page) -> None:
+def test_without_webgl_the_figures_stay(page) -> None:
+    says(page, "#arm-none", "this browser has no WebGL")
+    expect(page.locator("#arm")).to_be_hidden()
+    says(page, "#cloud-text", "median")
+
+
+def test_everything_is_reached_with_the_keyboard_alone(drawn) -> None:
+    page = drawn
     says(page, "#cloud-text", "median")
     expect(page.locator("#pause")).to_be_enabled()
     expect(page.locator("#tool")).to_be_enabled()
     reached = []
-    for _ in range(18):
+    for _ in range(20):
         page.keyboard.press("Tab")
         reached.append(page.evaluate("document.activeElement.id || document.activeElement.name"))
-    assert {"pause", "tool", "diagnose", "axis", "cloud", "cloud-reset"} <= set(reached)
+    assert {"pause", "tool", "diagnose", "axis", "arm", "arm-marker", "arm-reset", "cloud", "cloud-reset"} <= set(
+        reached
+    )
+    expect(page.locator("#arm-none")).to_be_hidden()
     page.focus("#cloud")
-    before = page.evaluate("document.getElementById('cloud').toDataURL()")
-    page.keyboard.press("ArrowRight")
-    page.wait_for_function("before => document.getElementById('cloud').toDataURL() !== before", arg=before)
+    before = page.locator("#cloud").screenshot()
+    for _ in range(5):
+        page.keyboard.press("ArrowRight")
+    while page.locator("#cloud").screenshot() == before:
+        page.wait_for_timeout(100)
 
 
 @pytest.mark.parametrize(("size", "scheme"), [("desktop", "light"), ("phone", "dark")])

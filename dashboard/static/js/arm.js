@@ -1,5 +1,5 @@
 // The robot at its newest pair: links as the URDF has them, the marker as measured and as predicted, and the cameras.
-import { byId, element } from "./dom.js";
+import { byId, text } from "./dom.js";
 import { roundDown } from "./format.js";
 import { color, disc, lines, Space, THREE } from "./space.js";
 
@@ -47,6 +47,7 @@ export class Arm extends Space {
   }
 
   async load() {
+    text("arm-said", "The robot's shapes are being read.");
     try {
       this.build(await (await fetch("api/body")).json());
     } catch {
@@ -135,7 +136,7 @@ export class Arm extends Space {
     this.cameras = new THREE.Group();
     this.scene.add(this.cameras);
     this.paint();
-    byId("arm-said").replaceChildren(...body.said.map((said) => element("span", {}, said)));
+    text("arm-said", body.said.join(" "));
     const show = () => {
       this.framed = null;
       if (this.document) this.update(this.document);
@@ -186,7 +187,7 @@ export class Arm extends Space {
     });
     if (rest < 1e-3) this.document.links.forEach((pose, k) => put(this.links[k], pose));
     this.placed = true;
-    between(this.marks.tool, this.links[this.document.hand].position.toArray(), this.document.tip);
+    between(this.marks.tool, this.links[this.document.hand].position.toArray(), this.document.predicted ?? this.document.measured);
     for (const { rod, ends } of this.rods) span(rod, ...ends.map((link) => this.links[link].position), ROD * this.size);
     for (const { joint, link } of this.joints) {
       joint.position.copy(this.links[link].position);
@@ -239,7 +240,7 @@ export class Arm extends Space {
     this.low = Math.min(box.min.z, 0);
     this.sun.position.copy(ball.center).add(new THREE.Vector3(-0.25, -1, 1.9).multiplyScalar(ball.radius));
     this.sun.target.position.copy(ball.center);
-    this.sun.shadow.normalBias = 0.004 * this.size;
+    this.sun.shadow.normalBias = 0.006 * this.size;
     Object.assign(this.sun.shadow.camera, { left: -1.6 * ball.radius, right: 1.6 * ball.radius, top: 1.6 * ball.radius, bottom: -1.6 * ball.radius, near: 0.01, far: 6 * ball.radius });
     this.sun.shadow.camera.updateProjectionMatrix();
     this.fill.position.set(-1, 1, 0.6);

@@ -9,7 +9,7 @@ export function tiles({ sampler, learner, series }) {
   text("tile-error", mm(status?.prequential_m[status.answering]));
   text("tile-expected", mm(series?.expected_m.at(-1)));
   text("tile-pairs", whole(status?.pairs ?? sampler?.status?.pairs));
-  text("tile-error-of", status?.prequential_pairs ? `${lastPairs(status)}, each predicted before it was learnt${noise(status)}` : "");
+  text("tile-error-of", status?.prequential_pairs ? `${lastPairs(status)}, each predicted before it was learnt` : "");
   text("tile-expected-of", status?.claimed_error_m ? "the learner's estimate of the same, where data is" : "");
   const since = status && status.pairs_since_change < status.pairs ? [`${whole(status.pairs_since_change)} since the last change`] : [];
   const behind = status?.behind ? [`${whole(status.behind)} stored and not learnt yet`] : [];
@@ -21,7 +21,6 @@ export function tiles({ sampler, learner, series }) {
 }
 
 const lastPairs = (status) => `last ${whole(status.prequential_pairs)} pairs`;
-const noise = (status) => (status.calibration ? `; noise of the measurement: ${mm(status.calibration.noise_m)} a coordinate` : "");
 
 export function pills({ sampler, learner }) {
   for (const [name, process] of [["sampler", sampler], ["learner", learner]]) {
@@ -177,7 +176,7 @@ export function models({ learner, course }) {
   }));
   const status = learner?.status;
   const errors = Object.entries(status?.prequential_m ?? {}).sort((a, b) => a[1] - b[1]);
-  text("models-of", errors.length ? `Error of each on the ${lastPairs(status)}, the same for all, predicted before they were learnt${noise(status)}` : "");
+  text("models-of", errors.length ? `Error of each on the ${lastPairs(status)}, the same for all, predicted before they were learnt` : "");
   const worst = Math.max(1e-12, ...errors.map(([, error]) => error));
   byId("models").hidden = !errors.length;
   byId("models").tBodies[0].replaceChildren(...errors.map(([name, error]) => {
