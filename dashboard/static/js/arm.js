@@ -1,7 +1,7 @@
 // The robot at its newest pair: links as the URDF has them, the marker as measured and as predicted, and the cameras.
 import { byId, text } from "./dom.js";
 import { roundDown } from "./format.js";
-import { color, disc, lines, Space, THREE } from "./space.js";
+import { color, disc, lines, named, Space, THREE } from "./space.js";
 
 // Shares of the robot's size: radius of rods, of axes, and length of axes and of what the cameras see.
 const ROD = 0.014;
@@ -11,7 +11,7 @@ const SEEN = 0.16;
 // Sizes on the screen [px].
 const DOT = 11;
 const RING = 17;
-const FOCUS = 60; // the marker's neighbourhood is so many times its uncertainty
+// Nearest to the marker that its button goes [m].
 const NEAREST_M = 0.002;
 
 const vector = ([x, y, z]) => new THREE.Vector3(x, y, z);
@@ -24,21 +24,19 @@ function put(object, [x, y, z, ...turn]) {
 export class Arm extends Space {
   constructor() {
     super("arm");
-    const { scene, renderer } = this;
-    renderer.shadowMap.enabled = true;
+    this.renderer.shadowMap.enabled = true;
     this.materials = new Map();
-    this.sky = new THREE.HemisphereLight(0xffffff, 0x8a8f99, 1.5);
+    const sky = new THREE.HemisphereLight(0xffffff, 0x8a8f99, 1.5);
     this.sun = new THREE.DirectionalLight(0xffffff, 2.2);
     this.sun.castShadow = true;
     this.sun.shadow.mapSize.set(1024, 1024);
-    this.sun.shadow.normalBias = 0.01;
     this.sun.shadow.radius = 4;
-    this.fill = new THREE.DirectionalLight(0xffffff, 0.7);
-    this.ground = new THREE.Mesh(new THREE.PlaneGeometry(1, 1), new THREE.ShadowMaterial({ opacity: 0.2 }));
+    const fill = new THREE.DirectionalLight(0xffffff, 0.7);
+    fill.position.set(-1, 1, 0.6);
+    this.ground = new THREE.Mesh(new THREE.PlaneGeometry(1, 1), new THREE.ShadowMaterial());
     this.ground.receiveShadow = true;
-    scene.add(this.sky, this.sun, this.sun.target, this.fill, this.ground);
-    this.links = [];
-    this.marker();
+    this.scene.add(sky, this.sun, this.sun.target, fill, this.ground);
+    this.marks = this.marker();
     this.paint();
     this.marked = false;
     byId("arm-marker").addEventListener("click", () => this.mark(!this.marked));
@@ -48,11 +46,9 @@ export class Arm extends Space {
 
   async load() {
     text("arm-said", "The robot's shapes are being read.");
-    try {
-      this.build(await (await fetch("api/body")).json());
-    } catch {
-      setTimeout(() => this.load(), 5000); // the page's server has gone; it comes back
-    }
+    const body = await fetch("api/body").then((answer) => answer.json(), () => null);
+    if (body) this.build(body);
+    else setTimeout(() => this.load(), 5000); // the page's server has gone; it comes back
   }
 
   // The material of a color: one of the scheme (`--name`), or what the URDF says.
@@ -60,42 +56,42 @@ export class Arm extends Space {
     const key = `${name} ${opacity}`;
     if (!this.materials.has(key)) {
       const made = new THREE.MeshStandardMaterial({ roughness: 0.62, metalness: 0.08, opacity, transparent: opacity < 1 });
-      if (!name.startsWith("--")) made.color.setStyle(name);
-      this.materials.set(key, Object.assign(made, { name }));
+      if (name.startsWith("--")) named(made, name);
+      else made.color.setStyle(name);
+      this.materials.set(key, made);
     }
     return this.materials.get(key);
   }
 
-  // Colors of the scheme; those of the URDF stay.
   paint() {
-    for (const material of [...this.materials.values(), ...Object.values(this.marks ?? {}).map((mark) => mark.material)]) {
-      if (material.name.startsWith("--")) material.color.copy(color(material.name));
-    }
+    super.paint();
     this.ground.material.opacity = matchMedia("(prefers-color-scheme: dark)").matches ? 0.5 : 0.16;
     if (this.grid) this.renewGrid();
   }
 
+  // What shows the marker, in front of everything.
   marker() {
     const on = { depthTest: false, transparent: true };
-    const sprite = (name, map) => new THREE.Sprite(Object.assign(new THREE.SpriteMaterial({ map, sizeAttenuation: false, ...on }), { name }));
-    const made = {
-      trail: new THREE.Points(new THREE.BufferGeometry(), Object.assign(new THREE.PointsMaterial({ size: 5, sizeAttenuation: false, map: disc(), vertexColors: true, ...on, depthWrite: false }), { name: "--mark" })),
-      tool: lines([[0, 0, 0], [0, 0, 0]]),
-      ellipsoid: new THREE.Mesh(new THREE.SphereGeometry(1, 32, 24), Object.assign(new THREE.MeshBasicMaterial({ opacity: 0.28, ...on }), { name: "--second" })),
-      apart: lines([[0, 0, 0], [0, 0, 0]]),
+    const sprite = (name, map) => new THREE.Sprite(named(new THREE.SpriteMaterial({ map, sizeAttenuation: false, ...on }), name));
+    const dots = named(new THREE.PointsMaterial({ size: 5, sizeAttenuation: false, map: disc(), vertexColors: true, ...on }), "--mark");
+    const line = (name, more) => {
+      const made = lines([[0, 0, 0], [0, 0, 0]]);
+      Object.assign(named(made.material, name), more);
+      return made;
+    };
+    const marks = {
+      tool: line("--soft"),
+      trail: new THREE.Points(new THREE.BufferGeometry(), dots),
+      ellipsoid: new THREE.Mesh(new THREE.SphereGeometry(1, 48, 32), named(new THREE.MeshBasicMaterial({ opacity: 0.28, ...on }), "--second")),
+      apart: line("--second", on),
       measured: sprite("--mark", disc()),
       predicted: sprite("--second", disc(true)),
     };
-    made.tool.material.name = "--soft";
-    made.apart.material.name = "--second";
-    made.apart.material.depthTest = false;
-    Object.values(made).forEach((mark, k) => {
-      mark.renderOrder = k + 1;
-      mark.visible = false;
-      mark.frustumCulled = false;
+    Object.values(marks).forEach((mark, k) => {
+      Object.assign(mark, { renderOrder: k + 1, visible: false, frustumCulled: false });
       this.scene.add(mark);
     });
-    this.marks = made;
+    return marks;
   }
 
   build(body) {
@@ -135,19 +131,19 @@ export class Arm extends Space {
     });
     this.cameras = new THREE.Group();
     this.scene.add(this.cameras);
-    this.paint();
     text("arm-said", body.said.join(" "));
     const show = () => {
       this.framed = null;
       if (this.document) this.update(this.document);
     };
     show();
-    Promise.all(waiting).then(show, () => {});
+    Promise.allSettled(waiting).then(show);
   }
 
   update(document) {
     this.document = document;
     if (!document || !this.body) return;
+    if (document.links.length !== this.links.length) location.reload(); // the page's server began again with another URDF
     const reached = [document.measured, document.predicted ?? document.measured].map(vector);
     if (!this.framed || reached.some((place) => place.distanceTo(this.center) > 1.05 * this.radius)) this.frameBody();
     this.redraw();
@@ -243,7 +239,6 @@ export class Arm extends Space {
     this.sun.shadow.normalBias = 0.006 * this.size;
     Object.assign(this.sun.shadow.camera, { left: -1.6 * ball.radius, right: 1.6 * ball.radius, top: 1.6 * ball.radius, bottom: -1.6 * ball.radius, near: 0.01, far: 6 * ball.radius });
     this.sun.shadow.camera.updateProjectionMatrix();
-    this.fill.position.set(-1, 1, 0.6);
     this.ground.scale.setScalar(12 * this.size);
     this.ground.position.z = this.low - 0.001 * this.size;
     this.renewGrid();
@@ -290,9 +285,7 @@ export class Arm extends Space {
       for (const eye of body.camera.eyes) {
         const placed = corners.map((corner) => corner.map((value, axis) => value + eye[axis]));
         const pyramid = lines(placed.flatMap((corner, k) => [eye, corner, corner, placed[(k + 1) % 4]]));
-        pyramid.material.name = "--good";
-        pyramid.material.color.copy(color("--good"));
-        this.materials.set(pyramid, pyramid.material);
+        named(pyramid.material, "--good");
         cameras.add(pyramid);
       }
     }

@@ -1,5 +1,5 @@
 // Residuals in space.
-import { color, disc, lines, Space, THREE } from "./space.js";
+import { color, disc, lines, named, Space, THREE } from "./space.js";
 import { box, stretchOf } from "./panels.js";
 
 export class Cloud extends Space {
@@ -48,7 +48,7 @@ export class Cloud extends Space {
       for (const axis of [1, 2, 4]) if (!(k & axis)) edges.push(corner(k), corner(k | axis));
     }
     const frame = lines(edges);
-    frame.material.color.copy(color("--grid"));
+    named(frame.material, "--grid");
     this.content.add(frame);
     this.content.updateMatrixWorld();
     const place = (point) => this.content.localToWorld(new THREE.Vector3(...point));

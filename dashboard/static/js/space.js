@@ -13,6 +13,13 @@ const still = matchMedia("(prefers-reduced-motion: reduce)");
 
 export const color = (name) => new THREE.Color(getComputedStyle(document.documentElement).getPropertyValue(name).trim());
 
+// Let a material have a color of the page; it follows the scheme.
+export function named(material, name) {
+  material.name = name;
+  material.color.copy(color(name));
+  return material;
+}
+
 export class Space {
   // `id`: of the canvas; the button that resets the view is `id`-reset. z is up in the scene.
   constructor(id, upright = true) {
@@ -215,7 +222,9 @@ export class Space {
     return false;
   }
 
-  paint() {}
+  paint() {
+    this.scene.traverse(({ material }) => material?.name.startsWith("--") && named(material, material.name));
+  }
 }
 
 // Lines between pairs of points, of one color or with one (r, g, b, a) for each point.
