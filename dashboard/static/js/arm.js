@@ -232,7 +232,7 @@ export class Arm extends Space {
     const eye = vector(this.document.camera);
     // The camera may be far away: then it does not shrink the arm.
     const shown = eye.distanceTo(ball.center) < 3 * ball.radius ? box.clone().expandByPoint(eye).getBoundingSphere(new THREE.Sphere()) : ball;
-    this.fit(shown.center, 0.9 * shown.radius);
+    this.fit(shown.center, (shown === ball ? 0.95 : 0.78) * shown.radius);
     this.low = Math.min(box.min.z, 0);
     this.sun.position.copy(ball.center).add(new THREE.Vector3(-0.25, -1, 1.9).multiplyScalar(ball.radius));
     this.sun.target.position.copy(ball.center);
