@@ -26,12 +26,12 @@ export class Arm extends Space {
     super("arm");
     this.renderer.shadowMap.enabled = true;
     this.materials = new Map();
-    const sky = new THREE.HemisphereLight(0xffffff, 0x8a8f99, 1.5);
+    const sky = new THREE.HemisphereLight(0xffffff, 0x9aa0aa, 1.8);
     this.sun = new THREE.DirectionalLight(0xffffff, 2.2);
     this.sun.castShadow = true;
     this.sun.shadow.mapSize.set(1024, 1024);
     this.sun.shadow.radius = 4;
-    const fill = new THREE.DirectionalLight(0xffffff, 0.7);
+    const fill = new THREE.DirectionalLight(0xffffff, 0.9);
     fill.position.set(-1, 1, 0.6);
     this.ground = new THREE.Mesh(new THREE.PlaneGeometry(1, 1), new THREE.ShadowMaterial());
     this.ground.receiveShadow = true;
@@ -230,9 +230,9 @@ export class Arm extends Space {
     const ball = box.getBoundingSphere(new THREE.Sphere());
     this.size = 2 * ball.radius;
     const eye = vector(this.document.camera);
-    // The camera may be far away: then it does not shrink the arm.
-    const shown = eye.distanceTo(ball.center) < 3 * ball.radius ? box.clone().expandByPoint(eye).getBoundingSphere(new THREE.Sphere()) : ball;
-    this.fit(shown.center, (shown === ball ? 0.95 : 0.78) * shown.radius);
+    // The camera may be far away, or the view narrow: then it does not shrink the arm.
+    const shown = eye.distanceTo(ball.center) < (this.eye.aspect < 1 ? 1.5 : 3) * ball.radius ? box.clone().expandByPoint(eye).getBoundingSphere(new THREE.Sphere()) : ball;
+    this.fit(shown.center, (shown === ball ? 0.95 : 0.84) * shown.radius);
     this.low = Math.min(box.min.z, 0);
     this.sun.position.copy(ball.center).add(new THREE.Vector3(-0.25, -1, 1.9).multiplyScalar(ball.radius));
     this.sun.target.position.copy(ball.center);

@@ -213,7 +213,8 @@ export class Space {
     for (const { element, place } of this.labels) {
       const { x, y, z } = place.clone().project(this.eye);
       element.hidden = Math.abs(x) > 0.98 || Math.abs(y) > 0.96 || z > 1;
-      element.style.transform = `translate(${((x + 1) / 2) * width + 6}px, ${((1 - y) / 2) * height - 20}px)`;
+      const across = ((x + 1) / 2) * width;
+      element.style.transform = `translate(${x > 0.7 ? across - 6 - element.offsetWidth : across + 6}px, ${((1 - y) / 2) * height - 20}px)`;
     }
   }
 
