@@ -220,4 +220,4 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
         """
         if self.calibration is None:
             return None
-        return min(self.calibration.noise_m, *(error_m / _MEAN_LENGTH for error_m in self.prequential_m.values()))
+        return min([self.calibration.noise_m, *(error_m / _MEAN_LENGTH for error_m in self.prequential_m.values())])
