@@ -232,7 +232,7 @@ export class Arm extends Space {
     const eye = vector(this.document.camera);
     // The camera may be far away, or the view narrow: then it does not shrink the arm.
     const shown = eye.distanceTo(ball.center) < (this.eye.aspect < 1 ? 1.5 : 3) * ball.radius ? box.clone().expandByPoint(eye).getBoundingSphere(new THREE.Sphere()) : ball;
-    this.fit(shown.center, (shown === ball ? 0.95 : 0.84) * shown.radius);
+    this.fit(shown.center, (eye.distanceTo(ball.center) < ball.radius || shown === ball ? 1 : 0.88) * shown.radius);
     this.low = Math.min(box.min.z, 0);
     this.sun.position.copy(ball.center).add(new THREE.Vector3(-0.25, -1, 1.9).multiplyScalar(ball.radius));
     this.sun.target.position.copy(ball.center);
