@@ -18,7 +18,7 @@ from typing import Self
 import msgspec
 import numpy as np
 
-from bodyschema.interfaces.errors import BodyschemaError
+from bodyschema.interfaces.errors import BodyschemaError, RobotError
 from bodyschema.interfaces.interpreter import module_command
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
@@ -109,7 +109,10 @@ class Body:
             return self._found
 
     def _read(self, urdf: Path) -> LinkShapes:
-        shapes = link_shapes(parse_urdf(urdf))
+        try:
+            shapes = link_shapes(parse_urdf(urdf))
+        except RobotError as error:  # it was there when the page began
+            return LinkShapes(said=[f"{error}. Links are shown as rods."])
         if not any(shape.mesh for parts in shapes.values() for shape in parts):
             return _sent(shapes, {}, [])
         try:

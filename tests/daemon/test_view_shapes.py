@@ -168,3 +168,11 @@ def test_a_reader_that_takes_too_long_is_ended(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(shapes, "READ_LIMIT_S", 0.0)
     document = Body(robot(tmp_path, mesh("a.stl"))).document()
     assert "could not be read" in document.said[0]
+
+
+def test_a_urdf_that_is_gone_leaves_rods(tmp_path) -> None:
+    body = Body(robot(tmp_path))
+    (tmp_path / "arm.urdf").unlink()
+    document = body.document()
+    assert len(document.rods) == 2
+    assert "arm.urdf" in document.said[0]
