@@ -11,6 +11,7 @@ from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.middleware import Middleware
+from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route
@@ -20,7 +21,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from bodyschema.daemon.service.local_web import HEADERS, host_refusal
 from bodyschema.daemon.transport.keys import CommandName
 from bodyschema.daemon.transport.wire import CommandReply, decode, encode
-from bodyschema.dashboard.documents import Process
+from bodyschema.dashboard.documents import BodyDocument, Process
 from bodyschema.dashboard.hub import Follower, Hub, HubFullError
 from bodyschema.interfaces.errors import BusError, RequestError
 
@@ -47,6 +48,8 @@ class Guard:
         async def send_guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
+                if scope["path"].startswith("/static/"):
+                    headers.setdefault("Cache-Control", "no-cache")  # a browser keeps them, and asks each time
                 for name, value in _HEADERS.items():
                     headers.setdefault(name, value)
             await send(message)
@@ -75,7 +78,9 @@ LARGEST_BODY = 4096
 HEARTBEAT_S = 10.0
 # Delay after which a browser reconnects.
 RETRY_MS = 1000
-_JSON, _EVENTS = "application/json", "text/event-stream"
+_JSON, _EVENTS, _BYTES = "application/json", "text/event-stream", "application/octet-stream"
+# Over a tunnel the page takes a quarter; higher levels take thrice the time for 3 % less.
+_GZIP_LEVEL = 5
 # The report is one file with its own style, and no script.
 _REPORT_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'; sandbox"
 
@@ -125,7 +130,19 @@ class Diagnosing(Protocol):
         ...
 
 
-def application(hub: Hub, processes: Processes, diagnoses: Diagnosing) -> Starlette:
+class Shapes(Protocol):
+    """Gives the robot as it looks."""
+
+    def document(self) -> BodyDocument:
+        """Return its links and shapes."""
+        ...
+
+    def mesh(self, number: int) -> bytes | None:
+        """Return a mesh of the document; None if there is none with this number."""
+        ...
+
+
+def application(hub: Hub, processes: Processes, diagnoses: Diagnosing, shapes: Shapes) -> Starlette:
     """Return the page's application on the documents of `hub`."""
 
     async def index(_: Request) -> Response:
@@ -153,6 +170,13 @@ def application(hub: Hub, processes: Processes, diagnoses: Diagnosing) -> Starle
         except (BusError, RequestError):  # the page hides its panel
             return Response(status_code=204)
 
+    async def body(_: Request) -> Response:
+        return Response(encode(await run_in_threadpool(shapes.document)), media_type=_JSON)
+
+    async def mesh(request: Request) -> Response:
+        found = await run_in_threadpool(shapes.mesh, request.path_params["number"])
+        return Response(found or b"", status_code=404 if found is None else 200, media_type=_BYTES)
+
     async def diagnose(_: Request) -> Response:
         return JSONResponse({"number": await run_in_threadpool(diagnoses.start)}, status_code=202)
 
@@ -172,12 +196,17 @@ def application(hub: Hub, processes: Processes, diagnoses: Diagnosing) -> Starle
         Route("/api/events", events),
         Route("/api/command", _explained(command), methods=["POST"]),
         Route("/api/picture", picture),
+        Route("/api/body", body),
+        Route("/api/body/{number:int}", mesh),
         Route("/api/diagnosis", _explained(diagnose), methods=["POST"]),
         Route("/api/diagnosis", _explained(stop_diagnosing), methods=["DELETE"]),
         Route("/report", report),
         Mount("/static", StaticFiles(directory=STATIC)),
     ]
-    return Starlette(routes=routes, middleware=[Middleware(Guard)])
+    packed = Middleware(GZipMiddleware, compresslevel=_GZIP_LEVEL)
+    app = Starlette(routes=routes, middleware=[Middleware(Guard), packed])
+    app.router.redirect_slashes = False
+    return app
 
 
 def _explained(endpoint: Endpoint) -> Endpoint:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 from bodyschema.daemon.transport.status import Change as LastChange
 from bodyschema.daemon.transport.status import LearnerStatus
 from bodyschema.dashboard.documents import OutlookDocument
@@ -105,29 +103,14 @@ def _marked(last: LastChange | None, pairs: int, t: float) -> Change:
     return Change(pairs, t, None if last is None else last.kind, last is not None and not last.found)
 
 
-# Mean length of a normal vector in three dimensions, in units of its 1-sigma a coordinate.
-_MEAN_LENGTH = math.sqrt(8.0 / math.pi)
-
-
-def expected_error_m(status: LearnerStatus, claimed_m: float | None) -> float | None:
-    """Return the mean distance [m] to expect between predictions and new measurements; None if the noise is unknown.
-
-    Args:
-        claimed_m: mean distance of predictions to the truth.
-    """
-    if claimed_m is None or status.calibration is None:
-        return None
-    return math.hypot(claimed_m, _MEAN_LENGTH * status.calibration.noise_m)
-
-
 def expected_outlook(status: LearnerStatus) -> OutlookDocument | None:
     """Return the learner's forecast as errors on new pairs; None while there is none."""
     outlook = status.outlook
-    if outlook is None or (now_m := expected_error_m(status, outlook.error_m)) is None:
+    if outlook is None or (now_m := status.expected_error_m(outlook.error_m)) is None:
         return None
 
     def expected(claimed: list[float]) -> list[float]:
-        return [expected_error_m(status, each_m) or each_m for each_m in claimed]
+        return [status.expected_error_m(each_m) or each_m for each_m in claimed]
 
     sentence = "Enough data where the arm was."
     if not outlook.enough:

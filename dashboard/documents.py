@@ -162,23 +162,78 @@ class ArmDocument(msgspec.Struct, frozen=True):
 
     Attributes:
         pair: sequence number of the pair.
-        links: lines from joint to joint, and to the marker.
-        joints: places of the joints that move.
-        camera: origin of the measurement frame, and its axes x, y, z.
+        links: pose of each link of the body document: x, y, z, and the quaternion's x, y, z, w.
+        camera: pose of the measurement frame.
+        hand: number of the link that holds the marker.
         measured: the marker as it was measured.
+        trail: where it was measured in the pairs before, the newest last.
         predicted: the marker by the answering model; null without one.
-        apart_m: distance of both. The pair may be learnt already.
+        radii: half axes of the ellipsoid around it, along the measurement frame's axes, in which 95 % of measurements
+            should lie by the learner's estimate; null without a prediction, or while the noise is unknown.
+        apart_m: distance of measurement and prediction. The pair may be learnt already.
         placed: true if the camera's pose is known.
     """
 
     pair: int
-    links: list[list[list[float]]]
-    joints: list[list[float]]
-    camera: list[list[float]]
+    links: list[list[float]]
+    camera: list[float]
+    hand: int
     measured: list[float]
+    trail: list[list[float]]
     predicted: list[float] | None
+    radii: list[float] | None
     apart_m: float | None
     placed: bool
+
+
+class LinkShape(msgspec.Struct, frozen=True):
+    """A visual shape of a link.
+
+    Attributes:
+        kind: box, sphere, cylinder, capsule or mesh. Cylinders and capsules lie along z.
+        sizes: edges of a box; radius; radius and length [m].
+        pose: in its link, as in `ArmDocument`.
+        rgba: its colour; null where the URDF gives none.
+        mesh: number of its mesh; null for other kinds.
+    """
+
+    kind: str
+    sizes: list[float]
+    pose: list[float]
+    rgba: list[float] | None
+    mesh: int | None
+
+
+class CameraShape(msgspec.Struct, frozen=True):
+    """What the cameras see.
+
+    Attributes:
+        eyes: places of the cameras in the measurement frame [m].
+        edges: left, right, upper and lower end of the image at a distance of 1 m.
+    """
+
+    eyes: list[list[float]]
+    edges: list[float]
+
+
+class BodyDocument(msgspec.Struct, frozen=True):
+    """The robot as it looks; constant.
+
+    Attributes:
+        links: names.
+        shapes: of each link.
+        rods: pairs of links between whose origins a rod stands for shapes that are not there.
+        moving: links that a moving joint carries.
+        camera: null where robot.toml does not describe the cameras.
+        said: what is not shown as the URDF has it, in sentences.
+    """
+
+    links: list[str]
+    shapes: list[list[LinkShape]]
+    rods: list[tuple[int, int]]
+    moving: list[int]
+    camera: CameraShape | None
+    said: list[str]
 
 
 class DiagnosisDocument(msgspec.Struct, frozen=True):

@@ -36,9 +36,10 @@ class RecentPairs:
         """Newest pair."""
         return self._pairs[-1] if self._pairs else None
 
-    def at(self, seq: int) -> Pair | None:
-        """Return the pair with this sequence number; None if it is not among them."""
-        return next((pair for pair in reversed(self._pairs) if pair.seq == seq), None)
+    def upto(self, seq: int, count: int) -> list[Pair]:
+        """Return the pair with this sequence number and those before it, `count` at most; [] if it is not there."""
+        at = next((k for k in range(len(self._pairs) - 1, -1, -1) if self._pairs[k].seq == seq), -1)
+        return [self._pairs[k] for k in range(max(at + 1 - count, 0), at + 1)]
 
     def add(self, pairs: Iterable[Pair]) -> None:
         """Append pairs."""

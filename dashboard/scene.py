@@ -1,71 +1,73 @@
-"""The arm at its newest pair: links by the URDF, and the marker where it was measured and predicted."""
+"""The arm at its newest pair: poses of its links, and the marker where it was measured and predicted."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from bodyschema.daemon.transport.status import LearnerStatus
 from bodyschema.daemon.transport.wire import PredictReply
 from bodyschema.interfaces.records import FloatArray, Pair
-from bodyschema.learning.status import ChainCalibration, LearntFigure
+from bodyschema.learning.status import LearntFigure
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.links import link_poses
 from bodyschema.robot.rpy import pose_of
-from bodyschema.robot.urdf import MOVING
+from kbmaps.rotations import quaternions
 
 from .documents import ArmDocument
 
-# Decimals of a coordinate [m] that is sent to the page; links shorter than that are not drawn.
+# Decimals of a coordinate [m] that is sent to the page.
 _DECIMALS = 5
-_SHORTEST_M = 1e-4
+# Half axes of the ellipsoid that holds 95 % of a normal distribution in space, in units of its 1-sigma: the root of the
+# chi-squared distribution's quantile for three degrees of freedom.
+_RADIUS_95 = 2.7955
+# Pairs before the newest whose measured positions are shown.
+TRAIL = 80
 
 
 def arm(
-    robot: RobotDescription, pair: Pair, calibration: ChainCalibration | None, reply: PredictReply | None
+    robot: RobotDescription, pairs: list[Pair], learner: LearnerStatus | None, reply: PredictReply | None
 ) -> ArmDocument:
     """Return the arm at a pair, in the root link's frame.
 
     Args:
-        calibration: the learnt camera, marker and joint offsets; None for those of robot.toml.
+        pairs: the pair, which is the last one, and those before it whose markers are its trail.
+        learner: its state, with the learnt camera pose and joint offsets; None for those of robot.toml.
         reply: the learner's prediction at the pair's joint angles; None without one.
     """
-    T_camera, marker, q = robot.camera.pose, np.array(robot.robot.marker_xyz), pair.q.copy()
+    calibration = None if learner is None else learner.calibration
+    noise_m = None if learner is None else learner.noise_m()
+    T_camera = robot.camera.pose
+    q, x = np.array([pair.q for pair in pairs]), np.array([pair.x for pair in pairs])
     if calibration is not None:
         T_camera = pose_of(_learnt(calibration.camera_xyz), _learnt(calibration.camera_rpy))
-        marker = _learnt(calibration.marker_xyz)
         for k, name in enumerate(robot.joints):
             zero = calibration.zeros.get(name)
-            q[k] += 0.0 if zero is None else zero.value
-    poses, links, joints = _links(robot, q)
-    T_root_camera = poses[robot.camera.parent_link] @ T_camera
-    hand = poses[robot.robot.marker_link]
-    tip = _moved(hand, marker)
-    links.append((hand[:3, 3], tip))
-    predicted = None if reply is None else _moved(T_root_camera, np.array(reply.x[0]))
-    measured = _moved(T_root_camera, pair.x)
+            q[:, k] += 0.0 if zero is None else zero.value
+    poses = link_poses(robot, q)
+    T_root_cameras = poses[robot.camera.parent_link] @ T_camera
+    measured = np.einsum("nij,nj->ni", T_root_cameras[:, :3, :3], x) + T_root_cameras[:, :3, 3]
+    newest = np.array([poses[link][-1] for link in robot.tree.links])
+    predicted = None if reply is None else _moved(T_root_cameras[-1], np.array(reply.x[0]))
     return ArmDocument(
-        pair=pair.seq,
-        links=[[_numbers(a), _numbers(b)] for a, b in links if np.linalg.norm(b - a) > _SHORTEST_M],
-        joints=[_numbers(place) for place in joints],
-        camera=[_numbers(T_root_camera[:3, k]) for k in (3, 0, 1, 2)],
-        measured=_numbers(measured),
+        pair=pairs[-1].seq,
+        links=_pose_numbers(newest),
+        camera=_pose_numbers(T_root_cameras[-1:])[0],
+        hand=robot.tree.links.index(robot.robot.marker_link),
+        measured=_numbers(measured[-1]),
+        trail=measured[:-1].round(_DECIMALS).tolist(),
         predicted=None if predicted is None else _numbers(predicted),
-        apart_m=None if predicted is None else float(np.linalg.norm(predicted - measured)),
+        radii=None if reply is None or noise_m is None else _radii(np.array(reply.sigma[0]), noise_m),
+        apart_m=None if predicted is None else float(np.linalg.norm(predicted - measured[-1])),
         placed=calibration is not None or robot.camera.pose_known,
     )
 
 
+def _radii(sigma: FloatArray, noise_m: float) -> list[float]:
+    return (_RADIUS_95 * np.hypot(sigma, noise_m)).tolist()
+
+
 def _learnt(figures: list[LearntFigure]) -> FloatArray:
     return np.array([figure.learnt for figure in figures])
-
-
-def _links(
-    robot: RobotDescription, q: FloatArray
-) -> tuple[dict[str, FloatArray], list[tuple[FloatArray, FloatArray]], list[FloatArray]]:
-    """Return poses (4, 4) of all links, the lines from joint to joint, and the places of joints that move."""
-    poses = {link: pose[0] for link, pose in link_poses(robot, q[None]).items()}
-    joints = robot.tree.joints.values()
-    lines = [(poses[joint.parent][:3, 3], poses[joint.child][:3, 3]) for joint in joints]
-    return poses, lines, [poses[joint.child][:3, 3] for joint in joints if joint.kind in MOVING]
 
 
 def _moved(T: FloatArray, point: FloatArray) -> FloatArray:
@@ -74,3 +76,8 @@ def _moved(T: FloatArray, point: FloatArray) -> FloatArray:
 
 def _numbers(point: FloatArray) -> list[float]:
     return point.round(_DECIMALS).tolist()
+
+
+def _pose_numbers(T: FloatArray) -> list[list[float]]:
+    """Return poses (n, 4, 4) as x, y, z and the quaternion's x, y, z, w."""
+    return np.hstack([T[:, :3, 3], quaternions(T[:, :3, :3])]).round(_DECIMALS).tolist()

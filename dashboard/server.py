@@ -17,6 +17,7 @@ from bodyschema.interfaces.errors import ConfigError
 from .app import application
 from .diagnosing import Diagnoses
 from .hub import Hub
+from .shapes import Body
 from .watch import Watch
 
 MOST_CONNECTIONS = 100
@@ -54,13 +55,14 @@ def serve(config: Config, port: int, ready: Callable[[str], None]) -> None:
     with listening(port) as listener:
         hub = Hub()
         with (
+            Body(config.robot) as body,
             Watch(config, hub) as watch,
             Diagnoses(
                 config.file, config.robot.joints, watch.history, lambda document: hub.put("diagnosis", document)
             ) as diagnoses,
         ):
             settings = uvicorn.Config(
-                application(hub, watch, diagnoses),
+                application(hub, watch, diagnoses, body),
                 http="h11",
                 ws="none",
                 lifespan="off",

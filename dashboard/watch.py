@@ -17,11 +17,11 @@ from bodyschema.daemon.transport.identity import Route
 from bodyschema.daemon.transport.keys import CommandName, Keys
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import CommandReply, CommandRequest, JointsRequest, PredictReply, decode, encode
-from bodyschema.dashboard.course import Course, Series, expected_error_m, expected_outlook
+from bodyschema.dashboard.course import Course, Series, expected_outlook
 from bodyschema.dashboard.documents import Process, ProcessDocument, RobotDocument
 from bodyschema.dashboard.hub import Hub
 from bodyschema.dashboard.recent import KEPT, RecentPairs, cloud
-from bodyschema.dashboard.scene import arm
+from bodyschema.dashboard.scene import TRAIL, arm
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import BusError, RecordingError, RequestError
 from bodyschema.interfaces.protocols import Clock
@@ -215,16 +215,16 @@ class Watch:
             return
         # The prediction was asked for before newer pairs came.
         seq, reply = self._predicted or (newest.seq, None)
-        pair = self._recent.at(seq) or newest
-        reply = reply if pair.seq == seq and learner is not None else None
-        self._hub.put("arm", arm(self._config.robot, pair, None if learner is None else learner.calibration, reply))
+        pairs = self._recent.upto(seq, TRAIL) or self._recent.upto(newest.seq, TRAIL)
+        reply = reply if pairs[-1].seq == seq and learner is not None else None
+        self._hub.put("arm", arm(self._config.robot, pairs, learner, reply))
 
     def _note_figures(self, learner: LearnerStatus | None) -> None:
         sampler = self._sampler.status if self._sampler.answers else None
         self._series.add(
             time.time(),
             error_m=None if learner is None else learner.prequential_m.get(learner.answering),
-            expected_m=None if learner is None else expected_error_m(learner, learner.claimed_error_m),
+            expected_m=None if learner is None else learner.expected_error_m(learner.claimed_error_m),
             pairs_per_s=None if sampler is None else sampler.pairs_per_s,
             predict_s=None if learner is None else self._predict_time(),
         )

@@ -211,7 +211,7 @@ def screen(members: Sequence[Member], unreached: Sequence[str]) -> RenderableTyp
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
     table.add_column("robot", overflow="fold")
     table.add_column("state", no_wrap=True)
-    for name in ("pairs", "a second", "error", "claimed"):
+    for name in ("pairs", "a second", "error", "expected"):
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("answers", no_wrap=True)
     table.add_column("health", justify="right", no_wrap=True)
@@ -231,7 +231,7 @@ def _row(member: Member) -> tuple[RenderableType, ...]:
         "-" if pairs is None else f"{pairs}",
         "-" if sampler is None else f"{sampler.pairs_per_s:.1f}",
         mm(member.error_m),
-        mm(None if learner is None else learner.claimed_error_m),
+        mm(None if learner is None else learner.expected_error_m(learner.claimed_error_m)),
         "-" if learner is None else learner.answering,
         Text(f"{wrong} wrong", style="yellow") if wrong else Text("well", style="green"),
     )

@@ -92,7 +92,7 @@ class UrdfTree:
         Raises:
             RobotError: the file is missing, not XML, not a URDF, or its links do not form a tree.
         """
-        root = _parse(file)
+        root = parse_urdf(file)
         links = _by_name(root, "link", file)
         joints = {name: _joint(element, file) for name, element in _by_name(root, "joint", file).items()}
         masses = {
@@ -406,7 +406,8 @@ def _link_named(joint: Any, end: str, file: Path) -> str:
     return link
 
 
-def _parse(file: Path) -> Any:
+def parse_urdf(file: Path) -> Any:
+    """Return the root element of a URDF, parsed without entities and network; RobotError if it cannot be read."""
     from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
     try:

@@ -15,13 +15,14 @@ import numpy as np
 from bodyschema.interfaces.errors import RobotError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.limited import read_at_most
+from bodyschema.robot.meshes import LARGEST_M
 from bodyschema.robot.rpy import rpy_of
 from bodyschema.robot.urdf import MOVING, UrdfJoint, UrdfTree
 from bodyschema.sim_backend.truth import root_link
 
 from .bullet import PhysicsUrdf
 from .geometry import turn_of_z
-from .meshes import LARGEST_M, Meshes
+from .meshes import Meshes
 from .truth import TrueRobot
 
 # The link above the robot's root. It has no inertia, so that the world frame is the root's frame for pybullet too.

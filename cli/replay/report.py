@@ -67,6 +67,7 @@ class ReplayReport(msgspec.Struct, frozen=True, kw_only=True):
         answering: the model that answered.
         prequential_mm: recent mean error on pairs before they were learnt, by model [mm].
         claimed_mm: mean error to the truth that the learner predicts in its support [mm], or null.
+        expected_mm: mean error on new pairs that it predicts, measurement noise included [mm], or null.
         in_support_share: share of held-out rows in the learner's support.
         within_sigma_share: share of held-out coordinates within 1-sigma of prediction and stated noise together.
         replayed: replay steps of the instant learner.
@@ -91,6 +92,7 @@ class ReplayReport(msgspec.Struct, frozen=True, kw_only=True):
     answering: str
     prequential_mm: dict[str, float]
     claimed_mm: float | None
+    expected_mm: float | None
     in_support_share: float
     within_sigma_share: float
     doubted: int
@@ -123,8 +125,8 @@ def as_text(report: ReplayReport, width: int = 80) -> str:
         f"before is {fitted} to the rows that were learnt; after is what the learner answers (model: "
         f"{report.answering}). {_verdict(report)}",
         f"error on new pairs before they were learnt: {_by_model(report.prequential_mm)}",
-        f"the errors above count the noise of the measurements; the learner claims {mm(_metres(report.claimed_mm))} to "
-        "the truth where data is; its 1-sigma and that noise together cover "
+        f"the errors above count the noise of the measurements; on new pairs where data is the learner expects "
+        f"{mm(_metres(report.expected_mm))}; its 1-sigma and that noise together cover "
         f"{report.within_sigma_share:.0%} of the held-out coordinates (68 % is right); "
         f"{report.in_support_share:.0%} of the held-out rows lie where data was",
         *([] if report.outlook is None else [outlook_sentence(report.outlook)]),

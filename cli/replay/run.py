@@ -122,6 +122,7 @@ def _report(job: Job, before: FloatArray, learnt: Learnt, prediction: PredictRep
     sampler, learner = learnt.sampler, learnt.learner
     x, sigma = np.array(prediction.x), np.array(prediction.sigma)
     claimed = learner.claimed_error_m
+    expected = learner.expected_error_m(claimed)
     unknown = (("pose_known = false", robot.camera.pose_known), ("marker_known = false", robot.robot.marker_known))
     return ReplayReport(
         recording=str(job.recording.file),
@@ -139,6 +140,7 @@ def _report(job: Job, before: FloatArray, learnt: Learnt, prediction: PredictRep
         answering=learner.answering,
         prequential_mm={name: 1e3 * error for name, error in learner.prequential_m.items()},
         claimed_mm=None if claimed is None else 1e3 * claimed,
+        expected_mm=None if expected is None else 1e3 * expected,
         in_support_share=float(np.mean(prediction.in_support)),
         within_sigma_share=coverage(x, held_out.x, sigma, job.noise_m),
         doubted=learner.doubted,

@@ -21,7 +21,7 @@ def outlook_lines(outlook: Outlook | None) -> list[str]:
     if outlook is None:
         return ["not known yet"]
     pairs = outlook.further_pairs[-1]
-    like = f"{pairs} more pairs like these would take {_gain(outlook, outlook.like_so_far_m)} off the error"
+    like = f"{pairs} more pairs like these take {_gain(outlook, outlook.like_so_far_m)} off the error beyond noise"
     return [
         f"{'yes' if outlook.enough else 'no'}: {like}",
         f"{pairs} of {outlook.best_motion}: {_gain(outlook, outlook.best_motion_m)}"
@@ -37,7 +37,7 @@ def outlook_sentence(outlook: Outlook) -> str:
         best = f"{outlook.best_motion} gains most: {_gain(outlook, outlook.best_motion_m)}"
     return (
         f"{outlook.further_pairs[-1]} more pairs like these would take {_gain(outlook, outlook.like_so_far_m)} off the "
-        f"error where the arm was; {best}. {'Enough data.' if outlook.enough else 'More data would help.'}"
+        f"error beyond noise where the arm was; {best}. {'Enough data.' if outlook.enough else 'More data would help.'}"
     )
 
 
@@ -87,7 +87,7 @@ def _other_is_better(outlook: Outlook) -> bool:
 
 
 def _gain(outlook: Outlook, after_m: list[float]) -> str:
-    """Return the share of the error that the largest number of further pairs would remove."""
+    """Return the share of the error beyond noise that the largest number of further pairs would remove."""
     return f"{max(1.0 - after_m[-1] / outlook.error_m, 0.0):.0%}" if outlook.error_m else "0%"
 
 

@@ -146,7 +146,7 @@ def _learner(status: LearnerStatus) -> list[RenderableType]:
     facts.add_row("new pairs", f"missed by: {errors}")
     if status.prequential_pairs:
         facts.add_row("", f"mean of the last {status.prequential_pairs}, measurement noise included")
-    facts.add_row("claimed", f"{mm(status.claimed_error_m)} from the truth where data is{_elsewhere(status)}")
+    facts.add_row("expected", _expected(status))
     if status.orientation is not None:
         facts.add_row("orientation", _orientation(status.orientation))
     if status.changes:
@@ -159,8 +159,12 @@ def _learner(status: LearnerStatus) -> list[RenderableType]:
     return [_head("learner", status), facts, *_health(status.health)]
 
 
-def _elsewhere(status: LearnerStatus) -> str:
-    return "" if status.outlook is None else f", {mm(status.outlook.anywhere_m)} over all joints' ranges"
+def _expected(status: LearnerStatus) -> str:
+    """Return the errors on new pairs that the learner expects."""
+    if (here_m := status.expected_error_m(status.claimed_error_m)) is None:
+        return "not known yet"
+    anywhere_m = None if status.outlook is None else status.expected_error_m(status.outlook.anywhere_m)
+    return f"{mm(here_m)} where data is" + ("" if anywhere_m is None else f", {mm(anywhere_m)} over all joints' ranges")
 
 
 def _change(status: LearnerStatus) -> Iterator[str]:
@@ -209,7 +213,7 @@ def _orientation(status: OrientationStatus) -> str:
     errors = ", ".join(f"{name} {degrees(error)}" for name, error in status.prequential_rad.items())
     return (
         f"{status.answering} answers, of {status.pairs} pairs; new pairs: {errors}; "
-        f"claimed {degrees(status.claimed_rad)} where data is"
+        f"claimed {degrees(status.claimed_rad)} from the truth where data is"
     )
 
 

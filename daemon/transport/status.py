@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import msgspec
 
 from bodyschema.learning.status import ChainCalibration, CurvePoint, OrientationStatus, Outlook
@@ -126,6 +128,10 @@ class Change(msgspec.Struct, frozen=True, kw_only=True):
     can_roll_back: bool
 
 
+# Mean length of a normal vector in three dimensions, in units of its 1-sigma a coordinate.
+_MEAN_LENGTH = math.sqrt(8.0 / math.pi)
+
+
 class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
     """State of the learner.
 
@@ -191,3 +197,27 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
     behind: int = 0
     age_s: float | None = None
     schema: int = SCHEMA
+
+    def expected_error_m(self, claimed_m: float | None) -> float | None:
+        """Return the mean distance [m] to expect between predictions and new measurements, their noise included.
+
+        People are shown this one: they can check it against `prequential_m`.
+
+        Args:
+            claimed_m: mean distance of predictions to the ground truth [m].
+
+        Returns:
+            None while the noise of the measurements is not known.
+        """
+        noise_m = self.noise_m()
+        return None if claimed_m is None or noise_m is None else math.hypot(claimed_m, _MEAN_LENGTH * noise_m)
+
+    def noise_m(self) -> float | None:
+        """Return the noise of the measurements, 1-sigma per coordinate [m]; None while it is not known.
+
+        The calibration's contains what its chain cannot explain. Errors on new pairs contain the noise, so it is at
+        most what the best model has.
+        """
+        if self.calibration is None:
+            return None
+        return min([self.calibration.noise_m, *(error_m / _MEAN_LENGTH for error_m in self.prequential_m.values())])

@@ -14,8 +14,10 @@ import numpy as np
 
 from bodyschema.interfaces.errors import RobotError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.robot.limited import read_at_most
+from bodyschema.robot.meshes import find_mesh
 from bodyschema.robot.rpy import rotation_of
+from bodyschema.robot.shapes import Shape, link_shapes
+from bodyschema.robot.urdf import parse_urdf
 from kbmaps.rotations import quaternions
 
 # Mesh formats that MuJoCo reads, and its limit of triangles in an STL file.
@@ -50,14 +52,11 @@ class LinkParts:
     @classmethod
     def of(cls, urdf: Path, folder: Path) -> LinkParts:
         """Read the parts of a checked URDF, for a file in `folder`."""
-        from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
-
-        parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False)
-        root = etree.fromstring(read_at_most(urdf), parser)
-        colours = {m.get("name"): m.find("color").get("rgba") for m in root.iter("material") if _coloured(m)}
+        root = parse_urdf(urdf)
+        shapes = link_shapes(root)
         parts = cls([], {}, {}, {}, [])
         for link in root.iterfind("link"):
-            geoms = [parts._geom(visual, colours, urdf, folder) for visual in link.iterfind("visual")]
+            geoms = [parts._geom(shape, urdf, folder) for shape in shapes[link.get("name")]]
             parts.geoms[link.get("name")] = [geom for geom in geoms if geom is not None]
             if link.find("inertial/inertia") is not None:
                 with _blamed_on(link, urdf):
@@ -69,46 +68,33 @@ class LinkParts:
             parts.mimics[joint.get("name")] = (mimic.get("joint", ""), *numbers)
         return parts
 
-    def _geom(self, visual: Any, colours: dict[str, str], urdf: Path, folder: Path) -> dict[str, str] | None:
-        shape = visual.find("geometry/*")
-        material = visual.find("material")
-        try:
-            kind = None if shape is None else self._kind(shape, urdf, folder)
-            T = _origin(visual)
-        except (AttributeError, ValueError):  # a shape is not checked where the URDF is read: none is needed
-            return None
+    def _geom(self, shape: Shape, urdf: Path, folder: Path) -> dict[str, str] | None:
+        kind = self._mesh(shape, urdf, folder) if shape.kind == "mesh" else _primitive(shape)
         if kind is None:
             return None
-        colour = None if material is None else colours.get(material.get("name"))
-        return kind | placed(T) | {"rgba": colour or _GREY}
+        colour = _GREY if shape.rgba is None else texts(np.array(shape.rgba))
+        return kind | placed(shape.T_link_shape) | {"rgba": colour}
 
-    def _kind(self, shape: Any, urdf: Path, folder: Path) -> dict[str, str] | None:
-        match shape.tag:
-            case "box":
-                return {"type": "box", "size": texts(0.5 * _floats(shape.get("size")))}
-            case "sphere":
-                return {"type": "sphere", "size": texts(_floats(shape.get("radius")))}
-            case "cylinder" | "capsule":
-                sizes = np.append(_floats(shape.get("radius")), 0.5 * _floats(shape.get("length")))
-                return {"type": shape.tag, "size": texts(sizes)}
-            case "mesh":
-                return self._mesh(shape, urdf, folder)
-        return None
-
-    def _mesh(self, shape: Any, urdf: Path, folder: Path) -> dict[str, str] | None:
-        given = shape.get("filename", "")
-        file = _found(given, urdf)
+    def _mesh(self, shape: Shape, urdf: Path, folder: Path) -> dict[str, str] | None:
+        file = find_mesh(shape.mesh, urdf)
         if file is None or not _readable(file):
-            self.unreadable.append(given)
+            self.unreadable.append(shape.mesh)
             return None
         name = f"mesh_{len(self.meshes)}"
         path = Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
         # MuJoCo computes no mass for a mesh that is not closed; a shell needs no closed mesh.
         mesh = {"name": name, "file": path, "inertia": "shell"}
-        if shape.get("scale"):
-            mesh["scale"] = shape.get("scale")
+        if shape.sizes != (1.0, 1.0, 1.0):
+            mesh["scale"] = texts(np.array(shape.sizes))
         self.meshes.append(mesh)
         return {"type": "mesh", "mesh": name}
+
+
+def _primitive(shape: Shape) -> dict[str, str]:
+    """Return type and size of a shape; MuJoCo has half lengths."""
+    sizes = np.array(shape.sizes)
+    sizes[0 if shape.kind == "box" else 1 :] *= 0.5
+    return {"type": shape.kind, "size": texts(sizes)}
 
 
 def rod(end: FloatArray) -> dict[str, str] | None:
@@ -139,11 +125,6 @@ def _blamed_on(element: Any, urdf: Path) -> Iterator[None]:
         raise RobotError(what, file=urdf, line=element.sourceline, remedy="Give numbers") from None
 
 
-def _coloured(material: Any) -> bool:
-    colour = material.find("color")
-    return colour is not None and colour.get("rgba") is not None
-
-
 def _origin(element: Any) -> FloatArray:
     """Return the pose (4, 4) of an element's <origin>."""
     origin, T = element.find("origin"), np.eye(4)
@@ -164,17 +145,6 @@ def _inertia(inertial: Any) -> FloatArray:
 
 def _floats(text: str) -> FloatArray:
     return np.array([float(word) for word in text.split()])
-
-
-def _found(name: str, urdf: Path) -> Path | None:
-    """Return the file of a mesh: relative to the URDF, or in a package whose folder is above the URDF or beside it."""
-    scheme, _, rest = name.rpartition("://")
-    places = [urdf.parent / name.removeprefix("file://")]
-    if scheme == "package":
-        package, _, inside = rest.partition("/")
-        for folder in urdf.resolve().parents:
-            places += [folder / package / inside, *([folder / inside] if package == folder.name else [])]
-    return next((place for place in places if place.is_file()), None)
 
 
 def _readable(file: Path) -> bool:

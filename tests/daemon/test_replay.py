@@ -155,6 +155,7 @@ def report(**changed: object) -> ReplayReport:
         answering="rigid",
         prequential_mm={"prior": 37.4, "nlms": 1.7, "rigid": 0.4, "residual": 0.4, "exact": 2.0},
         claimed_mm=0.09,
+        expected_mm=0.31,
         in_support_share=0.9,
         within_sigma_share=0.88,
         doubted=0,
@@ -173,8 +174,9 @@ def test_the_report_is_wrapped_to_the_terminal() -> None:
 
 def test_the_report_says_that_the_errors_have_the_measurements_noise() -> None:
     said = " ".join(as_text(report()).split())
+    assert "the errors above count the noise of the measurements" in said
     assert (
-        "the learner claims 0.090 mm to the truth where data is; its 1-sigma and that noise together cover 88%" in said
+        "on new pairs where data is the learner expects 0.310 mm; its 1-sigma and that noise together cover 88%" in said
     )
 
 

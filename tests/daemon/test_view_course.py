@@ -6,6 +6,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import pytest
 from told_statuses import LEARNER
 
 from bodyschema.daemon.transport.status import Change, LearnerStatus
@@ -150,3 +151,12 @@ def test_before_there_is_a_model_the_cloud_is_empty() -> None:
         raise RequestError("there is no model yet")
 
     assert cloud([pair(1)], refuse).x == []
+
+
+def test_noise_is_at_most_the_best_model_s_error() -> None:
+    assert LEARNER.calibration is not None
+    bent = msgspec.structs.replace(LEARNER.calibration, noise_m=0.1)
+    told = msgspec.structs.replace(LEARNER, calibration=bent)
+    assert told.expected_error_m(0.0) == pytest.approx(0.002)
+    assert msgspec.structs.replace(told, prequential_m={}).noise_m() == 0.1
+    assert msgspec.structs.replace(told, calibration=None).expected_error_m(0.001) is None

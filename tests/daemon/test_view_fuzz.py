@@ -13,15 +13,18 @@ from hypothesis import strategies as st
 pytest.importorskip("starlette")
 
 from bodyschema.dashboard.app import application
+from bodyschema.dashboard.documents import BodyDocument
 from bodyschema.dashboard.hub import Hub
 from bodyschema.interfaces.errors import BusError, RequestError
 
 LIMIT_S = 500.0
 HOST = b"127.0.0.1:8420"
 PATHS = ["/", "/api/state", "/api/events", "/api/command", "/api/diagnosis", "/report", "/static/style.css", "/static/"]
+PATHS += ["/api/body", "/api/body/0"]
 MEANT = {200, 206, 304, 400, 403, 404, 405, 416, 503}
 
 paths = st.sampled_from(PATHS) | st.text(max_size=30).map("/{}".format) | st.text(max_size=30).map("/static/{}".format)
+paths |= st.text(max_size=30).map("/api/body/{}".format)
 methods = st.sampled_from(["GET", "HEAD", "POST", "DELETE", "PUT", "OPTIONS", "PATCH"]) | st.text("ABC", max_size=9)
 names = st.sampled_from([b"host", b"origin", b"content-type", b"range", b"if-none-match", b"if-modified-since"])
 values = st.sampled_from([HOST, b"http://" + HOST, b"application/json", b"bytes=0-1", b"evil.example"])
@@ -53,6 +56,16 @@ class Refusing:
         return None
 
 
+class NoShapes:
+    """A robot without links."""
+
+    def document(self) -> BodyDocument:
+        return BodyDocument([], [], [], [], None, [])
+
+    def mesh(self, number: int) -> bytes | None:
+        return None
+
+
 async def status_of(method: str, path: str, asked: list[tuple[bytes, bytes]], body: bytes) -> int:
     hub = Hub()
     hub.close()  # else the stream of events never ends
@@ -60,7 +73,9 @@ async def status_of(method: str, path: str, asked: list[tuple[bytes, bytes]], bo
     left = [{"type": "http.request", "body": body, "more_body": False}]
 
     async def receive() -> dict[str, Any]:
-        return left.pop() if left else {"type": "http.disconnect"}
+        if not left:
+            await asyncio.sleep(LIMIT_S)  # a browser that stays
+        return left.pop()
 
     async def send(message: MutableMapping[str, Any]) -> None:
         said.append(message)
@@ -68,7 +83,7 @@ async def status_of(method: str, path: str, asked: list[tuple[bytes, bytes]], bo
     scope = {"type": "http", "http_version": "1.1", "method": method, "path": path, "headers": asked}
     scope |= {"raw_path": path.encode(errors="replace"), "query_string": b"", "root_path": "", "scheme": "http"}
     scope |= {"client": ("127.0.0.1", 1), "server": ("127.0.0.1", 8420), "asgi": {"version": "3.0"}}
-    await asyncio.wait_for(application(hub, Refusing(), Refusing())(scope, receive, send), LIMIT_S)
+    await asyncio.wait_for(application(hub, Refusing(), Refusing(), NoShapes())(scope, receive, send), LIMIT_S)
     return said[0]["status"]
 
 

@@ -13,12 +13,14 @@ httpx = pytest.importorskip("httpx")
 pytest.importorskip("starlette")
 
 from bodyschema.dashboard.app import LARGEST_BODY, STATIC, application  # noqa: E402
+from bodyschema.dashboard.documents import BodyDocument  # noqa: E402
 from bodyschema.dashboard.hub import MOST_FOLLOWERS, Hub  # noqa: E402
 from bodyschema.interfaces.errors import BusError, RequestError  # noqa: E402
 
 HERE = "http://127.0.0.1:8420"
 PAUSE = {"process": "sampler", "command": "pause"}
 ADDRESSES = ["/", "/api/state", "/api/events", "/api/picture", "/report", "/static/style.css", "/static/js/main.js"]
+ADDRESSES += ["/api/body", "/api/body/0"]
 
 
 @dataclass
@@ -34,6 +36,12 @@ class Processes:
         if self.jpeg is None:
             raise BusError("nothing answers")
         return self.jpeg
+
+    def document(self) -> BodyDocument:
+        return BodyDocument(["base"], [[]], [], [], None, ["Missing meshes: <b>a</b>."])
+
+    def mesh(self, number: int) -> bytes | None:
+        return b"mesh" if number == 0 else None
 
     def command(self, process: str, name: str) -> str:
         self._note(process, name)
@@ -71,7 +79,7 @@ def hub() -> Hub:
 def ask(hub: Hub, processes: Processes):
     def asked(method: str, address: str, headers: dict[str, str] | None = None, **more: Any):
         async def once():
-            transport = httpx.ASGITransport(app=application(hub, processes, processes))
+            transport = httpx.ASGITransport(app=application(hub, processes, processes, processes))
             async with httpx.AsyncClient(transport=transport, base_url=HERE) as client:
                 own = {"Origin": HERE} if method not in ("GET", "HEAD") else {}
                 return await client.request(method, address, headers=own | (headers or {}), **more)
@@ -97,6 +105,24 @@ def test_the_cameras_picture_is_served_where_there_is_one(ask, processes) -> Non
     processes.jpeg = b"jpeg"
     answer = ask("GET", "/api/picture")
     assert (answer.content, answer.headers["content-type"]) == (b"jpeg", "image/jpeg")
+
+
+def test_the_robot_s_shapes_are_served_by_number(ask) -> None:
+    assert ask("GET", "/api/body").json()["said"] == ["Missing meshes: <b>a</b>."]
+    answer = ask("GET", "/api/body/0")
+    assert (answer.content, answer.headers["content-type"]) == (b"mesh", "application/octet-stream")
+    for other in ("1", "-1", "99999999999999999999", "a.stl", "..%2f..%2fetc%2fpasswd", "%2fetc%2fpasswd", ""):
+        assert ask("GET", f"/api/body/{other}").status_code == 404, other
+
+
+def test_the_page_is_packed_on_its_way(ask) -> None:
+    plain, packed = (
+        ask("GET", "/static/vendor/three.core.min.js", {"Accept-Encoding": way}) for way in ("identity", "gzip")
+    )
+    assert packed.content == plain.content
+    assert int(packed.headers.get("content-length", 0)) < len(plain.content) / 3
+    again = ask("GET", "/static/style.css", {"If-None-Match": ask("GET", "/static/style.css").headers["etag"]})
+    assert (again.status_code, again.headers["cache-control"]) == (304, "no-cache")
 
 
 @pytest.mark.parametrize("address", ADDRESSES)
@@ -125,7 +151,7 @@ def test_another_page_s_button_does_nothing(ask, processes, method: str, address
 
 def test_a_command_without_an_origin_does_nothing(hub, processes) -> None:
     async def post() -> int:
-        transport = httpx.ASGITransport(app=application(hub, processes, processes))
+        transport = httpx.ASGITransport(app=application(hub, processes, processes, processes))
         async with httpx.AsyncClient(transport=transport, base_url=HERE) as client:
             return (await client.post("/api/command", json=PAUSE)).status_code
 
@@ -224,7 +250,7 @@ def test_all_documents_are_one_object_for_programs(ask, hub) -> None:
 
 async def opened_streams(hub: Hub, count: int) -> list[int]:
     """Return the status codes of `count` event streams requested at the same time and kept open for a while."""
-    app, codes, enough = application(hub, Processes(), Processes()), [], asyncio.Event()
+    app, codes, enough = application(hub, Processes(), Processes(), Processes()), [], asyncio.Event()
 
     async def send(message: dict[str, Any]) -> None:
         if message["type"] == "http.response.start":
@@ -303,5 +329,14 @@ def test_text_from_outside_is_never_taken_for_html() -> None:
         assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\b", file.read_text())
 
 
-def test_what_is_vendored_comes_with_its_licence() -> None:
-    assert "MIT" in (STATIC / "vendor" / "uPlot.LICENSE").read_text(encoding="utf-8")
+@pytest.mark.parametrize("name", ["uPlot", "three"])
+def test_what_is_vendored_comes_with_its_licence(name: str) -> None:
+    assert "MIT" in (STATIC / "vendor" / f"{name}.LICENSE").read_text(encoding="utf-8")
+    assert list((STATIC / "vendor").glob(f"{name}.*.js"))
+
+
+def test_what_is_vendored_asks_for_itself_alone() -> None:
+    for file in (STATIC / "vendor").glob("three.*.js"):
+        text = file.read_text(encoding="utf-8")
+        assert set(re.findall(r'from"([^"]*)"', text)) <= {"./three.core.min.js"}
+        assert not re.search(r"\beval\(|new Function\(|new Worker\(", text)

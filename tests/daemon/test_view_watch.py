@@ -192,10 +192,9 @@ def test_the_arm_stands_at_the_newest_pair(config, hub, watch) -> None:
         arm = until(lambda: (found := document(hub, "arm")) and found["predicted"] and found)
     robot = config.robot
     T = inverse(robot.camera.pose)
-    seen = [
-        T[:3, :3] @ np.array(point) + T[:3, 3] for point in (arm["links"][-1][1], arm["measured"], arm["predicted"])
-    ]
-    assert arm["pair"] == 20
+    places = (arm["links"][arm["hand"]][:3], arm["measured"], arm["predicted"])
+    seen = [T[:3, :3] @ np.array(point) + T[:3, 3] for point in places]
+    assert (arm["pair"], len(arm["trail"]), arm["radii"]) == (20, 19, None)
     np.testing.assert_allclose(seen[0], robot.chain.positions(np.array([[0.2, 0.0]]))[0], atol=1e-4)
     np.testing.assert_allclose(seen[1:], [[0.5, 0.0, 0.003], [0.5, 0.0, 0.0]], atol=1e-4)
     assert arm["apart_m"] == pytest.approx(0.003)

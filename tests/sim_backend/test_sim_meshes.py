@@ -7,9 +7,10 @@ import pytest
 from guided_run import described
 
 from bodyschema.interfaces.errors import RobotError
-from bodyschema.sim_backend import SimConfig, mesh_file, meshes
+from bodyschema.robot import mesh_file, meshes
+from bodyschema.robot.mesh_file import MeshError, read_mesh, stl_bytes
+from bodyschema.sim_backend import SimConfig
 from bodyschema.sim_backend.bullet import Body
-from bodyschema.sim_backend.mesh_file import MeshError, read_mesh, stl_bytes
 from bodyschema.sim_backend.meshes import MOST_TRIANGLES, Meshes
 from bodyschema.sim_backend.physics_urdf import MOST_LINKS, physics_urdf
 from bodyschema.sim_backend.truth import TrueRobot

@@ -1,70 +1,64 @@
 // Residuals in space.
-import { byId, text } from "./dom.js";
-import { mm } from "./format.js";
-import { box, color, dot, line, Orbit } from "./orbit.js";
+import { color, disc, lines, named, Space, THREE } from "./space.js";
+import { box, stretchOf } from "./panels.js";
 
-export class Cloud extends Orbit {
+export class Cloud extends Space {
   constructor() {
-    super("cloud");
-    this.document = null;
+    super("cloud", false);
+    // The measurement frame has y down and z forward.
+    this.content = new THREE.Group();
+    this.content.rotation.x = -Math.PI / 2;
+    this.scene.add(this.content);
+    this.dot = disc();
+    this.corners = ["x", "y", "z"].map((name) => Object.assign(this.label(""), { name }));
   }
 
   update(document) {
     this.document = document;
-    const shown = document && document.x.length > 0;
-    this.stretch = shown ? stretchOf(document) : 100;
-    text("cloud-stretch", String(this.stretch));
-    const said = shown
-      ? `${document.x.length} pairs with this tool, all learnt already: median ${mm(document.median_m)}, 95 % within ${mm(document.p95_m)}.`
-      : "No residuals yet";
-    text("cloud-text", said);
-    this.canvas.setAttribute("aria-label", said);
-    this.draw();
+    this.paint();
+    this.redraw();
   }
 
-  paint(pen, width, height) {
+  paint() {
+    for (const part of this.content.children) part.geometry.dispose();
+    this.content.clear();
     if (!this.document?.x.length) return;
     const { x, residual, segment } = this.document;
-    const { project } = this.projection(x, width, height);
-    this.frame(pen, project, ...box(x));
+    const stretch = stretchOf(this.document);
     const newest = segment.at(-1);
-    const order = x.map((point, k) => [project(point), k]).sort((a, b) => a[0][2] - b[0][2]);
-    pen.lineWidth = 1.2 * devicePixelRatio;
-    for (const [place, k] of order) {
-      const fresh = segment[k] === newest;
-      pen.strokeStyle = color("--second");
-      pen.globalAlpha = fresh ? 0.95 : 0.55;
-      line(pen, place, project(x[k].map((value, axis) => value - this.stretch * residual[k][axis])));
-      pen.fillStyle = color(fresh ? "--mark" : "--line");
-      dot(pen, place, (fresh ? 2.4 : 1.7) * devicePixelRatio);
-    }
-    pen.globalAlpha = 1;
+    const shade = (name, alpha) => [...color(name).toArray(), alpha];
+    const ends = x.flatMap((point, k) => [point, point.map((value, axis) => value - stretch * residual[k][axis])]);
+    const second = [shade("--second", 0.5), shade("--second", 1)];
+    this.content.add(lines(ends, ends.map((_, k) => second[Number(segment[k >> 1] === newest)])));
+    this.content.add(this.points(x.filter((_, k) => segment[k] !== newest), "--line", 4));
+    this.content.add(this.points(x.filter((_, k) => segment[k] === newest), "--mark", 6));
+    this.frameBox(...box(x));
   }
 
-  frame(pen, project, low, high) {
+  points(places, name, size) {
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.Float32BufferAttribute(places.flat(), 3));
+    return new THREE.Points(geometry, new THREE.PointsMaterial({ size, sizeAttenuation: false, map: this.dot, alphaTest: 0.5, color: color(name) }));
+  }
+
+  frameBox(low, high) {
     const corner = (k) => [0, 1, 2].map((axis) => ((k >> axis) & 1 ? high[axis] : low[axis]));
-    pen.strokeStyle = color("--rule");
-    pen.lineWidth = devicePixelRatio;
+    const edges = [];
     for (let k = 0; k < 8; k++) {
-      for (const axis of [1, 2, 4]) {
-        if (k & axis) continue;
-        const [from, to] = [project(corner(k)), project(corner(k | axis))];
-        line(pen, from, to);
-      }
+      for (const axis of [1, 2, 4]) if (!(k & axis)) edges.push(corner(k), corner(k | axis));
     }
-    pen.fillStyle = color("--soft");
-    pen.font = `${11 * devicePixelRatio}px system-ui`;
-    ["x", "y", "z"].forEach((name, axis) => {
-      const [u, v] = project(corner(1 << axis));
-      pen.fillText(`${name} ${(high[axis] - low[axis]).toFixed(2)} m`, u + 4 * devicePixelRatio, v - 4 * devicePixelRatio);
+    const frame = lines(edges);
+    named(frame.material, "--grid");
+    this.content.add(frame);
+    this.content.updateMatrixWorld();
+    const place = (point) => this.content.localToWorld(new THREE.Vector3(...point));
+    this.corners.forEach(({ element, place: at, name }, axis) => {
+      element.textContent = `${name} ${(high[axis] - low[axis]).toFixed(2)} m`;
+      at.copy(place(corner(0).map((value, k) => (k === axis ? (low[k] + high[k]) / 2 : value))));
     });
+    const middle = place(low.map((value, k) => (value + high[k]) / 2));
+    // What grows by a hair with each pair does not move the view.
+    const radius = 0.5 * Math.hypot(...high.map((value, k) => value - low[k])) || 1;
+    if (!this.fitted || Math.abs(radius - this.radius) > 0.1 * this.radius) this.fit(middle, radius);
   }
-}
-
-// 1, 2 or 5 times a power of ten, so that most lines are a twelfth of the box.
-function stretchOf({ x, p95_m: residual }) {
-  const [low, high] = box(x);
-  const wanted = Math.hypot(...high.map((value, k) => value - low[k])) / 12 / Math.max(residual, 1e-9);
-  const power = 10 ** Math.floor(Math.log10(Math.max(wanted, 1)));
-  return power * ([5, 2].find((digit) => wanted >= digit * power) ?? 1);
 }

@@ -46,3 +46,9 @@ export function changed({ kind, told }) {
 export function words(name) {
   return name.replaceAll("_", " ");
 }
+
+// The largest of 1, 2 and 5 times a power of ten that is no larger.
+export function roundDown(value) {
+  const power = 10 ** Math.floor(Math.log10(value));
+  return power * ([5, 2].find((digit) => value >= digit * power) ?? 1);
+}

@@ -1,12 +1,10 @@
 // Documents come as server-sent events, each whole under its topic; every panel shows those that it needs.
 import { Actions } from "./actions.js";
 import { ErrorChart, LatencyChart } from "./charts.js";
-import { Arm } from "./arm.js";
-import { Cloud } from "./cloud.js";
-import { text } from "./dom.js";
+import { byId, text } from "./dom.js";
 import { notices } from "./notices.js";
 import { Picture } from "./picture.js";
-import { calibration, coverage, footer, models, outlook, pills, rejected, segments, suspicions, tiles } from "./panels.js";
+import { arm, calibration, cloud, coverage, footer, models, outlook, pills, rejected, segments, suspicions, tiles } from "./panels.js";
 
 const TOPICS = ["robot", "sampler", "learner", "outlook", "series", "course", "segments", "cloud", "arm", "diagnosis"];
 // Figures come every second: nothing for so long, and the connection is taken for lost.
@@ -19,12 +17,11 @@ let scheduled = false;
 
 const error = new ErrorChart();
 const latency = new LatencyChart();
-const cloud = new Cloud();
-const arm = new Arm();
 new Picture();
 const actions = new Actions(() => render());
-let cloudShown = null;
-let armShown = null;
+// Views in space by their topics, and what they show.
+const spaces = {};
+const shown = {};
 
 function render() {
   scheduled = false;
@@ -33,16 +30,13 @@ function render() {
     text("robot", state.robot.robot);
     document.title = `${state.robot.robot} · bodyschema`;
   }
-  for (const panel of [tiles, pills, calibration, outlook, coverage, rejected, segments, suspicions, models, footer]) panel(state);
+  for (const panel of [tiles, pills, arm, cloud, calibration, outlook, coverage, rejected, segments, suspicions, models, footer]) panel(state);
   error.update(state);
   latency.update(state);
-  if (cloudShown !== state.cloud) {
-    cloudShown = state.cloud;
-    cloud.update(state.cloud);
-  }
-  if (armShown !== state.arm) {
-    armShown = state.arm;
-    arm.update(state.arm);
+  for (const [topic, space] of Object.entries(spaces)) {
+    if (shown[topic] === state[topic]) continue;
+    shown[topic] = state[topic];
+    space.update(state[topic]);
   }
   notices(state, connected);
   actions.update(state, connected);
@@ -75,8 +69,24 @@ function setConnected(now) {
   schedule();
 }
 
+// The rest of the page does not wait for the graphics, nor need them.
+async function openSpaces() {
+  const probe = document.createElement("canvas").getContext("webgl2");
+  probe?.getExtension("WEBGL_lose_context")?.loseContext();
+  for (const id of ["arm", "cloud"]) {
+    byId(`${id}-none`).hidden = Boolean(probe);
+    byId(id).hidden = byId(`${id}-reset`).hidden = !probe;
+  }
+  if (!probe) return;
+  const [{ Arm }, { Cloud }] = await Promise.all([import("./arm.js"), import("./cloud.js")]);
+  spaces.arm = new Arm();
+  spaces.cloud = new Cloud();
+  schedule();
+}
+
 setInterval(() => {
   if (connected && performance.now() - heardAt > SILENT_MS) setConnected(false);
 }, 1000);
 connect();
 render();
+openSpaces();

@@ -1,6 +1,6 @@
 // Tiles, tables and sentences.
 import { bar, byId, element, row, text } from "./dom.js";
-import { clock, joint, kindOfChange, milliseconds, mm, span, whole, words } from "./format.js";
+import { clock, joint, kindOfChange, milliseconds, mm, roundDown, span, whole, words } from "./format.js";
 
 const last = (values) => values?.findLast((value) => value !== null);
 
@@ -9,7 +9,7 @@ export function tiles({ sampler, learner, series }) {
   text("tile-error", mm(status?.prequential_m[status.answering]));
   text("tile-expected", mm(series?.expected_m.at(-1)));
   text("tile-pairs", whole(status?.pairs ?? sampler?.status?.pairs));
-  text("tile-error-of", status?.prequential_pairs ? `${lastPairs(status)}, each predicted before it was learnt${noise(status)}` : "");
+  text("tile-error-of", status?.prequential_pairs ? `${lastPairs(status)}, each predicted before it was learnt` : "");
   text("tile-expected-of", status?.claimed_error_m ? "the learner's estimate of the same, where data is" : "");
   const since = status && status.pairs_since_change < status.pairs ? [`${whole(status.pairs_since_change)} since the last change`] : [];
   const behind = status?.behind ? [`${whole(status.behind)} stored and not learnt yet`] : [];
@@ -21,7 +21,6 @@ export function tiles({ sampler, learner, series }) {
 }
 
 const lastPairs = (status) => `last ${whole(status.prequential_pairs)} pairs`;
-const noise = (status) => (status.calibration ? `; noise of the measurement: ${mm(status.calibration.noise_m)} a coordinate` : "");
 
 export function pills({ sampler, learner }) {
   for (const [name, process] of [["sampler", sampler], ["learner", learner]]) {
@@ -47,6 +46,37 @@ export function outlook({ outlook: found }) {
     rows[1].className = "best";
   }
   table.tBodies[0].replaceChildren(...rows);
+}
+
+export function arm({ arm: found }) {
+  if (!found) return;
+  const apart = found.apart_m === null ? "no model answers" : `prediction and measurement are ${mm(found.apart_m)} apart`;
+  const sure = found.radii ? `; 95 % of measurements should lie in the ellipsoid around the prediction, at most ${mm(Math.max(...found.radii))} away` : "";
+  caption("arm", `Pair ${found.pair}: ${apart}${sure}.${found.placed ? "" : " The camera's pose is not known yet: the marker is drawn at robot.toml's guess."}`);
+}
+
+export function cloud({ cloud: found }) {
+  const shown = found && found.x.length > 0;
+  text("cloud-stretch", String(shown ? stretchOf(found) : 100));
+  caption("cloud", shown ? `${found.x.length} pairs with this tool, all learnt already: median ${mm(found.median_m)}, 95 % within ${mm(found.p95_m)}.` : "No residuals yet");
+}
+
+function caption(id, said) {
+  text(`${id}-text`, said);
+  byId(id).setAttribute("aria-label", said);
+}
+
+export function box(points) {
+  const low = [0, 1, 2].map((axis) => Math.min(...points.map((point) => point[axis])));
+  const high = [0, 1, 2].map((axis) => Math.max(...points.map((point) => point[axis])));
+  return [low, high];
+}
+
+// 1, 2 or 5 times a power of ten, so that most residuals are a twelfth of the box.
+export function stretchOf({ x, p95_m: residual }) {
+  const [low, high] = box(x);
+  const wanted = Math.hypot(...high.map((value, k) => value - low[k])) / 12 / Math.max(residual, 1e-9);
+  return roundDown(Math.max(wanted, 1));
 }
 
 // Nominal and learnt figures with their intervals; what no motion shows is said below.
@@ -146,7 +176,7 @@ export function models({ learner, course }) {
   }));
   const status = learner?.status;
   const errors = Object.entries(status?.prequential_m ?? {}).sort((a, b) => a[1] - b[1]);
-  text("models-of", errors.length ? `Error of each on the ${lastPairs(status)}, the same for all, predicted before they were learnt${noise(status)}` : "");
+  text("models-of", errors.length ? `Error of each on the ${lastPairs(status)}, the same for all, predicted before they were learnt` : "");
   const worst = Math.max(1e-12, ...errors.map(([, error]) => error));
   byId("models").hidden = !errors.length;
   byId("models").tBodies[0].replaceChildren(...errors.map(([name, error]) => {

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.robot.limited import read_at_most
-from bodyschema.sim_backend.geometry import transform
+from kbmaps.rotations import exponentials
+
+from .limited import read_at_most
 
 MESHES = (".stl", ".obj", ".dae")
 LARGEST_MESH_BYTES = 64 * 2**20  # the meshes of public arms have 0.1 to 20 MB
@@ -244,15 +245,18 @@ def _numbers(text: str | None, kind: Any) -> np.ndarray:
 
 def _placement(element: Any) -> FloatArray:
     """Return one of a node's transforms, (4, 4)."""
-    numbers = _numbers(element.text, np.float64)
+    numbers, T = _numbers(element.text, np.float64), np.eye(4)
     match element.tag.rpartition("}")[2]:
         case "matrix":
             return numbers.reshape(4, 4)
         case "translate":
-            return transform(np.zeros(3), numbers.reshape(3))
+            T[:3, 3] = numbers.reshape(3)
+            return T
         case "rotate":
             x, y, z, degrees = numbers
             length = float(np.hypot(np.hypot(x, y), z))
-            return transform(np.radians(degrees) * np.array([x, y, z]) / (length or 1.0), np.zeros(3))
+            turn = np.radians(degrees) * np.array([[x, y, z]]) / (length or 1.0)
+            T[:3, :3] = exponentials(turn)[0][0]
+            return T
         case _:
             return np.diag([*numbers.reshape(3), 1.0])
