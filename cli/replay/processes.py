@@ -18,7 +18,7 @@ from bodyschema.daemon.transport.bus import is_alive
 from bodyschema.interfaces.errors import BusError
 from bodyschema.interfaces.interpreter import module_command
 
-START_LIMIT_S = 60.0
+START_LIMIT_S = 300.0  # a full machine takes minutes to import; a process that ends is reported at once
 END_LIMIT_S = 15.0
 
 

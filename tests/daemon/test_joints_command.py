@@ -80,7 +80,7 @@ def test_noise_is_no_movement(config) -> None:
 # --- on the emulator
 
 
-def test_the_watch_has_angles_speeds_temperatures_and_ranges(config, tmp_path) -> None:
+def test_the_watch_has_angles_speeds_temperatures_and_ranges(config, tmp_path, patient_host) -> None:
     shoulder = [0.2]
     angles = {joint: (lambda _: 0.1) for joint in config.robot.joints} | {"shoulder_pitch": lambda _: shoulder[0]}
     servos = config.tables.drivers.dynamixel

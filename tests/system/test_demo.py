@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+import warm
 from hostile_folder import HostileFolder
 
 from bodyschema.recordings.recording import Recording
@@ -99,8 +100,7 @@ def test_the_demo_reaches_its_figures_and_claims_what_is_true(tmp_path: Path, se
 def test_the_demo_refuses_a_folder_that_is_not_its_own(tmp_path: Path) -> None:
     precious = tmp_path / "thesis.tex"
     precious.write_text("years of work")
-    command = [sys.executable, "-m", "bodyschema", "demo", "--out", str(tmp_path)]
-    result = subprocess.run(command, check=False, capture_output=True, text=True, timeout=LIMIT_S)
+    result = warm.run("-m", "bodyschema", "demo", "--out", tmp_path)
     assert result.returncode == 1
     assert "thesis.tex" in result.stderr
     assert precious.read_text() == "years of work"
