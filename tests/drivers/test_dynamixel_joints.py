@@ -405,6 +405,6 @@ def test_in_a_storm_of_faults_no_wrong_reading_is_believed(models, fast) -> None
     arm = Arm(models, fast=fast, seed=5)
     with arm.joints:
         arm.chain.faults = storm(0.02, Random(6))
-        readings = read(arm, 1000)
-    assert sum(arm.chain.faults.struck.values()) > 30
+        readings = read(arm, 600)
+    assert sum(arm.chain.faults.struck.values()) > 18
     assert max(arm.error(reading) for reading in readings) < 0.01
