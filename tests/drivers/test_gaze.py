@@ -36,7 +36,7 @@ def dropped(robot: GazingRobot, seconds: float = 3.0) -> str:
 
 def test_the_hand_stays_in_view_on_a_path_on_which_it_leaves_it_without_gaze() -> None:
     with (still := GazingRobot()).joints:
-        without = still.in_view(still.run(PATH_S))
+        without = still.in_view(still.run(PATH_S, looking=False))
     with (gazing := GazingRobot()).joints:
         gazing.switch_on()
         assert gazing.in_view(gazing.run(PATH_S)).all()
