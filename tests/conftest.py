@@ -19,7 +19,7 @@ from skip_remedies import Report, with_remedy
 # No time limits: a busy machine is no failure. The same examples in every run, so that a red test is red again;
 # `make soak` generates other and more examples (its profile), and keeps failures in .hypothesis.
 TIMELESS = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.register_profile("suite", TIMELESS, derandomize=True, max_examples=10)
+settings.register_profile("suite", TIMELESS, derandomize=True, max_examples=6)
 settings.register_profile("soak", TIMELESS, print_blob=True, max_examples=300)
 settings.load_profile("suite")
 

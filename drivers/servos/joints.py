@@ -193,10 +193,13 @@ class ServoJoints:
             raise
 
     def temperature_c(self, joint: str) -> float | None:
-        """Read the temperature of a joint's servo; None without an answer. For the reading thread only."""
+        """Read the temperature of a joint's servo; None without an answer or port. For the reading thread only."""
         servo = self.servos[self._names.index(joint)]
         bus, register = self._buses[servo.bus], servo.model.layout["temperature"]
-        exchange = bus.ask(bus.read_request(servo.model, servo.id, register))
+        try:
+            exchange = bus.ask(bus.read_request(servo.model, servo.id, register))
+        except SourceLost:
+            return None  # the next reading reports that the port is gone
         return float(exchange.answers[0].status.data[0]) if exchange.trouble is None else None
 
     def _read_until(self, deadline: float) -> JointReading | None:

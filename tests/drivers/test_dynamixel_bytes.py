@@ -89,6 +89,8 @@ def test_the_bench_survives_any_bytes(chunks) -> None:
     chain = Chain([Servo(BY_NAME["XM430-W350"], 1, lambda t: 0.0), Servo(BY_NAME["AX-12A"], 2, lambda t: 0.0)])
     for k, chunk in enumerate(chunks):
         chain.send(chunk, k * 1e-3, 1_000_000)
+    servo = chain.servos[0]
+    assert chain.send(PACKETS2.ping(servo.id), 1.0, servo.baud)
 
 
 @given(NOISE.filter(lambda noise: not noise.endswith((b"\xff", b"\xfd"))))

@@ -78,6 +78,8 @@ def test_the_bench_survives_any_bytes(chunks) -> None:
     chain = Chain([Servo(BY_NAME["STS3215"], 1, lambda t: 0.0), Servo(BY_NAME["SCS0009"], 2, lambda t: 0.0)])
     for k, chunk in enumerate(chunks):
         chain.send(chunk, k * 1e-3, BAUD)
+    servo = chain.servos[0]
+    assert chain.send(PACKETS.ping(servo.id), 1.0, servo.baud)
 
 
 @given(st.integers(0, 252), st.integers(0, 255), st.binary(min_size=1, max_size=60))

@@ -213,9 +213,9 @@ def test_in_a_storm_of_faults_no_wrong_reading_is_believed(sync) -> None:
     arm = FeetechArm(("STS3215",) * 6, sync=sync, seed=5)
     with arm.joints:
         arm.chain.faults = struck = storm(0.02, Random(6))
-        readings = read(arm, 1000)
-    assert arm.chain.instructions > 1000
-    assert sum(struck.struck.values()) > 30
+        readings = read(arm, 600)
+    assert arm.chain.instructions > 600
+    assert sum(struck.struck.values()) > 18
     assert max(arm.error(reading) for reading in readings) < 0.01
 
 

@@ -36,7 +36,7 @@ def dropped(robot: GazingRobot, seconds: float = 3.0) -> str:
 
 def test_the_hand_stays_in_view_on_a_path_on_which_it_leaves_it_without_gaze() -> None:
     with (still := GazingRobot()).joints:
-        without = still.in_view(still.run(PATH_S))
+        without = still.in_view(still.run(PATH_S, looking=False))
     with (gazing := GazingRobot()).joints:
         gazing.switch_on()
         assert gazing.in_view(gazing.run(PATH_S)).all()
@@ -85,10 +85,10 @@ def test_the_head_stays_within_its_limits() -> None:
 def test_a_head_without_a_fresh_aim_stands_still() -> None:
     with (robot := GazingRobot()).joints:
         robot.switch_on()
-        robot.run(1.5)
-        robot.run(1.0, looking=False)
+        robot.run(1.0)
+        robot.run(0.7, looking=False)
         before = robot.q()[:2]
-        robot.run(1.0, looking=False)
+        robot.run(0.5, looking=False)
         assert robot.gaze.state == "on"
         assert np.abs(robot.q()[:2] - before).max() < 1e-6
 
@@ -119,8 +119,8 @@ def learner(robot: RobotDescription, truth, sigma: float, support: bool = True):
 def off_middle(robot: GazingRobot) -> float:
     with robot.joints:
         robot.switch_on()
-        robot.run(1.0)
-        return float(np.abs(robot.run(2.0) - [340.0, 239.5]).mean())
+        robot.run(0.7)
+        return float(np.abs(robot.run(1.0) - [340.0, 239.5]).mean())
 
 
 @pytest.fixture(scope="module")
@@ -232,7 +232,7 @@ def often_switched() -> Iterator[None]:
 
 def test_cameras_see_where_a_head_was_while_its_servo_turns_it(often_switched) -> None:
     shaft = DrivenShaft(0.5)
-    turning = threading.Thread(target=lambda: [shaft(t) for t in range(20_000)])
+    turning = threading.Thread(target=lambda: [shaft(t) for t in range(5_000)])
     turning.start()
     seen = set()
     while turning.is_alive():

@@ -60,4 +60,5 @@ def test_the_messages_that_are_shown_are_those_of_the_code() -> None:
 @pytest.mark.parametrize("command", re.findall(r"^\$ (bodyschema .*)$", PAGE, re.MULTILINE))
 def test_every_command_on_the_page_is_understood(command: str) -> None:
     words = command.split()[1:]
-    command_line(words[0]).parse_args(words, exit_on_error=False, print_error=False)
+    understood, *_ = command_line(words[0]).parse_args(words, exit_on_error=False, print_error=False)
+    assert callable(understood)

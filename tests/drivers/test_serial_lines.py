@@ -387,8 +387,8 @@ def test_in_a_storm_of_faults_no_wrong_reading_is_believed() -> None:
     with arm.joints:
         arm.board.faults = struck = storm(0.02, Random(6))
         begun = arm.board.lines
-        readings = arm.read(10_000)
-    assert sum(struck.struck.values()) > 100
+        readings = arm.read(6_000)
+    assert sum(struck.struck.values()) > 60
     assert max(arm.error(reading) for reading in readings) < 2 * TICK
     assert len(readings) / (arm.board.lines - begun) > 0.95
 

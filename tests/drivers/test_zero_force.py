@@ -44,9 +44,9 @@ def test_the_arm_floats_where_it_is_left() -> None:
     with (arm := FloatingArm((0.3, -0.4, 1.2))).joints:
         arm.float()
         before = arm.q
-        arm.run(2.0)
+        arm.run(1.0)
         assert arm.force.state == "on"
-        assert np.abs(np.subtract(arm.q, before)).max() < DRIFT_RAD / 5
+        assert np.abs(np.subtract(arm.q, before)).max() < DRIFT_RAD / 10
 
 
 def test_the_arm_falls_without_zero_force() -> None:
@@ -64,11 +64,11 @@ def test_a_hand_moves_it_and_it_stays_there() -> None:
         arm.pendulums[0].pushed = 0.04
         arm.run(1.0)
         arm.pendulums[0].pushed = 0.0
-        arm.run(3.0)
+        arm.run(2.0)
         moved = arm.q[0]
-        arm.run(1.0)
+        arm.run(0.5)
         assert moved > 0.4
-        assert abs(arm.q[0] - moved) < DRIFT_RAD
+        assert abs(arm.q[0] - moved) < DRIFT_RAD / 20
 
 
 @pytest.mark.parametrize("directions", [(1, -1), pytest.param((-1, 1), marks=pytest.mark.soak)])
@@ -149,7 +149,7 @@ def test_readings_are_as_many_as_without() -> None:
         with (arm := FloatingArm((0.1,) * 6)).joints:
             if on:
                 arm.switch_on()
-            rates[on] = arm.run(2.0) / 2.0
+            rates[on] = arm.run(1.0)
     assert rates[True] > 0.97 * rates[False]
 
 
@@ -158,7 +158,7 @@ def test_readings_are_as_many_as_without() -> None:
 
 def test_no_torque_before_somebody_asks() -> None:
     with (arm := FloatingArm()).joints:
-        arm.run(2.0)
+        arm.run(0.5)
         assert arm.force.state == "off"
     assert arm.port.writes() == []
 

@@ -200,7 +200,7 @@ def test_no_number_is_written_that_json_does_not_have():
 def test_the_header_of_every_model_is_json_as_its_standard_has_it(name):
     data = stored()[name][1]
     _, _, length = PREFIX.unpack_from(data)
-    json.loads(data[PREFIX.size : PREFIX.size + length], parse_constant=pytest.fail)
+    assert json.loads(data[PREFIX.size : PREFIX.size + length], parse_constant=pytest.fail)
 
 
 def test_infinite_tolerances_come_back():

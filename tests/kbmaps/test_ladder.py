@@ -200,9 +200,9 @@ def test_pairs_one_by_one_are_learnt_at_each_models_own_pace(arm):
 def test_the_usual_ladder_survives_as_bytes(arm):
     held = Ladder.around(arm.nominal, ROUGH, -LIMIT, LIMIT)
     rng = np.random.default_rng(9)
-    held.learn(*arm.pairs(rng, 50, 0.005))
+    held.learn(*arm.pairs(rng, 20, 0.005))
     copy = Ladder.from_bytes(held.to_bytes())
-    more = arm.pairs(rng, 30, 0.005)
+    more = arm.pairs(rng, 8, 0.005)
     for one in (held, copy):
         one.learn(*more)
     np.testing.assert_array_equal(copy.predict(more[0]), held.predict(more[0]))

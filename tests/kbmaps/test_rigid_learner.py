@@ -127,7 +127,7 @@ def test_gross_outliers_are_left_out(told):
 @pytest.mark.parametrize("told", [True, False])
 @pytest.mark.parametrize("pairs", [8, 12])
 def test_no_good_pair_is_taken_for_an_outlier_while_they_are_few(told, pairs):
-    for seed in range(30):
+    for seed in range(12):
         rng = np.random.default_rng(seed)
         arm = rough_arm(rng)
         learner = RigidLearner(arm.nominal, ROUGH)

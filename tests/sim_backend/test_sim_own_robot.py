@@ -9,6 +9,7 @@ from bodyschema.sim_backend import SimConfig, SimWorld
 from bodyschema.sim_backend.physics import Physics
 from bodyschema.sim_backend.truth import JointRoles, TrueRobot
 
+LIMIT_S = 500.0
 # A carriage on a rail with a two-joint arm, no inertias given, and a camera on a mast.
 URDF = """<robot name="carriage">
   <link name="base"/>
@@ -82,7 +83,7 @@ def test_a_robot_with_the_camera_on_the_hand_is_guided_in_view(tmp_path):
 def test_such_a_robot_delivers_readings_and_frames(tmp_path):
     robot = described(tmp_path, URDF, ON_A_MAST)
     with SimWorld(robot, SimConfig()) as world, world.joints, world.camera:
-        frame, reading = world.camera.read(20.0), world.joints.read(20.0)
+        frame, reading = world.camera.read(LIMIT_S), world.joints.read(LIMIT_S)
     assert frame is not None
     assert reading is not None
     assert (frame.left.shape, reading.q.shape) == ((480, 640, 3), (3,))

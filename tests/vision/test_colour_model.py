@@ -89,7 +89,7 @@ def test_a_file_that_is_no_image_is_named(tmp_path):
 def test_the_band_follows_light_that_grows_warm():
     # At the end the ball's hue is 24° from the band's initial centre, whose half-width is 20°.
     tracker = StereoTracker(SMALL, VisionConfig(colour=HueBand(120.0, half_width_deg=30.0)))
-    hues = np.linspace(120.0, 82.0, 75)
+    hues = np.linspace(120.0, 82.0, 50)
     fixes = [tracker.track(stage(ball(float(hue)), t=n / 30, seed=n)) for n, hue in enumerate(hues)]
     assert all(isinstance(fix, MarkerFix) for fix in fixes)
 

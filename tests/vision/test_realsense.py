@@ -29,7 +29,7 @@ WIDTH, HEIGHT, FOCAL_PX, BASELINE_M = 320, 240, 200.0, 0.05
 CENTRE_PX = (159.5, 119.5)
 SETTINGS = RealsenseConfig(image_size_px=(WIDTH, HEIGHT))
 BALL, RADIUS_M = (0.03, -0.02, 0.4), 0.02
-LIMIT_S = 20.0
+LIMIT_S = 300.0
 
 
 class Device:
