@@ -161,6 +161,15 @@ def test_zeros_that_no_motion_shows_are_null_and_the_others_are_not() -> None:
     assert [name for name, zero in zeros.items() if zero is None] == ["base_yaw", "wrist_roll"]
 
 
+def test_the_status_has_the_camera_s_pose_as_ros_takes_it() -> None:
+    findings = findings_of(shared(1, 60))
+    findings.renew()
+    found = findings.calibration
+    assert np.array(found.hand_eye.matrix)[:3, 3] == pytest.approx([figure.learnt for figure in found.camera_xyz])
+    variances = np.diag(np.reshape(found.hand_eye.covariance, (6, 6)))[:3]
+    assert 1.96 * np.sqrt(variances) == pytest.approx([figure.half_width for figure in found.camera_xyz], rel=1e-3)
+
+
 def test_the_arm_is_found_to_be_better_made_than_the_learner_s_tolerances() -> None:
     arm = shared(2, 60)
     _, made = figures(arm.robot, arm.known())

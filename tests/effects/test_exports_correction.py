@@ -167,11 +167,11 @@ def test_a_file_of_an_older_version_says_what_to_do(commands, robot, tmp_path) -
 
 
 def test_the_readers_are_short(commands) -> None:
-    """About sixty lines of code each: none of them is worth a package."""
+    """Check the lengths that docs/exporting.md states."""
     lengths = {}
     for name, comment in (("correction.py", "#"), ("correction.js", "//"), ("correction.hpp", "//")):
         text = re.sub(r'"""[\s\S]*?"""', "", (READERS / name).read_text())
         lengths[name] = sum(bool(line.strip()) and not line.strip().startswith(comment) for line in text.splitlines())
     assert lengths["correction.py"] <= 60
     assert lengths["correction.js"] <= 60
-    assert lengths["correction.hpp"] <= 92  # 20 of them read JSON
+    assert lengths["correction.hpp"] <= 91  # 15 of them read JSON

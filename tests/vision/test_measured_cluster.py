@@ -129,6 +129,9 @@ def test_views_that_show_one_tag_alone_are_named_as_unused() -> None:
     assert found.unused == ("05",)
     assert said(found).endswith("Not used, as they do not show two tags to both eyes: 05.")
     assert figures(found).unused == ["05"]
+    tag, pose = found.tags[1], figures(found).tags[1].pose
+    assert pose.translation_m == pytest.approx(list(tag.placed.xyz))
+    assert np.diag(np.reshape(pose.covariance, (6, 6)))[3:] == pytest.approx(np.square(tag.turn_sigma_rad))
 
 
 @pytest.mark.parametrize("text", ["7", "7=", "=25", "seven=25", "7=-25", "7=nan", "7=25,"])
