@@ -100,12 +100,11 @@ def _version() -> str:
     return version("bodyschema")
 
 
-@cache
 def __getattr__(name: str) -> cyclopts.App:
     """Return `app`, the command line in which no command is called."""
     if name != "app":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return command_line()
+    return globals().setdefault(name, command_line())
 
 
 # A learner with two neighbours opens 26 files, one of fifty robots 200. Libraries abort when they cannot open more.
