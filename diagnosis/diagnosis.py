@@ -18,6 +18,7 @@ from bodyschema.diagnosis.assess.explanation import (
 from bodyschema.diagnosis.assess.leftover import Leftover, leftover
 from bodyschema.diagnosis.assess.rivals import Standing, standings
 from bodyschema.diagnosis.assess.shares import Shares, shares
+from bodyschema.diagnosis.assess.stored import is_better_with, stored
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.background import Scales
 from bodyschema.diagnosis.fit.contact import doubtful
@@ -56,6 +57,8 @@ _HALF = 0.5
 _SAME_SCALE, _RESCALED = 0.25, 3
 # Fits with the play of a loose marker; the first tells the noise beside it.
 _RATTLED = 2
+# Squares reduced by less than to this share are reduced a little.
+_LITTLE = 0.9
 # The fit absorbs at most this share of the noise.
 _MOST_SPENT = 0.9
 # Smallest change of the instrument's noise (in logarithms) that triggers a refit.
@@ -72,6 +75,7 @@ class Diagnosis:
         aligned: fit of the parameters that robot.toml does not know.
         geometry: fit with all lengths, axes, joint offsets, the tool and the camera's pose free.
         extended: fit with the causes, the tolerances, and the smooth model of the unnamed causes.
+        stored: the part of it that is surely better on another recording, which is written to extended.toml.
         tolerated: sizes of the tolerances.
         standings: assessment of each cause against its rivals.
         left: residual structure that no effect fits.
@@ -85,6 +89,7 @@ class Diagnosis:
     aligned: Fit
     geometry: Fit
     extended: Fit
+    stored: Fit
     tolerated: Tolerated
     standings: tuple[Standing, ...]
     left: Leftover
@@ -102,12 +107,18 @@ class Diagnosis:
         """Measured minus predicted (n, 3) [m] by each simulation, on held-out rows."""
         fits = {"nominal": self.nominal, "aligned": self.aligned, "geometry": self.geometry}
         errors = {name: held_out_errors(fit, self.blocks) for name, fit in fits.items()}
-        return errors | {"extended": self._extended_errors(self.extended)}
+        is_complete = self.stored is self.extended
+        return errors | {"extended": self.complete_errors if is_complete else held_out_errors(self.stored, self.blocks)}
+
+    @cached_property
+    def complete_errors(self) -> FloatArray:
+        """Measured minus predicted (n, 3) [m] by all that was found, stored or not, on held-out rows."""
+        return self._extended_errors(self.extended)
 
     @cached_property
     def with_names_alone(self) -> FloatArray | None:
         """Held-out distances (n,) [m] with the named causes and no smooth model; None where there is no such model."""
-        if self.left.model is None or self.left.model.stored is None:
+        if self.left.model is None or self.left.model.stored is None or self.leaves_out:
             return None
         return np.linalg.norm(held_out_errors(self.aligned.with_causes(self.causes), self.blocks), axis=1)
 
@@ -116,6 +127,12 @@ class Diagnosis:
         if self.left.model is None:
             return held_out_errors(fit, self.blocks)
         return fit.observations.x - fit.predicted + self.left.model.unseen
+
+    @cached_property
+    def leaves_out(self) -> bool:
+        """True if extended.toml leaves out what reduces the error by more than a little here."""
+        squares = [np.square(errors[self.markers]).sum() for errors in (self.complete_errors, self.errors["extended"])]
+        return bool(squares[0] < _LITTLE * squares[1])
 
     @cached_property
     def held_out(self) -> dict[str, FloatArray]:
@@ -303,6 +320,7 @@ def diagnose(
         aligned=start,
         geometry=_geometry(start),
         extended=fit,
+        stored=fit if fit.is_exact else _stored(start, explanation.fit, fit, left, blocks),
         tolerated=made,
         standings=tuple(stands),
         left=left,
@@ -310,6 +328,24 @@ def diagnose(
         seed=seed,
         ended_early=search.ended_early,
     )
+
+
+def _stored(start: Fit, alone: Fit, complete: Fit, left: Leftover, blocks: Blocks) -> Fit:
+    """Return what extended.toml holds: the complete fit, or as much of it as is surely better on another recording.
+
+    Args:
+        alone: the complete fit without a smooth model.
+    """
+    markers = is_marker(complete)
+    has_model = left.model is not None and left.model.stored is not None
+    largest = alone.settled() if has_model else complete
+    fits = [start, largest]
+    if largest.causes and largest.background.scales is not None:
+        fits.insert(1, start.with_causes(largest.causes))
+    best = stored(fits, markers)
+    if left.model is not None and has_model:
+        return complete if is_better_with(left.model, best, markers, blocks) else best
+    return best
 
 
 def _searched(begun: Fit, search: Search, enough: Callable[[Sequence[Fit], float], bool]) -> Fit:

@@ -258,7 +258,7 @@ def written(found: Found, folder: Path) -> None:
     """
     about = About(found.source.name, found.robot.name, version("bodyschema"))
     heading = f"Found by bodyschema {about.version} in {len(found.source.recording)} pairs of {about.recording}"
-    extended = found.diagnosis.extended.written
+    extended = found.diagnosis.stored.written
     told = " ".join(filter(None, [f"{heading}.", modelled(found.file.unexplained)]))
     write_extended(extended, folder, told, replace=True)
     # Tolerances alone are put into a URDF where the recording shows them.
