@@ -279,7 +279,7 @@ def diagnose(
         unknowns = Unknowns(start)
         enough = partial(needs_no_more_names, unknowns=unknowns, search=search)
         scales = extended.background.scales or Scales()
-        extended = _searched(start.with_causes(extended.causes).tolerating(scales), search, enough)
+        extended = _searched(extended.to(observations).tolerating(scales), search, enough)
     loose = None if start.is_exact else rattle(extended)
     if loose is not None and explain(extended, search.path, unknowns, search, told).unknown:
         # An error of the last joint moves the marker along one line as well.
@@ -352,17 +352,30 @@ def _searched(begun: Fit, search: Search, enough: Callable[[Sequence[Fit], float
     """Run the search for causes from a fit, and refit with tolerances updated to what it finds."""
     extended = begun
     for _ in range(_RESCALED):
-        extended = search.run(with_small_ripples(begun), enough)
+        begun = _with_small_ones_tolerated(begun)
+        extended = search.run(begun, enough)
         before = extended.background.scales or Scales()
         # Unnamed causes may be all there is, and inflate the apparent tolerances.
         bare = extended.with_causes([])
         search.path = [bare.tolerating(before.no_larger), bare, *search.path[1:]]
         scales = tolerated(extended).scales
-        small = [cause for cause in extended.causes if extended.background.tolerates(cause)]
-        if search.ended_early or (not small and np.abs(np.log(scales) - np.log(before)).max() < _SAME_SCALE):
+        is_same = not _small_ones(extended) and np.abs(np.log(scales) - np.log(before)).max() < _SAME_SCALE
+        if search.ended_early or is_same:
             break
-        begun = extended.tolerating(scales, small)
+        begun = extended.tolerating(scales, _small_ones(extended))
     return extended
+
+
+def _with_small_ones_tolerated(fit: Fit) -> Fit:
+    """Refit with the periodic errors of drives that are no larger than those of other drives as tolerances."""
+    fit = with_small_ripples(fit)
+    small = _small_ones(fit)
+    return fit.tolerating(tolerated(fit).scales, small) if small else fit
+
+
+def _small_ones(fit: Fit) -> list[Effect]:
+    """Return the causes of a fit that are no larger than its tolerances."""
+    return [cause for cause in fit.causes if fit.background.tolerates(cause)]
 
 
 def _exceeds(some: FloatArray, others: FloatArray) -> float:
