@@ -19,7 +19,7 @@ from bodyschema.effects import Effect, Motion
 from bodyschema.interfaces.records import FloatArray
 
 from .nameless import Nameless
-from .stability import Instead, named_again
+from .stability import Instead, bagged, named_again
 
 # Signals that differ by less than this, twice the log-likelihood that the right one is expected to gain, are one.
 SAME = 6.0
@@ -134,12 +134,12 @@ def _standing(
         if (nameless := Nameless.in_place_of(cause, fit, aparts, unknowns, search)) is not None:
             others.append((nameless, None, nameless.what))
             behind.append(nameless.behind)
-    odds = np.exp(np.clip([0.0, -worth, *behind], -500.0, 50.0))
-    shares = odds / odds.sum()
+    fits = [one if isinstance(one, Fit) else one.apart.fit for one, _, _ in others]
+    probable = bagged(fit, [without, *fits], [-worth, *behind], blocks, seed)
     wide = widened(fit, range(fit.observations.motion.q.shape[1]), uneven=_UNEVEN)
     signal = apart_on(fit, without, wide)
     rivals = []
-    for (other, effect, told), share in zip(others, shares[2:], strict=True):
+    for (other, effect, told), share in zip(others, probable[2:], strict=True):
         if share >= PROBABLE:
             anywhere = apart_on(fit, other, wide)
             one = anywhere < _SAME_SHARE * signal and _is_no_more(other, fit, without, wide)
@@ -148,7 +148,7 @@ def _standing(
     ordered = tuple(sorted(rivals, key=lambda rival: rival.probability, reverse=True))
     return Standing(
         itself,
-        float(shares[0]) + same,
+        float(probable[0]) + same,
         worth,
         itself.dof,
         gain,
