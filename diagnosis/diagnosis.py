@@ -30,7 +30,7 @@ from bodyschema.diagnosis.search.drives import with_small_ripples
 from bodyschema.diagnosis.search.held_out import Added, Blocks, added, gain_percent, held_out_errors, is_marker
 from bodyschema.diagnosis.search.hypotheses import Hypotheses
 from bodyschema.diagnosis.search.scan import Candidate, Scan
-from bodyschema.diagnosis.search.search import Search
+from bodyschema.diagnosis.search.search import Search, are_a_description
 from bodyschema.diagnosis.search.together import Tolerated, together, tolerated
 from bodyschema.diagnosis.unnamed.rattle import rattle
 from bodyschema.diagnosis.unnamed.unknown import Unknowns
@@ -81,7 +81,7 @@ class Diagnosis:
         left: residual structure that no effect fits.
         blocks: blocks of time for held-out errors.
         seed: seed of the resampling.
-        ended_early: True if the search stopped at its limit, so that more causes may exist.
+        ended_early: True if the causes describe the error and do not explain it, as there are too many.
     """
 
     hypotheses: Hypotheses
@@ -326,7 +326,7 @@ def diagnose(
         left=left,
         blocks=blocks,
         seed=seed,
-        ended_early=search.ended_early,
+        ended_early=search.ended_early or are_a_description(fit.causes),
     )
 
 

@@ -34,6 +34,8 @@ from .result import (
 from .text import advice, evidence, sentence
 
 _HALF_WIDTH_95 = 1.959964
+# Probability that causes which describe the error, and do not explain it, are there at all.
+_OF_A_DESCRIPTION = 0.5
 # Below this p-value, the report explains why a hypothesis is not a cause.
 _HARDLY_CHANCE = 1e-3
 
@@ -126,7 +128,7 @@ def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:
     fit, kept = diagnosis.extended, diagnosis.markers
     full = float(np.square(diagnosis.complete_errors[kept]).sum())
     losses = [max(float(np.square(diagnosis.without[c.identity][kept]).sum()) - full, 0.0) for c in fit.causes]
-    causes = []
+    sure, causes = _OF_A_DESCRIPTION if diagnosis.ended_early else 1.0, []
     parts = zip(fit.causes, diagnosis.standings, diagnosis.shares.causes, losses, strict=True)
     for cause, standing, share, loss in parts:
         causes.append(
@@ -135,7 +137,7 @@ def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:
                 where=cause.where,
                 source=cause.source,
                 parameters=_parameters(diagnosis, cause, standing),
-                probability=standing.probability,
+                probability=sure * standing.probability,
                 share_of_gain_percent=100.0 * share,
                 held_out_gain_percent=100.0 * (1.0 - float(np.sqrt(full / max(full + loss, 1e-300)))),
                 stability_percent=100.0 * float(standing.again.mean()),
@@ -264,7 +266,7 @@ def _limitations(diagnosis: Diagnosis) -> tuple[str, ...]:
             "behind them that this recording does not separate. Move one joint at a time in another recording."
         )
     if diagnosis.ended_early:
-        told.append(f"The search ended at its longest, with {len(diagnosis.causes)} causes: there may be more of them.")
+        told.append("The causes found describe the error and do not explain it: there may be others in their place.")
     return tuple(told)
 
 
