@@ -64,7 +64,7 @@ def row(folder: Path) -> str:
     diagnosis = diagnose(known, simulation)
     promised = conclusion(diagnosis).gain
     start = aligned(Observations.of(known, simulation), simulation).simulation
-    written = diagnosis.extended.written
+    written = diagnosis.stored.written
     with tempfile.TemporaryDirectory() as name:
         mjcf, correction = Path(name) / "model.xml", Path(name) / "correction.json"
         write_mjcf(written, mjcf, "a benchmark")

@@ -156,7 +156,7 @@ class Found:
     @property
     def hand_eye(self) -> HandEye:
         """The camera's pose with what was found in it. Without a fitted pose it has no covariance."""
-        fit, covariance = self.diagnosis.extended, None
+        fit, covariance = self.diagnosis.stored, None
         effects = fit.simulation.effects
         shifts = [effect for effect in effects if isinstance(effect.kind, CameraEffect) and effect.kind.rigid]
         ends = np.cumsum([len(effect.values) for effect in shifts])
