@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyschema.diagnosis.fit.fit import Fit, amount_columns
-from bodyschema.diagnosis.fit.scatter import beyond_single_rows, remembers
+from bodyschema.diagnosis.fit.scatter import beyond_single_rows, limited_rows, remembers
 from bodyschema.diagnosis.fit.worth import nats
 from bodyschema.diagnosis.search.held_out import Blocks
 from bodyschema.diagnosis.search.scan import Candidate
@@ -134,8 +134,9 @@ def _standing(
         if (nameless := Nameless.in_place_of(cause, fit, aparts, unknowns, search)) is not None:
             others.append((nameless, None, nameless.what))
             behind.append(nameless.behind)
-    fits = [one if isinstance(one, Fit) else one.apart.fit for one, _, _ in others]
-    probable = bagged(fit, [without, *fits], [-worth, *behind], blocks, seed)
+    # What a cause is worth allows for blocks already.
+    rows = [np.zeros(len(fit.left)), *(_at_rows(fit, other, cause, effect) for other, effect, _ in others)]
+    probable = bagged([-worth, *behind], rows, blocks, seed)
     wide = widened(fit, range(fit.observations.motion.q.shape[1]), uneven=_UNEVEN)
     signal = apart_on(fit, without, wide)
     rivals = []
@@ -155,6 +156,14 @@ def _standing(
         ordered,
         named_again(fit, nothing, [one for one, _ in tried], blocks, seed),
     )
+
+
+def _at_rows(fit: Fit, other: Fit | Nameless, cause: Effect, effect: Effect | None) -> FloatArray:
+    """Return the log-likelihood of an alternative over a fit at each row (n,) [nats]."""
+    there = other if isinstance(other, Fit) else other.apart.fit
+    if effect is not None and remembers(cause) and remembers(effect):
+        return limited_rows(fit, there)
+    return there.row_log_likelihoods - fit.row_log_likelihoods
 
 
 def _is_no_more(other: Fit | Nameless, fit: Fit, without: Fit, wide: Motion) -> bool:

@@ -35,18 +35,17 @@ class Instead:
     doubt: float
 
 
-def bagged(fit: Fit, others: Sequence[Fit], behind: Sequence[float], blocks: Blocks, seed: int) -> FloatArray:
-    """Return the probability of a fit and of each alternative to it (1 + m,), as the mean over block resamplings.
+def bagged(behind: Sequence[float], rows: Sequence[FloatArray], blocks: Blocks, seed: int) -> FloatArray:
+    """Return the probability of a cause and of each alternative to it (1 + m,), as the mean over block resamplings.
 
     No model is exact, so evidence that a few blocks decide is not sure (Huggins and Miller 2023, bagged posteriors).
 
     Args:
-        others: alternatives, with the same observations.
-        behind: log-evidence of each of them over the fit [nats].
+        behind: log-evidence of each alternative over the cause [nats].
+        rows: the part of it that each row holds (n,).
     """
-    drawn = _drawn(blocks, _BAGGED, seed)
-    gains = [blocks.sums(other.row_log_likelihoods - fit.row_log_likelihoods) for other in others]
-    nats = np.array([np.zeros(_BAGGED), *(b + (drawn - 1) @ gain for b, gain in zip(behind, gains, strict=True))])
+    drawn = _drawn(blocks, _BAGGED, seed) - 1
+    nats = np.array([np.zeros(_BAGGED), *(b + drawn @ blocks.sums(own) for b, own in zip(behind, rows, strict=True))])
     odds = np.exp(nats - nats.max(axis=0))
     return np.asarray((odds / odds.sum(axis=0)).mean(axis=1), dtype=np.float64)
 
