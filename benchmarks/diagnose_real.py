@@ -72,7 +72,7 @@ def corner_mm(arm: Arm, number: int, seed: int) -> FloatArray:
     out = corner(arm.recording.x, number)
     found = diagnose(arm.recording.rows(np.flatnonzero(~out)), arm.simulation, seed=seed)
     there = Observations.of(arm.recording, arm.simulation).motion
-    return 1e3 * np.linalg.norm(arm.recording.x - found.extended.written.positions(there), axis=1)[out]
+    return 1e3 * np.linalg.norm(arm.recording.x - found.stored.written.positions(there), axis=1)[out]
 
 
 def distances_mm(diagnosis: Diagnosis) -> FloatArray:

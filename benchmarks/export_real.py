@@ -66,7 +66,7 @@ def row(folder: Path) -> str:
     # Among the held-out rows are fixes that are not the marker, too.
     promised = gains.with_outliers_ci95 or gains.ci95
     start = aligned(Observations.of(known, simulation), simulation).simulation
-    written = diagnosis.extended.written
+    written = diagnosis.stored.written
     with tempfile.TemporaryDirectory() as name:
         mjcf, correction = Path(name) / "model.xml", Path(name) / "correction.json"
         write_mjcf(written, mjcf, "a benchmark")

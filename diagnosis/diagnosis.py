@@ -18,6 +18,7 @@ from bodyschema.diagnosis.assess.explanation import (
 from bodyschema.diagnosis.assess.leftover import Leftover, leftover
 from bodyschema.diagnosis.assess.rivals import Standing, standings
 from bodyschema.diagnosis.assess.shares import Shares, shares
+from bodyschema.diagnosis.assess.stored import is_better_with, stored
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.background import Scales
 from bodyschema.diagnosis.fit.contact import doubtful
@@ -29,7 +30,7 @@ from bodyschema.diagnosis.search.drives import with_small_ripples
 from bodyschema.diagnosis.search.held_out import Added, Blocks, added, gain_percent, held_out_errors, is_marker
 from bodyschema.diagnosis.search.hypotheses import Hypotheses
 from bodyschema.diagnosis.search.scan import Candidate, Scan
-from bodyschema.diagnosis.search.search import Search
+from bodyschema.diagnosis.search.search import Search, are_a_description
 from bodyschema.diagnosis.search.together import Tolerated, together, tolerated
 from bodyschema.diagnosis.unnamed.rattle import rattle
 from bodyschema.diagnosis.unnamed.unknown import Unknowns
@@ -56,6 +57,8 @@ _HALF = 0.5
 _SAME_SCALE, _RESCALED = 0.25, 3
 # Fits with the play of a loose marker; the first tells the noise beside it.
 _RATTLED = 2
+# Squares reduced by less than to this share are reduced a little.
+_LITTLE = 0.9
 # The fit absorbs at most this share of the noise.
 _MOST_SPENT = 0.9
 # Smallest change of the instrument's noise (in logarithms) that triggers a refit.
@@ -72,12 +75,13 @@ class Diagnosis:
         aligned: fit of the parameters that robot.toml does not know.
         geometry: fit with all lengths, axes, joint offsets, the tool and the camera's pose free.
         extended: fit with the causes, the tolerances, and the smooth model of the unnamed causes.
+        stored: the part of it that is surely better on another recording, which is written to extended.toml.
         tolerated: sizes of the tolerances.
         standings: assessment of each cause against its rivals.
         left: residual structure that no effect fits.
         blocks: blocks of time for held-out errors.
         seed: seed of the resampling.
-        ended_early: True if the search stopped at its limit, so that more causes may exist.
+        ended_early: True if the causes describe the error and do not explain it, as there are too many.
     """
 
     hypotheses: Hypotheses
@@ -85,6 +89,7 @@ class Diagnosis:
     aligned: Fit
     geometry: Fit
     extended: Fit
+    stored: Fit
     tolerated: Tolerated
     standings: tuple[Standing, ...]
     left: Leftover
@@ -102,12 +107,18 @@ class Diagnosis:
         """Measured minus predicted (n, 3) [m] by each simulation, on held-out rows."""
         fits = {"nominal": self.nominal, "aligned": self.aligned, "geometry": self.geometry}
         errors = {name: held_out_errors(fit, self.blocks) for name, fit in fits.items()}
-        return errors | {"extended": self._extended_errors(self.extended)}
+        is_complete = self.stored is self.extended
+        return errors | {"extended": self.complete_errors if is_complete else held_out_errors(self.stored, self.blocks)}
+
+    @cached_property
+    def complete_errors(self) -> FloatArray:
+        """Measured minus predicted (n, 3) [m] by all that was found, stored or not, on held-out rows."""
+        return self._extended_errors(self.extended)
 
     @cached_property
     def with_names_alone(self) -> FloatArray | None:
         """Held-out distances (n,) [m] with the named causes and no smooth model; None where there is no such model."""
-        if self.left.model is None or self.left.model.stored is None:
+        if self.left.model is None or self.left.model.stored is None or self.leaves_out:
             return None
         return np.linalg.norm(held_out_errors(self.aligned.with_causes(self.causes), self.blocks), axis=1)
 
@@ -116,6 +127,12 @@ class Diagnosis:
         if self.left.model is None:
             return held_out_errors(fit, self.blocks)
         return fit.observations.x - fit.predicted + self.left.model.unseen
+
+    @cached_property
+    def leaves_out(self) -> bool:
+        """True if extended.toml leaves out what reduces the error by more than a little here."""
+        squares = [np.square(errors[self.markers]).sum() for errors in (self.complete_errors, self.errors["extended"])]
+        return bool(squares[0] < _LITTLE * squares[1])
 
     @cached_property
     def held_out(self) -> dict[str, FloatArray]:
@@ -269,7 +286,7 @@ def diagnose(
         unknowns = Unknowns(start)
         enough = partial(needs_no_more_names, unknowns=unknowns, search=search)
         scales = extended.background.scales or Scales()
-        extended = _searched(start.with_causes(extended.causes).tolerating(scales), search, enough)
+        extended = _searched(extended.to(observations).tolerating(scales), search, enough)
     loose = None if start.is_exact else rattle(extended)
     if loose is not None and explain(extended, search.path, unknowns, search, told).unknown:
         # An error of the last joint moves the marker along one line as well.
@@ -310,30 +327,62 @@ def diagnose(
         aligned=start,
         geometry=_geometry(start),
         extended=fit,
+        stored=fit if fit.is_exact else _stored(start, explanation.fit, fit, left, blocks),
         tolerated=made,
         standings=tuple(stands),
         left=left,
         blocks=blocks,
         seed=seed,
-        ended_early=search.ended_early,
+        ended_early=search.ended_early or are_a_description(fit.causes),
     )
+
+
+def _stored(start: Fit, alone: Fit, complete: Fit, left: Leftover, blocks: Blocks) -> Fit:
+    """Return what extended.toml holds: the complete fit, or as much of it as is surely better on another recording.
+
+    Args:
+        alone: the complete fit without a smooth model.
+    """
+    markers = is_marker(complete)
+    has_model = left.model is not None and left.model.stored is not None
+    largest = alone.settled() if has_model else complete
+    fits = [start, largest]
+    if largest.causes and largest.background.scales is not None:
+        fits.insert(1, start.with_causes(largest.causes))
+    best = stored(fits, markers)
+    if left.model is not None and has_model:
+        return complete if is_better_with(left.model, best, markers, blocks) else best
+    return best
 
 
 def _searched(begun: Fit, search: Search, enough: Callable[[Sequence[Fit], float], bool]) -> Fit:
     """Run the search for causes from a fit, and refit with tolerances updated to what it finds."""
     extended = begun
     for _ in range(_RESCALED):
-        extended = search.run(with_small_ripples(begun), enough)
+        begun = _with_small_ones_tolerated(begun)
+        extended = search.run(begun, enough)
         before = extended.background.scales or Scales()
         # Unnamed causes may be all there is, and inflate the apparent tolerances.
         bare = extended.with_causes([])
         search.path = [bare.tolerating(before.no_larger), bare, *search.path[1:]]
         scales = tolerated(extended).scales
-        small = [cause for cause in extended.causes if extended.background.tolerates(cause)]
-        if search.ended_early or (not small and np.abs(np.log(scales) - np.log(before)).max() < _SAME_SCALE):
+        is_same = not _small_ones(extended) and np.abs(np.log(scales) - np.log(before)).max() < _SAME_SCALE
+        if search.ended_early or is_same:
             break
-        begun = extended.tolerating(scales, small)
+        begun = extended.tolerating(scales, _small_ones(extended))
     return extended
+
+
+def _with_small_ones_tolerated(fit: Fit) -> Fit:
+    """Refit with the periodic errors of drives that are no larger than those of other drives as tolerances."""
+    fit = with_small_ripples(fit)
+    small = _small_ones(fit)
+    return fit.tolerating(tolerated(fit).scales, small) if small else fit
+
+
+def _small_ones(fit: Fit) -> list[Effect]:
+    """Return the causes of a fit that are no larger than its tolerances."""
+    return [cause for cause in fit.causes if fit.background.tolerates(cause)]
 
 
 def _exceeds(some: FloatArray, others: FloatArray) -> float:

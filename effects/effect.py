@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -99,12 +100,12 @@ class Effect:
         """Parameters of its values."""
         return self.kind.sliding if self.prismatic else self.kind.turning
 
-    @property
+    @cached_property
     def all_amounts(self) -> list[int]:
         """Indices of the values that are amounts."""
         return [k for k, parameter in enumerate(self.parameters) if parameter.is_amount]
 
-    @property
+    @cached_property
     def amounts(self) -> list[int]:
         """Indices of the values that are amounts, and free."""
         own = self.all_amounts
@@ -116,7 +117,7 @@ class Effect:
         amounts = self.amounts
         return [k for k, parameter in enumerate(self.parameters) if k in amounts or not parameter.is_amount]
 
-    @property
+    @cached_property
     def shapes(self) -> list[int]:
         """Indices of the smooth shape values: periods and time constants."""
         return [k for k, parameter in enumerate(self.parameters) if parameter.smooth]

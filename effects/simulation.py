@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -32,6 +33,8 @@ _STEP = 1e-6
 _SHAPE_STEP = 1e-3
 # A spring's deflection changes its own load; each round adds the next order.
 SPRING_ROUNDS = 3
+# Corrections (n,) of readings by the encoder effects that were evaluated there, as long as both live.
+_CORRECTIONS: WeakKeyDictionary[Motion, WeakKeyDictionary[Effect, FloatArray]] = WeakKeyDictionary()
 Staged = TypeVar("Staged", bound=EffectType)
 
 
@@ -168,8 +171,10 @@ class Simulation:
         q = readings.q.copy()
         for effect in self.all_effects:
             if effect.kind.encoder is not None:
-                place = self.place(effect)
-                q[:, place.joint] += effect.kind.encoder.correction(readings, place, effect.values)
+                place, known = self.place(effect), _CORRECTIONS.setdefault(readings, WeakKeyDictionary())
+                if effect not in known:
+                    known[effect] = effect.kind.encoder.correction(readings, place, effect.values)
+                q[:, place.joint] += known[effect]
         return q
 
     def place(self, effect: Effect) -> Place:

@@ -156,7 +156,7 @@ class Found:
     @property
     def hand_eye(self) -> HandEye:
         """The camera's pose with what was found in it. Without a fitted pose it has no covariance."""
-        fit, covariance = self.diagnosis.extended, None
+        fit, covariance = self.diagnosis.stored, None
         effects = fit.simulation.effects
         shifts = [effect for effect in effects if isinstance(effect.kind, CameraEffect) and effect.kind.rigid]
         ends = np.cumsum([len(effect.values) for effect in shifts])
@@ -258,7 +258,7 @@ def written(found: Found, folder: Path) -> None:
     """
     about = About(found.source.name, found.robot.name, version("bodyschema"))
     heading = f"Found by bodyschema {about.version} in {len(found.source.recording)} pairs of {about.recording}"
-    extended = found.diagnosis.extended.written
+    extended = found.diagnosis.stored.written
     told = " ".join(filter(None, [f"{heading}.", modelled(found.file.unexplained)]))
     write_extended(extended, folder, told, replace=True)
     # Tolerances alone are put into a URDF where the recording shows them.

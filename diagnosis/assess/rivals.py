@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyschema.diagnosis.fit.fit import Fit, amount_columns
-from bodyschema.diagnosis.fit.scatter import beyond_single_rows, remembers
+from bodyschema.diagnosis.fit.scatter import beyond_single_rows, limited_rows, remembers
 from bodyschema.diagnosis.fit.worth import nats
 from bodyschema.diagnosis.search.held_out import Blocks
 from bodyschema.diagnosis.search.scan import Candidate
@@ -19,7 +19,7 @@ from bodyschema.effects import Effect, Motion
 from bodyschema.interfaces.records import FloatArray
 
 from .nameless import Nameless
-from .stability import Instead, named_again
+from .stability import Instead, bagged, named_again
 
 # Signals that differ by less than this, twice the log-likelihood that the right one is expected to gain, are one.
 SAME = 6.0
@@ -134,12 +134,13 @@ def _standing(
         if (nameless := Nameless.in_place_of(cause, fit, aparts, unknowns, search)) is not None:
             others.append((nameless, None, nameless.what))
             behind.append(nameless.behind)
-    odds = np.exp(np.clip([0.0, -worth, *behind], -500.0, 50.0))
-    shares = odds / odds.sum()
+    # What a cause is worth allows for blocks already.
+    rows = [np.zeros(len(fit.left)), *(_at_rows(fit, other, cause, effect) for other, effect, _ in others)]
+    probable = bagged([-worth, *behind], rows, blocks, seed)
     wide = widened(fit, range(fit.observations.motion.q.shape[1]), uneven=_UNEVEN)
     signal = apart_on(fit, without, wide)
     rivals = []
-    for (other, effect, told), share in zip(others, shares[2:], strict=True):
+    for (other, effect, told), share in zip(others, probable[2:], strict=True):
         if share >= PROBABLE:
             anywhere = apart_on(fit, other, wide)
             one = anywhere < _SAME_SHARE * signal and _is_no_more(other, fit, without, wide)
@@ -148,13 +149,21 @@ def _standing(
     ordered = tuple(sorted(rivals, key=lambda rival: rival.probability, reverse=True))
     return Standing(
         itself,
-        float(shares[0]) + same,
+        float(probable[0]) + same,
         worth,
         itself.dof,
         gain,
         ordered,
         named_again(fit, nothing, [one for one, _ in tried], blocks, seed),
     )
+
+
+def _at_rows(fit: Fit, other: Fit | Nameless, cause: Effect, effect: Effect | None) -> FloatArray:
+    """Return the log-likelihood of an alternative over a fit at each row (n,) [nats]."""
+    there = other if isinstance(other, Fit) else other.apart.fit
+    if effect is not None and remembers(cause) and remembers(effect):
+        return limited_rows(fit, there)
+    return there.row_log_likelihoods - fit.row_log_likelihoods
 
 
 def _is_no_more(other: Fit | Nameless, fit: Fit, without: Fit, wide: Motion) -> bool:

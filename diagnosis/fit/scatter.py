@@ -52,8 +52,12 @@ def beyond_single_rows(one: Fit, other: Fit) -> float:
     Only rows after a short move distinguish the memory effects of a joint. They are few, so a single outlier decides
     easily: the first row after a bump, or a joint that the motion of another one pushed across its backlash.
     """
-    ratios = other.row_log_likelihoods - one.row_log_likelihoods
-    return float((np.clip(ratios, -_MOST_OF_A_ROW, _MOST_OF_A_ROW) - ratios).sum())
+    return float((limited_rows(one, other) - (other.row_log_likelihoods - one.row_log_likelihoods)).sum())
+
+
+def limited_rows(one: Fit, other: Fit) -> FloatArray:
+    """Return the log-likelihood of `other` over `one` at each row (n,), with its weight limited [nats]."""
+    return np.clip(other.row_log_likelihoods - one.row_log_likelihoods, -_MOST_OF_A_ROW, _MOST_OF_A_ROW)
 
 
 def _between(fit: Fit, motion: Motion, joint: int, far: float) -> FloatArray:

@@ -8,6 +8,7 @@ from bodyschema.diagnosis.assess.rivals import Rival, Standing
 from bodyschema.diagnosis.diagnosis import MOST_DOUBTFUL, Diagnosis
 from bodyschema.diagnosis.fit.background import ANGLE_RAD, DRIVE_RAD, LENGTH_M
 from bodyschema.diagnosis.fit.contact import doubtful
+from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.worth import NAMED, nats
 from bodyschema.diagnosis.search.aliases import alias_sentences
 from bodyschema.diagnosis.search.scan import Candidate
@@ -33,6 +34,8 @@ from .result import (
 from .text import advice, evidence, sentence
 
 _HALF_WIDTH_95 = 1.959964
+# Probability that causes which describe the error, and do not explain it, are there at all.
+_OF_A_DESCRIPTION = 0.5
 # Below this p-value, the report explains why a hypothesis is not a cause.
 _HARDLY_CHANCE = 1e-3
 
@@ -42,7 +45,7 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
     percent, interval = diagnosis.gain()
     causes = _causes(diagnosis)
     rms = _rms_mm(diagnosis)
-    verdict = _verdict(diagnosis, causes)
+    verdict = _verdict(diagnosis, causes, percent)
     counted = (None, None) if diagnosis.markers.all() else diagnosis.gain_with_outliers()
     gain = Gain(percent, interval, with_outliers_percent=counted[0], with_outliers_ci95=counted[1])
     tolerances = _tolerances(diagnosis)
@@ -79,16 +82,19 @@ def _tolerances(diagnosis: Diagnosis) -> Tolerances:
     ends = zip(sizes.tolist(), lowest.tolist(), (sizes * wide).tolist(), strict=True)
     intervals = [Interval(size, (low, high)) for size, low, high in ends]
     shares = diagnosis.shares
-    return Tolerances(*intervals, links_share_percent=100.0 * shares.links, drives_share_percent=100.0 * shares.drives)
+    in_extended = not diagnosis.leaves_out or diagnosis.stored.background.scales is not None
+    links, drives = 100.0 * shares.links, 100.0 * shares.drives
+    return Tolerances(*intervals, links_share_percent=links, drives_share_percent=drives, in_extended=in_extended)
 
 
-def _verdict(diagnosis: Diagnosis, causes: tuple[Cause, ...]) -> Verdict:
+def _verdict(diagnosis: Diagnosis, causes: tuple[Cause, ...], gain_percent: float) -> Verdict:
     # A search that ends at its limit has described the error and not explained it; so have tolerances of no workshop.
     if diagnosis.left.is_there or diagnosis.ended_early or is_at_limit(diagnosis.extended.background.scales):
         return "unexplained"
     if not causes:
         return "nothing_found"
-    return "undecided" if any(cause.leaves_open for cause in causes) else "explained"
+    is_open = any(cause.leaves_open for cause in causes) or gain_percent <= 0.0
+    return "undecided" if is_open else "explained"
 
 
 def _rms_mm(diagnosis: Diagnosis) -> Errors:
@@ -122,9 +128,9 @@ def _mean_mm(diagnosis: Diagnosis) -> Errors:
 
 def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:
     fit, kept = diagnosis.extended, diagnosis.markers
-    full = float(np.square(diagnosis.held_out["extended"][kept]).sum())
+    full = float(np.square(diagnosis.complete_errors[kept]).sum())
     losses = [max(float(np.square(diagnosis.without[c.identity][kept]).sum()) - full, 0.0) for c in fit.causes]
-    causes = []
+    sure, causes = _OF_A_DESCRIPTION if diagnosis.ended_early else 1.0, []
     parts = zip(fit.causes, diagnosis.standings, diagnosis.shares.causes, losses, strict=True)
     for cause, standing, share, loss in parts:
         causes.append(
@@ -133,7 +139,7 @@ def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:
                 where=cause.where,
                 source=cause.source,
                 parameters=_parameters(diagnosis, cause, standing),
-                probability=standing.probability,
+                probability=sure * standing.probability,
                 share_of_gain_percent=100.0 * share,
                 held_out_gain_percent=100.0 * (1.0 - float(np.sqrt(full / max(full + loss, 1e-300)))),
                 stability_percent=100.0 * float(standing.again.mean()),
@@ -253,6 +259,8 @@ def _limitations(diagnosis: Diagnosis) -> tuple[str, ...]:
             "few runs cross it. What seems to jump or to change with time there may be that. Record longer runs, "
             "and move the joint to and fro in each."
         )
+    if diagnosis.leaves_out:
+        told.append(_left_out(diagnosis.stored))
     told += alias_sentences(diagnosis.extended)
     if is_at_limit(diagnosis.extended.background.scales):
         told.append(
@@ -260,8 +268,19 @@ def _limitations(diagnosis: Diagnosis) -> tuple[str, ...]:
             "behind them that this recording does not separate. Move one joint at a time in another recording."
         )
     if diagnosis.ended_early:
-        told.append(f"The search ended at its longest, with {len(diagnosis.causes)} causes: there may be more of them.")
+        told.append("The causes found describe the error and do not explain it: there may be others in their place.")
     return tuple(told)
+
+
+def _left_out(stored: Fit) -> str:
+    """Return a sentence on what extended.toml leaves out."""
+    parts = ["the causes"] if stored.causes else []
+    parts += ["small errors everywhere"] if stored.background.scales is not None else []
+    held = " and ".join(parts) or "none of it but the parameters that robot.toml calls unknown"
+    return (
+        f"extended.toml holds {held}: with all that was found here it would not surely be better on another recording. "
+        "Record poses over the whole range of all joints."
+    )
 
 
 def _alike(diagnosis: Diagnosis) -> tuple[Alike, ...]:
@@ -292,5 +311,6 @@ def _unexplained(diagnosis: Diagnosis) -> Unexplained:
     if left.model is None:
         return Unexplained(rattle_mm, tuple(names), left.p_value, left.what)
     rms = float(np.hypot(rattle_mm, 1e3 * np.sqrt(np.square(left.model.explained).sum(axis=1).mean())))
-    stored = () if left.model.stored is None else tuple(dict.fromkeys(left.model.stored.joints))
+    model = left.model.stored if diagnosis.stored is diagnosis.extended else None
+    stored = () if model is None else tuple(dict.fromkeys(model.joints))
     return Unexplained(rms, tuple(names), left.p_value, left.what, stored, left.untold)

@@ -155,6 +155,7 @@ class Tolerances(msgspec.Struct, frozen=True):
         angle_deg: tolerance of axes and joint offsets.
         drive_deg: size of the periodic errors of drives.
         links_share_percent, drives_share_percent: shares of the gain of links and axes, and of drives.
+        in_extended: False where extended.toml leaves them out, since it would not surely be better elsewhere.
     """
 
     length_mm: Interval
@@ -162,6 +163,7 @@ class Tolerances(msgspec.Struct, frozen=True):
     drive_deg: Interval
     links_share_percent: float = 0.0
     drives_share_percent: float = 0.0
+    in_extended: bool = True
 
     @property
     def share_percent(self) -> float:

@@ -108,6 +108,8 @@ def sentence(
     figures = f"{rms.aligned:.3g} → {rms.extended:.3g} mm on held-out data"
     if verdict == "nothing_found" and rms.extended < _BY_TOLERANCES * rms.aligned:
         return f"No cause stands out: small errors everywhere explain {_share(gain)} ({figures})"
+    if verdict == "nothing_found" and tolerances is not None and not tolerances.in_extended:
+        return f"No cause stands out; small errors everywhere are not known well enough to correct {rms.aligned:.3g} mm"
     if verdict == "nothing_found":
         return f"The simulation is right to within the noise: nothing found in {rms.aligned:.3g} mm of error"
     if not causes:
@@ -180,7 +182,7 @@ def to_do(diagnosis: DiagnosisFile, remedies: Sequence[str]) -> tuple[list[str],
     first = sum(not cause.is_small for cause in diagnosis.causes)
     told = list(remedies[:first])
     of = diagnosis.tolerances
-    if of is not None and of.share_percent >= SMALL:
+    if of is not None and of.in_extended and of.share_percent >= SMALL:
         told.append(
             f"Use extended.toml: small errors of all links and drives are {of.share_percent:.0f} % of the gain, and no "
             "single one is worth mending."
@@ -262,7 +264,7 @@ def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
 
 
 def _of_the_model(diagnosis: Diagnosis) -> str:
-    stored = diagnosis.left.model is not None and diagnosis.left.model.stored is not None
+    stored = diagnosis.left.model is not None and diagnosis.left.model.stored is not None and not diagnosis.leaves_out
     return " The extended simulation is right about it only where the recording has been." if stored else ""
 
 

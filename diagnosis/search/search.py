@@ -25,6 +25,8 @@ _NEAR, _MOST = 0.4, 6
 _WORTH_IN_FULL = 0.2
 # With more causes than this, the error has been described and not explained; maximum of steps of the search.
 _MOST_CAUSES, _MOST_STEPS = 12, 20
+# More jumps, slips and bumps than this in one recording describe something that comes and goes.
+_MOST_MOMENTS = 3
 # Check for completeness each time after this many further causes.
 _ASKED_EACH = 3
 # Maximum of sets of causes to examine; none is examined twice.
@@ -421,6 +423,11 @@ def joined(start: Fit, sought: Effect, least: float, expected: float) -> Fit:
 def named(causes: Sequence[Effect]) -> Named:
     """Return the identity of a set of causes without their parameters: the count of each kind at each place."""
     return frozenset(Counter(effect.key for effect in causes).items())
+
+
+def are_a_description(causes: Sequence[Effect]) -> bool:
+    """Return True if causes describe the error and do not explain it: too many of them begin at a moment."""
+    return sum(cause.kind.begins for cause in causes) > _MOST_MOMENTS
 
 
 def simplicity(effect: Effect) -> int:

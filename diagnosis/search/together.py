@@ -127,6 +127,7 @@ class Sets:
         flat *= self._units
         self._inner, self._toward = flat.T @ flat, flat.T @ self._target
         self._square, self._rows = float(self._target @ self._target), 3.0 * float(fit.noise.weights.sum())
+        self._kinds, self._keys = [one.kind for one in self.effects], [one.key for one in self.effects]
         self._trials = [float(np.log(candidate.trials)) for candidate in candidates]
         self._first = doubt + NAMED
         ends = np.cumsum([0, *(len(effect.amounts) for effect in self.effects)])
@@ -226,12 +227,12 @@ class Sets:
         total, kinds = 0.0, set[EffectType]()
         numbers: Counter[Key] = Counter()
         for k in chosen:
-            effect = self.effects[k]
-            if effect.kind.in_parts:
-                numbers[effect.key] += len(effect.amounts)
+            kind = self._kinds[k]
+            if kind.in_parts:
+                numbers[self._keys[k]] += len(self._places[k])
                 continue
-            total += self._trials[k] + (min(self._first, ANOTHER) if effect.kind in kinds else self._first)
-            kinds.add(effect.kind)
+            total += self._trials[k] + (min(self._first, ANOTHER) if kind in kinds else self._first)
+            kinds.add(kind)
         return total + sum(
             self._first + float(np.log(ways_to_choose(n, self._numbers[key]))) for key, n in numbers.items()
         )

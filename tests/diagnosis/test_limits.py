@@ -11,7 +11,7 @@ from planted_cases import SHOULDER, Motion, desk_arm, seen, walk
 from bodyschema.diagnosis.assess.explanation import Explanation, useful
 from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
 from bodyschema.diagnosis.report.conclusion import conclusion
-from bodyschema.diagnosis.search.search import Search
+from bodyschema.diagnosis.search.search import Search, are_a_description
 from bodyschema.effects import Effect, Simulation
 
 
@@ -25,12 +25,21 @@ def small() -> Diagnosis:
 def test_a_search_that_ended_at_its_longest_is_told(small) -> None:
     assert conclusion(small).limitations == small.hypotheses.limitations
     ended = dataclasses.replace(small, ended_early=True)
-    assert "there may be more of them" in conclusion(ended).limitations[-1]
+    assert "describe the error and do not explain it" in conclusion(ended).limitations[-1]
 
 
 def test_a_search_that_ended_at_its_limit_explains_nothing(small) -> None:
     assert conclusion(small).verdict == "explained"
-    assert conclusion(dataclasses.replace(small, ended_early=True)).verdict == "unexplained"
+    ended = conclusion(dataclasses.replace(small, ended_early=True))
+    assert ended.verdict == "unexplained"
+    assert all(cause.probability <= 0.5 for cause in ended.causes)
+
+
+def test_many_jumps_describe_the_error_and_do_not_explain_it(small) -> None:
+    robot = small.extended.simulation.robot
+    jumps = [Effect.at(robot, "encoder_jump", SHOULDER).one_more(k) for k in range(4)]
+    assert are_a_description(jumps)
+    assert not are_a_description([*jumps[:3], *small.causes])
 
 
 def test_what_is_rejected_though_chance_hardly_brings_it_about_has_a_word_why(small) -> None:

@@ -1,0 +1,118 @@
+"""Choose what extended.toml holds: nothing that is not surely better on another recording."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+from bodyschema.diagnosis.fit.background import Background
+from bodyschema.diagnosis.fit.fit import Fit, amount_columns, solved
+from bodyschema.diagnosis.search.held_out import Blocks, held_out_errors
+from bodyschema.diagnosis.unnamed.smooth import SmoothModel
+from bodyschema.effects import Motion
+from bodyschema.interfaces.records import FloatArray
+
+# Number of long blocks of time, each of which is left out once. In short ones a walk stays near where it was.
+_PARTS = 10
+# One-sided probability of the t-test.
+_SURELY = 0.95
+# Number of new poses.
+_POSES = 400
+
+
+def stored(candidates: Sequence[Fit], markers: NDArray[np.bool_]) -> Fit:
+    """Return the fit that is surely best on another recording.
+
+    The expected squared error there is that on long blocks of time that were left out, and the variance between fits
+    without one of them on poses that combine the readings of each joint in new ways. A fit has to be better than a
+    simpler one by Student's t-test of the blocks.
+
+    Args:
+        candidates: fits of the same observations, the simplest first.
+        markers: True for fixes (n,) that are probably the marker.
+    """
+    best, *others = (_Elsewhere.of(fit, markers) for fit in candidates)
+    for other in others:
+        if other.is_better_than(best):
+            best = other
+    return best.fit
+
+
+def is_better_with(model: SmoothModel, simpler: Fit, markers: NDArray[np.bool_], blocks: Blocks) -> bool:
+    """Return True if a fit with a smooth model is surely better on another recording than a simpler fit.
+
+    Args:
+        blocks: those that held out the functions of the model.
+    """
+    before, after = _Elsewhere.of(simpler, markers), _Elsewhere.of(model.fit, markers)
+    left = model.fit.observations.x - model.fit.predicted + model.unseen
+    gains = _sums(held_out_errors(simpler, blocks), markers) - _sums(left, markers)
+    return replace(after, squares=before.squares - gains).is_better_than(before)
+
+
+@dataclass(frozen=True, eq=False)
+class _Elsewhere:
+    """What a fit is expected to do on another recording.
+
+    Attributes:
+        squares: sum of squared held-out errors in each long block, over the number of all rows (blocks,) [m²].
+        variance: mean squared distance between its predictions of new poses [m²].
+    """
+
+    fit: Fit
+    squares: FloatArray
+    variance: float
+
+    @classmethod
+    def of(cls, fit: Fit, markers: NDArray[np.bool_]) -> _Elsewhere:
+        errors = fit.observations.x - fit.predicted
+        if not len(fit.precision):
+            return cls(fit, _sums(errors, markers), 0.0)
+        parts, columns, here = _long_blocks(len(errors)).of_row, fit.columns, fit.run_columns
+        flat, left = columns.reshape(fit.left.size, -1), fit.left.ravel()
+        normal = flat.T @ flat + np.diag(fit.precision) * fit.noise.sigma**2
+        gradient, changes = flat.T @ left, []
+        for part in np.unique(parts):
+            own = parts == part
+            rows = columns[own].reshape(-1, columns.shape[2])
+            change = solved(normal - rows.T @ rows, gradient - rows.T @ fit.left[own].ravel())
+            errors[own] -= here[own] @ change
+            changes.append(change)
+        moved = _columns(fit, _new_poses(fit.observations.motion)) @ np.transpose(changes - np.mean(changes, axis=0))
+        variance = (1.0 - 1.0 / len(changes)) * float(np.square(moved).sum(axis=(1, 2)).mean())
+        return cls(fit, _sums(errors, markers), variance)
+
+    def is_better_than(self, simpler: _Elsewhere) -> bool:
+        """Return True if this fit is surely better elsewhere."""
+        gains = simpler.squares - self.squares
+        unsure = float(np.std(gains, ddof=1)) * np.sqrt(len(gains)) * stdtrit(len(gains) - 1, _SURELY)
+        return float(gains.sum()) - unsure > self.variance - simpler.variance
+
+
+def _long_blocks(rows: int) -> Blocks:
+    """Return the long blocks of time."""
+    return Blocks.cut(rows, _PARTS)
+
+
+def _sums(errors: FloatArray, markers: NDArray[np.bool_]) -> FloatArray:
+    """Return the sum of squared errors (n, 3) in each long block, over the number of rows that count [m²]."""
+    squares = np.where(markers, np.square(errors).sum(axis=1), 0.0)
+    return _long_blocks(len(errors)).sums(squares) / max(float(markers.sum()), 1.0)
+
+
+def _new_poses(motion: Motion) -> Motion:
+    """Return a motion whose joints have their readings in another order, each joint in its own."""
+    rng, rows = np.random.default_rng(0), np.linspace(0, len(motion) - 1, min(len(motion), _POSES)).astype(int)
+    q = np.stack([rng.permutation(own)[rows] for own in motion.q.T], axis=1)
+    return replace(motion, q=q, t=None if motion.t is None else motion.t[rows], segment=motion.segment[rows])
+
+
+def _columns(fit: Fit, motion: Motion) -> FloatArray:
+    """Return derivatives (n, 3, p) [m] of the predictions on another motion, in the order of `run_columns`."""
+    run = fit.settled().simulation.run(motion)
+    background = Background(run, fit.observations.whitening, fit.background.scales)
+    return np.concatenate([amount_columns(run, fit.simulation.effects), background.columns], axis=2)

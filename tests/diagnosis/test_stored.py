@@ -1,0 +1,53 @@
+"""extended.toml holds only what makes another recording more exact."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from planted_cases import ELBOW, SHOULDER, SIGMA_M, desk_arm, measured, motion_of, walk
+
+from bodyschema.diagnosis.assess.stored import stored
+from bodyschema.diagnosis.fit.alignment import aligned
+from bodyschema.diagnosis.fit.background import MOST, Scales
+from bodyschema.diagnosis.fit.fit import Fit
+from bodyschema.diagnosis.fit.observations import Observations
+from bodyschema.diagnosis.search.held_out import is_marker
+from bodyschema.effects import Effect, Simulation
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.robot.description import RobotDescription
+
+ROWS = 100
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotDescription:
+    return desk_arm()
+
+
+def placed(robot: RobotDescription, off: FloatArray) -> Fit:
+    """Return the fit of the camera and the marker to a walk in which the elbow is off by (n,) [rad]."""
+    motion = walk(robot, 1, rows=ROWS)
+    q = motion.q.copy()
+    q[:, robot.joints.index(ELBOW)] += off
+    x = Simulation(robot).positions(motion_of(q))
+    x += SIGMA_M * np.random.default_rng([1, 1]).normal(size=x.shape)
+    return aligned(Observations.of(measured(robot, motion, x), Simulation(robot)), Simulation(robot))
+
+
+def test_a_joint_offset_is_stored(robot) -> None:
+    start = placed(robot, np.full(ROWS, 0.04))
+    found = start.with_causes([Effect.at(robot, "joint_offset", ELBOW, values=[0.0])])
+    assert stored([start, found], is_marker(found)) is found
+
+
+def test_tolerances_fitted_to_a_change_with_time_are_not_stored(robot) -> None:
+    start = placed(robot, 0.05 * np.sin(np.linspace(0.0, 30.0, ROWS)))
+    large = start.tolerating(Scales(MOST, MOST, MOST))
+    assert np.square(large.residuals).sum() < np.square(start.residuals).sum()
+    assert stored([start, large], is_marker(large)) is start
+
+
+def test_a_cause_that_explains_nothing_is_not_stored(robot) -> None:
+    start = placed(robot, np.zeros(ROWS))
+    none = start.with_causes([Effect.at(robot, "joint_scale", SHOULDER, values=[0.0])])
+    assert stored([start, none], is_marker(none)) is start
