@@ -176,7 +176,7 @@ def test_the_report_says_that_the_errors_have_the_measurements_noise() -> None:
     said = " ".join(as_text(report()).split())
     assert "the errors above count the noise of the measurements" in said
     assert (
-        "on new pairs where data is the learner expects 0.310 mm; its 1-sigma and that noise together cover 88%" in said
+        "on new pairs where data is the learner expects 0.31 mm; its 1-sigma and that noise together cover 88%" in said
     )
 
 

@@ -30,7 +30,7 @@ def found(robot: RobotDescription, truth: Simulation | None, seed: int, effects:
     recording = Recording(joints=robot.joints, q=q, x=x + SIGMA_M * rng.normal(size=x.shape))
     nominal = Simulation(robot, effects)
     fit = fitted(Observations.of(recording, nominal), nominal, len(effects))
-    return Found(cast(Diagnosis, SimpleNamespace(extended=fit)), Source(recording, "a test"), robot, ())
+    return Found(cast(Diagnosis, SimpleNamespace(stored=fit)), Source(recording, "a test"), robot, ())
 
 
 def test_covariance_of_the_pose_covers_the_truth() -> None:
