@@ -46,7 +46,7 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
     causes = _causes(diagnosis)
     rms = _rms_mm(diagnosis)
     verdict = _verdict(diagnosis, causes, percent)
-    counted = (None, None) if diagnosis.markers.all() else diagnosis.gain_with_outliers()
+    counted = diagnosis.gain_with_outliers() if diagnosis.outliers else (None, None)
     gain = Gain(percent, interval, with_outliers_percent=counted[0], with_outliers_ci95=counted[1])
     tolerances = _tolerances(diagnosis)
     timed = diagnosis.aligned.observations.motion.t is not None
