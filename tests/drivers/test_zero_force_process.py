@@ -129,9 +129,19 @@ class Floating:
 
 @pytest.fixture
 def floating(bench: DryRun, tmp_path: Path) -> Iterator[Floating]:
-    with Floating(tmp_path) as floating:
-        floating.until(lambda _: min(map(abs, currents(bench, 0.0))) > 0.1)
-        yield floating
+    def begun(said: dict) -> bool:
+        return min(map(abs, currents(bench, 0.0))) > 0.1 or has_ended(said)
+
+    # On a full machine a heartbeat may come too late for the servos, which end it as they should: begin again.
+    while True:
+        with Floating(tmp_path) as floating:
+            if not has_ended(floating.until(begun)):
+                yield floating
+                return
+
+
+def has_ended(said: dict) -> bool:
+    return any("zero_force ended" in text for text in said["health"])
 
 
 def torque(bench: DryRun) -> list[int]:
@@ -167,7 +177,7 @@ def test_an_unplugged_bus_leaves_no_current_and_torque_is_off_when_it_is_back(be
 
 def test_a_fault_of_a_servo_ends_it(bench, floating) -> None:
     bench.arm.servo("elbow").fail(0x20)
-    said = floating.until(lambda said: any("zero_force ended" in text for text in said["health"]))
+    said = floating.until(has_ended)
     assert torque(bench) == [0, 0]
     assert floating.process.poll() is None
     assert any("'elbow'" in text for text in said["health"])
