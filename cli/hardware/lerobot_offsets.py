@@ -108,6 +108,6 @@ def _of_ranges(changes: Sequence[Correction]) -> str:
     largest = max(changes, key=lambda change: abs(change.ticks))
     degrees = abs(largest.ticks) * math.degrees(RAD_PER_TICK)
     return (
-        f"The ends of the ranges move along, {largest.motor} by {degrees:.1f}°: "
-        "drive there slowly the first time. Datasets and policies of before have the old offsets."
+        f"The range ends shift with the zeros, {largest.motor} by {degrees:.1f}°: "
+        "drive there slowly the first time. Datasets and policies from before have the old offsets."
     )

@@ -84,4 +84,10 @@ if __name__ == "__main__":
     with open(sys.argv[1], encoding="utf-8") as stream:
         correction = Correction(stream.read())
     for line in sys.stdin:
-        print(*(number for part in correction.read([float(word) for word in line.split()]) for number in part))
+        print(
+            *(
+                number
+                for part in correction.read([float(word) for word in line.replace(",", " ").split()])
+                for number in part
+            )
+        )

@@ -35,6 +35,7 @@ from bodyschema.recordings.store.store import PairStore, Session
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "desk_arm" / "servos.toml"
 LONGEST_S = 5.0
+pytestmark = pytest.mark.usefixtures("patient_host")
 
 
 def called(*arguments: object) -> int:
@@ -52,7 +53,7 @@ def state(tmp_path, monkeypatch, free_endpoint) -> None:
     monkeypatch.setenv("BODYSCHEMA_ZENOH_LEARNER", free_endpoint())
 
 
-@pytest.mark.usefixtures("state", "patient_host")
+@pytest.mark.usefixtures("state")
 @pytest.mark.parametrize(
     ("file", "what"), [("servos.toml", "servos"), ("feetech.toml", "servos"), ("encoders.toml", "encoders")]
 )

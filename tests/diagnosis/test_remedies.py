@@ -87,6 +87,12 @@ def test_an_offset_is_given_in_degrees_and_ticks(robot) -> None:
     assert "Add +0.52° (+6 ticks of 4096 a turn)" in told(robot, cause(effect), step=2.0 * np.pi / 4096)[0]
 
 
+@pytest.mark.parametrize("step", [1e-4, np.radians(0.01)])
+def test_decimals_of_a_file_are_no_ticks(robot, step) -> None:
+    effect = Effect.at(robot, "joint_offset", "elbow_pitch", values={"offset_rad": np.radians(0.52)})
+    assert "tick" not in told(robot, cause(effect), step=step)[0]
+
+
 def test_ticks_are_not_spoken_of_where_none_are_seen(robot) -> None:
     effect = Effect.at(robot, "joint_offset", "elbow_pitch", values={"offset_rad": 0.01})
     assert "tick" not in told(robot, cause(effect))[0]

@@ -68,6 +68,7 @@ def encoders(folder: Path) -> Iterator[tuple[PtyShell, Callable[[], SerialLineJo
         yield shell, lambda: SerialLineJoints(config, NAMES, SystemClock(), limits=LIMITS)
 
 
+pytestmark = pytest.mark.usefixtures("patient_host")
 EACH = pytest.mark.parametrize("make", [dynamixel, feetech, encoders])
 
 
@@ -79,7 +80,6 @@ def wait_for_reading(source: Any) -> JointReading:
     raise AssertionError("no reading came")
 
 
-@pytest.mark.usefixtures("patient_host")
 @EACH
 def test_readings_are_right_with_wire_time(make: Make, tmp_path, monkeypatch) -> None:
     # Emulator and driver share this process: on a busy machine the emulator itself may be silent for a while.

@@ -79,6 +79,7 @@ def export(
 
 def _export_robot(source: Path, out: Path, measured: Path | None, console: Console, *, force: bool) -> None:
     from rich.table import Table
+    from rich.text import Text
 
     from bodyschema.calibration.plausibility.limits import require_units
     from bodyschema.cli.terminal import robot_export
@@ -101,7 +102,8 @@ def _export_robot(source: Path, out: Path, measured: Path | None, console: Conso
     if recording is None:
         return
     rows, why_not = robot_export.compared(simulation, recording, out)
-    table = Table("model", "RMS [mm]", "mean [mm]", "gain [%]", title=f"{len(recording)} rows of {measured}")
+    heads = map(Text, ("model", "RMS [mm]", "mean [mm]", "gain [%]"))
+    table = Table(*heads, title=Text(f"all {len(recording)} rows of {measured}, outliers included"))
     for row in rows:
         gain = "" if row.gain_percent is None else f"{row.gain_percent:.1f}"
         table.add_row(row.model, f"{row.rms_mm:.3f}", f"{row.mean_mm:.3f}", gain)
