@@ -90,7 +90,7 @@ class _Elsewhere:
         """Return True if this fit is surely better elsewhere."""
         gains = simpler.squares - self.squares
         unsure = float(np.std(gains, ddof=1)) * np.sqrt(len(gains)) * stdtrit(len(gains) - 1, _SURELY)
-        return float(gains.sum()) - unsure > self.variance - simpler.variance
+        return float(gains.sum()) - unsure > max(self.variance - simpler.variance, 0.0)
 
 
 def _long_blocks(rows: int) -> Blocks:

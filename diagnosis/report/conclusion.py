@@ -82,7 +82,7 @@ def _tolerances(diagnosis: Diagnosis) -> Tolerances:
     ends = zip(sizes.tolist(), lowest.tolist(), (sizes * wide).tolist(), strict=True)
     intervals = [Interval(size, (low, high)) for size, low, high in ends]
     shares = diagnosis.shares
-    in_extended = not diagnosis.leaves_out or diagnosis.stored.background.scales is not None
+    in_extended = diagnosis.stored is diagnosis.extended or diagnosis.stored.background.scales is not None
     links, drives = 100.0 * shares.links, 100.0 * shares.drives
     return Tolerances(*intervals, links_share_percent=links, drives_share_percent=drives, in_extended=in_extended)
 
@@ -259,7 +259,7 @@ def _limitations(diagnosis: Diagnosis) -> tuple[str, ...]:
             "few runs cross it. What seems to jump or to change with time there may be that. Record longer runs, "
             "and move the joint to and fro in each."
         )
-    if diagnosis.leaves_out:
+    if diagnosis.leaves_out or len(diagnosis.stored.causes) < len(diagnosis.causes):
         told.append(_left_out(diagnosis.stored))
     told += alias_sentences(diagnosis.extended)
     if is_at_limit(diagnosis.extended.background.scales):

@@ -264,8 +264,9 @@ def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
 
 
 def _of_the_model(diagnosis: Diagnosis) -> str:
-    stored = diagnosis.left.model is not None and diagnosis.left.model.stored is not None and not diagnosis.leaves_out
-    return " The extended simulation is right about it only where the recording has been." if stored else ""
+    has_model = diagnosis.left.model is not None and diagnosis.left.model.stored is not None
+    is_stored = has_model and diagnosis.stored is diagnosis.extended
+    return " The extended simulation is right about it only where the recording has been." if is_stored else ""
 
 
 def _some(pairs: Sequence[str]) -> str:

@@ -86,14 +86,17 @@ def gain_percent(before: FloatArray, after: FloatArray, blocks: Blocks, seed: in
     """
     blocks = blocks.merged(_LONG_BLOCKS)
     rows = blocks.sums(np.stack([np.square(before), np.square(after)], axis=1))
-    total = rows.sum(axis=0)
+    rows = rows[rows[:, 0] > 0.0]  # the others have no fix that counts
+    if not len(rows):
+        return 0.0, (0.0, 0.0)
+    count, total = len(rows), rows.sum(axis=0)
     rng = np.random.default_rng(seed)
-    again = rng.integers(blocks.count, size=(_BOOTSTRAPS, blocks.count))
-    other = rng.integers(blocks.count, size=(_BOOTSTRAPS, blocks.count // 2))
+    again = rng.integers(count, size=(_BOOTSTRAPS, count))
+    other = rng.integers(count, size=(_BOOTSTRAPS, max(count // 2, 1)))
     sums = rows[np.take_along_axis(again, other, axis=1)].sum(axis=1)
 
     def percent(before_after: FloatArray) -> FloatArray:
-        return 100.0 * (1.0 - np.sqrt(before_after[..., 1] / np.maximum(before_after[..., 0], 1e-300)))
+        return 100.0 * (1.0 - np.sqrt(before_after[..., 1] / before_after[..., 0]))
 
     low, high = np.quantile(percent(sums), [0.025, 0.975])
     return float(percent(total)), (float(low), float(high))

@@ -151,6 +151,13 @@ def is_uniform(p_values: FloatArray) -> bool:
     return stats.kstest(p_values, "uniform").pvalue > CHANCE
 
 
+def test_blocks_without_a_fix_that_counts_promise_nothing() -> None:
+    before = np.repeat([1.0, 0.0], 50)
+    gain, interval = gain_percent(before, 0.9 * before, Blocks.cut(100, 10), seed=0)
+    assert (gain, *interval) == pytest.approx((10.0, 10.0, 10.0))
+    assert gain_percent(0.0 * before, 0.0 * before, Blocks.cut(100, 10), seed=0) == (0.0, (0.0, 0.0))
+
+
 def read_in_ticks(robot: RobotDescription, seed: int) -> Fit:
     """Return a fit of an arm that rests for some rows, read in whole ticks, so that these rows share one error."""
     rows = ALIKE * POSES

@@ -103,7 +103,7 @@ def test_what_wanders_with_time_is_not_in_the_model_and_that_is_told(robot) -> N
     x = Simulation(robot).positions(motion_of(q))
     noise = SIGMA_M * np.random.default_rng([1, 1]).normal(size=x.shape)
     # Of the effects, those that are most like it: the search among all sets of all effects takes seconds.
-    nearest = ("joint_offset", "joint_scale", "joint_eccentricity", "encoder_jump")
+    nearest = ("joint_offset", "joint_scale", "encoder_jump", "thermal_drift", "tool_slip", "camera_moved")
     diagnosis = diagnose(measured(robot, motion, x + noise), Simulation(robot), only=nearest)
     left = conclusion(diagnosis).unexplained
     assert diagnosis.extended.simulation.residual is None

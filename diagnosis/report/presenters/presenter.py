@@ -25,7 +25,7 @@ from .plots import measured_against_predicted
 DEG = math.degrees(1.0)
 # Ticks that divide a turn to within this share are counted per turn.
 _WHOLE_TURN = 0.01
-# Decimals of a file, by which its values are rounded, are a whole number to this.
+# A step is one decimal of a file, and no tick, if its logarithm is a whole number to this.
 _DECIMAL = 1e-3
 
 
@@ -138,10 +138,11 @@ class Workshop:
 
     def _ticks(self, found: Found, amount: float) -> str:
         step = float(self.steps[self.joint(found)])
-        if step <= 0.0 or any(
-            abs(digits - round(digits)) < _DECIMAL for digits in np.log10([step, math.degrees(step)])
-        ):
-            return ""  # unknown, or that of a file with so many decimals
+        if step <= 0.0:
+            return ""
+        decimals = np.log10([step, math.degrees(step)])
+        if np.abs(decimals - np.round(decimals)).min() < _DECIMAL:
+            return ""
         count = round(amount / step)
         per_turn = 2.0 * math.pi / step
         of = ""
