@@ -275,7 +275,8 @@ def stereo_calibration(robot: RobotDescription) -> StereoCalibration:
         raise ConfigError(
             "the simulation renders images, but [camera] does not describe how the cameras see",
             file=robot.file,
-            remedy="Add focal_px, principal_point_px, image_size_px, and baseline_m or eyes = 1 to [camera]",
+            remedy="Add focal_px, principal_point_px, image_size_px, and baseline_m or eyes = 1 to [camera]. In a "
+            "robot.toml of `bodyschema init` these lines stand behind #",
         )
     return robot.calibration
 

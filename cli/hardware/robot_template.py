@@ -194,8 +194,9 @@ def guess_from(urdf: Path, robot: Path, *, marker_link: str | None = None, camer
 
     Raises:
         RobotError: the URDF cannot be read.
-        ConfigError: it has no such link.
+        ConfigError: it has no such link, or no joint moves between the two.
     """
+    from bodyschema.interfaces.errors import ConfigError
     from bodyschema.robot.urdf import UrdfTree
 
     tree = UrdfTree.load(urdf)
@@ -206,7 +207,11 @@ def guess_from(urdf: Path, robot: Path, *, marker_link: str | None = None, camer
         paths = {link: [joint for joint, _ in tree.path(root, link)] for link in tree.links}
         whole = {link: path for link, path in paths.items() if not any(map(_is_finger, path))}
         marker_link = max(whole, key=lambda link: (len(_moving(whole[link])), len(whole[link])))
-    return guess_of(tree, os.path.relpath(urdf, robot.parent), marker_link, camera_link)
+    guess = guess_of(tree, os.path.relpath(urdf, robot.parent), marker_link, camera_link)
+    if not guess.joints:
+        between = f"between {guess.camera_link} and {guess.marker_link} no joint moves"
+        raise ConfigError(between, file=urdf, remedy="Is it the URDF of the arm, and are these its links?")
+    return guess
 
 
 def guess_of(tree: UrdfTree, urdf: str, end: str, root: str | None = None) -> Guess:

@@ -76,7 +76,8 @@ class _Limits:
             )
         if robot.robot.hold == "torque_free":
             self.sentences.append(
-                "The arm was guided torque-free: the hand bore its weight, so no joint gave under it."
+                'robot.toml says hold = "torque_free": the hand bore the weight, so sag was not tested. If the arm '
+                'held itself, write hold = "held" and diagnose again.'
             )
         elif not simulation.gravity.known:
             self.sentences.append(

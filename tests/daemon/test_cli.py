@@ -201,6 +201,13 @@ def test_init_refuses_a_link_that_the_urdf_has_not(tmp_path) -> None:
         called("init", "--robot", tmp_path / "new.toml", "--urdf", tmp_path / "arm.urdf", "--marker-link", "hnad")
 
 
+def test_init_refuses_a_urdf_in_which_nothing_moves(tmp_path) -> None:
+    (tmp_path / "arm.urdf").write_text('<robot name="x"><link name="a"/></robot>')
+    with pytest.raises(ConfigError, match="no joint moves"):
+        called("init", "--robot", tmp_path / "new.toml", "--urdf", tmp_path / "arm.urdf")
+    assert not (tmp_path / "new.toml").exists()
+
+
 @pytest.mark.parametrize("present", RENAMED.values(), ids=" ".join)
 def test_what_an_earlier_name_became_is_a_command(present, capsys) -> None:
     command_line(present[0])([*present, "--help"], exit_on_error=False, result_action="return_value")

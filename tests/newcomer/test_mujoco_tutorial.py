@@ -49,5 +49,6 @@ def test_the_tutorial_ends_with_its_numbers(tmp_path: Path, monkeypatch, capfd) 
         told = run.stdout
     for name, numbers in figures(SHOWN).items():
         assert figures(told)[name] == pytest.approx(numbers, rel=0.01)
+    assert "RMS [mm]" in told
     exec(use, {})
     assert "in the camera's frame" in capfd.readouterr().out

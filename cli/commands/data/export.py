@@ -102,8 +102,9 @@ def _export_robot(source: Path, out: Path, measured: Path | None, console: Conso
     if recording is None:
         return
     rows, why_not = robot_export.compared(simulation, recording, out)
-    heads = map(Text, ("model", "RMS [mm]", "mean [mm]", "gain [%]"))
-    table = Table(*heads, title=Text(f"all {len(recording)} rows of {measured}, outliers included"))
+    table = Table(title=Text(f"all {len(recording)} rows of {measured}, outliers included"))
+    for head in ("model", "RMS [mm]", "mean [mm]", "gain [%]"):
+        table.add_column(Text(head))
     for row in rows:
         gain = "" if row.gain_percent is None else f"{row.gain_percent:.1f}"
         table.add_row(row.model, f"{row.rms_mm:.3f}", f"{row.mean_mm:.3f}", gain)
