@@ -125,7 +125,7 @@ def _glance(residuals: Residuals, file: DiagnosisFile) -> str:
     ]
     if file.stability is not None:
         same = f"{file.stability.same_causes} of {file.stability.resampled}"
-        tiles.append((same, "resampled, with the same large causes"))
+        tiles.append((same, "resampled recordings with the same large causes"))
     items = "".join(f"<div><b>{value}</b><span>{escape(label)}</span></div>" for value, label in tiles)
     return (
         f'<section><div class="tiles">{items}</div><div class="beside"><div>{_panels([histogram(residuals)])}</div>'
