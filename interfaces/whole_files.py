@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import os
 import secrets
+import stat
 from collections.abc import Mapping
 from pathlib import Path
 
+BACKUP = ".before"
 
-def write_whole(contents: Mapping[Path, bytes]) -> None:
+
+def write_whole(contents: Mapping[Path, bytes], *, mode: int | None = None) -> None:
     """Write files, replacing those that are there: all of them once all are on the disk, else none.
+
+    Args:
+        contents: of each file.
+        mode: permissions of the files; by default those of new files.
 
     Raises:
         OSError: one of them cannot be written; nothing was changed.
@@ -22,8 +29,45 @@ def write_whole(contents: Mapping[Path, bytes]) -> None:
                 stream.write(contents[file])
                 stream.flush()
                 os.fsync(stream.fileno())
+            if mode is not None:
+                part.chmod(mode)
         for part, file in parts.items():
             os.replace(part, file)
     finally:
         for part in parts:
             part.unlink(missing_ok=True)
+
+
+def replace_kept(file: Path, data: bytes, beside: Mapping[str, bytes] | None = None) -> Path:
+    """Replace a file, and keep the old one beside it; return the name of the old one.
+
+    The target of a link is replaced, not the link. Permissions stay.
+
+    Args:
+        file: to be replaced.
+        data: its new contents.
+        beside: contents of other files to write with it, by what their names have after the name of the file.
+
+    Raises:
+        OSError: one of them cannot be written; nothing was changed.
+    """
+    target = link_target(file)
+    backup = free_backup(target)
+    others = {target.with_name(f"{target.name}{ending}"): text for ending, text in (beside or {}).items()}
+    contents = {backup: target.read_bytes(), **others, target: data}
+    write_whole(contents, mode=stat.S_IMODE(target.stat().st_mode))
+    return backup
+
+
+def link_target(file: Path) -> Path:
+    """Return the file that a link leads to; any other as it is named."""
+    return file.resolve() if file.is_symlink() else file
+
+
+def free_backup(file: Path) -> Path:
+    """Return a name for the old file that nothing has yet."""
+    count, name = 1, file.with_name(f"{file.name}{BACKUP}")
+    while os.path.lexists(name):
+        count += 1
+        name = file.with_name(f"{file.name}{BACKUP}{count}")
+    return name

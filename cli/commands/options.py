@@ -121,12 +121,19 @@ def robot_file(given: Path | None, source: Path | None) -> Path:
     return Path(os.environ.get(VARIABLE, HERE))
 
 
-def lerobot_lines(config: Config, file: Path, offsets_rad: Mapping[str, float], *, write: bool) -> list[str]:
-    """Return what joint offsets change in LeRobot's calibration `file`, after writing it where `write` says so."""
+def lerobot_lines(
+    config: Config, file: Path, offsets_rad: Mapping[str, float], recording: Path | None, *, write: bool
+) -> list[str]:
+    """Return what joint offsets change in LeRobot's calibration `file`, after writing it where `write` says so.
+
+    Where the file has the offsets of this `recording` already, this is said, and nothing is written.
+    """
     from bodyschema.cli.hardware.lerobot_offsets import CorrectedCalibration, after_writing, difference
 
     corrected = CorrectedCalibration.of(config, file, offsets_rad)
+    if already := corrected.already(recording):
+        return already
     lines = difference(corrected)
     if not any(change.ticks for change in corrected.changes):
         return lines
-    return [*lines, after_writing(corrected.write()) if write else "Nothing is written without --write."]
+    return [*lines, after_writing(corrected.write(recording)) if write else "Nothing is written without --write."]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +11,7 @@ from pathlib import Path
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.servos import require_servos
 from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.whole_files import free_backup, link_target, replace_kept
 from bodyschema.robot.lerobot import (
     RAD_PER_TICK,
     Calibrations,
@@ -22,7 +23,7 @@ from bodyschema.robot.lerobot import (
 
 from .lerobot_robot import joint_servos
 
-BACKUP = ".before"
+RECORDINGS = ".recordings"
 
 
 @dataclass(frozen=True)
@@ -51,32 +52,62 @@ class CorrectedCalibration:
         changes = tuple(corrections(motors, servos, offsets_rad))
         return cls(file, motors | {change.motor: change.after for change in changes}, changes)
 
-    def write(self) -> Path:
+    def already(self, recording: Path | None) -> list[str]:
+        """Return what to say where the offsets of this recording are in the file already; else nothing."""
+        digest = _digest(recording)
+        backups = [line.split("\t")[1] for line in self._noted().splitlines() if line.startswith(f"{digest}\t")]
+        if recording is None or not backups:
+            return []
+        target = link_target(self.file)
+        backup, noted = target.with_name(backups[-1]), target.with_name(target.name + RECORDINGS)
+        return [
+            f"{self.file} already has the offsets of {recording.name} in it ({backup} is the file without them). "
+            f"Record again with the new calibration; or delete {noted} to write all the same."
+        ]
+
+    def write(self, recording: Path | None = None) -> Path:
         """Replace the file, and keep the old one beside it; return the name of the old one.
+
+        Args:
+            recording: the file in which the offsets were found, to be noted beside the calibration.
 
         Raises:
             ConfigError: nothing could be written.
         """
-        backup = _free_name(self.file)
-        part = self.file.with_name(f".{self.file.name}.part")
+        beside = dict[str, bytes]()
+        if recording is not None and (digest := _digest(recording)):
+            backup = free_backup(link_target(self.file))
+            noted = f"{digest}\t{backup.name}\t{recording.name}\n"
+            beside[RECORDINGS] = (self._noted() + noted).encode(errors="surrogateescape")
         try:
-            part.write_text(calibration_json(self.motors), encoding="utf-8")
-            backup.write_bytes(self.file.read_bytes())
-            os.replace(part, self.file)
+            return replace_kept(self.file, calibration_json(self.motors).encode(), beside)
         except OSError as error:
             raise ConfigError(f"cannot be written: {error.strerror}", file=self.file) from error
-        finally:
-            part.unlink(missing_ok=True)
-        return backup
+
+    def _noted(self) -> str:
+        """Return a line for each recording whose offsets are in the file: digest, name of the old file, recording."""
+        target = link_target(self.file)
+        try:
+            noted = target.with_name(target.name + RECORDINGS).read_bytes()
+        except OSError:
+            return ""
+        return noted.decode(errors="surrogateescape")
 
 
-def _free_name(file: Path) -> Path:
-    """Return a name for the old file that nothing has yet."""
-    count, name = 1, file.with_name(f"{file.name}{BACKUP}")
-    while name.exists():
-        count += 1
-        name = file.with_name(f"{file.name}{BACKUP}{count}")
-    return name
+def _digest(recording: Path | None) -> str | None:
+    """Return the SHA-256 of a recording in one file; None of any other."""
+    if recording is None or not recording.is_file():
+        return None
+    digest = hashlib.sha256()
+    recent = recording.with_name(f"{recording.name}-wal")  # where SQLite keeps what it has not yet put into a store
+    try:
+        for file in (recording, recent):
+            if file is recording or file.is_file():
+                with file.open("rb") as stream:
+                    hashlib.file_digest(stream, lambda: digest)
+    except OSError:
+        return None
+    return digest.hexdigest()
 
 
 def difference(corrected: CorrectedCalibration) -> list[str]:

@@ -10,11 +10,11 @@ import pytest
 from scripted_sources import Walk
 from small_arm import write_small_arm
 
-from bodyschema.calibration.latency import LatencyError
+from bodyschema.calibration.latency import Latency, LatencyError
 from bodyschema.cli.hardware.wiggling import collected
 from bodyschema.cli.main import app
 from bodyschema.daemon.sampler.sources import Sources
-from bodyschema.interfaces.errors import BodyschemaError, SourceLost
+from bodyschema.interfaces.errors import BodyschemaError, ConfigError, SourceLost
 from bodyschema.interfaces.records import MarkerFix, MarkerMiss
 from bodyschema.robot.description import RobotDescription
 
@@ -69,3 +69,46 @@ def test_the_simulated_robot_has_no_latency(tmp_path, monkeypatch, capsys) -> No
     found = json.loads(capsys.readouterr().out)
     assert np.abs(found["latency_s"]) < 3 * found["sigma_s"] + 1e-3
     assert found["sigma_s"] < 3e-3
+
+
+def measured_by(folder: Path, tables: str, *words: str) -> Path:
+    """Run the command on a recording of a small arm, whose robot.toml has `tables` besides."""
+    file = write_small_arm(folder, tables)
+    (folder / "w.csv").write_text("not read")
+    command = ["calibrate", "latency", str(folder / "w.csv"), "--robot", str(file), *words]
+    app(command, exit_on_error=False, result_action="return_value")
+    return file
+
+
+@pytest.fixture
+def known(monkeypatch) -> None:
+    """Let any recording show the same latency."""
+    found = Latency(latency_s=0.03412, sigma_s=0.00121, residual_m=1e-3, speed_m_s=0.3, fixes=150)
+    monkeypatch.setattr("bodyschema.cli.hardware.wiggling.read_wiggle", lambda *_: None)
+    monkeypatch.setattr("bodyschema.calibration.latency.latency_of", lambda *_: found)
+
+
+BOTH = "latency_s = 0.0341\nlatency_sigma_s = 0.0012\n"
+
+
+@pytest.mark.usefixtures("known")
+def test_without_a_table_of_cameras_the_values_are_told(tmp_path, capsys) -> None:
+    file = measured_by(tmp_path, "")
+    out = capsys.readouterr().out
+    assert BOTH in out
+    assert "there is no table [vision.cameras]" in out
+    before = file.read_bytes()
+    with pytest.raises(ConfigError, match=r"yourself: latency_s = 0\.0341, latency_sigma_s = 0\.0012"):
+        measured_by(tmp_path, "", "--write")
+    assert BOTH in capsys.readouterr().out
+    assert file.read_bytes() == before
+
+
+@pytest.mark.usefixtures("known")
+def test_written_values_are_those_that_were_printed(tmp_path, capsys) -> None:
+    cameras = 'two = {left = "a", right = "b", image_size_px = [640, 480]}'
+    file = measured_by(tmp_path, f"[vision.cameras]\n{cameras}\n", "--write")
+    out = capsys.readouterr().out
+    assert BOTH in out
+    assert f"Written; the old file is {file}.before" in out
+    assert file.read_text(encoding="utf-8").endswith(f"{cameras}\n{BOTH}")

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bodyschema.cli.commands.options import lerobot_lines
 from bodyschema.cli.hardware.lerobot_offsets import CorrectedCalibration
 from bodyschema.cli.main import command_line
 from bodyschema.daemon.config import Config
@@ -206,6 +207,46 @@ def test_calibrate_writes_and_keeps_the_old_file(tmp_path) -> None:
     found = read_calibration(mine)["shoulder_lift"].homing_offset
     assert found == pytest.approx(1021 - 2.0 * 4096 / 360, abs=3)
     assert (tmp_path / "follower.json.before").read_bytes() == (SO101 / "follower.json").read_bytes()
+
+
+def test_offsets_of_one_recording_are_written_once(tmp_path, capsys, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    mine, file = Path("follower.json"), Path("r.csv")
+    shutil.copy(SO101 / "follower.json", mine)
+    robot, offsets = robot_of("follower", Path("robot.toml")), {"shoulder_lift": math.radians(2.0)}
+    planted(file, robot)
+    lerobot_lines(robot, mine, offsets, file, write=True)
+    once = mine.read_bytes()
+    told = (
+        "follower.json already has the offsets of r.csv in it (follower.json.before is the file without them). Record "
+        "again with the new calibration; or delete follower.json.recordings to write all the same."
+    )
+    assert lerobot_lines(robot, mine, offsets, file, write=False) == [told]
+    capsys.readouterr()
+    calibrate(file, "--lerobot", mine, "--write")
+    assert f"{told}\n" in capsys.readouterr().out
+    assert mine.read_bytes() == once
+    assert not Path("follower.json.before2").exists()
+    Path("follower.json.recordings").unlink()
+    lerobot_lines(robot, mine, offsets, file, write=True)
+    assert Path("follower.json.before2").read_bytes() == once != mine.read_bytes()
+
+
+def test_a_second_recording_is_noted_beside_the_first(tmp_path) -> None:
+    mine = tmp_path / "follower.json"
+    shutil.copy(SO101 / "follower.json", mine)
+    robot = robot_of("follower", tmp_path / "robot.toml")
+    corrected = CorrectedCalibration.of(robot, mine, {"elbow_flex": math.radians(1.0)})
+    files = [tmp_path / name for name in ("first.csv", "second.csv", "third.csv")]
+    for file in files:
+        file.write_text(file.name)
+    for file in files[:2]:
+        corrected.write(file)
+    corrected.write(tmp_path)  # a folder is not noted
+    assert [bool(corrected.already(file)) for file in (*files, tmp_path, None)] == [True, True, False, False, False]
+    assert "follower.json.before2" in corrected.already(files[1])[0]
+    (tmp_path / "first.csv-wal").write_text("later pairs of a store")
+    assert corrected.already(files[0]) == []
 
 
 def test_calibrations_of_old_lerobot_are_refused(tmp_path) -> None:

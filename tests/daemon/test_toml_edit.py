@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import stat
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -50,3 +53,72 @@ def test_a_table_that_is_not_there_is_told(tmp_path: Path, text: str) -> None:
     (tmp_path / "robot.toml").write_text(text)
     with pytest.raises(ConfigError, match="no table"):
         with_values(tmp_path / "robot.toml", "vision.cameras", {"latency_s": 0.01})
+
+
+WAS = b'[vision.cameras]  # two\r\nleft = "a"\r\nlatency_s = 0.0  # mine\r\n\r\n[robot]\r\n'
+BECOMES = WAS.replace(b"0.0", b"0.01").replace(b"mine\r\n", b"mine\r\nlatency_sigma_s = 0.001\r\n")
+VALUES = {"latency_s": 0.01, "latency_sigma_s": 0.001}
+
+
+@pytest.mark.parametrize("bom", [b"", b"\xef\xbb\xbf"])
+def test_line_ends_and_byte_order_mark_stay(tmp_path: Path, bom: bytes) -> None:
+    file = tmp_path / "robot.toml"
+    file.write_bytes(bom + WAS)
+    edited = with_values(file, "vision.cameras", VALUES)
+    assert len(difference(file, edited)) == 3 + 2 + 3
+    write_edited(file, edited)
+    assert file.read_bytes() == bom + BECOMES
+
+
+def test_a_last_line_without_an_end_gets_that_of_the_others(tmp_path: Path) -> None:
+    file = tmp_path / "robot.toml"
+    file.write_bytes(b'[robot]\r\n[vision.cameras]\r\nleft = "a"')
+    edited = with_values(file, "vision.cameras", {"latency_s": 0.01})
+    assert edited == '[robot]\r\n[vision.cameras]\r\nleft = "a"\r\nlatency_s = 0.01\r\n'
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[vision.cameras]\nm = [\n[1, 2],\n  [3, 4],\n]\nlatency_s = 0.0\n",
+        '[vision.cameras]\n"latency_s" = 0.0\n[robot]\n',
+        "[vision.'cameras']\n'latency_s' = 0.0\n[robot]\n",
+        '[robot]\nnote = """\n[vision.cameras]\nlatency_s = 1\n"""\n[vision.cameras]\nnote = "["\n',
+    ],
+)
+def test_arrays_strings_and_quoted_keys_are_read_as_toml_has_them(tmp_path: Path, text: str) -> None:
+    (tmp_path / "robot.toml").write_text(text)
+    expected = tomllib.loads(text)
+    expected["vision"]["cameras"] |= VALUES
+    assert tomllib.loads(with_values(tmp_path / "robot.toml", "vision.cameras", VALUES)) == expected
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[vision.cameras]\nlatency_s = [\n0.1,\n]\n",
+        '[vision.cameras]\n"latency\\u005fs" = 0.1\n',
+        '[vision]\nnote = """\n[vision.cameras]\n"""\n',
+    ],
+)
+def test_what_cannot_be_edited_is_told_with_what_to_write(tmp_path: Path, text: str) -> None:
+    (tmp_path / "robot.toml").write_text(text)
+    told = r"Nothing was changed\. Write into \[vision\.cameras\] yourself: latency_s = 0\.01, latency_sigma_s = 0\.001"
+    with pytest.raises(ConfigError, match=told):
+        with_values(tmp_path / "robot.toml", "vision.cameras", VALUES)
+    assert (tmp_path / "robot.toml").read_text() == text
+
+
+def test_links_permissions_and_earlier_backups_stay(tmp_path: Path) -> None:
+    (tmp_path / "shared").mkdir()
+    target, link = tmp_path / "shared" / "left.toml", tmp_path / "robot.toml"
+    target.write_text(TEXT)
+    target.chmod(0o640)
+    link.symlink_to(target)
+    earlier = tmp_path / "shared" / "left.toml.before"
+    earlier.write_text("mine")
+    backup = write_edited(link, "[robot]\n")
+    assert os.readlink(link) == str(target)
+    assert (target.read_text(), backup.read_text(), earlier.read_text()) == ("[robot]\n", TEXT, "mine")
+    assert {stat.S_IMODE(file.stat().st_mode) for file in (target, backup)} == {0o640}
+    assert backup.name == "left.toml.before2"

@@ -115,6 +115,8 @@ def arm(
     Next: `bodyschema run --robot OUT/robot.toml` starts from what was learnt. With --lerobot the joint offsets go into
     the servos instead, by LeRobot's own calibration file.
     """
+    import sys
+
     from bodyschema.calibration.next_poses import check_target
     from bodyschema.calibration.plausibility.check import plausibility, told_sigma
     from bodyschema.calibration.plausibility.limits import require_units
@@ -141,11 +143,12 @@ def arm(
         _require_writable(report, force=force)
     told = [] if out is None else _written(config, found, report, out, replace=force)
     lines = [] if next_poses is None else _planned(found, next_poses, poses)
-    lines += [] if lerobot is None else _into_servos(config, report, lerobot, write=write)
+    changed = [] if lerobot is None else _into_servos(config, report, lerobot, source, write=write)
     if as_json:
         print_json(report)
+        sys.stderr.writelines(f"{line}\n" for line in changed)
     else:
-        _show(report, lines, told)
+        _show(report, [*lines, *changed], told)
 
 
 def _require_one_target(lerobot: Path | None, out: Path | None, *, write: bool) -> None:
@@ -236,12 +239,12 @@ def _planned(found: Calibration, file: Path, count: int) -> list[str]:
     ]
 
 
-def _into_servos(config: Config, report: CalibrationReport, lerobot: Path, *, write: bool) -> list[str]:
+def _into_servos(config: Config, report: CalibrationReport, lerobot: Path, source: Path, *, write: bool) -> list[str]:
     """Return what the joint offsets change in LeRobot's calibration file."""
     import math
 
     offsets = {zero.joint: math.radians(zero.zero) for zero in report.zeros if zero.half_width is not None}
-    return lerobot_lines(config, lerobot, offsets, write=write)
+    return lerobot_lines(config, lerobot, offsets, source, write=write)
 
 
 def _show(report: CalibrationReport, lines: list[str], written: list[str]) -> None:

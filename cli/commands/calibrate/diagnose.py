@@ -91,9 +91,10 @@ def diagnose(
             for cause in found.file.causes
             if cause.effect == "joint_offset" and cause.where is not None and "offset_rad" in cause.parameters
         }
-        lines = lerobot_lines(config, lerobot, offsets, write=write)
+        lines = lerobot_lines(config, lerobot, offsets, recording, write=write)
     if as_json:
         sys.stdout.write(found.json + "\n")
+        sys.stderr.writelines(f"{line}\n" for line in lines)
         return
     console = Console(highlight=False)
     console.print(view(found.file, found.remedies, timed=found.timed))

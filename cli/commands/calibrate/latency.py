@@ -48,6 +48,7 @@ def latency(
     from bodyschema.calibration.latency import latency_of
     from bodyschema.cli.hardware.wiggling import write_wiggle
     from bodyschema.daemon.config import Config
+    from bodyschema.interfaces.errors import ConfigError
     from bodyschema.robot.toml_edit import difference, with_values, write_edited
 
     config = Config.load(robot)
@@ -70,7 +71,15 @@ def latency(
         )
     if sim or (as_json and not write):
         return
-    edited = with_values(config.robot.file, table, values)
+    if not as_json:
+        console.print("\n".join(f"{key} = {value}" for key, value in values.items()), markup=False)
+    try:
+        edited = with_values(config.robot.file, table, values)
+    except ConfigError as error:
+        if write:
+            raise
+        console.print(str(error), markup=False)
+        return
     changed = difference(config.robot.file, edited)
     backup = write_edited(config.robot.file, edited) if write else None
     if not as_json:
