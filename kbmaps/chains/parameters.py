@@ -122,7 +122,18 @@ class ChainParameters:
         self._points = self._frames[:-1, :3, 3]
         self._tangents = tangents(self._axes)
         self._slides = np.flatnonzero(reference.prismatic)
-        self._kernel = self._kernel_of(np.arange(self.size))
+        self._kernel = self._whole_kernel()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state without the compiled kernel, which can be neither pickled nor copied."""
+        state = self.__dict__.copy()
+        del state["_kernel"]
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore the state, with the kernel that the present process chooses."""
+        self.__dict__.update(state)
+        self._kernel = self._whole_kernel()
 
     @property
     def tables(self) -> tuple[FloatArray, ...]:
@@ -277,6 +288,9 @@ class ChainParameters:
         axes[self._slides] = 0.0
         omega[:, :, self.zeros] = axes.transpose(1, 2, 0)
         return rotations[-1] @ self._frames[-1, :3, :3], omega
+
+    def _whole_kernel(self) -> FilterKernel | None:
+        return self._kernel_of(np.arange(self.size))
 
     def _kernel_of(self, columns: IntArray) -> FilterKernel | None:
         scales = np.zeros(self.size)
