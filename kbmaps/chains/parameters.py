@@ -229,7 +229,7 @@ class ChainParameters:
         """
         if self._kernel is not None:
             x, jacobian = np.empty((len(q), 3)), np.empty((len(q), 3, self.size))
-            self._kernel.linearise(np.ascontiguousarray(change), np.ascontiguousarray(q), x, jacobian)
+            self._kernel.linearise(_plain(change), _plain(q), x, jacobian)
             return x, jacobian
         geometry = self._geometry(change)
         angles = q + geometry.zeros
@@ -260,7 +260,12 @@ class ChainParameters:
         """Return a function of change (size,), q (n, d), x (n, 3) and jacobian (n, 3, p), all contiguous.
 
         It writes the positions to x, and their derivatives by the p parameters `columns` to jacobian.
+
+        Raises:
+            SettingError: the columns do not ascend from 0 or above.
         """
+        if np.ndim(columns) != 1 or (np.diff(columns, prepend=-1) <= 0).any():
+            raise SettingError(f"columns must ascend from 0 or above, each once, got {columns!r}")
         kernel = self._kernel_of(columns)
         if kernel is not None:
             return kernel.linearise
@@ -300,7 +305,7 @@ class ChainParameters:
     def _positions(self, change: FloatArray, q: FloatArray) -> FloatArray:
         if self._kernel is not None:
             x = np.empty((len(q), 3))
-            self._kernel.linearise(np.ascontiguousarray(change), np.ascontiguousarray(q), x, None)
+            self._kernel.linearise(_plain(change), _plain(q), x, None)
             return x
         geometry = self._geometry(change)
         placed = self._placed(geometry, q + geometry.zeros)
@@ -349,6 +354,11 @@ class ChainParameters:
         for k, motion in enumerate(motions):
             np.matmul(placed[k], motion, out=placed[k + 1])
         return placed
+
+
+def _plain(values: FloatArray) -> FloatArray:
+    """Return the values as the compiled kernel takes them."""
+    return np.ascontiguousarray(values, dtype=np.float64)
 
 
 def tangents(axes: FloatArray) -> FloatArray:
