@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import Literal, Protocol
@@ -81,6 +82,10 @@ RETRY_MS = 1000
 _JSON, _EVENTS, _BYTES = "application/json", "text/event-stream", "application/octet-stream"
 # Over a tunnel the page takes a quarter; higher levels take thrice the time for 3 % less.
 _GZIP_LEVEL = 5
+# Requests for shapes that take a thread at once: reading meshes takes minutes, and the others need threads too.
+_MOST_FOR_SHAPES = 2
+# Digits of a mesh's number.
+_MOST_DIGITS = 9
 # The report is one file with its own style, and no script.
 _REPORT_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'; sandbox"
 
@@ -144,6 +149,7 @@ class Shapes(Protocol):
 
 def application(hub: Hub, processes: Processes, diagnoses: Diagnosing, shapes: Shapes) -> Starlette:
     """Return the page's application on the documents of `hub`."""
+    for_shapes = asyncio.Semaphore(_MOST_FOR_SHAPES)
 
     async def index(_: Request) -> Response:
         return FileResponse(STATIC / "index.html")
@@ -171,10 +177,16 @@ def application(hub: Hub, processes: Processes, diagnoses: Diagnosing, shapes: S
             return Response(status_code=204)
 
     async def body(_: Request) -> Response:
-        return Response(encode(await run_in_threadpool(shapes.document)), media_type=_JSON)
+        async with for_shapes:
+            document = await run_in_threadpool(shapes.document)
+        return Response(encode(document), media_type=_JSON)
 
     async def mesh(request: Request) -> Response:
-        found = await run_in_threadpool(shapes.mesh, request.path_params["number"])
+        number = request.path_params["number"]
+        if not (number.isascii() and number.isdigit() and len(number) <= _MOST_DIGITS):
+            return Response(status_code=404)
+        async with for_shapes:
+            found = await run_in_threadpool(shapes.mesh, int(number))
         return Response(found or b"", status_code=404 if found is None else 200, media_type=_BYTES)
 
     async def diagnose(_: Request) -> Response:
@@ -197,7 +209,7 @@ def application(hub: Hub, processes: Processes, diagnoses: Diagnosing, shapes: S
         Route("/api/command", _explained(command), methods=["POST"]),
         Route("/api/picture", picture),
         Route("/api/body", body),
-        Route("/api/body/{number:int}", mesh),
+        Route("/api/body/{number}", mesh),
         Route("/api/diagnosis", _explained(diagnose), methods=["POST"]),
         Route("/api/diagnosis", _explained(stop_diagnosing), methods=["DELETE"]),
         Route("/report", report),

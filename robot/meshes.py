@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,8 @@ def find_mesh(name: str, urdf: Path) -> Path | None:
         candidates = [folder / part for folder in folders for part in (inside, Path(*inside.parts[1:]))]
     else:
         candidates = [urdf.resolve().parent / name.removeprefix("file://")]
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
+    # Path.is_file raises OSError for names that are too long or not readable.
+    return next((candidate for candidate in candidates if os.path.isfile(candidate)), None)
 
 
 class MeshSet:

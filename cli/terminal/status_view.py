@@ -116,8 +116,9 @@ def _absent(process: str, route: Route) -> list[RenderableType]:
 
 def _sampler(status: SamplerStatus) -> list[RenderableType]:
     reasons = ", ".join(f"{count} {reason}" for reason, count in rejected(status)) or "none"
+    segments = f"{status.segment} segment{'' if status.segment == 1 else 's'}"
     facts = _facts()
-    facts.add_row("pairs", f"{status.pairs} in {status.segment} segments, {status.pairs_per_s:.1f}/s")
+    facts.add_row("pairs", f"{status.pairs} in {segments}, {status.pairs_per_s:.1f}/s")
     facts.add_row("frames", f"{status.frames}, {status.frames_per_s:.1f}/s; readings {status.readings_per_s:.0f}/s")
     facts.add_row("rejected", reasons)
     for name, bus in status.buses.items():

@@ -122,7 +122,18 @@ class ChainParameters:
         self._points = self._frames[:-1, :3, 3]
         self._tangents = tangents(self._axes)
         self._slides = np.flatnonzero(reference.prismatic)
-        self._kernel = self._kernel_of(np.arange(self.size))
+        self._kernel = self._whole_kernel()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state without the compiled kernel, which can be neither pickled nor copied."""
+        state = self.__dict__.copy()
+        del state["_kernel"]
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore the state, with the kernel that the present process chooses."""
+        self.__dict__.update(state)
+        self._kernel = self._whole_kernel()
 
     @property
     def tables(self) -> tuple[FloatArray, ...]:
@@ -218,7 +229,7 @@ class ChainParameters:
         """
         if self._kernel is not None:
             x, jacobian = np.empty((len(q), 3)), np.empty((len(q), 3, self.size))
-            self._kernel.linearise(np.ascontiguousarray(change), np.ascontiguousarray(q), x, jacobian)
+            self._kernel.linearise(_plain(change), _plain(q), x, jacobian)
             return x, jacobian
         geometry = self._geometry(change)
         angles = q + geometry.zeros
@@ -249,7 +260,12 @@ class ChainParameters:
         """Return a function of change (size,), q (n, d), x (n, 3) and jacobian (n, 3, p), all contiguous.
 
         It writes the positions to x, and their derivatives by the p parameters `columns` to jacobian.
+
+        Raises:
+            SettingError: the columns do not ascend from 0 or above.
         """
+        if np.ndim(columns) != 1 or (np.diff(columns, prepend=-1) <= 0).any():
+            raise SettingError(f"columns must ascend from 0 or above, each once, got {columns!r}")
         kernel = self._kernel_of(columns)
         if kernel is not None:
             return kernel.linearise
@@ -278,6 +294,9 @@ class ChainParameters:
         omega[:, :, self.zeros] = axes.transpose(1, 2, 0)
         return rotations[-1] @ self._frames[-1, :3, :3], omega
 
+    def _whole_kernel(self) -> FilterKernel | None:
+        return self._kernel_of(np.arange(self.size))
+
     def _kernel_of(self, columns: IntArray) -> FilterKernel | None:
         scales = np.zeros(self.size)
         scales[columns] = 1.0
@@ -286,7 +305,7 @@ class ChainParameters:
     def _positions(self, change: FloatArray, q: FloatArray) -> FloatArray:
         if self._kernel is not None:
             x = np.empty((len(q), 3))
-            self._kernel.linearise(np.ascontiguousarray(change), np.ascontiguousarray(q), x, None)
+            self._kernel.linearise(_plain(change), _plain(q), x, None)
             return x
         geometry = self._geometry(change)
         placed = self._placed(geometry, q + geometry.zeros)
@@ -335,6 +354,11 @@ class ChainParameters:
         for k, motion in enumerate(motions):
             np.matmul(placed[k], motion, out=placed[k + 1])
         return placed
+
+
+def _plain(values: FloatArray) -> FloatArray:
+    """Return the values as the compiled kernel takes them."""
+    return np.ascontiguousarray(values, dtype=np.float64)
 
 
 def tangents(axes: FloatArray) -> FloatArray:

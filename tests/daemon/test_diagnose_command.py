@@ -213,6 +213,7 @@ def test_without_out_nothing_is_written(again, here, file) -> None:
 
 def test_out_gets_the_three_files(told, out) -> None:
     assert {file.name for file in out.iterdir()} == {"diagnosis.json", "report.html", "extended.toml"}
+    assert f"give it to any command as --robot {out / 'extended.toml'}; robot.toml is unchanged." in told.out
 
 
 def test_nothing_is_found_with_the_extended_simulation_as_the_nominal_one(told, out, file) -> None:

@@ -52,6 +52,14 @@ def test_the_tables_of_a_printed_cube_are_those_of_its_size_on_paper(tmp_path, c
     assert (tmp_path / "cube.pdf").read_bytes().startswith(b"%PDF")
 
 
+@pytest.mark.parametrize(
+    ("ids", "said"), [("5", "both rulers are 50 mm."), ("0-5", "the line below is 160 mm, the other 110 mm.")]
+)
+def test_what_to_measure_on_the_print_is_said(ids, said, tmp_path, capsys) -> None:
+    called("marker", "print", "--ids", ids, "--out", tmp_path / "tags.svg")
+    assert said in capsys.readouterr().err
+
+
 def test_single_tags_have_the_table_of_the_first(tmp_path, capsys) -> None:
     called("marker", "print", "--ids", "5,9", "--family", "aruco_6x6_50", "--out", tmp_path / "tags.svg")
     config = printed(capsys)

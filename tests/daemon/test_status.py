@@ -89,6 +89,10 @@ def test_the_screen_shows_both_processes(config, said) -> None:
     assert said in " ".join(shown(Seen(SAMPLER, LEARNER), config).split())
 
 
+def test_one_segment_is_not_said_to_be_several(config) -> None:
+    assert "612 in 1 segment, " in shown(Seen(msgspec.structs.replace(SAMPLER, segment=1), None), config)
+
+
 def test_a_told_tool_change_is_shown_as_told(config) -> None:
     change = msgspec.structs.replace(
         LEARNER.last_change, found=False, kind="tool", earliest_seq=601, latest_seq=601, moved_m=None

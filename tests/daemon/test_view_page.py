@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import re
+import threading
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,6 +22,7 @@ HERE = "http://127.0.0.1:8420"
 PAUSE = {"process": "sampler", "command": "pause"}
 ADDRESSES = ["/", "/api/state", "/api/events", "/api/picture", "/report", "/static/style.css", "/static/js/main.js"]
 ADDRESSES += ["/api/body", "/api/body/0"]
+LIMIT_S = 30.0
 
 
 @dataclass
@@ -111,8 +113,46 @@ def test_the_robot_s_shapes_are_served_by_number(ask) -> None:
     assert ask("GET", "/api/body").json()["said"] == ["Missing meshes: <b>a</b>."]
     answer = ask("GET", "/api/body/0")
     assert (answer.content, answer.headers["content-type"]) == (b"mesh", "application/octet-stream")
-    for other in ("1", "-1", "99999999999999999999", "a.stl", "..%2f..%2fetc%2fpasswd", "%2fetc%2fpasswd", ""):
+    others = ("1", "-1", "99999999999999999999", "9" * 5000, "\u0663", "a.stl", "..%2f..%2fetc%2fpasswd")
+    for other in (*others, "%2fetc%2fpasswd", ""):
         assert ask("GET", f"/api/body/{other}").status_code == 404, other
+
+
+class SlowShapes(Processes):
+    """Stub whose shapes are being read until `read` is set."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.read = threading.Event()
+
+    def document(self) -> BodyDocument:
+        assert self.read.wait(60.0)
+        return super().document()
+
+    def mesh(self, number: int) -> bytes | None:
+        assert self.read.wait(60.0)
+        return super().mesh(number)
+
+
+def test_pages_that_wait_for_the_shapes_hold_up_nothing_else(hub, processes) -> None:
+    shapes = SlowShapes()
+
+    async def asked() -> tuple[list[int], list[int]]:
+        transport = httpx.ASGITransport(app=application(hub, processes, processes, shapes))
+        async with httpx.AsyncClient(transport=transport, base_url=HERE, headers={"Origin": HERE}) as client:
+            waiting = [asyncio.create_task(client.get(f"/api/body{each}")) for each in 30 * ["", "/0"]]
+            try:
+                async with asyncio.timeout(LIMIT_S):
+                    others = [
+                        await client.get("/static/style.css"),
+                        await client.post("/api/command", json=PAUSE),
+                    ]
+            finally:
+                shapes.read.set()
+                late = await asyncio.gather(*waiting)
+        return [each.status_code for each in others], [each.status_code for each in late]
+
+    assert asyncio.run(asked()) == ([200, 200], 60 * [200])
 
 
 def test_the_page_is_packed_on_its_way(ask) -> None:

@@ -112,6 +112,28 @@ def test_missing_meshes_are_named(tmp_path) -> None:
     assert (len(document.rods), body.mesh(0)) == (2, None)
 
 
+@pytest.mark.parametrize("error", [PermissionError(13, "Permission denied"), OSError(36, "File name too long")])
+def test_names_that_the_system_refuses_are_missing_meshes(tmp_path, monkeypatch, error: OSError) -> None:
+    robot(tmp_path, mesh("package://locked/a.stl"), mesh("b.stl"))
+    (tmp_path / "b.stl").write_bytes(stl_bytes(CUBE))
+    look = os.stat
+
+    def refuse(path, *more, **options):
+        if "locked" in str(path):
+            raise error
+        return look(path, *more, **options)
+
+    monkeypatch.setattr(os, "stat", refuse)
+    found = read_shapes(tmp_path / "arm.urdf")
+    assert ([each.mesh for each in found.shapes["upper"]], len(found.said)) == ([0], 1)
+    assert "Missing meshes: package://locked/a.stl." in found.said[0]
+
+
+def test_a_name_longer_than_any_file_s_is_a_missing_mesh(tmp_path) -> None:
+    robot(tmp_path, mesh(f"{'a' * 5000}.stl"))
+    assert "Missing meshes: aaa" in read_shapes(tmp_path / "arm.urdf").said[0]
+
+
 HOSTILE = {
     "words": (b"solid\nvertex 1 2 x\n", "cannot be used"),
     "short": (bytes(80) + b"\xff\xff\xff\xff", "cannot be used"),

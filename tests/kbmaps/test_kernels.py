@@ -115,6 +115,24 @@ def test_the_derivatives_by_some_parameters_are_those_columns():
         np.testing.assert_allclose(jacobian, every[:, :, columns], rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("path", kernels.available())
+@pytest.mark.parametrize("columns", [[7, 1], [1, 1], [-1, 0], [[1, 7]]])
+def test_columns_that_do_not_ascend_are_refused(path, columns):
+    with kernels.using(path), pytest.raises(SettingError, match="columns must ascend"):
+        ChainParameters(random_chain(np.random.default_rng(0), "RPR")).lineariser(np.array(columns))
+
+
+@pytest.mark.parametrize("path", kernels.available())
+@pytest.mark.parametrize("kind", ["f4", "i8", ">f8"])
+def test_any_numbers_are_linearised(path, kind):
+    with kernels.using(path):
+        parameters = ChainParameters(random_chain(np.random.default_rng(0), "RPR"))
+    q, change = np.array([[1, 0, -1], [0, 1, 2]]), np.zeros(parameters.size)
+    expected, got = parameters.linearised(change, q.astype(float)), parameters.linearised(change, q.astype(kind))
+    for one, other in zip(expected, got, strict=True):
+        np.testing.assert_allclose(other, one, rtol=0, atol=1e-6)
+
+
 BAD_VECTORS = [
     [0.1, math.nan],
     [0.1, math.inf],

@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import copy
 import math
+import pickle
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -71,6 +74,19 @@ def test_the_posterior_of_a_nearly_linear_problem_is_the_closed_form():
     assert np.abs(shift).max() < 1e-8
     sigma = np.sqrt(np.einsum("nip,pr,nir->ni", jacobian[:, :, free], covariance, jacobian[:, :, free]))
     np.testing.assert_allclose(learner.estimate(q).sigma, sigma, rtol=1e-3)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda learner: pickle.loads(pickle.dumps(learner))])
+def test_copies_of_a_taught_learner_predict_the_same(copied: Callable[[RigidLearner], RigidLearner]):
+    rng = np.random.default_rng(5)
+    arm = rough_arm(rng, "RPR")
+    learner = RigidLearner(arm.nominal, ROUGH)
+    q, x = arm.pairs(rng, 12, 0.005)
+    learner.learn(q, x, 0.005)
+    expected = learner.estimate(q)
+    got = copied(learner).estimate(q)
+    np.testing.assert_allclose(got.x, expected.x, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(got.sigma, expected.sigma, rtol=1e-9)
 
 
 def test_claimed_intervals_cover_as_they_say():

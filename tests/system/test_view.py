@@ -307,6 +307,16 @@ CONTRASTS = """() => {
 }"""
 
 
+def test_before_its_first_documents_the_page_waits(page) -> None:
+    said = page.evaluate("""async () => {
+      const { notices } = await import("/static/js/notices.js");
+      notices({}, false);
+      return [...document.querySelectorAll("#notices .notice")].map((notice) => [notice.textContent, notice.className]);
+    }""")
+    assert ["Waiting for the page's server…", "notice "] in said
+    assert not any("does not answer" in words for words, _ in said)
+
+
 def test_a_page_s_server_that_ends_is_named_and_comes_back_by_itself(page, server: PageServer, complaints) -> None:
     says(page, "#pill-learner", "learning")
     server.end()

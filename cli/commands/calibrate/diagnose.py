@@ -59,7 +59,7 @@ def diagnose(
 
     Needs: a recording or a store and its robot.toml, no hardware; with --live a running sampler.
 
-    Next: open OUT/report.html; OUT/extended.toml takes the place of robot.toml in any command, and
+    Next: open OUT/report.html; give OUT/extended.toml to any command as --robot, and
     `bodyschema export` turns it into models for MuJoCo, controllers and drivers.
     """
     import sys
@@ -103,8 +103,9 @@ def diagnose(
     if out is not None:
         console.print(
             f"\nOpen {out / 'report.html'}. Beside it are diagnosis.json and extended.toml, the simulation with what "
-            "was found, which takes the place of robot.toml.",
+            f"was found: give it to any command as --robot {out / 'extended.toml'}; robot.toml is unchanged.",
             markup=False,
+            soft_wrap=True,
         )
 
 

@@ -43,7 +43,7 @@ def bench(
 
     Needs: robot.toml with servos (`bodyschema init --from scan`) or encoders, no hardware.
 
-    Next: in another terminal `bodyschema scan`, `doctor` or `joints`, each with --robot PORT.toml.
+    Next: in another terminal `bodyschema scan`, `doctor` or `watch joints`, each with --robot PORT.toml.
     """
     from rich.console import Console
 

@@ -29,6 +29,10 @@ export function notices(state, connected) {
 }
 
 function* problems(state, connected) {
+  if (!connected && Object.keys(state).length === 0) {
+    yield { kind: "", said: "Waiting for the page's server…" };
+    return;
+  }
   if (!connected) {
     yield { kind: "bad", said: "The page's server does not answer. What is shown is old; it goes on by itself when `bodyschema view` runs again." };
     return;
