@@ -12,8 +12,12 @@ int main(int argc, char** argv) {
   std::ifstream file(argc > 1 ? argv[1] : "", std::ios::binary);
   Correction arm(std::string(std::istreambuf_iterator<char>(file), {}));
   for (std::string line; std::getline(std::cin, line);) {
+    std::replace(line.begin(), line.end(), ',', ' ');
     std::istringstream words(line);
-    arm.read(std::vector<double>(std::istream_iterator<double>(words), {}));
+    std::vector<double> readings;
+    for (std::string word; words >> word;) readings.push_back(std::stod(word));
+    if (readings.empty()) continue;
+    arm.read(readings);
     for (double angle : arm.angles) std::printf("%.17g ", angle);
     for (size_t k = 0; k < 12; ++k) std::printf("%.17g%c", arm.pose[k], k == 11 ? '\n' : ' ');
   }
