@@ -3,6 +3,7 @@
 #include "correction.hpp"
 
 #include <cstdio>
+#include <cstdlib>
 #include <fstream>
 #include <iostream>
 #include <iterator>
@@ -15,7 +16,11 @@ int main(int argc, char** argv) {
     std::replace(line.begin(), line.end(), ',', ' ');
     std::istringstream words(line);
     std::vector<double> readings;
-    for (std::string word; words >> word;) readings.push_back(std::stod(word));
+    for (std::string word; words >> word;) {
+      char* end;
+      readings.push_back(std::strtod(word.c_str(), &end));
+      if (*end) throw std::invalid_argument("not a number: " + word);
+    }
     if (readings.empty()) continue;
     arm.read(readings);
     for (double angle : arm.angles) std::printf("%.17g ", angle);
