@@ -3,28 +3,43 @@
 #pragma once
 #include <algorithm>
 #include <array>
+#include <charconv>
 #include <cmath>
 #include <stdexcept>
 #include <string>
+#include <string_view>
+#include <utility>
 #include <vector>
 
 class Correction {
   using Row = std::vector<double>;
   using Vector = std::array<double, 4>;
 
-  std::vector<Row> rows(const std::string& key) const {  // of a table in the file; lists in a row lose their brackets
+  // A table in the file, `width` numbers in a row (lists in it lose their brackets), the first indices below `limits`.
+  std::vector<Row> rows(const std::string& key, size_t width, const Row& limits = {}) const {
     const size_t start = text.find('"' + key + "\":");
-    if (text.find("\"bodyschema correction\"") == text.npos || start == text.npos)
+    if (text.find("\"bodyschema correction\"") == text.npos || start == text.npos ||
+        (key != "version" && rows("version", 1) != std::vector<Row>(1, Row(1, 2.0))))
       throw std::runtime_error("not a correction of version 2: write it again with `bodyschema export`");
     std::vector<Row> found;
-    int depth = 0;
-    for (char *at = const_cast<char*>(text.c_str()) + start + key.size() + 3, *end; *at; at = end + (end == at)) {
-      const double number = std::strtod(at, &end);
-      if (end != at) found.back().push_back(number);
-      else if (*at == '[' && ++depth < 3 && (found.empty() || !found.back().empty())) found.emplace_back();
-      else if (*at == ']' && --depth == 0) return found[0].empty() ? std::vector<Row>() : found;
+    bool good = true;
+    const char *at = text.data() + start + key.size() + 3, *const stop = text.data() + text.size();
+    for (int depth = 0; good && (depth > 0 || found.empty());) {
+      double number = 0;
+      const auto [end, error] = std::from_chars(at, stop, number);  // whatever the locale
+      const char seen = *std::exchange(at, std::max(end, at + 1));
+      if (error == std::errc() && std::isfinite(number)) (depth > 0 ? found : found = {Row()}).back().push_back(number);
+      else if (seen == '[' && ++depth < 3 && (found.empty() || !found.back().empty())) found.emplace_back();
+      else if (seen == ']' && depth > 0) --depth;
+      else good = std::string_view(" \t\r\n,[").find(seen) != std::string_view::npos;
     }
-    throw std::runtime_error("the file ends too soon");
+    if (found == std::vector<Row>(1)) found.clear();
+    for (const Row& row : found) good = good && row.size() == width;
+    for (const Row& row : found)
+      for (size_t k = 0; good && k < limits.size(); ++k)
+        good = row[k] >= 0 && row[k] < limits[k] && row[k] == std::floor(row[k]);
+    if (!good) throw std::runtime_error("a table is not as it should be: " + key);
+    return found;
   }
 
   void give_way(bool loose, size_t inside) {  // let the springs yield to gravity, or all that is loose
@@ -41,7 +56,7 @@ class Correction {
       const auto [x, y, z, mass] = sums[k];
       const double torque = body[2] != 0 ? mass * downs[k][2] : x * downs[k][1] - y * downs[k][0];
       carry(k, size_t(body[1]), body[2] != 0, body + 3, angle);
-      if (loose && (spring[3] == 0 || std::abs(torque) > spring[2])) spring[3] = torque < 0 ? -1 : 1;  // its side
+      if (loose && std::abs(torque) > (spring[3] != 0 ? spring[2] : -1)) spring[3] = torque < 0 ? -1 : 1;  // its side
       angle = loose ? angle + spring[1] * spring[3] : free[size_t(body[0])] + spring[0] * torque;
     }
   }
@@ -53,6 +68,7 @@ class Correction {
   }
 
   static double strain(double kind, double scale, double* state, double reading, double pace) {
+    if (std::isnan(reading)) return reading;
     const double move = state[0] > 0 ? reading - state[1] : 0, way = move < 0 ? -1 : 1, x = way * move / scale;
     const double left = state[0] > 1 ? 1 - way * state[2] : 0;  // the first move shows the side
     if (kind > 1) state[2] = pace < 0 ? 0 : move + std::copysign(std::pow(std::abs(scale), pace), scale) * state[2];
@@ -73,22 +89,31 @@ class Correction {
   }
 
   const std::string text;
-  std::vector<Row> zeros = rows("zeros"), ratios = rows("ratios"), waves = rows("waves"), memories = rows("memories"),
-      passes = rows("passes"), gravity = rows("gravity"), loads = rows("loads"),
-      bodies = rows("bodies"), carried = rows("carried"), chain = rows("chain"), marker = rows("marker");
-  std::vector<Vector> downs{gravity.size() + bodies.size(), Vector{}}, sums{loads.size(), Vector{}}, own;
-  std::vector<double> free;
+  std::vector<Row> chain = rows("chain", 13), marker = rows("marker", 4), gravity = rows("gravity", 3),
+      loads = rows("loads", 4);
+  const size_t joints = chain.size(), links = loads.size();
+  const double J = double(joints), L = double(links);
+  std::vector<Row> zeros = rows("zeros", joints), ratios = rows("ratios", 3, {J, J}), waves = rows("waves", 4, {J}),
+      memories = rows("memories", 7, {J}), carried = rows("carried", 16, {J, L, L}),
+      bodies = rows("bodies", 19, {J, L}), passes = rows("passes", 2, {2, L});
+  std::vector<Vector> downs{links, Vector{}}, sums{links, Vector{}}, own;
+  Row free, q = Row(joints);
 
  public:
   std::vector<double> angles;   // true joint angles at the last readings
   std::array<double, 12> pose;  // of the marker in the measurement frame, three rows of four
 
-  explicit Correction(const std::string& file) : text(file) {}
+  explicit Correction(const std::string& file) : text(file) {
+    bool good = zeros.size() == 1 && gravity.size() == 1 && marker.size() == 4 && bodies.size() < links;
+    for (size_t k = 0; good && k < bodies.size(); ++k) good = bodies[k][1] <= k;
+    if (!good) throw std::runtime_error("the tables do not belong together");
+  }
 
   // Set `angles` and `pose` at the next readings. pace: time since the last ones, as a multiple of the usual one;
-  // negative after an interruption.
-  void read(const std::vector<double>& q, double pace = 1.0) {
-    if (q.size() != chain.size()) throw std::invalid_argument("another number of readings than of joints");
+  // negative after an interruption. A reading that is not finite makes what depends on it NaN, and is not remembered.
+  void read(const std::vector<double>& readings, double pace = 1.0) {
+    if (readings.size() != joints) throw std::invalid_argument("another number of readings than of joints");
+    for (size_t k = 0; k < joints; ++k) q[k] = std::isfinite(readings[k]) ? readings[k] : NAN;
     angles = zeros[0];
     for (const Row& r : ratios) angles[size_t(r[0])] += r[2] * q[size_t(r[1])];
     for (const Row& r : waves) angles[size_t(r[0])] += r[1] * std::sin(r[2] * q[size_t(r[0])] + r[3]);
@@ -100,7 +125,7 @@ class Correction {
     for (const Row& r : passes) sums = own, give_way(r[0] != 0, size_t(r[1]));  // what gives moves its own load
     std::array<Vector, 4> columns;
     for (size_t k = 0; k < 4; ++k) std::copy_n(marker[k].begin(), 4, columns[k].begin());
-    for (size_t k = q.size(); k-- > 0;) through(&chain[k][1], chain[k][0] != 0, angles[k], columns);
+    for (size_t k = joints; k-- > 0;) through(&chain[k][1], chain[k][0] != 0, angles[k], columns);
     for (size_t k = 0; k < 12; ++k) pose[k] = columns[k % 4][k / 4];
   }
 };

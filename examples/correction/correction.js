@@ -10,17 +10,18 @@ class Correction {
 
   // True joint angles, and the marker's pose (3 rows of 4) in the measurement frame, at the next readings.
   // pace: time since the last readings, as a multiple of the usual one; null after an interruption.
-  read(q, pace = 1) {
-    const angles = this.zeros.slice();
+  // A reading that is not finite makes what depends on it NaN, and is not remembered.
+  read(readings, pace = 1) {
+    const angles = this.zeros.slice(), q = readings.map((x) => (Number.isFinite(x) ? x : NaN));
+    if (q.length !== angles.length) throw new Error("another number of readings than of joints");
     for (const [joint, source, factor] of this.ratios) angles[joint] += factor * q[source];
     for (const [joint, size, rate, phase] of this.waves) angles[joint] += size * Math.sin(rate * q[joint] + phase);
     for (const [joint, kind, amount, scale, state] of this.memories)
-      angles[joint] -= amount * strain(kind, scale, state, q[joint], pace);
+      if (!Number.isNaN(q[joint])) angles[joint] -= amount * strain(kind, scale, state, q[joint], pace);
     const free = angles.slice(), loads = this.loads.slice();  // a load is mass times place, and mass
     for (const [joint, body, ...rest] of this.carried) carry(loads, body, ...rest, angles[joint]);
     for (const [loose, inside] of this.passes) this.giveWay(loose, inside, free, loads.slice(), angles);
-    let columns = this.marker;
-    for (let k = angles.length; k-- > 0;) columns = through(this.chain[k][1], this.chain[k][0], angles[k], columns);
+    const columns = this.chain.reduceRight((c, [slides, pose], k) => through(pose, slides, angles[k], c), this.marker);
     return { angles, pose: [0, 1, 2].flatMap((row) => columns.map((column) => column[row])) };
   }
 
@@ -35,7 +36,7 @@ class Correction {
       const [joint, parent, slides, pose, spring] = this.bodies[body - 1], [compliance, half, hold, side] = spring;
       const [a, b, , mass] = loads[body], [x, y, z] = downs[body], torque = slides ? mass * z : a * y - b * x;
       carry(loads, body, parent, slides, pose, angles[joint]);
-      if (loose && (!side || Math.abs(torque) > hold)) spring[3] = torque < 0 ? -1 : 1;  // the side on which it rests
+      if (loose && Math.abs(torque) > (side ? hold : -1)) spring[3] = torque < 0 ? -1 : 1;  // where it rests
       angles[joint] = loose ? angles[joint] + half * spring[3] : free[joint] + compliance * torque;
     }
   }
@@ -67,6 +68,6 @@ function through([a, b, c, p, d, e, f, q, g, h, i, r], slides, angle, vectors) {
 module.exports = { Correction };
 if (require.main === module) {
   const fs = require("fs"), correction = new Correction(fs.readFileSync(process.argv[2], "utf8"));
-  for (const line of fs.readFileSync(0, "utf8").trim().split("\n"))
-    console.log(Object.values(correction.read(line.trim().split(/\s+/).map(Number))).flat().join(" "));
+  for (const line of fs.readFileSync(0, "utf8").split("\n").filter((each) => each.trim()))
+    console.log(Object.values(correction.read(line.match(/[^\s,]+/g).map(Number))).flat().join(" "));
 }

@@ -5,7 +5,7 @@ python correction.py correction.json < readings.txt    # readings in each line; 
 
 import json
 import sys
-from math import copysign, cos, exp, sin
+from math import copysign, cos, exp, isfinite, nan, sin
 
 
 class Correction:
@@ -19,9 +19,12 @@ class Correction:
     def read(self, q, pace=1.0):
         """Return true joint angles, and the marker's pose (3 rows of 4) in the measurement frame, at the next readings.
 
-        pace: time since the last readings, as a multiple of the usual one; None after an interruption.
+        pace: time since the last readings, as a multiple of the usual one; None after an interruption. A reading that
+        is not finite makes what depends on it NaN, and is not remembered.
         """
-        angles = list(self.file["zeros"])
+        angles, q = list(self.file["zeros"]), [reading if isfinite(reading) else nan for reading in q]
+        if len(q) != len(angles):
+            raise ValueError("another number of readings than of joints")
         for joint, source, factor in self.file["ratios"]:
             angles[joint] += factor * q[source]
         for joint, amplitude, frequency, phase in self.file["waves"]:
@@ -44,12 +47,11 @@ class Correction:
             (x, y, z), turn = downs[parent], 0.0 if slides else angles[joint]
             u, v, x, y, z = cos(turn), sin(turn), a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z
             downs.append((u * x + v * y, u * y - v * x, z))
-        for body in range(len(downs) - 1, inside, -1):
-            joint, parent, slides, pose, spring = self.file["bodies"][body - 1]
+        for body, (joint, parent, slides, pose, spring) in reversed(list(enumerate(self.file["bodies"], 1))[inside:]):
             (compliance, half, hold, side), (a, b, _, mass), (x, y, z) = spring, loads[body], downs[body]
             torque = mass * z if slides else a * y - b * x
             carry(loads, body, parent, slides, pose, angles[joint])
-            spring[3] = side if not loose or (side and abs(torque) <= hold) else -1.0 if torque < 0.0 else 1.0
+            spring[3] = (-1.0 if torque < 0.0 else 1.0) if loose and abs(torque) > (hold if side else -1.0) else side
             angles[joint] = angles[joint] + half * spring[3] if loose else free[joint] + compliance * torque
 
 
@@ -67,27 +69,20 @@ def strain(kind, scale, state, reading, pace):
     elif move:  # the first move shows the side
         x, left = abs(move) / scale, 1.0 - copysign(1.0, move) * strain if begun > 1 else 0.0
         strain = copysign(1.0, move) * (1.0 - (left * exp(-x) if kind else max(left - x, 0.0)))
-    state[:] = 2 if move else max(begun, 1), reading, strain
+    state[:] = (2 if move else max(begun, 1), reading, strain) if isfinite(reading) else state
     return strain
 
 
-def through(pose, slides, angle, vectors):
-    """Yield vectors (x, y, z, w) after a joint's motion, in the frame in which its own has this pose."""
-    a, b, c, p, d, e, f, q, g, h, i, r = pose
-    u, v, shift = (1.0, 0.0, angle) if slides else (cos(angle), sin(angle), 0.0)
+def through(pose, slides, by, vectors):
+    """Yield vectors (x, y, z, w) after a joint's motion `by`, in the frame in which its own has this pose."""
+    (a, b, c, p, d, e, f, q, g, h, i, r), (u, v, s) = pose, (1.0, 0.0, by) if slides else (cos(by), sin(by), 0.0)
     for x, y, z, w in vectors:
-        x, y, z = u * x - v * y, v * x + u * y, z + shift * w
+        x, y, z = u * x - v * y, v * x + u * y, z + s * w
         yield a * x + b * y + c * z + p * w, d * x + e * y + f * z + q * w, g * x + h * y + i * z + r * w, w
 
 
 if __name__ == "__main__":
     with open(sys.argv[1], encoding="utf-8") as stream:
         correction = Correction(stream.read())
-    for line in sys.stdin:
-        print(
-            *(
-                number
-                for part in correction.read([float(word) for word in line.replace(",", " ").split()])
-                for number in part
-            )
-        )
+    for line in filter(str.strip, sys.stdin):
+        print(*(x for part in correction.read(map(float, line.replace(",", " ").split())) for x in part))

@@ -4,8 +4,9 @@ python ros2_node.py correction.json [--router tcp/127.0.0.1:7447] [--domain 0] [
 
 It publishes sensor_msgs/JointState on /joint_states_corrected, which `ros2 topic echo` shows, and for programs without
 ROS {"t_ns": …, "q": […], "marker": {…}} as JSON on bodyschema/<robot>/corrected, the marker's pose in SI as matrix and
-quaternion. A message that does not have all joints is passed over. Velocities and efforts stay as they are. What
-depends on moves between rows of a recording (settling) is left out: messages come at another pace.
+quaternion. A message that does not have all joints, or a position that is not finite, is passed over. Velocities and
+efforts stay as they are. What depends on moves between rows of a recording (settling) is left out: messages come at
+another pace.
 """
 
 import argparse
@@ -52,7 +53,10 @@ class CorrectedJoints:
         try:
             message = decode_joint_state(sample.payload.to_bytes())
             places = [message.names.index(name) for name in self.names]
-            angles, pose = self.arm.read([message.positions[place] for place in places])
+            readings = [message.positions[place] for place in places]
+            if not np.isfinite(readings).all():
+                return
+            angles, pose = self.arm.read(readings)
         except (Malformed, ValueError, IndexError):
             return
         positions = list(message.positions)

@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
 import zenoh
@@ -15,7 +16,13 @@ from bodyschema.drivers.ros2 import rmw
 from bodyschema.drivers.ros2.bench.node import Node
 from bodyschema.drivers.ros2.bench.zenoh_robot import ZenohRobot
 from bodyschema.drivers.ros2.link import open_session
-from bodyschema.drivers.ros2.messages import JOINT_STATE, decode_joint_state
+from bodyschema.drivers.ros2.messages import (
+    JOINT_STATE,
+    Header,
+    JointState,
+    decode_joint_state,
+    encode_joint_state,
+)
 from bodyschema.effects import Effect, Simulation
 from bodyschema.effects.exports import write_correction
 from bodyschema.robot.description import RobotDescription
@@ -78,3 +85,17 @@ def test_corrected_joint_states_have_the_raw_ones_stamps(endpoint, correction, m
             marker = json.loads(next(as_json).payload.to_string())["marker"]
             assert [len(row) for row in marker["matrix"]] == [4] * 4
             assert len(marker["quaternion_xyzw"]) == 4
+
+
+@pytest.mark.parametrize("wrong", [float("nan"), float("inf")])
+def test_a_position_that_is_not_finite_is_passed_over(wrong, correction, monkeypatch) -> None:
+    monkeypatch.syspath_prepend(str(READERS))
+    from ros2_node import CorrectedJoints
+
+    node = CorrectedJoints(MagicMock(), correction, 0, "/joint_states")
+    sample = MagicMock()
+    for position, published in ((wrong, 0), (0.1, 1)):
+        message = JointState(Header(1, ""), NAMES, (position, *[0.2] * (len(NAMES) - 1)))
+        sample.payload.to_bytes.return_value = encode_joint_state(message)
+        node.take(sample)
+        assert node.sequence == published

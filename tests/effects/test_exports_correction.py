@@ -47,6 +47,11 @@ def steady(rows: int = 40) -> Motion:
     return Motion(walk(rows=rows).q, 0.1 * np.arange(rows), np.zeros(rows, dtype=np.int64))
 
 
+def read_lines(command: list[str], file: Path, lines: str) -> subprocess.CompletedProcess[str]:
+    """Run a reader that may fail."""
+    return subprocess.run([*command, str(file)], input=lines, capture_output=True, text=True, check=False)
+
+
 def corrected(command: list[str], file: Path, q: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return true joint angles (n, d) and positions (n, 3) computed by a reader."""
     lines = "\n".join(" ".join(map(repr, row)) for row in q.tolist())
@@ -156,14 +161,111 @@ def test_what_is_no_error_of_the_arm_is_listed(name, robot, tmp_path) -> None:
 
 def test_a_file_of_an_older_version_says_what_to_do(commands, robot, tmp_path) -> None:
     write_correction(Simulation(robot), tmp_path / "c.json", "")
-    old = (tmp_path / "c.json").read_text().replace('"version": 2', '"version": 1').replace('"zeros"', '"effects"')
+    old = (tmp_path / "c.json").read_text().replace('"version": 2', '"version": 1')
     (tmp_path / "c.json").write_text(old)
     for command in commands.values():
-        run = subprocess.run(
-            [*command, str(tmp_path / "c.json")], input="", capture_output=True, text=True, check=False
-        )
+        run = read_lines(command, tmp_path / "c.json", "")
         assert run.returncode != 0
         assert "bodyschema export" in run.stderr
+
+
+@pytest.mark.parametrize(
+    ("key", "table"),
+    [
+        ("ratios", [[999, 0, 1.0]]),
+        ("ratios", [[0, 999, 1.0]]),
+        ("ratios", [[-1, 0, 1.0]]),
+        ("ratios", [[0.5, 0, 1.0]]),
+        ("ratios", [[0, 0]]),
+        ("ratios", [[0, 0, float("nan")]]),
+        ("waves", [[0, 1.0]]),
+        ("waves", [[999, 1.0, 1.0, 0.0]]),
+        ("memories", [[0, 0, 1.0, 1.0, [0, 0.0]]]),
+        ("carried", [[0, 999, 0, 0, [0.0] * 12]]),
+        ("bodies", [[0, 999, 0, [0.0] * 12, [0.0] * 4]]),
+        ("passes", [[0, 999]]),
+        ("zeros", [0.0]),
+        ("zeros", []),
+        ("zeros", 0.0),
+        ("gravity", [0.0]),
+        ("loads", []),
+        ("chain", []),
+        ("chain", [[0, [0.0] * 12]]),
+        ("marker", []),
+        ("marker", [[0.0] * 4] * 3),
+        ("marker", None),
+    ],
+)
+def test_a_malformed_table_is_refused_in_cpp(key, table, commands, robot, tmp_path) -> None:
+    if "c++" not in commands:
+        pytest.skip("no compiler of c++; to run it: apt install g++")
+    write_correction(Simulation(robot), tmp_path / "c.json", "")
+    contents = json.loads((tmp_path / "c.json").read_text()) | {key: table}
+    (tmp_path / "c.json").write_text(json.dumps(contents))
+    run = read_lines(commands["c++"], tmp_path / "c.json", "")
+    assert run.returncode != 0
+    assert "a table is not as it should be" in run.stderr or "do not belong together" in run.stderr
+
+
+def test_a_file_that_ends_too_soon_is_refused(commands, robot, tmp_path) -> None:
+    write_correction(Simulation(robot), tmp_path / "c.json", "")
+    (tmp_path / "c.json").write_text((tmp_path / "c.json").read_text()[:-20])
+    for command in commands.values():
+        run = read_lines(command, tmp_path / "c.json", "")
+        assert run.returncode != 0
+        assert run.stderr
+
+
+def test_lines_are_read_alike(commands, robot, tmp_path) -> None:
+    write_correction(Simulation(robot), tmp_path / "c.json", "")
+    d = len(robot.joints)
+    for language, command in commands.items():
+        for count in (d - 1, d + 1):
+            run = read_lines(command, tmp_path / "c.json", " ".join(["0.1"] * count))
+            assert run.returncode != 0, language
+            assert "another number of readings than of joints" in run.stderr, language
+        spaced, commas = " ".join(["0.1"] * d), ", ".join(["0.1"] * d)
+        run = read_lines(command, tmp_path / "c.json", f"\n{spaced}\n  \n\n{commas}\r\n\n")
+        assert run.returncode == 0, language
+        first, second = run.stdout.splitlines()
+        assert first == second, language
+        assert read_lines(command, tmp_path / "c.json", "\n").stdout == "", language
+        if language != "javascript":  # which has NaN for it
+            assert read_lines(command, tmp_path / "c.json", " ".join(["0.1x"] * d)).returncode != 0, language
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
+def test_a_reading_that_is_not_finite_is_not_remembered(wrong, commands, robot, tmp_path) -> None:
+    pairs = [
+        ("backlash", "elbow", [0.02]),
+        ("settling", "wrist", [0.1, 0.5]),
+        ("hysteresis", "rail", [0.001, 0.02]),
+        ("gravity_backlash", "shoulder_lift", [0.02, 0.1]),
+        ("joint_eccentricity", "elbow", [0.01, 0.004]),
+    ]
+    simulation = Simulation(robot, tuple(Effect.at(robot, name, at, values=values) for name, at, values in pairs))
+    file, q = tmp_path / "c.json", steady(12).q
+    write_correction(simulation, file, "")
+    bad = np.insert(q, [0, 6], wrong, axis=0)  # all joints, before the first row and in between
+    for command in commands.values():
+        (angles, x), (found, at) = corrected(command, file, q), corrected(command, file, bad)
+        kept = np.isfinite(bad).all(axis=1)
+        assert np.isnan(found[~kept]).all()
+        assert np.isnan(at[~kept]).all()
+        np.testing.assert_array_equal(found[kept], angles)
+        np.testing.assert_array_equal(at[kept], x)
+
+
+def test_one_reading_that_is_not_finite_spares_other_joints(commands, robot, tmp_path) -> None:
+    names = ("joint_scale", "backlash", "hysteresis")
+    effects = [began(sized(robot, where, 0.3, k)) for k, where in enumerate(everywhere(robot)) if where[0] in names]
+    write_correction(Simulation(robot, tuple(effects)), tmp_path / "c.json", "")
+    q = steady(12).q
+    q[[0, 5], 2] = np.nan
+    found = {language: corrected(command, tmp_path / "c.json", q)[0] for language, command in commands.items()}
+    for angles in found.values():
+        assert (np.isnan(angles) == np.isnan(q)).all()
+        np.testing.assert_allclose(angles, found["python"], rtol=0, atol=1e-13)
 
 
 def test_the_readers_are_short(commands) -> None:
@@ -174,4 +276,4 @@ def test_the_readers_are_short(commands) -> None:
         lengths[name] = sum(bool(line.strip()) and not line.strip().startswith(comment) for line in text.splitlines())
     assert lengths["correction.py"] <= 60
     assert lengths["correction.js"] <= 60
-    assert lengths["correction.hpp"] <= 91  # 15 of them read JSON
+    assert lengths["correction.hpp"] <= 115  # 27 of them read and check JSON
