@@ -39,7 +39,7 @@ def test_a_robot_without_masses_is_not_tested_for_joints_that_give() -> None:
 def test_an_arm_that_a_hand_bears_is_not_tested_for_joints_that_give() -> None:
     found = asked_of(desk_arm())
     assert "joint_compliance" not in names(found)
-    assert [s for s in found.limitations if "torque-free" in s]
+    assert [s for s in found.limitations if "torque_free" in s]
     assert not [s for s in found.limitations if "masses" in s]
 
 
