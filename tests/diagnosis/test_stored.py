@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from planted_cases import ELBOW, SHOULDER, SIGMA_M, desk_arm, measured, motion_of, walk
 
-from bodyschema.diagnosis.assess.stored import stored
+from bodyschema.diagnosis.assess.stored import _Elsewhere, stored
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.background import MOST, Scales
 from bodyschema.diagnosis.fit.fit import Fit
@@ -51,3 +51,14 @@ def test_a_cause_that_explains_nothing_is_not_stored(robot) -> None:
     start = placed(robot, np.zeros(ROWS))
     none = start.with_causes([Effect.at(robot, "joint_scale", SHOULDER, values=[0.0])])
     assert stored([start, none], is_marker(none)) is start
+
+
+@pytest.mark.parametrize(
+    ("gains", "variance"),
+    [([9.0, -7.0, 8.0, -6.0, 7.0, -8.0, 9.0, -7.0, 8.0, -6.0], 0.0), ([0.0] * 10, -1.0), ([1.0] * 10, 11.0)],
+    ids=["by chance", "of no fix that counts", "by less than it varies"],
+)
+def test_a_gain_that_is_not_sure_stores_nothing(robot, gains, variance) -> None:
+    start = placed(robot, np.zeros(ROWS))
+    simpler = _Elsewhere(start, np.full(10, 20.0), 2.0)
+    assert not _Elsewhere(start, simpler.squares - gains, 2.0 + variance).is_better_than(simpler)
