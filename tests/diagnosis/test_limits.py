@@ -28,6 +28,11 @@ def test_a_search_that_ended_at_its_longest_is_told(small) -> None:
     assert "describe the error and do not explain it" in conclusion(ended).limitations[-1]
 
 
+def test_what_extended_toml_leaves_out_is_told(small) -> None:
+    told = conclusion(dataclasses.replace(small, stored=small.aligned)).limitations
+    assert any(line.startswith("extended.toml holds none of it") for line in told)
+
+
 def test_a_search_that_ended_at_its_limit_explains_nothing(small) -> None:
     assert conclusion(small).verdict == "explained"
     ended = conclusion(dataclasses.replace(small, ended_early=True))
