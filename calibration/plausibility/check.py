@@ -57,6 +57,8 @@ FAR_ZERO_RAD = math.radians(20.0)
 NEAR_ZERO_RAD = FAR_ZERO_RAD / 2.0
 # A known camera pose is not off by this much.
 TURNED_RAD = math.radians(30.0)
+# A position belongs to the angles of a row this near at most: logs joined by row number lose one or two at the start.
+NEAR_ROWS = 3
 # Share of its tolerance that is left to a joint offset that is held.
 HELD = 1e-3
 # A zero of the last joint this far off is not fitted where the marker is known: its quarter turns are tried instead.
@@ -161,6 +163,11 @@ def plausibility(
     as_it_is, chosen, others = search.verdict()
     fit, names = search.fits[chosen], robot.joints
     before, after = search.fits[as_it_is].error, fit.error / chosen.scale
+    unnamed = not (_nameable(as_it_is, search.fits[as_it_is], spread) or _nameable(chosen, fit, spread))
+    if unnamed and len(q) >= FEWEST_ROWS:
+        shifted = _shifted(search, q, x, before)
+        if shifted is not None:
+            return shifted
     noise = 0.0 if sigma_m is None else NOISES * sigma_m
     if before <= MUCH_BETTER * fit.error and not _nameable(chosen, fit, spread):
         chosen, fit, after = as_it_is, search.fits[as_it_is], before
@@ -227,6 +234,32 @@ def _drawn_arm_misses(before: str) -> str:
 def _nameable(reading: Reading, fit: _Fit, spread: float) -> bool:
     """Return True if a fit is better than that of any wrong reading with as many changes."""
     return fit.error < NAMED / (1 + reading.changes) * spread
+
+
+def _shifted(search: _Search, q: FloatArray, x: FloatArray, before: float) -> Plausibility | None:
+    """Return a refusal if each position belongs to the angles of a row nearby; else None.
+
+    Args:
+        search: the search over other readings, which found none.
+        q, x: all pairs (n, d) [rad, m] and (n, 3) [m].
+        before: distance of the pairs as they are [m].
+    """
+    shifts = [shift for shift in range(-NEAR_ROWS, NEAR_ROWS + 1) if shift]
+    rows = np.unique(np.linspace(NEAR_ROWS, len(q) - 1 - NEAR_ROWS, ROWS).astype(np.intp))
+    errors = search.errors(np.stack([q[rows + shift] for shift in shifts]), np.stack([x[rows]] * len(shifts)))
+    best = int(errors.argmin())
+    after, shift = float(errors[best]), shifts[best]
+    if after > NAMED / 2 * spread_m(x) or before < MUCH_BETTER * after:
+        return None
+    where, count = "later" if shift > 0 else "earlier", abs(shift)
+    row = f"{count} row{'s' if count > 1 else ''} {where}"
+    return Plausibility(
+        f"it seems that angles and positions are shifted against each other: with the angles of {row}, the pairs fit "
+        f"to {_mm(after)}, and as they are to {_mm(before)}",
+        f"Move the columns of the joints by {row.removesuffix(f' {where}')} {'up' if shift > 0 else 'down'}, or the "
+        "positions the other way; or join the two logs by time, not by row",
+        misread=True,
+    )
 
 
 def _turned(chain: RigidChain, q: FloatArray, x: FloatArray, fit: _Fit) -> Plausibility | None:
@@ -329,6 +362,11 @@ class _Search:
         )
         ratio = max(float(held.errors(MEASURED)[0]), self._exact_m) / fit.error
         return ratio > MUCH_BETTER and 3.0 * MEASURED * self._poses * math.log(ratio) > CERTAIN
+
+    def errors(self, q: FloatArray, x: FloatArray) -> FloatArray:
+        """Return the distances (s,) [m] of sets of pairs q (s, n, d) and x (s, n, 3), with the columns as they are."""
+        placed = place(self._chain, q, x, zeros_std=self._std, tool_std=TOOL_M)
+        return np.maximum(placed.errors(MEASURED), self._exact_m)
 
     def with_marker_known(self, reading: Reading) -> tuple[Reading, _Fit] | None:
         """Return the reading with the last joint off by quarter turns, and its fit, if the known marker shows it.

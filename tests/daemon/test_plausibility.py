@@ -236,6 +236,14 @@ def test_positions_of_another_robot_are_refused_without_a_name() -> None:
     assert not found.misread
 
 
+@pytest.mark.parametrize(("rows", "said"), [(1, "1 row earlier"), (-2, "2 rows later")])
+def test_positions_of_another_row_are_named(rows, said) -> None:
+    right = pairs()
+    found = replace(right, q=np.roll(right.q, -rows, axis=0)).seen()
+    assert f"with the angles of {said}" in (found.refusal or "")
+    assert found.misread
+
+
 def test_the_direction_of_a_joint_through_the_marker_is_not_shown() -> None:
     right = pairs(tool=0.0, zeros_deg=0.0)
     still = right.q * [1, 1, 1, 1, 1, 0]
