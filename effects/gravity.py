@@ -1,4 +1,4 @@
-"""Compute gravity's torque about each joint, from the masses in the URDF."""
+"""Compute gravity's torque about each joint, from the masses in the URDF or, where it states none, from lengths."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from bodyschema.robot.urdf import REVOLUTE, PointMass, UrdfJoint, UrdfTree, stan
 from kbmaps.rotations import cross_matrix
 
 GRAVITY_M_S2 = 9.80665  # down the root link's z axis, as simulators load a URDF
+# Mass per length of the links of a URDF without masses. Any other gives the same sag, with another compliance.
+ROD_KG_PER_M = 1.0
 
 
 @dataclass
@@ -39,12 +41,19 @@ class GravityLoad:
     Joints that are not read stand where robot.toml holds them. The mass of the tool is unknown and not included.
 
     Args:
-        masses: masses of the links; those of the URDF by default.
+        masses: masses of the links. By default those of the URDF; if it states none that a joint bears, each link
+            weighs `ROD_KG_PER_M` along straight lines between its joints.
+
+    Attributes:
+        known: True if the URDF states a mass that a joint bears.
     """
 
     def __init__(self, robot: RobotDescription, masses: Mapping[str, PointMass] | None = None) -> None:
         self._robot = robot
-        self._bodies = _bodies(robot, robot.tree.masses if masses is None else masses)
+        stated = _bodies(robot, robot.tree.masses)
+        self.known = any(body.mass_kg > 0.0 for k, body in stated.items() if k is not None)
+        assumed = {} if self.known or masses is not None else _rods(robot)
+        self._bodies = stated if self.known and masses is None else _bodies(robot, masses or assumed)
         self._outwards = [k for k in self._order() if k is not None]
 
     @classmethod
@@ -69,11 +78,6 @@ class GravityLoad:
     def outwards(self) -> Sequence[int]:
         """Indices in q of the joints, each after the one that carries it."""
         return self._outwards
-
-    @property
-    def known(self) -> bool:
-        """True if the URDF states a mass that a joint bears."""
-        return any(body.mass_kg > 0.0 for k, body in self._bodies.items() if k is not None)
 
     def in_supports(self, k: int) -> list[FloatArray]:
         """Return poses (4, 4) of a joint's frame in the links that carry it as one: parent link first, farthest last.
@@ -144,6 +148,20 @@ def _bodies(robot: RobotDescription, masses: Mapping[str, PointMass]) -> dict[in
         body.mass_kg += mass.mass_kg
         body.moment = body.moment + mass.mass_kg * (T[:3, :3] @ mass.centre + T[:3, 3])
     return bodies
+
+
+def _rods(robot: RobotDescription) -> dict[str, PointMass]:
+    """Return masses of links that are rods of `ROD_KG_PER_M` from their origin to their joints, and to the marker."""
+    ends = [(joint.parent, joint.T_parent_joint[:3, 3]) for joint in robot.tree.joints.values()]
+    ends.append((robot.robot.marker_link, np.array(robot.robot.marker_xyz)))
+    lengths, moments = dict[str, float](), dict[str, FloatArray]()
+    for link, end in ends:
+        length = float(np.linalg.norm(end))
+        lengths[link] = lengths.get(link, 0.0) + length
+        moments[link] = moments.get(link, np.zeros(3)) + 0.5 * length * end
+    return {
+        link: PointMass(ROD_KG_PER_M * length, moments[link] / length) for link, length in lengths.items() if length > 0
+    }
 
 
 def carried(

@@ -63,8 +63,6 @@ def without_consequence(simulation: Simulation, like: Recording | None = None) -
             said.append(f"{name} changes nothing: the recording has no column t")
         if EFFECT_TYPES[name].needs_weight and not simulation.bears_weight:
             said.append(f'{name} changes nothing: with hold = "torque_free" the guiding hand bears the weight')
-        elif EFFECT_TYPES[name].needs_weight and not simulation.gravity.known:
-            said.append(f"{name} changes nothing: the URDF states no masses")
     return said
 
 

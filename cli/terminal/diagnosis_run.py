@@ -181,7 +181,7 @@ class Found:
     def remedies(self) -> list[str]:
         """Remedies for the causes found."""
         run = self.diagnosis.extended.run
-        torques = np.abs(run.torques).max(axis=0) if run.simulation.gravity.known else None
+        torques = np.abs(run.torques).max(axis=0)
         return remedies(self.file, self.robot, ticks(self.source.recording.q), torques)
 
 

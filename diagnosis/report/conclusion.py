@@ -52,10 +52,12 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
     timed = diagnosis.aligned.observations.motion.t is not None
     # A tracker or a scanner has no intrinsics in robot.toml.
     seen_by = "instrument" if diagnosis.aligned.simulation.robot.calibration is None else "camera"
+    weighed = diagnosis.aligned.simulation.gravity.known
+    named_mm, tolerated_mm = _named_mm(diagnosis), _tolerated_mm(diagnosis)
     return DiagnosisFile(
         verdict=verdict,
         sentence=sentence(
-            verdict, causes, rms, gain, tolerances, _named_mm(diagnosis), _tolerated_mm(diagnosis), seen_by, timed=timed
+            verdict, causes, rms, gain, tolerances, named_mm, tolerated_mm, seen_by, timed=timed, weighed=weighed
         ),
         pairs=Pairs(len(diagnosis.markers), len(diagnosis.markers), diagnosis.outliers),
         rms_mm=rms,
@@ -70,6 +72,7 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
         alike=_alike(diagnosis),
         tolerances=tolerances,
         seen_by=seen_by,
+        weighed=weighed,
     )
 
 

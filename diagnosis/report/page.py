@@ -140,7 +140,7 @@ def _causes(residuals: Residuals, file: DiagnosisFile, remedies: Sequence[str]) 
     effects = {id(cause): effect for cause, effect in zip_longest(file.causes, residuals.diagnosis.causes)}
     ordered = in_order(file.causes)
     articles = [
-        _cause(residuals, cause, effects[id(cause)], remedy, file.seen_by, opened=k < _OPEN and not cause.is_small)
+        _cause(residuals, cause, effects[id(cause)], remedy, file, opened=k < _OPEN and not cause.is_small)
         for k, (cause, remedy) in enumerate(zip(ordered, remedies, strict=True))
     ]
     return (
@@ -151,9 +151,10 @@ def _causes(residuals: Residuals, file: DiagnosisFile, remedies: Sequence[str]) 
 
 
 def _cause(
-    residuals: Residuals, cause: Cause, effect: Effect | None, remedy: str, seen_by: str, *, opened: bool
+    residuals: Residuals, cause: Cause, effect: Effect | None, remedy: str, file: DiagnosisFile, *, opened: bool
 ) -> str:
-    said = finding(cause.effect, cause.where, cause.source, told_values(cause), seen_by, timed=residuals.timed)
+    numbers, seen_by, timed = told_values(cause), file.seen_by, residuals.timed
+    said = finding(cause.effect, cause.where, cause.source, numbers, seen_by, timed=timed, weighed=file.weighed)
     plot = outlier_panel(residuals) if effect is None else presenter_of(effect.name).panel(residuals, effect)
     state = " open" if opened else ""
     return (

@@ -79,7 +79,8 @@ def _by_joint(residuals: Residuals) -> Iterator[Panel]:
 
 
 def _by_torque(residuals: Residuals) -> Iterator[Panel]:
-    if not residuals.run.simulation.gravity.known:
+    simulation = residuals.run.simulation
+    if not (simulation.gravity.known or simulation.bears_weight):
         return
     for k, name in enumerate(residuals.robot.joints):
         torque = residuals.run.torques[:, k]

@@ -201,6 +201,7 @@ class DiagnosisFile(msgspec.Struct, frozen=True):
 
     Attributes:
         seen_by: the kind of measuring device: a camera, or an instrument such as a laser tracker.
+        weighed: True if the URDF states masses; otherwise compliances are those of links of 1 kg per metre.
     """
 
     verdict: Verdict
@@ -218,4 +219,5 @@ class DiagnosisFile(msgspec.Struct, frozen=True):
     alike: tuple[Alike, ...] = ()
     tolerances: Tolerances | None = None
     seen_by: Literal["camera", "instrument"] = "camera"
+    weighed: bool = True
     schema: int = 1

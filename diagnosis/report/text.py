@@ -50,24 +50,24 @@ def finding(
     seen_by: str = "camera",
     *,
     timed: bool = True,
+    weighed: bool = True,
 ) -> str:
     """Return one cause as a clause: what is wrong, where, by how much.
 
     Args:
         numbers: only the shifts and turns given count.
         seen_by: the kind of measuring device, as in `DiagnosisFile`.
+        timed, weighed: as in `Found`.
     """
-    return presenter_of(name).finding(Found(where, source, numbers, seen_by, timed))
+    return presenter_of(name).finding(Found(where, source, numbers, seen_by, timed, weighed))
 
 
-def remedies(
-    diagnosis: DiagnosisFile, robot: RobotDescription, steps: FloatArray, torques: FloatArray | None
-) -> list[str]:
+def remedies(diagnosis: DiagnosisFile, robot: RobotDescription, steps: FloatArray, torques: FloatArray) -> list[str]:
     """Return advice on each cause, the one that explains most first.
 
     Args:
         steps: encoder step of each joint (d,) [rad, m]; 0 where it is unknown.
-        torques: the largest torque of gravity on each joint (d,) [N·m, N]; None where masses are unknown.
+        torques: the largest torque of gravity on each joint (d,) [N·m, N].
     """
     workshop = Workshop(robot, steps, torques, {cause.effect: cause for cause in diagnosis.causes})
     causes = in_order(diagnosis.causes)
@@ -97,6 +97,7 @@ def sentence(
     seen_by: str = "camera",
     *,
     timed: bool = True,
+    weighed: bool = True,
 ) -> str:
     """Return the verdict in one or two short sentences.
 
@@ -104,6 +105,7 @@ def sentence(
         named_mm: RMS with the causes alone [mm], where there is also a smooth model of unnamed causes.
         tolerated_mm: RMS with small errors everywhere and no cause [mm], where such errors show.
         seen_by: the kind of measuring device, as in `DiagnosisFile`.
+        timed, weighed: as in `Found`.
     """
     figures = f"{rms.aligned:.3g} → {rms.extended:.3g} mm on held-out data"
     if verdict == "nothing_found" and rms.extended < _BY_TOLERANCES * rms.aligned:
@@ -115,7 +117,7 @@ def sentence(
     if not causes:
         told = "What is measured differs from the simulation in a way that none of the known effects explains"
         return told if named_mm is None else f"{told}; a smooth model of it explains {_share(gain)} ({figures})"
-    head = _head(causes, tolerances, seen_by, timed=timed)
+    head = _head(causes, tolerances, seen_by, timed=timed, weighed=weighed)
     if gain.held_out_percent <= 0.0:
         return f"{head}: this explains the pairs that were fitted and no others ({figures})"
     if named_mm is not None:
@@ -125,12 +127,13 @@ def sentence(
     return f"{head}. RMS error {figures}{_open(verdict, causes)}"
 
 
-def _head(causes: Sequence[Cause], tolerances: Tolerances | None, seen_by: str, *, timed: bool) -> str:
+def _head(causes: Sequence[Cause], tolerances: Tolerances | None, seen_by: str, *, timed: bool, weighed: bool) -> str:
     """Return the largest causes as a sentence without its full stop."""
     ordered = in_order(causes)
     everywhere = ["small errors everywhere"] if tolerances is not None and tolerances.share_percent >= SMALL else []
     first = [cause for cause in ordered if not (everywhere and cause.is_small)][:_TOLD]
-    told = [finding(c.effect, c.where, c.source, told_values(c), seen_by, timed=timed) + _or(c) for c in first]
+    said = [finding(c.effect, c.where, c.source, told_values(c), seen_by, timed=timed, weighed=weighed) for c in first]
+    told = [clause + _or(cause) for clause, cause in zip(said, first, strict=True)]
     if more := len(ordered) - len(first):
         everywhere.append(f"{more} {'smaller' if first else 'small'} cause{'s' * (more > 1)}")
     parts = [*told, *everywhere]

@@ -81,14 +81,15 @@ class _Limits:
             )
         elif not simulation.gravity.known:
             self.sentences.append(
-                "The URDF states no masses: joints that give under the arm's weight cannot be tested."
+                "The URDF states no masses: links of 1 kg per metre were assumed. How far joints give under the arm's "
+                "weight is not affected by that, but their stiffness is."
             )
 
     def excludes(self, kind: EffectType) -> bool:
         """Return True if no effect of this kind can be tested, or if all of it is free anyway."""
         robot = self._simulation.robot
         if kind.needs_weight:
-            return robot.robot.hold == "torque_free" or not self._simulation.gravity.known
+            return robot.robot.hold == "torque_free"
         if kind.rigid and not kind.at_joint:
             return kind.is_free(robot)
         if kind.needs_times and self._motion.t is None:

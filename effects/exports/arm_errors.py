@@ -17,6 +17,7 @@ from bodyschema.robot.calibrated import CalibratedGeometry
 from bodyschema.robot.urdf import PointMass
 
 BORNE_BY_HAND = 'with hold = "torque_free" the guiding hand bore the weight'
+WITHOUT_MASSES = "the URDF states no masses, so nothing pulls at the joint"
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,8 @@ class ArmErrors:
                 continue
             if effect.kind.needs_weight and not simulation.bears_weight:
                 why = BORNE_BY_HAND
+            elif effect.kind.needs_weight and not simulation.gravity.known:
+                why = WITHOUT_MASSES
             elif isinstance(effect.kind, StructureEffect) and (mass := effect.kind.point_mass(effect.values)):
                 payloads.append(mass)
                 why = None

@@ -89,7 +89,7 @@ def test_a_new_effect_is_found_with_its_size(diagnosis) -> None:
 
 def test_a_new_effect_is_told_in_its_words(diagnosis, robot) -> None:
     file = conclusion(diagnosis)
-    told = remedies(file, robot, np.zeros(len(robot.joints)), None)
+    told = remedies(file, robot, np.zeros(len(robot.joints)), np.zeros(len(robot.joints)))
     assert "from a right angle" in file.sentence
     assert told == [f"Calibrate the camera of {robot.name} with a skew"]
     assert "from a right angle" in page(diagnosis, file, told, About("a.csv", "desk", "1.2.3"))

@@ -53,7 +53,7 @@ def file(planted) -> DiagnosisFile:
 
 def advice_on(diagnosis: Diagnosis, file: DiagnosisFile) -> list[str]:
     robot = diagnosis.nominal.simulation.robot
-    return remedies(file, robot, ticks(diagnosis.extended.run.motion.q), None)
+    return remedies(file, robot, ticks(diagnosis.extended.run.motion.q), np.zeros(len(robot.joints)))
 
 
 @pytest.fixture(scope="module")
@@ -188,7 +188,7 @@ def test_every_effect_has_a_plot_and_a_remedy_of_its_own(robot, planted, file, n
         source=at[1],
         parameters=parameters | (extra if "sine_rad" in parameters else {}),
     )
-    told = remedies(msgspec.structs.replace(file, causes=(cause,)), robot, np.zeros(len(joints)), None)
+    told = remedies(msgspec.structs.replace(file, causes=(cause,)), robot, np.zeros(len(joints)), np.zeros(len(joints)))
     assert len(told[0]) > 20
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planted_cases import DESK_ARM, ELBOW, SHOULDER, SIGMA_M, measured, seen, walk
+from planted_cases import DESK_ARM, ELBOW, SHOULDER, SIGMA_M, desk_arm, measured, seen, walk
 from scipy.spatial.transform import Rotation
 
 from bodyschema.diagnosis.diagnosis import diagnose
@@ -97,6 +97,17 @@ def test_a_joint_that_gives_is_named(robot, where) -> None:
     truth = Effect.at(robot, "joint_compliance", where, values=[0.03])
     (cause,) = found(seen(robot, walk(robot, 1), (truth,), 1), robot).causes
     assert (cause.effect, cause.where) == ("joint_compliance", where)
+
+
+def test_a_joint_that_gives_is_named_where_the_urdf_states_no_masses(robot) -> None:
+    truth = Effect.at(robot, "joint_compliance", SHOULDER, values=[0.03])
+    recording = seen(robot, walk(robot, 1), (truth,), 1)
+    held = {"torque_free": "held", "_known = false": "_known = true"}
+    file = found(recording, desk_arm(held))
+    first = max(file.causes, key=lambda cause: cause.weight_percent)
+    assert (first.effect, first.where) == ("joint_compliance", SHOULDER)
+    assert "N·m" not in file.sentence
+    assert not file.weighed
 
 
 def test_what_may_be_a_mount_that_gives_is_told_with_how_to_see_it(robot) -> None:

@@ -17,19 +17,19 @@ class JointCompliance(Presenter):
 
     def finding(self, found: Found) -> str:
         numbers = found.numbers
+        if not found.weighed:
+            return f"{found.at} gives under the arm's weight"
         if "compliance_rad_per_Nm" in numbers:
             return f"{found.at} gives by {numbers['compliance_rad_per_Nm'] * DEG:.2g}°/N·m under the arm's weight"
         return f"{found.at} gives by {1e3 * numbers['compliance_m_per_N']:.2g} mm/N under the arm's weight"
 
     def remedy(self, workshop: Workshop, found: Found) -> str:
-        sag = ""
-        if workshop.torques is not None:
-            compliance = next(v for name, v in found.numbers.items() if name.startswith("compliance"))
-            most = workshop.torques[workshop.joint(found)] * compliance
-            sag = f" (up to {1e3 * most:.2g} mm here)" if workshop.slides(found) else f" (up to {most * DEG:.2g}° here)"
+        compliance = next(v for name, v in found.numbers.items() if name.startswith("compliance"))
+        most = workshop.torques[workshop.joint(found)] * compliance
+        sag = f"{1e3 * most:.2g} mm" if workshop.slides(found) else f"{most * DEG:.2g}°"
         return (
-            f"Check what bears the weight at {found.where}: screws, gear, belt, the gain of its position loop{sag}. A "
-            "spring that stays belongs into the simulation, as in extended.toml."
+            f"Check what bears the weight at {found.where}: screws, gear, belt, the gain of its position loop (up to "
+            f"{sag} here). A spring that stays belongs into the simulation, as in extended.toml."
         )
 
     def panel(self, residuals: Residuals, effect: Effect) -> Panel:

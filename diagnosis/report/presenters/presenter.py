@@ -38,6 +38,7 @@ class Found:
         numbers: of shifts and turns, only those given count.
         seen_by: the kind of measuring device, as in `DiagnosisFile`.
         timed: True if the recording has times; otherwise a moment is a row number.
+        weighed: True if the URDF states masses; otherwise compliances are those of links of an assumed weight.
     """
 
     where: str | None
@@ -45,6 +46,7 @@ class Found:
     numbers: Mapping[str, float]
     seen_by: str = "camera"
     timed: bool = True
+    weighed: bool = True
 
     @classmethod
     def of(cls, cause: Cause) -> Found:
@@ -109,13 +111,13 @@ class Workshop:
     Attributes:
         robot: the robot as described.
         steps: encoder step of each joint (d,) [rad, m]; 0 where it is unknown.
-        torques: the largest torque of gravity on each joint (d,) [N·m, N]; None where masses are unknown.
+        torques: the largest torque of gravity on each joint (d,) [N·m, N].
         causes: all causes, by effect.
     """
 
     robot: RobotDescription
     steps: FloatArray
-    torques: FloatArray | None
+    torques: FloatArray
     causes: Mapping[str, Cause] = field(default_factory=dict)
 
     @property
