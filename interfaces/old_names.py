@@ -19,10 +19,11 @@ PLACES = {
     **{
         f"interfaces.{name}": f"bodyschema.robot.{name}"
         for name in (
-            *("calibrated", "calibrated_files", "interval", "limited", "plugins"),
+            *("calibrated", "calibrated_files", "limited", "plugins"),
             *("pointing", "rpy", "suggest", "toml_file", "toml_text", "urdf"),
         )
     },
+    "interfaces.interval": "bodyschema.vision.calibration.report.page",
     "interfaces.robot": "bodyschema.robot.description",
     "interfaces.recording": "bodyschema.recordings.recording",
     "interfaces.recording_columns": "bodyschema.recordings.columns",

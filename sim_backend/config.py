@@ -8,7 +8,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from bodyschema.robot.toml_types import Fraction, NonNegative, Positive
+from bodyschema.robot.toml_file import Fraction, NonNegative, Positive
 
 Rate = Annotated[int, Meta(ge=1, le=1000)]
 # The ball where neither [sim.camera] nor [vision] describes one.

@@ -13,7 +13,7 @@ from msgspec import Meta
 from bodyschema.drivers.servos.config import ServoConfig
 from bodyschema.drivers.servos.model import Model
 from bodyschema.robot.suggest import did_you_mean
-from bodyschema.robot.toml_types import Positive
+from bodyschema.robot.toml_file import Positive
 
 # By model: torque [N·m] and the corresponding current [A].
 TORQUE_AT_CURRENT: Mapping[str, tuple[float, float]] = MappingProxyType(
