@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import threading
 from contextlib import ExitStack
-from types import TracebackType
 from typing import Self
 
 import numpy as np
@@ -88,11 +87,9 @@ class PosedWorld:
         self.clock.start(SystemClock())
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         with self._fetching:
-            self._exit.__exit__(kind, error, trace)
+            self._exit.close()
 
     def now(self) -> float:
         """Return the time of the posture seen last [s]."""

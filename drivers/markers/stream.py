@@ -7,7 +7,6 @@ import math
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterable, Iterator
-from types import TracebackType
 from typing import Protocol, Self
 
 import numpy as np
@@ -168,9 +167,7 @@ class MarkerStream:
         self._is_open = True
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._is_open = False
         self._receiver.close()
 

@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Self
 
 from bodyschema.drivers.checks import MANY_TROUBLES, READ_S, Check
@@ -178,9 +177,7 @@ class SerialLineJoints:
         log.info("%d encoders are read", len(self.encoders))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._port is not None:
             _close(self._port)
             self._port = None

@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from itertools import zip_longest
-from types import TracebackType
 from typing import Any, Self
 
 from bodyschema.drivers.echo import without_echo
@@ -171,9 +170,7 @@ class ServoJoints:
         self._say_opened()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._is_open = False
         self._opened.close()
 
