@@ -7,9 +7,9 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from typing import Any, Self
 
-from bodyschema.drivers.servos.health import BusHealth, ServoHealth
 from bodyschema.interfaces.protocols import JointSource
 from bodyschema.interfaces.records import JointReading, frozen_array
+from bodyschema.interfaces.servos import BusHealth, ServoHealth
 
 from .dry_run import Angle
 

@@ -18,12 +18,13 @@ from bodyschema.drivers.turns import SpeedGate
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import JointReading, frozen_array
+from bodyschema.interfaces.servos import BusHealth, ServoHealth
 
 from .bus import Bus, Counts, Request
 from .channel import Channel, Punctuality, Sample, middle
 from .config import ServoConfig, ServosConfig
 from .handshake import RETRY_S, Finding, IdentifiedServo, identify, require_all, restore_torque, switch_torque_off
-from .health import BusHealth, Health, ServoHealth
+from .health import Health
 from .port import Port
 from .vendor import ServoVendor
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from bodyschema.drivers.scan import FoundServo, ScannedPort
+from bodyschema.drivers.scan import ScannedPort
 from bodyschema.drivers.servos.handshake import ATTEMPTS
 from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.servos import FoundServo
 
 from .bus import BITS_PER_BYTE, SLOWEST_DELAY_S, Bus, Exchange, Request, Trouble
 from .model import Model, Register, no_driver
