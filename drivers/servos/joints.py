@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 from itertools import zip_longest
 from typing import Any, Self
 
@@ -31,10 +32,22 @@ from .vendor import ServoVendor
 log = logging.getLogger(__name__)
 
 LOST_AFTER_S = 0.25  # without a reading; no joint makes half a turn unnoticed in this time
-FEW_POLLS = 3  # this many must fail as well: the program itself may have been delayed
-DOUBTS = 5  # consecutive implausible answers after which the servo was restarted
-ANCHOR_POLLS = 50
-SLACK_TICKS = 3
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the reading of servos."""
+
+    # this many must fail as well: the program itself may have been delayed
+    few_polls: int = 3
+    # consecutive implausible answers after which the servo was restarted
+    doubts: int = 5
+    anchor_polls: int = 50
+    slack_ticks: int = 3
+
+
+_SETTINGS = _Settings()
+
 IMPROVE_EVERY_S = 10.0  # a failed attempt costs a reading or two
 GOLDEN = 0.618034  # its multiples, modulo 1, are spread most evenly
 
@@ -238,7 +251,9 @@ class ServoJoints:
         self._channels = [self._make.channel(servo) for servo in self.servos]
         self._at = {(servo.bus, servo.id): place for place, servo in enumerate(self.servos)}
         speed = math.radians(self._config.max_speed_deg_s)
-        self._gate = SpeedGate([speed / s.model.rad_per_tick for s in self.servos], [SLACK_TICKS] * len(self.servos))
+        self._gate = SpeedGate(
+            [speed / s.model.rad_per_tick for s in self.servos], [_SETTINGS.slack_ticks] * len(self.servos)
+        )
         self._punctuality = Punctuality()
         now = self._clock.now()
         self._believed_s, self._failures, self._next_poll, self._polls = now, 0, now, 0
@@ -249,7 +264,7 @@ class ServoJoints:
     def _anchor(self) -> None:
         """Find the turn of each joint from two consistent readings."""
         believed = 0
-        for _ in range(ANCHOR_POLLS):
+        for _ in range(_SETTINGS.anchor_polls):
             samples = self._ask_all()
             if samples is None:
                 continue
@@ -390,11 +405,11 @@ class ServoJoints:
     def _dropped_one(self) -> None:
         self.dropped += 1
         self._failures += 1
-        if self._failures >= FEW_POLLS and self._clock.now() - self._believed_s > LOST_AFTER_S:
+        if self._failures >= _SETTINGS.few_polls and self._clock.now() - self._believed_s > LOST_AFTER_S:
             raise SourceLost(self._inspection.first_silent() or self._why, retry_s=RETRY_S)
 
     def _refuse_restarted(self, channel: Channel) -> None:
-        if channel.doubts >= DOUBTS:
+        if channel.doubts >= _SETTINGS.doubts:
             servo = channel.servo
             raise SourceLost(f"joint {servo.joint!r} (ID {servo.id}) was restarted", retry_s=RETRY_S)
 
