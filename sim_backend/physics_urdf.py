@@ -19,6 +19,7 @@ from bodyschema.robot.limited import read_at_most
 from bodyschema.robot.meshes import LARGEST_M, MeshSet, stl_bytes
 from bodyschema.robot.rpy import rpy_of
 from bodyschema.robot.shapes import floats, rgba_of
+from bodyschema.robot.suggest import first_few
 from bodyschema.robot.urdf import MOVING, UrdfJoint, UrdfTree
 from bodyschema.sim_backend.truth import root_link
 
@@ -36,7 +37,6 @@ HEAVIEST_KG = 1e4
 _ROD_SHARE, _ROD_RADII_M, _SHORTEST_ROD_M = 0.1, (0.005, 0.04), 0.01
 _ROD_RGBA = "0.55 0.57 0.6 1"
 _SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length"), "capsule": ("radius", "length")}
-_NAMED = 3
 # TinyRenderer takes 0.3 µs for a triangle, and a stereo frame is four pictures: 8,000 cost some 10 ms of CPU a frame.
 MOST_TRIANGLES = 8_000
 # A hull tells what is in the way. It is that of the outermost points in these directions (Fibonacci's sphere).
@@ -221,19 +221,20 @@ class _Writer:
                     link.remove(shape)
 
     def _said(self) -> Iterator[str]:
-        drawn = f", and draws rods for {_some(sorted(self._rods))}" if self._rods else ""
+        drawn = f", and draws rods for {first_few(sorted(self._rods))}" if self._rods else ""
         meshes = self._meshes
         if meshes.missing:
             yield (
-                f"missing meshes: {_some(meshes.missing)}. The simulation continues without{drawn}. It only looks "
+                f"missing meshes: {first_few(meshes.missing)}. The simulation continues without{drawn}. It only looks "
                 f"different. To see the robot's shape, put its meshes beside {self._file}"
             )
             drawn = ""
         if meshes.unusable:
             faults = [f"{name}: {why}" for name, why in meshes.unusable.items()]
-            yield f"meshes that cannot be used: {_some(faults, '; ')}. The simulation continues without{drawn}"
+            yield f"meshes that cannot be used: {first_few(faults, '; ')}. The simulation continues without{drawn}"
         if self._left_out:
-            yield f"the simulation leaves out what it cannot take of {self._file}: {_some(list(self._left_out), '; ')}"
+            left_out = first_few(list(self._left_out), "; ")
+            yield f"the simulation leaves out what it cannot take of {self._file}: {left_out}"
 
 
 class Meshes(MeshSet):
@@ -293,11 +294,6 @@ def _moved(tree: UrdfTree) -> set[str]:
         while (link := above.get(link, link)) in above and link not in moved:
             moved.add(link)
     return moved
-
-
-def _some(names: Sequence[str], between: str = ", ") -> str:
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return between.join(names[:_NAMED]) + more
 
 
 def _shape_at(kind: str, xyz: Sequence[float], rpy: Sequence[float]) -> ElementTree.Element:

@@ -12,12 +12,9 @@ from numpy.typing import ArrayLike
 from kbmaps.arrays import BoolArray, FloatArray, frozen, numbers, rows
 from kbmaps.chains.chain import RigidChain
 from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
-from kbmaps.robust import MEDIAN_NORM, ROUNDING_M
+from kbmaps.robust import MEDIAN_NORM, ROUNDING_M, UNCALIBRATED_SIGMAS
 from kbmaps.rotations import cross_matrix, exponentials, nearest_rotation
 
-# Pairs beyond this many σ are outliers. The limit is wide because the errors of an uncalibrated arm have long tails,
-# which must not be rejected.
-_OUTLIER_SIGMAS = 15.0
 _ROUNDS = 60
 _START_PAIRS = 300
 _STEP_TOLERANCE = 1e-12
@@ -247,7 +244,7 @@ def _fit_robustly(fit: _Fit, sigma: float, tolerance: float = _STEP_TOLERANCE) -
             break
     inliers = np.ones(len(fit.x), dtype=np.bool_)
     for _ in range(_ROUNDS):
-        chosen = norms <= max(_OUTLIER_SIGMAS * fit.spread(sigma), ROUNDING_M)
+        chosen = norms <= max(UNCALIBRATED_SIGMAS * fit.spread(sigma), ROUNDING_M)
         step = fit.improve(chosen.astype(np.float64))
         norms = fit.norms()
         settled = bool((chosen == inliers).all()) and step < tolerance

@@ -32,8 +32,6 @@ from kbmaps.pairs import checked_pairs, stored_pairs, with_units
 LEAST_WINDOW = 16
 # With few pairs and no prior, an earlier fit may be far off: start from the nominal chain.
 _FRESH = 200
-# Upper bound of the number of coordinates that older pairs contribute to the noise estimate.
-_NOISE_MEMORY = 900.0
 
 
 class RigidWindow:
@@ -118,7 +116,7 @@ class RigidWindow:
         self.belief = folded(self.belief, pairs.chosen(good), fit.belief.mean, fit.noise)
         if not pairs.known:
             told = self.noise.coordinates + fit.freedom * count / self._count
-            self.noise = NoiseKnowledge(min(told, _NOISE_MEMORY), fit.noise**2)
+            self.noise = NoiseKnowledge(min(told, NOISE_MEMORY), fit.noise**2)
         self._begun = True
         self._count -= count
         self._rows[: self._count] = self._rows[count : count + self._count].copy()

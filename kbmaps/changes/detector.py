@@ -16,6 +16,7 @@ from kbmaps.changes.bends import NOTHING_SEEN
 from kbmaps.changes.kinds import JOINT, SIZES, ChangeKind, change_kinds, log_ratios
 from kbmaps.changes.shared_noise import SharedNoise
 from kbmaps.changes.white_noise import inverse_roots
+from kbmaps.robust import CLIPPED_SIGMAS
 
 # Each of the newest pairs may be the first of a change; older onsets are thinned to this share of their age.
 SPACING = 0.15
@@ -86,8 +87,6 @@ PAIRS_BETWEEN_FALSE_ALARMS = 75_000.0
 # The statistic often exceeds its limit by far, most of all for the large changes that it allows for. So the limit may
 # be lower than that number of pairs, by this factor (`python -m benchmarks.false_alarms`).
 _OVERSHOOT = 0.33
-# No pair counts for more than one this many sigmas away: it may be an outlier.
-CLIPPED_SIGMAS = 4.0
 # Number of the newest pairs that decide if the noise has grown.
 _RECENT = 50
 _CLEARLY = 3.0

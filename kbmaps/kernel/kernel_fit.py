@@ -17,13 +17,15 @@ import numpy as np
 from kbmaps.arrays import FloatArray
 from kbmaps.errors import SettingError
 from kbmaps.kernel.product_kernel import ProductKernel
-from kbmaps.maps.evidence import VARIANCE_FLOOR, LinearEvidence, most_evident
+from kbmaps.maps.evidence import LinearEvidence, most_evident
+from kbmaps.maps.exact import SEARCH_LIMITS
 from kbmaps.maps.factor import ShiftedGram
+from kbmaps.robust import VARIANCE_FLOOR
 
 Precision = float | Literal["evidence"] | None
 
-# Limits and start of the search for λ, relative to the mean diagonal of the Gram matrix.
-_SEARCH_LIMITS, _SEARCH_START = (1e-12, 1e6), 1e-4
+# Start of the search for λ, relative to the mean diagonal of the Gram matrix.
+_SEARCH_START = 1e-4
 # Relative to the trace of the Gram matrix: just enough for a stable Cholesky factorisation.
 _VANISHING_RIDGE = 1e-15
 # The refinement of the exact solution ends when a step no longer reduces the residual to this share.
@@ -85,7 +87,7 @@ class KernelFit:
             return
         if isinstance(precision, str):
             mean = self._gram.trace / len(observations.scale)
-            low, high = (limit * mean for limit in _SEARCH_LIMITS)
+            low, high = (limit * mean for limit in SEARCH_LIMITS)
             # With few pairs, the evidence may be flat towards τ = 0, a prior mean that is right everywhere. A density
             # of τ that is flat there (Gelman 2006) keeps τ, and so the predicted uncertainty, at the value that the
             # pairs support.

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from kbmaps.arrays import FloatArray
+from kbmaps.robust import VARIANCE_FLOOR
 
-# Variances below (1 pm)² are rounding.
-VARIANCE_FLOOR = 1e-24
 _ROUNDS, _POINTS = 5, 41
 # Range of the search for the best variance around the mean square: below it down to float64's resolution, and above.
 _LEAST_SHARE, _GREATEST_SHARE = 1e-20, 1e2

@@ -20,6 +20,7 @@ from kbmaps.maps.factor import ShiftedGram
 from kbmaps.maps.kbmap import POSE_OUTPUTS, POSITION_OUTPUTS, KBMap
 from kbmaps.maps.targets import pose_targets
 from kbmaps.memory import Memory
+from kbmaps.robust import VARIANCE_FLOOR
 
 # Below this reciprocal condition number a triangular solve would return rounding errors.
 _SMALLEST_RCOND = 1e-13
@@ -103,10 +104,8 @@ def _nearest(rows: FloatArray, errors: FloatArray) -> FloatArray:
 
 
 # Limits of the evidence's search for lambda, relative to the mean diagonal of the Gram matrix.
-_SEARCH_LIMITS = (1e-12, 1e6)
+SEARCH_LIMITS = (1e-12, 1e6)
 _FIRST_PRECISION = 1e-2
-# Variances below (1 pm)² are rounding.
-_VARIANCE_FLOOR = 1e-24
 
 
 @dataclass(frozen=True)
@@ -320,7 +319,7 @@ class ExactLearner:
         else:
             squares = precision * np.einsum("ko,ko->o", errors, solution)
         spread = gram.log_determinant - gram.size * math.log(precision)
-        variances = [max(float(squares[part].mean()) / self._count, _VARIANCE_FLOOR) for part in self._parts]
+        variances = [max(float(squares[part].mean()) / self._count, VARIANCE_FLOOR) for part in self._parts]
         log_evidence = 0.0
         for part, variance in zip(self._parts, variances, strict=True):
             outputs = part.stop - part.start
@@ -346,7 +345,7 @@ class ExactLearner:
     def _most_evident(self, gram: ShiftedGram, errors: FloatArray, rhs: FloatArray) -> _Fit:
         """Return the fit at λ of the greatest evidence, searched from the last λ on."""
         mean = gram.trace / gram.size
-        low, high = (limit * mean for limit in _SEARCH_LIMITS)
+        low, high = (limit * mean for limit in SEARCH_LIMITS)
         fits: dict[float, _Fit] = {}
 
         def log_evidence(precision: float) -> float:

@@ -12,6 +12,7 @@ import numpy as np
 
 from kbmaps.arrays import FloatArray, IntArray
 from kbmaps.lapack import lower_inverse
+from kbmaps.robust import VARIANCE_FLOOR
 
 # Candidate variances of a group, relative to the variance at which its best determined direction is barely visible.
 _TRIED = 10.0 ** np.arange(0.0, 7.0, 0.5)
@@ -25,8 +26,6 @@ _LEAST_GAIN = 0.5
 _SWAP_WINDOW = 8.0
 _ROUNDS = 40
 _SETTLED = 0.02
-# Lower bound of a variance: weights are of the order of radians or metres.
-_LEAST_VARIANCE = 1e-24
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,7 +246,7 @@ class GroupedModel:
                 width = self._columns[name].stop - self._columns[name].start
                 weights = posterior.mean[start : start + width]
                 start += width
-                new = max(float(weights @ weights) / max(posterior.used[name], 1e-9), _LEAST_VARIANCE)
+                new = max(float(weights @ weights) / max(posterior.used[name], 1e-9), VARIANCE_FLOOR)
                 change = max(change, 0.5 * abs(math.log(new / old)))
                 self.variances[name] = new
             if change < _SETTLED:

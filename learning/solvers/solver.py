@@ -12,7 +12,7 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.model_bank import EXACT, RESIDUAL, RIGID, LearntModel
-from bodyschema.learning.solvers.orientation import OrientationSolution, OrientationSolver
+from bodyschema.learning.solvers.orientation import KEPT, WINDOW, OrientationSolution, OrientationSolver
 from bodyschema.learning.solvers.tolerance_selection import Tolerances, best_tolerances, workmanship
 from kbmaps import (
     ChainBelief,
@@ -34,14 +34,10 @@ log = logging.getLogger(__name__)
 
 # Memory and time grow with the square and the cube of the control points: 3^7 take 77 MB and 0.2 s.
 LARGEST_NET = 2187
-# Number of the newest pairs that the exact map is fitted to, which bounds time and memory; the chain keeps the
-# information of older ones. Measured where a chain misses 10 mm (docs/results/learning.md).
-WINDOW = 20_000
 # Growth of the number of pairs before the next search for the prior's precision.
 RETUNE = 1.25
-# Number of the newest pairs kept as pairs; the information of older ones about the chain is folded into its prior, this
-# many at a time.
-KEPT, FOLDED = 4000, 2000
+# The information about the chain of pairs older than those kept is folded into its prior, this many at a time.
+FOLDED = 2000
 # Number of pairs that a chain is fitted to, evenly spread.
 FITTED = 2000
 # The chain with residual takes longest, up to a second: it waits for this growth of the number of pairs.
