@@ -61,7 +61,7 @@ class Guard:
 
 
 def refusal(method: str, headers: Headers) -> str | None:
-    """Return the problem of a request, in words; None if it is valid."""
+    """Return the reason to refuse a request; None if it is valid."""
     hosts = headers.getlist("host")
     if (said := host_refusal(hosts)) is not None:
         return said

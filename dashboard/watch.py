@@ -57,7 +57,7 @@ class Heard(Generic[S]):
             return self._is_there()
 
     def take(self, payload: bytes, utc: float) -> None:
-        """Take a published status, received at this time [s since 1970]."""
+        """Store a published status, received at this time [s since 1970]."""
         try:
             status, fields, problem = decode(payload, self._kind), decode(payload, dict[str, Any]), None
         except RequestError as error:

@@ -1,4 +1,4 @@
-"""Ask the robots of one type, and compare their models: distance from the median model, and outlying figures."""
+"""Query the robots of one type, and compare their models: distance from the median model, and outlying figures."""
 
 from __future__ import annotations
 
@@ -309,7 +309,7 @@ def view(comparisons: Sequence[TypeComparison], left_out: Sequence[str]) -> Rend
 
 
 def sentences(comparison: TypeComparison) -> list[str]:
-    """Return the compared robots and the outliers, in words."""
+    """Return sentences on the compared robots and the outliers."""
     units = comparison.units
     said = [
         f"{len(units)} robots with the joints {', '.join(comparison.joints)}, at {comparison.poses} common poses, each "

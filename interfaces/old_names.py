@@ -70,7 +70,7 @@ class _Alias(Loader):
 
 
 def allow() -> None:
-    """Let plug-ins loaded from now on import by the old names, each with a FutureWarning."""
+    """Allow plug-ins loaded from now on to import by the old names, each with a FutureWarning."""
     if not any(isinstance(finder, OldNames) for finder in sys.meta_path):
         sys.meta_path.insert(0, OldNames())
 

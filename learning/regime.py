@@ -136,7 +136,7 @@ class Regime:
         return not doubted
 
     def meet(self, pair: Pair) -> None:
-        """Let the instant learner learn one pair, and no other model yet: `judge` will.
+        """Teach one pair to the instant learner alone; `judge` teaches the other models.
 
         Whether it is an outlier is not known yet. If it seems one by the pairs before, its step is no longer than any
         other.
@@ -276,7 +276,7 @@ class Regime:
         self.monitor.asked()
 
     def take(self, solved: Solved, model: LearntModel, fed: int) -> None:
-        """Take a solution of this regime's task, for one of the models; the solver has `fed` pairs."""
+        """Store a solution of this regime's task, for one of the models; the solver has `fed` pairs."""
         self.models.take(solved.name, model)
         q, x = self.memory.some(fed, LOOKED_BACK)
         neighbours = follow_a_path(self.models.prior, q)
@@ -299,7 +299,7 @@ class Regime:
         self.monitor.offer(Reference(self.model, self.map, belief, wide, residual, claim, known, q, x, variance))
 
     def take_orientation(self, solution: OrientationSolution) -> None:
-        """Take a solution of this regime's task for the orientations."""
+        """Store a solution of this regime's task for the orientations."""
         self.orientations.take(solution)
 
     @property
@@ -308,7 +308,7 @@ class Regime:
         return self.orientations.model(self._claims.support)
 
     def solve_from_what_is_known(self) -> None:
-        """Let the last solutions stand for the pairs before them, if pairs are no longer kept."""
+        """Use the last solutions in place of the pairs before them, if pairs are no longer kept."""
         if EXACT in self.models.names and not self.memory.complete:
             self._solver_prior = self.models.map(EXACT)
             self.arm = self.arm.updated(self._claims.wide, self._claims.residual)

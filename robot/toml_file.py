@@ -76,7 +76,7 @@ def read_toml(
 
 
 def line_of_endless_key(text: str) -> int | None:
-    """Return the first line (from 1) with a key of so many parts that parsing it would take hours; else None."""
+    """Return the first line (from 1) with a key of more than `MOST_PARTS` parts, which parse slowly; else None."""
     for number, line in enumerate(without_quoted(text).split("\n"), 1):
         if line.count(".") > MOST_PARTS and any(piece.count(".") > MOST_PARTS for piece in _BETWEEN.split(line)):
             return number

@@ -83,7 +83,7 @@ class CameraConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
     @property
     def rgb(self) -> tuple[float, float, float]:
-        """The ball's colour, a red one where nothing is said of it."""
+        """The ball's colour; red by default."""
         return self.ball_rgb or BALL_RGB
 
     @property

@@ -259,7 +259,7 @@ class Meshes(MeshSet):
         return f"{'drawn' if drawn else 'hull'}_{number}.stl"
 
     def files(self) -> tuple[dict[str, bytes], str]:
-        """Return the files by name, and in words how much coarser they are than the meshes, if they are."""
+        """Return the files by name, and a sentence on how much coarser than the meshes they are, if they are."""
         drawn, before = self.coarser(self._drawn)
         files = {}
         for number, triangles in enumerate(self.shapes):

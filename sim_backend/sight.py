@@ -59,7 +59,7 @@ class Gaze:
         self._chain = robot.chain
 
     def hold_tool(self, marker_xyz: FloatArray) -> None:
-        """Look at a marker at `marker_xyz` (3,) [m] in the marker link from now on."""
+        """Set the marker to `marker_xyz` (3,) [m] in the marker link."""
         self._chain = nominal_chain(self._robot, marker_xyz)
 
     def solve(self, q: FloatArray) -> FloatArray:

@@ -86,7 +86,7 @@ def _bus(bus: BusHealth) -> BusStatus:
 
 
 def accept_turns(encoders: object) -> str:
-    """Let encoders that lost their turn count assume the turns nearest to the last positions; return a message.
+    """Set lost turn counts to the turns nearest to the last positions; return a message.
 
     Raises:
         RequestError: no turn count was lost.

@@ -93,7 +93,7 @@ class Member:
         self.newest_t = self.fixed_at = -math.inf
 
     def take(self, seen: MarkerFix | MarkerMiss, now: float) -> None:
-        """Take a position or a miss that came at `now` [s]."""
+        """Store a position or a miss that arrived at `now` [s]."""
         self.newest_t = seen.t
         if isinstance(seen, MarkerFix):
             fix = _moved(seen, self.pose)

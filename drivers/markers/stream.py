@@ -217,7 +217,7 @@ class MarkerStream:
         self._turns = False
 
     def _note_silence(self) -> None:
-        """Ask once why nothing comes: the answer may take a second."""
+        """Find out once why nothing arrives; this may take a second."""
         if self._silence is None and self._clock.now() - self._heard > SILENT_AFTER_S:
             self._silence = self._receiver.silence()
 

@@ -414,7 +414,7 @@ class ServoJoints:
             raise SourceLost(f"joint {servo.joint!r} (ID {servo.id}) was restarted", retry_s=RETRY_S)
 
     def _wait_until(self, t: float) -> bool:
-        """Wait. Return False when a servo sent bytes without being asked."""
+        """Wait until a time. Return False when a servo sent bytes that were not requested."""
         if t <= self._clock.now():
             return True
         bus, *_ = self._buses.values()

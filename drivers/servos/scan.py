@@ -177,7 +177,7 @@ class PingScanner:
         return Register(0, max(layout[name].end for layout in layouts for name in ("model", "firmware", "id")))
 
     def _identity(self, head: bytes, id: int) -> Identity | None:
-        """Return the identity from the first kind that knows the model, else from the first possible kind."""
+        """Return the identity from the first kind with this model, else from the first possible kind."""
         told = [identity for kind in self._kinds if (identity := kind.told(head, id)) is not None]
         known = [identity for identity in told if identity.model is not None]
         return next(iter([*known, *told]), None)

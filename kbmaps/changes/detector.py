@@ -207,7 +207,7 @@ class ChangeDetector:
         return np.array(self._surprises).reshape(-1, 3)
 
     def add(self, q: FloatArray, errors: FloatArray, covariances: FloatArray) -> None:
-        """Add pairs that came after those that the model knows, in their order.
+        """Add pairs that came after those that the model was fitted to, in their order.
 
         Args:
             q: configurations (n, d) [rad, m].

@@ -37,7 +37,7 @@ SMALLEST_M = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Model that knows none of the monitored pairs, with its posterior.
+    """Model fitted to none of the monitored pairs, with its posterior.
 
     Attributes:
         model: the answering model.
@@ -86,7 +86,7 @@ class Reference:
         return white + np.eye(3) * np.maximum(missed, SMALLEST_M**2)[:, None, :]
 
     def noise(self, covariances: FloatArray, white: FloatArray) -> SharedNoise:
-        """Return the noise of the reference's whitened errors at pairs that it knows.
+        """Return the noise of the reference's whitened errors at pairs that it was fitted to.
 
         Args:
             covariances: of these errors (n, 3, 3) [m²].

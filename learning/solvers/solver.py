@@ -345,7 +345,7 @@ class SolverClient:
         self._busy = self._soon = False
 
     def solve_soon(self) -> None:
-        """Ask even though fewer pairs than usual are new."""
+        """Request a solution although fewer pairs than usual are new."""
         self._soon = self._soon or self._fed > self._solved_at or self._task is None
 
     def begin(self, task: Task) -> bool:

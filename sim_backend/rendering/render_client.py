@@ -79,7 +79,7 @@ class RenderProcess:
         self._exit.close()
 
     def request(self, number: int, scene: Scene) -> None:
-        """Ask for frame `number`, with a stick from the hand to where the tool ends."""
+        """Request frame `number`, with a stick from the hand to where the tool ends."""
         tip = (float(scene.tip[0]), float(scene.tip[1]), float(scene.tip[2]))
         if tip != self._tip:
             self._send(Tool(tip=tip))
