@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,14 +27,24 @@ from kbmaps import ChainBelief, KBMap, Recent, follow_a_path
 
 # Number of learnt pairs on which a model's fit is assessed.
 LOOKED_BACK = 500
-# Number of pairs that determine the errors of a refitted prior, and that are replayed on top of it.
-RECENT = 200
-REPLAY_STEPS = 64
-# Maximum number of pairs received during a solve that judge its solution.
-JUDGED_LATE = 100
-# With this share of new pairs, the last solution no longer applies: the new one is judged by these pairs alone.
-JUDGED_ANEW = 0.25
-LOOKED_BACK_IN_REPLAY = 4
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of a regime."""
+
+    # Number of pairs that determine the errors of a refitted prior, and that are replayed on top of it.
+    recent: int = 200
+    replay_steps: int = 64
+    # Maximum number of pairs received during a solve that judge its solution.
+    judged_late: int = 100
+    # With this share of new pairs, the last solution no longer applies: the new one is judged by these pairs alone.
+    judged_anew: float = 0.25
+    looked_back_in_replay: int = 4
+
+
+_SETTINGS = _Settings()
+
 NO_TURN = (math.nan,) * 4
 
 BoolArray = NDArray[np.bool_]
@@ -237,9 +248,9 @@ class Regime:
         """Take some of the replay steps that are due; return their number."""
         if not self.owes_replays:
             return 0
-        places = self._order.take(min(REPLAY_STEPS, int(self._replays_due)), len(self.memory))
+        places = self._order.take(min(_SETTINGS.replay_steps, int(self._replays_due)), len(self.memory))
         q, x = self.memory.at(places)
-        seen = slice(LOOKED_BACK_IN_REPLAY)
+        seen = slice(_SETTINGS.looked_back_in_replay)
         self._claims.replayed(x[seen] - self.models.predict(INSTANT, q[seen]))
         self.models.replay(q, x)
         self._replays_due -= len(places)
@@ -265,9 +276,9 @@ class Regime:
         """Replace the prior by another one fitted to the same pairs."""
         q, x = self.memory.all()
         self.models.start_again(prior, q, x)
-        self._claims.prior_changed(x[-RECENT:] - prior.predict(q[-RECENT:]))
+        self._claims.prior_changed(x[-_SETTINGS.recent :] - prior.predict(q[-_SETTINGS.recent :]))
         self._choose_map()
-        self._replays_due += self._replays_per_pair * min(len(q), RECENT)
+        self._replays_due += self._replays_per_pair * min(len(q), _SETTINGS.recent)
 
     def ask(self) -> None:
         """Record that the solver works on all pairs so far."""
@@ -339,14 +350,14 @@ class Regime:
 
     def _judge_late(self, name: str, model: LearntModel, pairs: int, fed: int) -> None:
         """Compare a solution on the pairs received while the solver worked: it has not learnt them."""
-        q, x, _ = self.memory.since(max(pairs, self.memory.count - JUDGED_LATE))
+        q, x, _ = self.memory.since(max(pairs, self.memory.count - _SETTINGS.judged_late))
         if len(q) == 0:
             return
         instant = np.full(x.shape, math.nan)
         new = min(max(self.memory.count - fed, 0), len(q))
         if new and self.models.delayed is not None:
             instant[-new:] = x[-new:] - self.models.delayed.predict(q[-new:])
-        anew = len(q) >= JUDGED_ANEW * pairs
+        anew = len(q) >= _SETTINGS.judged_anew * pairs
         self._claims.predicted_late(name, model.predict, q, x - model.predict(q), instant, anew=anew)
 
     def _learn_turn(self, q: FloatArray, turn: FloatArray | None, cov: FloatArray | None = None) -> None:
