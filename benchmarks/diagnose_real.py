@@ -125,7 +125,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args(argv)
     if args.data is None:
-        print("The real recordings are not in this repository (docs/real_data.md): give their folder as --data.")
+        print(
+            "The real recordings (docs/results/real_data.md) are not in this repository: give their folder as --data."
+        )
         return
     for name in args.sets if args.corners else ():
         arm = Arm.load(args.data / name, args.every if name == ONE_DAY else 1)

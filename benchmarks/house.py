@@ -45,6 +45,14 @@ FACTS = re.compile(
     r"NORMAL_95|HALF_WIDTH_95|CHI2\w*|GOLDEN|MEAN_LENGTH|MEAN_OVER_RMS|MEDIAN_COSTS|DECADE|\w*_PER_UNIT|\w*_UNIT_S|"
     r"POLYNOMIAL|STATUS|ALERT|TERMIOS2|LINE_SPEED|SO_\w+|PR_\w+|\w*_MODE|TURN_TICKS|CHECKSUM_BYTES|CHUNK)"
 )
+# Constants of a distribution, counts of coordinates, index patterns, stencils, units, codes of the system, colours.
+MORE_FACTS = re.compile(
+    r"MEDIAN_NORM|_ONE_SIGMA|ENTRY_OF_TURN|MEDIAN_TO_SIGMA|_RADIUS_95|UNKNOWN_TURN_RAD2|_THIRD_OF_A_TURN|QUARTER|_?FORWARD|"
+    r"POSITION_OUTPUTS|POSE_OUTPUTS|_ALLOWED_OUTPUTS|CORE_NUMBERS|_MOTIONS|_(FIXED|JOINT)_PARAMETERS|_CONSTANTS|_HARMONICS|"
+    r"_ROWS, _COLUMNS|_FIRST, _SECOND|_FACTORS|_STENCIL|_SLOPES|_FLIP|_MM|_UNITS|_?UNITS_PER_(METRE|SECOND)|"
+    r"TIME_ERROR|TIMEX_BYTES|TCGETS2, TERMIOS2|_PRIORITIES|WITH_RESTART_STEPS|_LARGEST_(COUNT|SEQ)|FIRST_ROW_LINE|"
+    r"_JOINTS, _MARKER|_GREY, _ORANGE|_STL_\w+|ERRORS|_HOMING_SIGN|PROTOCOL1, PROTOCOL2|HEADER, LARGEST_ID"
+)
 # In rooms that move data and compute no estimate: bounds against broken input, and how long loops and requests wait.
 OF_IO = ("cli", "daemon", "dashboard", "drivers", "fleet", "interfaces", "recordings", "robot", "sim_backend")
 BOUNDS = re.compile(r"(MOST|LARGEST|LONGEST|FARTHEST|SMALLEST|OLDEST|NEWEST|HEAVIEST|KEPT|SENDERS|NAMES|REMEMBERED)")
@@ -78,7 +86,7 @@ def numbers(tree: ast.Module) -> list[str]:
 
 def kind_of_number(file: Path, name: str) -> str:
     """Return "fact", "bound", "wait", or "tuned" for what is none of these."""
-    if str(file) in TABLES or FACTS.fullmatch(name.split(",")[0]):
+    if str(file) in TABLES or FACTS.fullmatch(name.split(",")[0]) or MORE_FACTS.fullmatch(name):
         return "fact"
     if file.parts[0] in OF_IO:
         if BOUNDS.match(name):

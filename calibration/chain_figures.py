@@ -20,17 +20,27 @@ from kbmaps import ChainBelief, ChainParameters
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
 
-# Where what is probable differs by more than this, the pairs do not tell.
-TOLD_WITHIN = 4.0
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the figures that are shown."""
+
+    # Where what is probable differs by more than this, the pairs do not tell.
+    told_within: float = 4.0
+    # A zero that is still as uncertain as it was before is nothing that the pairs show.
+    not_shown: float = 0.9
+    # Of the numerical derivatives by tilts, shifts and zeros [rad, m].
+    step: float = 1e-6
+    # Poses that stand for all, and the noise of exact pairs [m].
+    poses: int = 100
+    exact_m: float = 1e-6
+    # From one linearisation to the next the error along a curve is squared.
+    relinearised: int = 4
+
+
+_SETTINGS = _Settings()
+
 HALF_WIDTH_95 = 1.959964
-# A zero that is still as uncertain as it was before is nothing that the pairs show.
-NOT_SHOWN = 0.9
-# Of the numerical derivatives by tilts, shifts and zeros [rad, m].
-_STEP = 1e-6
-# Poses that stand for all, and the noise of exact pairs [m].
-_POSES, _EXACT_M = 100, 1e-6
-# From one linearisation to the next the error along a curve is squared.
-_RELINEARISED = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +118,7 @@ class ChainFigures:
 
     @property
     def _unsure(self) -> FloatArray:
-        return NOT_SHOWN * _spread(self.prior, self._zeros)
+        return _SETTINGS.not_shown * _spread(self.prior, self._zeros)
 
     @cached_property
     def _best(self) -> ChainBelief:
@@ -153,15 +163,15 @@ class ChainFigures:
         return np.concatenate([camera[:3, 3], rpy_of(camera[:3, :3]), geometry.marker_xyz, split[self._zeros]])
 
     def _derivatives(self, change: FloatArray) -> FloatArray:
-        steps = _STEP * np.eye(len(change))
+        steps = _SETTINGS.step * np.eye(len(change))
         here = self._figures(change, change)
-        return np.array([_unwound(self._figures(moved, moved) - here) for moved in change + steps]).T / _STEP
+        return np.array([_unwound(self._figures(moved, moved) - here) for moved in change + steps]).T / _SETTINGS.step
 
 
 def after_exact_pairs(prior: ChainBelief, change: FloatArray, robot: RobotDescription) -> ChainBelief:
     """Return what exact pairs of all poses would leave of the prior, linearised at a change (size,)."""
     _, jacobian = prior.parameters.linearised(change, _poses(robot))
-    rows = (jacobian @ prior.root).reshape(-1, prior.root.shape[1]) / _EXACT_M
+    rows = (jacobian @ prior.root).reshape(-1, prior.root.shape[1]) / _SETTINGS.exact_m
     _, singular, vt = np.linalg.svd(rows, full_matrices=False)
     return replace(prior, root=prior.root @ (vt.T / np.sqrt(1.0 + np.square(singular))))
 
@@ -173,10 +183,12 @@ def most_probable_alike(prior: ChainBelief, change: FloatArray, robot: RobotDesc
     """
     poses = _poses(robot)
     same, found = prior.parameters.positions(change, poses), change
-    for _ in range(_RELINEARISED):
+    for _ in range(_SETTINGS.relinearised):
         x, jacobian = prior.parameters.linearised(found, poses)
-        u, singular, vt = np.linalg.svd((jacobian @ prior.root).reshape(3 * _POSES, -1) / _EXACT_M, full_matrices=False)
-        target = (same - x + jacobian @ (found - prior.mean)).ravel() / _EXACT_M
+        u, singular, vt = np.linalg.svd(
+            (jacobian @ prior.root).reshape(3 * _SETTINGS.poses, -1) / _SETTINGS.exact_m, full_matrices=False
+        )
+        target = (same - x + jacobian @ (found - prior.mean)).ravel() / _SETTINGS.exact_m
         found = prior.mean + prior.root @ (vt.T @ (singular / (1.0 + np.square(singular)) * (u.T @ target)))
     return found
 
@@ -205,13 +217,13 @@ def no_surer_than_possible(belief: ChainBelief, prior: ChainBelief, robot: Robot
 
 def _poses(robot: RobotDescription) -> FloatArray:
     """Return a fixed random sample of configurations (m, d) within the joint limits."""
-    return np.random.default_rng(0).uniform(robot.lower, robot.upper, (_POSES, len(robot.joints)))
+    return np.random.default_rng(0).uniform(robot.lower, robot.upper, (_SETTINGS.poses, len(robot.joints)))
 
 
 def is_told(made: Sequence[tuple[float, float]]) -> bool:
     """Return True if the probable workmanships (axes [rad], positions [m]) agree within the factor TOLD_WITHIN."""
     axes = [axes for axes, _ in made]
-    return max(axes) <= TOLD_WITHIN * min(axes)
+    return max(axes) <= _SETTINGS.told_within * min(axes)
 
 
 def _spread(belief: ChainBelief, which: IntArray) -> FloatArray:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.errors import RecordingError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.interfaces.whole_files import write_whole
-from bodyschema.robot.links import link_poses
+from bodyschema.robot.description import link_poses
 from kbmaps import ChainPosterior, ExperimentDesign, next_poses
 
 from .rigid_chain import Calibration

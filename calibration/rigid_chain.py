@@ -33,19 +33,30 @@ from .chain_figures import ChainFigures, is_told
 IntArray = NDArray[np.intp]
 Trusted = Literal["nothing", "links", "urdf"]
 
-# How many pairs are asked. No arm is quite rigid, and thousands of pairs would take its sag for bad workmanship.
-JUDGED_PAIRS = 300
-SLIDE_ZEROS_M = 0.02
-# A parameter counts as determined if its uncertainty falls below this share of the prior one.
-MUCH_SURER = 1.0 / 3.0
-# Of what is said to be known, and of what is not, once it has been fitted: then far more than the fit can be off.
-KNOWN_TURN_RAD, KNOWN_PLACE_M = 0.02, 0.01
-FITTED_TURN_RAD, FITTED_PLACE_M = 0.5, 0.5
-# Number of cross-validation folds, each of two stretches far apart. Five leave four fifths of the rows to learn from;
-# more cost a fit each.
-FOLDS = 5
-# Rows that one of these fits takes at most: figures of a millimetre do not change by more, and 20,000 take a minute.
-FOLD_ROWS = 2000
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the calibration and its cross-validation."""
+
+    # How many pairs are asked. No arm is quite rigid, and thousands of pairs would take its sag for bad workmanship.
+    judged_pairs: int = 300
+    slide_zeros_m: float = 0.02
+    # A parameter counts as determined if its uncertainty falls below this share of the prior one.
+    much_surer: float = 1.0 / 3.0
+    # Of what is said to be known, and of what is not, once it has been fitted: then far more than the fit can be off.
+    known_turn_rad: float = 0.02
+    known_place_m: float = 0.01
+    fitted_turn_rad: float = 0.5
+    fitted_place_m: float = 0.5
+    # Number of cross-validation folds, each of two stretches far apart. Five leave four fifths of the rows to learn
+    # from; more cost a fit each.
+    folds: int = 5
+    # Rows that one of these fits takes at most: figures of a millimetre do not change by more, and 20,000 take a
+    # minute.
+    fold_rows: int = 2000
+
+
+_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,15 +154,15 @@ class Calibration:
     def expected(self) -> Expected | None:
         """Errors on new poses, from contiguous blocks that were each held out; None of too few rows."""
         rows = len(self.recording)
-        fold = np.arange(rows) * 2 * FOLDS // rows % FOLDS
-        if rows < FOLDS * 2 * len(self.robot.joints):
+        fold = np.arange(rows) * 2 * _SETTINGS.folds // rows % _SETTINGS.folds
+        if rows < _SETTINGS.folds * 2 * len(self.robot.joints):
             return None
         sigma_m = self.learner.report().noise if self.noise_told else None
         told = _told(self.recording, self.learner, np.arange(rows))
         predicted = np.empty_like(self.recording.x)
-        for held_out in range(FOLDS):
+        for held_out in range(_SETTINGS.folds):
             kept = np.flatnonzero(fold != held_out)
-            kept = kept[np.unique(np.linspace(0, len(kept) - 1, FOLD_ROWS).astype(np.intp))]
+            kept = kept[np.unique(np.linspace(0, len(kept) - 1, _SETTINGS.fold_rows).astype(np.intp))]
             fresh = RigidLearner(self.placed.chain, self.learner.tolerances)
             q, x = self.recording.q[kept], self.recording.x[kept]
             fresh.learn(q, x, sigma_m) if told is None else fresh.learn(q, x, cov=told[kept])
@@ -164,7 +175,7 @@ class Calibration:
 
     @cached_property
     def shown(self) -> int:
-        """Number of independent parameters whose uncertainty the pairs reduce to less than a third (`MUCH_SURER`).
+        """Number of independent parameters whose uncertainty the pairs reduce to less than a third (`much_surer`).
 
         The prior allows an arm of the worst workmanship.
         """
@@ -174,7 +185,7 @@ class Calibration:
         _, jacobian = parameters.linearised(self.learner.change, self.recording.q)
         rows = (jacobian @ before.root).reshape(-1, before.root.shape[1]) / (report.noise * report.misfit)
         left = 1.0 / np.sqrt(1.0 + np.square(np.linalg.svd(rows, compute_uv=False)))
-        return int((left < MUCH_SURER).sum())
+        return int((left < _SETTINGS.much_surer).sum())
 
     @cached_property
     def figures(self) -> ChainFigures:
@@ -188,7 +199,7 @@ def _learners(
 ) -> tuple[tuple[RigidLearner, ...], FloatArray]:
     """Return learners of all pairs with the tolerances that a sample of the pairs makes probable, and their shares."""
     told = None if recording.cov is None else recording.cov + ROUNDING_M**2 * np.eye(3)
-    some = np.unique(np.linspace(0, len(recording) - 1, JUDGED_PAIRS).astype(np.intp))
+    some = np.unique(np.linspace(0, len(recording) - 1, _SETTINGS.judged_pairs).astype(np.intp))
 
     def learner(tolerances: ChainTolerances, rows: IntArray) -> RigidLearner:
         fresh = RigidLearner(nominal, tolerances)
@@ -230,10 +241,10 @@ def _tolerances(robot: RobotDescription, zeros_rad: float, trusted: Trusted) -> 
             axes=axes,
             points=points,
             zeros=zeros_rad if free_zeros else 0.0,
-            slide_zeros=SLIDE_ZEROS_M if free_zeros else 0.0,
-            tool=KNOWN_PLACE_M if marker_known else FITTED_PLACE_M,
-            base_rotation=KNOWN_TURN_RAD if pose_known else FITTED_TURN_RAD,
-            base_translation=KNOWN_PLACE_M if pose_known else FITTED_PLACE_M,
+            slide_zeros=_SETTINGS.slide_zeros_m if free_zeros else 0.0,
+            tool=_SETTINGS.known_place_m if marker_known else _SETTINGS.fitted_place_m,
+            base_rotation=_SETTINGS.known_turn_rad if pose_known else _SETTINGS.fitted_turn_rad,
+            base_translation=_SETTINGS.known_place_m if pose_known else _SETTINGS.fitted_place_m,
         )
         for axes, points in links
     ]

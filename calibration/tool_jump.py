@@ -10,13 +10,21 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.recordings.recording import Recording
 from kbmaps import ChainBelief, ChainParameters, RigidLearner
 
-# Minimum number of pairs on either side of a change, and the share of all squared residuals that it must explain.
-FEWEST = 6
-EXPLAINED = 0.5
-# Residuals beyond this multiple of the median get less weight, so that single outliers are no change.
-FAR = 5.0
-# Excludes splits that the data cannot determine, e.g. where all poses are alike.
-_RIDGE = 1e-9
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the test for another tool."""
+
+    # Minimum number of pairs on either side of a change, and the share of all squared residuals that it must explain.
+    fewest: int = 6
+    explained: float = 0.5
+    # Residuals beyond this multiple of the median get less weight, so that single outliers are no change.
+    far: float = 5.0
+    # Excludes splits that the data cannot determine, e.g. where all poses are alike.
+    ridge: float = 1e-9
+
+
+_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,12 +50,12 @@ def tool_jump(learner: RigidLearner, recording: Recording) -> ToolJump | None:
     Args:
         learner: fitted to all pairs in the recording.
     """
-    if len(recording) < 2 * FEWEST:
+    if len(recording) < 2 * _SETTINGS.fewest:
         return None
     explained, shifts = _splits(learner, recording)
-    allowed = slice(FEWEST - 1, len(recording) - FEWEST)
-    best = FEWEST - 1 + int(explained[allowed].argmax())
-    if explained[best] < EXPLAINED:
+    allowed = slice(_SETTINGS.fewest - 1, len(recording) - _SETTINGS.fewest)
+    best = _SETTINGS.fewest - 1 + int(explained[allowed].argmax())
+    if explained[best] < _SETTINGS.explained:
         return None
     return ToolJump(best + 2, float(np.linalg.norm(shifts[best])))
 
@@ -72,14 +80,16 @@ def _splits(learner: RigidLearner, recording: Recording) -> tuple[FloatArray, Fl
     in_basis = _after(np.einsum("nip,nij->npj", basis.reshape(*residuals.shape, -1), columns))
     square = _after(columns.swapaxes(1, 2) @ columns) - in_basis.swapaxes(1, 2) @ in_basis
     product = _after(np.einsum("nij,ni->nj", columns, target))
-    shifts: FloatArray = np.linalg.solve(square + _RIDGE * np.eye(3), product[..., None])[..., 0].astype(np.float64)
+    shifts: FloatArray = np.linalg.solve(square + _SETTINGS.ridge * np.eye(3), product[..., None])[..., 0].astype(
+        np.float64
+    )
     return np.einsum("nj,nj->n", shifts, product) / np.square(target).sum(), shifts
 
 
 def _weights(residuals: FloatArray) -> FloatArray:
     """Return square roots of the weights (n,) of residuals (n, 3)."""
     squares = np.square(residuals).sum(axis=1)
-    far = FAR**2 * max(float(np.median(squares)), np.finfo(float).tiny)
+    far = _SETTINGS.far**2 * max(float(np.median(squares)), np.finfo(float).tiny)
     return np.sqrt(far / (far + squares))
 
 

@@ -23,8 +23,7 @@ from bodyschema.learning.config import LearnerConfig
 from bodyschema.robot.calibrated_files import EXTENSIONS
 from bodyschema.robot.description import CameraSection, RobotDescription, RobotSection
 from bodyschema.robot.suggest import did_you_mean, hint_at, with_choices
-from bodyschema.robot.toml_file import convert, line_of, line_of_endless_key, read_toml
-from bodyschema.robot.toml_types import Count, Positive
+from bodyschema.robot.toml_file import Count, Positive, convert, line_of, line_of_endless_key, read_toml
 from bodyschema.sim_backend.config import SimConfig
 from bodyschema.vision.config import VisionConfig
 

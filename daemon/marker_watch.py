@@ -42,7 +42,7 @@ class MarkerWatch:
         self._source.__exit__(kind, error, trace)
 
     def read(self, timeout_s: float) -> None:
-        """Take what comes within `timeout_s`."""
+        """Read all positions that arrive within `timeout_s`."""
         end = self._clock.now() + timeout_s
         while (left := end - self._clock.now()) > 0:
             seen = self._source.read(left)

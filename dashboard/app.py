@@ -61,7 +61,7 @@ class Guard:
 
 
 def refusal(method: str, headers: Headers) -> str | None:
-    """Return the problem of a request, in words; None if it is valid."""
+    """Return the reason to refuse a request; None if it is valid."""
     hosts = headers.getlist("host")
     if (said := host_refusal(hosts)) is not None:
         return said
@@ -147,72 +147,79 @@ class Shapes(Protocol):
         ...
 
 
-def application(hub: Hub, processes: Processes, diagnoses: Diagnosing, shapes: Shapes) -> Starlette:
-    """Return the page's application on the documents of `hub`."""
-    for_shapes = asyncio.Semaphore(_MOST_FOR_SHAPES)
+class _Endpoints:
+    """Endpoints of the page's routes."""
 
-    async def index(_: Request) -> Response:
+    def __init__(self, hub: Hub, processes: Processes, diagnoses: Diagnosing, shapes: Shapes) -> None:
+        self._hub, self._processes, self._diagnoses, self._shapes = hub, processes, diagnoses, shapes
+        self._for_shapes = asyncio.Semaphore(_MOST_FOR_SHAPES)
+
+    async def index(self, _: Request) -> Response:
         return FileResponse(STATIC / "index.html")
 
-    async def state(_: Request) -> Response:
-        return Response(hub.all(), media_type=_JSON)
+    async def state(self, _: Request) -> Response:
+        return Response(self._hub.all(), media_type=_JSON)
 
-    async def events(request: Request) -> Response:
+    async def events(self, request: Request) -> Response:
         if request.method == "HEAD":  # otherwise the answer would never end
             return Response(media_type=_EVENTS)
         try:
-            return _EventStream(hub, hub.follow())
+            return _EventStream(self._hub, self._hub.follow())
         except HubFullError as error:
             return JSONResponse({"error": str(error)}, status_code=503)
 
-    async def command(request: Request) -> Response:
+    async def command(self, request: Request) -> Response:
         asked = decode(await _body(request), PageCommand)
-        message = await run_in_threadpool(processes.command, asked.process, asked.command)
+        message = await run_in_threadpool(self._processes.command, asked.process, asked.command)
         return Response(encode(CommandReply(asked.command, message)), media_type=_JSON)
 
-    async def picture(_: Request) -> Response:
+    async def picture(self, _: Request) -> Response:
         try:
-            return Response(await run_in_threadpool(processes.picture), media_type="image/jpeg")
+            return Response(await run_in_threadpool(self._processes.picture), media_type="image/jpeg")
         except (BusError, RequestError):  # the page hides its panel
             return Response(status_code=204)
 
-    async def body(_: Request) -> Response:
-        async with for_shapes:
-            document = await run_in_threadpool(shapes.document)
+    async def body(self, _: Request) -> Response:
+        async with self._for_shapes:
+            document = await run_in_threadpool(self._shapes.document)
         return Response(encode(document), media_type=_JSON)
 
-    async def mesh(request: Request) -> Response:
+    async def mesh(self, request: Request) -> Response:
         number = request.path_params["number"]
         if not (number.isascii() and number.isdigit() and len(number) <= _MOST_DIGITS):
             return Response(status_code=404)
-        async with for_shapes:
-            found = await run_in_threadpool(shapes.mesh, int(number))
+        async with self._for_shapes:
+            found = await run_in_threadpool(self._shapes.mesh, int(number))
         return Response(found or b"", status_code=404 if found is None else 200, media_type=_BYTES)
 
-    async def diagnose(_: Request) -> Response:
-        return JSONResponse({"number": await run_in_threadpool(diagnoses.start)}, status_code=202)
+    async def diagnose(self, _: Request) -> Response:
+        return JSONResponse({"number": await run_in_threadpool(self._diagnoses.start)}, status_code=202)
 
-    async def stop_diagnosing(_: Request) -> Response:
-        await run_in_threadpool(diagnoses.stop)
+    async def stop_diagnosing(self, _: Request) -> Response:
+        await run_in_threadpool(self._diagnoses.stop)
         return Response(status_code=204)
 
-    async def report(_: Request) -> Response:
-        page = await run_in_threadpool(diagnoses.report)
+    async def report(self, _: Request) -> Response:
+        page = await run_in_threadpool(self._diagnoses.report)
         if page is None:
             return JSONResponse({"error": "there is no report yet. Press `Diagnose now`"}, status_code=404)
         return Response(page, media_type="text/html", headers={"Content-Security-Policy": _REPORT_POLICY})
 
+
+def application(hub: Hub, processes: Processes, diagnoses: Diagnosing, shapes: Shapes) -> Starlette:
+    """Return the page's application on the documents of `hub`."""
+    page = _Endpoints(hub, processes, diagnoses, shapes)
     routes = [
-        Route("/", index),
-        Route("/api/state", state),
-        Route("/api/events", events),
-        Route("/api/command", _explained(command), methods=["POST"]),
-        Route("/api/picture", picture),
-        Route("/api/body", body),
-        Route("/api/body/{number}", mesh),
-        Route("/api/diagnosis", _explained(diagnose), methods=["POST"]),
-        Route("/api/diagnosis", _explained(stop_diagnosing), methods=["DELETE"]),
-        Route("/report", report),
+        Route("/", page.index),
+        Route("/api/state", page.state),
+        Route("/api/events", page.events),
+        Route("/api/command", _explained(page.command), methods=["POST"]),
+        Route("/api/picture", page.picture),
+        Route("/api/body", page.body),
+        Route("/api/body/{number}", page.mesh),
+        Route("/api/diagnosis", _explained(page.diagnose), methods=["POST"]),
+        Route("/api/diagnosis", _explained(page.stop_diagnosing), methods=["DELETE"]),
+        Route("/report", page.report),
         Mount("/static", StaticFiles(directory=STATIC)),
     ]
     packed = Middleware(GZipMiddleware, compresslevel=_GZIP_LEVEL)

@@ -36,7 +36,7 @@ class Follower:
         self.wake()
 
     def wake(self) -> None:
-        """Let `take` return; from any thread."""
+        """Make `take` return; from any thread."""
         self._loop.call_soon_threadsafe(self._news.set)
 
     async def take(self, timeout_s: float) -> dict[str, bytes]:

@@ -8,8 +8,7 @@ from bodyschema.daemon.transport.status import LearnerStatus
 from bodyschema.daemon.transport.wire import PredictReply
 from bodyschema.interfaces.records import FloatArray, Pair
 from bodyschema.learning.status import LearntFigure
-from bodyschema.robot.description import RobotDescription
-from bodyschema.robot.links import link_poses
+from bodyschema.robot.description import RobotDescription, link_poses
 from bodyschema.robot.rpy import pose_of
 from kbmaps.rotations import quaternions
 

@@ -37,7 +37,7 @@ class _Server(uvicorn.Server):
         await super().shutdown(sockets)
 
     def stop(self) -> None:
-        """Let `serve` end. Only sets a flag: a signal handler may call it."""
+        """End `serve`. Sets a flag only, so that a signal handler may call it."""
         self.should_exit = True
 
 

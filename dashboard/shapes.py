@@ -12,7 +12,6 @@ import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 import msgspec
@@ -25,6 +24,7 @@ from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.limited import bounded_memory
 from bodyschema.robot.meshes import MeshSet
 from bodyschema.robot.shapes import Shape, link_shapes
+from bodyschema.robot.suggest import first_few
 from bodyschema.robot.urdf import MOVING, parse_urdf
 from kbmaps.rotations import quaternions
 
@@ -43,7 +43,6 @@ NICENESS = 10
 _CREASE_COSINE = float(np.cos(np.radians(32.0)))
 # Corners at one vertex whose normals are compared, so that no mesh takes long.
 _MOST_NEIGHBOURS = 24
-_NAMED = 3
 
 
 class LinkShapes(msgspec.Struct, frozen=True):
@@ -73,9 +72,7 @@ class Body:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         with self._starting:
             self._closed = True
             if self._child is not None:
@@ -177,16 +174,11 @@ def _link_shape(shape: Shape, mesh: int | None) -> LinkShape:
 
 def _sentences(meshes: MeshSet, before: int, after: int) -> Iterator[str]:
     if meshes.missing:
-        yield f"Missing meshes: {_some(meshes.missing)}. Links without any are shown as rods."
-    if meshes.unusable:
-        yield f"Meshes that cannot be used: {_some([f'{name}: {why}' for name, why in meshes.unusable.items()])}."
+        yield f"Missing meshes: {first_few(meshes.missing, '; ')}. Links without any are shown as rods."
+    if faults := [f"{name}: {why}" for name, why in meshes.unusable.items()]:
+        yield f"Meshes that cannot be used: {first_few(faults, '; ')}."
     if after < before:
         yield f"The meshes have {before:,} triangles, of which the page shows {after:,}."
-
-
-def _some(names: list[str]) -> str:
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return "; ".join(names[:_NAMED]) + more
 
 
 def mesh_buffer(triangles: FloatArray) -> bytes:

@@ -7,7 +7,6 @@ import threading
 import time
 from contextlib import ExitStack
 from importlib.metadata import version
-from types import TracebackType
 from typing import Any, Generic, Self, TypeVar
 
 from bodyschema.cli.recordings.recorder import History
@@ -58,7 +57,7 @@ class Heard(Generic[S]):
             return self._is_there()
 
     def take(self, payload: bytes, utc: float) -> None:
-        """Take a published status, received at this time [s since 1970]."""
+        """Store a published status, received at this time [s since 1970]."""
         try:
             status, fields, problem = decode(payload, self._kind), decode(payload, dict[str, Any]), None
         except RequestError as error:
@@ -130,9 +129,7 @@ class Watch:
             self._open = stack.pop_all()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._open is not None:
             self._open.close()
 

@@ -9,8 +9,7 @@ import msgspec
 
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.plugins import PluginConfig
-from bodyschema.robot.toml_file import line_of
-from bodyschema.robot.toml_types import NonNegative, Positive
+from bodyschema.robot.toml_file import NonNegative, Positive, line_of
 
 from .dynamixel.config import DynamixelConfig
 from .feetech.config import FeetechConfig

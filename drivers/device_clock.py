@@ -4,10 +4,33 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from dataclasses import dataclass
 
 RELEARN_AFTER_S = 30.0
 KNOWN_AFTER_S = 1.0
-WORST = 0.02  # largest difference of clock rates that is tolerated until the rate is estimated
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the fit of a device's clock."""
+
+    # largest difference of clock rates that is tolerated until the rate is estimated
+    worst: float = 0.02
+    window_s: float = 20.0
+    bucket_s: float = 0.1
+    # until this much was observed, the rate stays 1
+    early_s: float = 1.0
+    # a stamp further ahead is rejected; one less ahead shows that all earlier messages were delayed
+    ahead_s: float = 0.02
+    # two buckets define the edge; the next few show its uncertainty
+    near_edge: int = 6
+    # buckets whose least delay is used until the rate is known
+    lately: int = 3
+    # USB polls every millisecond, so the delay of the fastest message is unknown
+    quickest_sigma_s: float = 1e-3 / math.sqrt(3)
+
+
+_SETTINGS = _Settings()
 
 
 class DeviceClock:
@@ -52,7 +75,7 @@ class DeviceClock:
         device_s = self._unwrapped(stamp, ((earliest + latest) - (low + high)) / (2 * self._rate))
         first = device_s * self._rate + low
         last = (device_s + self._tick_s) * self._rate + high
-        slack_s = self._slack_s if self._is_known else self._slack_s + WORST * (latest - self._begin[1])
+        slack_s = self._slack_s if self._is_known else self._slack_s + _SETTINGS.worst * (latest - self._begin[1])
         if first > latest + slack_s or last < earliest - slack_s:
             return None
         offsets = self._offsets(earliest, latest, device_s)
@@ -89,13 +112,7 @@ class DeviceClock:
             self._begin = (earliest, latest, self._device_s)
 
 
-WINDOW_S, BUCKET_S = 20.0, 0.1
-EARLY_S = 1.0  # until this much was observed, the rate stays 1
 LONGEST_HELD_S = 0.5
-AHEAD_S = 0.02  # a stamp further ahead is rejected; one less ahead shows that all earlier messages were delayed
-NEAR_EDGE = 6  # two buckets define the edge; the next few show its uncertainty
-LATELY = 3  # buckets whose least delay is used until the rate is known
-QUICKEST_SIGMA_S = 1e-3 / math.sqrt(3)  # USB polls every millisecond, so the delay of the fastest message is unknown
 
 
 class StreamClock:
@@ -122,14 +139,14 @@ class StreamClock:
     @property
     def sigma_s(self) -> float:
         """1-sigma of an estimated time [s]: delay of the fastest message, and uncertainty of the edge."""
-        if len(self._least) <= LATELY:
+        if len(self._least) <= _SETTINGS.lately:
             return math.inf
         if not self._edge_s:
-            lately = [offset for _, offset in list(self._least)[-LATELY:]]
-            unknown_rate_s = WORST * LATELY * BUCKET_S / math.sqrt(3)
-            return math.hypot(QUICKEST_SIGMA_S, unknown_rate_s, max(lately) - min(lately))
+            lately = [offset for _, offset in list(self._least)[-_SETTINGS.lately :]]
+            unknown_rate_s = _SETTINGS.worst * _SETTINGS.lately * _SETTINGS.bucket_s / math.sqrt(3)
+            return math.hypot(_SETTINGS.quickest_sigma_s, unknown_rate_s, max(lately) - min(lately))
         fraction = (self._device_s - self._origin_s) / self._edge_s
-        return math.hypot(QUICKEST_SIGMA_S, self._above_s * math.hypot(1 - fraction, fraction))
+        return math.hypot(_SETTINGS.quickest_sigma_s, self._above_s * math.hypot(1 - fraction, fraction))
 
     def time(self, latest: float, stamp: int) -> float | None:
         """Return the time of the event whose message arrived at `latest` [s].
@@ -141,8 +158,8 @@ class StreamClock:
             self._offset_s = latest - self._device_s
         device_s = self._unwrapped(stamp, latest)
         t = self._mapped(device_s)
-        is_early = device_s - self._least[0][0] < EARLY_S if self._least else True
-        if latest - t > LONGEST_HELD_S or t - latest > (LONGEST_HELD_S if is_early else AHEAD_S):
+        is_early = device_s - self._least[0][0] < _SETTINGS.early_s if self._least else True
+        if latest - t > LONGEST_HELD_S or t - latest > (LONGEST_HELD_S if is_early else _SETTINGS.ahead_s):
             return None
         self._device_s = max(device_s, self._device_s)
         self._note(device_s, latest - device_s)
@@ -158,10 +175,10 @@ class StreamClock:
 
     def _note(self, device_s: float, offset_s: float) -> None:
         least = self._least
-        if not least or device_s - self._bucket_s >= BUCKET_S:
+        if not least or device_s - self._bucket_s >= _SETTINGS.bucket_s:
             self._bucket_s = device_s
             least.append((device_s, offset_s))
-            while least[-1][0] - least[0][0] > WINDOW_S:
+            while least[-1][0] - least[0][0] > _SETTINGS.window_s:
                 least.popleft()
             self._fit()
         elif offset_s < least[-1][1]:
@@ -171,15 +188,15 @@ class StreamClock:
 
     def _fit(self) -> None:
         points = list(self._least)
-        if points[-1][0] - points[0][0] < EARLY_S:
+        if points[-1][0] - points[0][0] < _SETTINGS.early_s:
             self._origin_s, self._offset_s = points[-1][0], min(offset for _, offset in points[-3:])
             return
         mean = sum(device_s for device_s, _ in points) / len(points)
         (x0, y0), (x1, y1) = _edge_below(points, mean)
-        slope = min(max((y1 - y0) / (x1 - x0), -WORST), WORST)
+        slope = min(max((y1 - y0) / (x1 - x0), -_SETTINGS.worst), _SETTINGS.worst)
         self.rate, self._origin_s, self._offset_s, self._edge_s = 1.0 + slope, x0, y0, x1 - x0
         above = sorted(y - y0 - slope * (x - x0) for x, y in points)
-        self._above_s = above[min(NEAR_EDGE, len(above) - 1)]
+        self._above_s = above[min(_SETTINGS.near_edge, len(above) - 1)]
 
 
 def _edge_below(points: list[tuple[float, float]], x: float) -> tuple[tuple[float, float], tuple[float, float]]:

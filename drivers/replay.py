@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from types import TracebackType
 from typing import Self
 
 import numpy as np
@@ -73,9 +72,7 @@ class ReplayJoints:
         self._pace.open(_JOINTS)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._pace.close(_JOINTS)
 
     def read(self, timeout_s: float) -> JointReading | None:
@@ -94,9 +91,7 @@ class ReplayMarker:
         self._pace.open(_MARKER)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._pace.close(_MARKER)
 
     def read(self, timeout_s: float) -> MarkerFix | None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.servos import FoundServo, ScannedBus
 
 from .echo import without_echo
 from .serial_line import DEFAULT_LATENCY_S, SerialLine
@@ -43,36 +43,6 @@ class ScannedPort(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class FoundServo:
-    """A servo that answered.
-
-    Attributes:
-        port: the port it is on.
-        baud: bits per second.
-        protocol: its name, such as "Dynamixel 2.0".
-        id: on the bus.
-        firmware: its version, as its maker writes it.
-        model: its name, or its number where the model is unknown; None when not reported.
-        voltage_v, temperature_c: as measured by the servo; None when not reported.
-        has_torque: True while the motor holds its position; None when not reported.
-        troubles: what is wrong with it, and what to do.
-        is_double: several servos answer to this ID.
-    """
-
-    port: str
-    baud: int
-    protocol: str
-    id: int
-    model: str | None = None
-    firmware: str | None = None
-    voltage_v: float | None = None
-    temperature_c: float | None = None
-    has_torque: bool | None = None
-    troubles: tuple[str, ...] = ()
-    is_double: bool = False
-
-
 class Scanner(Protocol):
     """Scanner for the servos that speak one protocol."""
 
@@ -93,21 +63,6 @@ class Scanner(Protocol):
 
 OpenPort = Callable[[str, int, Clock], ScannedPort]
 Tell = Callable[[str], None]
-
-
-@dataclass(frozen=True, slots=True)
-class ScannedBus:
-    """Result of scanning one port.
-
-    Attributes:
-        port: that was scanned.
-        servos: those that answered.
-        trouble: why the scan failed or was cut short, or None.
-    """
-
-    port: str
-    servos: tuple[FoundServo, ...]
-    trouble: str | None = None
 
 
 def serial_ports(root: Path = Path("/")) -> list[str]:

@@ -1,4 +1,4 @@
-"""Ask the robots of one type, and compare their models: distance from the median model, and outlying figures."""
+"""Query the robots of one type, and compare their models: distance from the median model, and outlying figures."""
 
 from __future__ import annotations
 
@@ -26,15 +26,24 @@ from bodyschema.interfaces.errors import BusError, RequestError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.status import ChainCalibration
 
-POSES = 400
-# With two robots, an outlier cannot be attributed to either.
-FEWEST_TO_JUDGE = 3
-# A robot is off if one of its figures stands out, or if its model's distance from the median exceeds this multiple of
-# both the models' predicted errors and the robots' median distance.
-FAR = 3.0
-# Probability that chance makes any figure of any robot stand out.
-CHANCE = 0.05
-ROUNDS = 20
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the comparison of units of one type."""
+
+    poses: int = 400
+    # With two robots, an outlier cannot be attributed to either.
+    fewest_to_judge: int = 3
+    # A robot is off if one of its figures stands out, or if its model's distance from the median exceeds this multiple
+    # of both the models' predicted errors and the robots' median distance.
+    far: float = 3.0
+    # Probability that chance makes any figure of any robot stand out.
+    chance: float = 0.05
+    rounds: int = 20
+
+
+_SETTINGS = _Settings()
+
 # Standard error of a median of normal numbers, over that of their mean.
 MEDIAN_COSTS = math.sqrt(math.pi / 2.0)
 
@@ -127,7 +136,7 @@ def common_poses(coverages: Sequence[Mapping[str, JointRange]], joints: tuple[st
     if not ranges:
         raise RequestError("no sampler of these robots answers, so the ranges of their joints are unknown")
     low, high = np.sort(np.median(np.array(ranges), axis=0), axis=1).T
-    return np.random.default_rng(seed).uniform(low, high, (POSES, len(joints)))
+    return np.random.default_rng(seed).uniform(low, high, (_SETTINGS.poses, len(joints)))
 
 
 def compared(joints: tuple[str, ...], q: FloatArray, models: Sequence[Model]) -> TypeComparison:
@@ -137,9 +146,9 @@ def compared(joints: tuple[str, ...], q: FloatArray, models: Sequence[Model]) ->
     typical = float(np.median([each.rms_mm for each in apart]))
     claimed = float(np.median([1e3 * model.sigma_m for model in models]))
     figures = _figures(models)
-    judged = len(models) >= FEWEST_TO_JUDGE
+    judged = len(models) >= _SETTINGS.fewest_to_judge
     odd = [_odd(k, figures) if judged else () for k in range(len(models))]
-    far = [FAR * max(typical, math.hypot(1e3 * model.sigma_m, claimed)) for model in models]
+    far = [_SETTINGS.far * max(typical, math.hypot(1e3 * model.sigma_m, claimed)) for model in models]
     units = tuple(
         Unit(
             robot=model.robot,
@@ -167,7 +176,7 @@ def median_model(positions: Sequence[FloatArray]) -> FloatArray:
         return float(np.median([np.linalg.norm(laid_on(x, other)[0] - x) for other in positions]))
 
     middle = min(positions, key=distance)
-    for _ in range(ROUNDS):
+    for _ in range(_SETTINGS.rounds):
         middle = np.median([laid_on(middle, x)[0] for x in positions], axis=0)
     return middle
 
@@ -198,7 +207,7 @@ def _figures(models: Sequence[Model]) -> list[_Figure]:
         numbers = np.full((2, len(models)), np.nan)
         for k, (value, half_width) in of_robots.items():
             numbers[:, k] = value, half_width
-        if len(of_robots) >= FEWEST_TO_JUDGE:
+        if len(of_robots) >= _SETTINGS.fewest_to_judge:
             figures.append(_Figure(name, unit, *numbers))
     return figures
 
@@ -213,7 +222,7 @@ def _odd(robot: int, figures: Sequence[_Figure]) -> tuple[Odd, ...]:
         half_width = math.hypot(own, MEDIAN_COSTS * float(np.median(others)) / math.sqrt(len(others)))
         possible = math.hypot(half_width, _quantile(0.975) * _spread(figure.values))
         far = abs(difference) / possible if possible > 0.0 else 0.0
-        if far > _quantile(1.0 - 0.5 * CHANCE / tried) / _quantile(0.975):
+        if far > _quantile(1.0 - 0.5 * _SETTINGS.chance / tried) / _quantile(0.975):
             found.append((far, Odd(figure.name, difference, half_width, figure.unit)))
     return tuple(odd for _, odd in sorted(found, key=lambda each: -each[0]))
 
@@ -300,13 +309,13 @@ def view(comparisons: Sequence[TypeComparison], left_out: Sequence[str]) -> Rend
 
 
 def sentences(comparison: TypeComparison) -> list[str]:
-    """Return the compared robots and the outliers, in words."""
+    """Return sentences on the compared robots and the outliers."""
     units = comparison.units
     said = [
         f"{len(units)} robots with the joints {', '.join(comparison.joints)}, at {comparison.poses} common poses, each "
         "model laid on their median as a whole."
     ]
-    if len(units) < FEWEST_TO_JUDGE:
+    if len(units) < _SETTINGS.fewest_to_judge:
         return [*said, "Of two robots, it is not possible to say which is the odd one."]
     off = [unit for unit in units if unit.is_off]
     if not off:

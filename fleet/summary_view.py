@@ -75,7 +75,7 @@ def view(summary: Summary) -> RenderableType:
 
 
 def sentences(one: Type) -> list[str]:
-    """Return the units of a type that are off and why, in words."""
+    """Return sentences on the units of a type that are off, and why."""
     units = len(one.well) + len(one.off)
     said = [f"{name} is off: {'; '.join(why)}." for name, why in one.off.items()]
     if one.well:

@@ -19,10 +19,11 @@ PLACES = {
     **{
         f"interfaces.{name}": f"bodyschema.robot.{name}"
         for name in (
-            *("calibrated", "calibrated_files", "interval", "limited", "plugins"),
+            *("calibrated", "calibrated_files", "limited", "plugins"),
             *("pointing", "rpy", "suggest", "toml_file", "toml_text", "urdf"),
         )
     },
+    "interfaces.interval": "bodyschema.vision.calibration.report.page",
     "interfaces.robot": "bodyschema.robot.description",
     "interfaces.recording": "bodyschema.recordings.recording",
     "interfaces.recording_columns": "bodyschema.recordings.columns",
@@ -69,7 +70,7 @@ class _Alias(Loader):
 
 
 def allow() -> None:
-    """Let plug-ins loaded from now on import by the old names, each with a FutureWarning."""
+    """Allow plug-ins loaded from now on to import by the old names, each with a FutureWarning."""
     if not any(isinstance(finder, OldNames) for finder in sys.meta_path):
         sys.meta_path.insert(0, OldNames())
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from .protocols import JointSource
@@ -48,3 +49,87 @@ class ServoJoints(EncoderJoints, Protocol):
     @property
     def drives(self) -> Sequence[object]: ...
     def temperature_c(self, joint: str) -> float | None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class ServoHealth:
+    """State of one servo.
+
+    Attributes:
+        homing_offset, drive_mode: as stored in its EEPROM.
+        voltage_v, temperature_c: last reported; None before.
+        current_a: None where it is not measured.
+        troubles: what is wrong with it, and what to do.
+    """
+
+    joint: str
+    bus: str
+    id: int
+    model: str
+    firmware: int
+    homing_offset: int
+    drive_mode: int
+    voltage_v: float | None
+    temperature_c: float | None
+    current_a: float | None
+    troubles: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class BusHealth:
+    """Statistics of one bus since the start.
+
+    Attributes:
+        exchanges: number of requests.
+        troubles: number of failed requests, by kind of failure.
+        way: read method of its servos; empty before the first opening.
+    """
+
+    exchanges: int
+    troubles: Mapping[str, int]
+    way: str
+
+
+@dataclass(frozen=True, slots=True)
+class FoundServo:
+    """A servo that answered.
+
+    Attributes:
+        port: the port it is on.
+        baud: bits per second.
+        protocol: its name, such as "Dynamixel 2.0".
+        id: on the bus.
+        firmware: its version, as its maker writes it.
+        model: its name, or its number where the model is unknown; None when not reported.
+        voltage_v, temperature_c: as measured by the servo; None when not reported.
+        has_torque: True while the motor holds its position; None when not reported.
+        troubles: what is wrong with it, and what to do.
+        is_double: several servos answer to this ID.
+    """
+
+    port: str
+    baud: int
+    protocol: str
+    id: int
+    model: str | None = None
+    firmware: str | None = None
+    voltage_v: float | None = None
+    temperature_c: float | None = None
+    has_torque: bool | None = None
+    troubles: tuple[str, ...] = ()
+    is_double: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class ScannedBus:
+    """Result of scanning one port.
+
+    Attributes:
+        port: that was scanned.
+        servos: those that answered.
+        trouble: why the scan failed or was cut short, or None.
+    """
+
+    port: str
+    servos: tuple[FoundServo, ...]
+    trouble: str | None = None

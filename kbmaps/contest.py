@@ -12,8 +12,31 @@ from numpy.typing import ArrayLike
 from kbmaps.arrays import FloatArray
 from kbmaps.errors import ShapeError
 
-# Over longer lags than this share of the series, the sum would be dominated by noise.
-_LONGEST_LAG_SHARE = 0.25
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the comparison of models."""
+
+    # Over longer lags than this share of the series, the sum would be dominated by noise.
+    longest_lag_share: float = 0.25
+    # Minimum number of pairs predicted by both models for a comparison.
+    fewest: int = 3
+    # A model whose mean error on the last so many pairs is so many times another one's does not answer: what fitted
+    # most of the pairs may fail where the arm has just come to, and the cap below hides by how much. A share of 1.2 is
+    # what answers are promised to stay within; fewer than 50 pairs scatter by about as much. Sensitivity, mean error on
+    # 90 pairs each of two measured arms (UR5 0.158 mm, UR10 0.409 mm), a solution every ten: 0.3 to 3 times as many
+    # pairs change it by up to 1 %, 0.3 to 3 times the margin above 1 by -3 to +12 %.
+    lately: int = 50
+    worse: float = 1.2
+    # A difference too small for any camera [m].
+    least_m: float = 1e-6
+    # A squared error is capped at this multiple of the better model's median: an outlier says nothing about either.
+    cap: float = 9.0
+    # Lower bound of the median [m²]: where a model is exact, another one that errs still loses.
+    least: float = 1e-30
+
+
+_SETTINGS = _Settings()
 
 
 def shared_by(residuals: FloatArray) -> float:
@@ -24,7 +47,7 @@ def shared_by(residuals: FloatArray) -> float:
     centred: a mean is an error too.
     """
     n = len(residuals)
-    longest = int(n * _LONGEST_LAG_SHARE)
+    longest = int(n * _SETTINGS.longest_lag_share)
     square = float(np.vdot(residuals, residuals)) / max(n, 1)
     if longest < 2 or square == 0.0:
         return 1.0
@@ -38,26 +61,12 @@ def shared_by(residuals: FloatArray) -> float:
     return max(2.0 * float(pairs[:count].sum()) - 1.0, 1.0)
 
 
-# Minimum number of pairs predicted by both models for a comparison.
-FEWEST = 3
 # Number of the last pairs that are compared: at least this many, or this share of all so far, up to a bound.
 SHORTEST, SHARE, LONGEST = 100, 0.5, 1000
 # A model is worse than another when the difference of their squared errors is this many standard errors.
 CLEARLY = 2.0
-# A model whose mean error on the last so many pairs is so many times another one's does not answer: what fitted most of
-# the pairs may fail where the arm has just come to, and the cap below hides by how much. A share of 1.2 is what answers
-# are promised to stay within; fewer than 50 pairs scatter by about as much.
-# Sensitivity, mean error on 90 pairs each of two measured arms (UR5 0.158 mm, UR10 0.409 mm), a solution every ten:
-# 0.3 to 3 times as many pairs change it by up to 1 %, 0.3 to 3 times the margin above 1 by -3 to +12 %.
-LATELY, WORSE = 50, 1.2
-# A difference too small for any camera [m].
-_LEAST_M = 1e-6
 # A model is listed next to the answering one if it has predicted this many of the last pairs.
 LISTED = 10
-# A squared error is capped at this multiple of the better model's median: an outlier says nothing about either.
-_CAP = 9.0
-# Lower bound of the median [m²]: where a model is exact, another one that errs still loses.
-_LEAST = 1e-30
 
 
 @dataclass(frozen=True)
@@ -144,14 +153,14 @@ class PrequentialComparison:
 
     def compares(self, name: str) -> bool:
         """Return True if a model has predicted enough of the last pairs to be compared."""
-        return name in self._errors and _count(self._errors[name]) >= FEWEST
+        return name in self._errors and _count(self._errors[name]) >= _SETTINGS.fewest
 
     def recent(self, answering: str) -> Recent:
         """Return the models' errors on the last pairs, the same pairs for all of them.
 
         A model that has predicted few of the pairs of `answering` is left out.
         """
-        last = {name: values[-LATELY:] for name, values in self._errors.items()}
+        last = {name: values[-_SETTINGS.lately :] for name, values in self._errors.items()}
         seen = {name: np.isfinite(values) for name, values in last.items()}
         if answering not in seen or not seen[answering].any():
             answering = max(seen, key=lambda name: int(seen[name].sum()), default="")
@@ -176,7 +185,7 @@ class PrequentialComparison:
             present: the model that answers while too few pairs were predicted.
         """
         errors = ((name, self._errors.get(name)) for name in trusted)
-        tried = {name: values for name, values in errors if values is not None and _count(values) >= FEWEST}
+        tried = {name: values for name, values in errors if values is not None and _count(values) >= _SETTINGS.fewest}
         rivals = {name: [other for rival, other in tried.items() if rival != name] for name in tried}
         lately = [name for name in tried if not any(_worse_lately(tried[name], other) for other in rivals[name])]
         for name in lately:
@@ -190,19 +199,21 @@ def _count(errors: FloatArray) -> int:
 
 
 def _worse_lately(errors: FloatArray, others: FloatArray) -> bool:
-    errors, others = errors[-LATELY:], others[-LATELY:]
+    errors, others = errors[-_SETTINGS.lately :], others[-_SETTINGS.lately :]
     both = np.isfinite(errors) & np.isfinite(others)
-    if both.sum() < FEWEST:
+    if both.sum() < _SETTINGS.fewest:
         return False
-    return float(np.sqrt(errors[both]).mean()) > WORSE * float(np.sqrt(others[both]).mean()) + _LEAST_M
+    return (
+        float(np.sqrt(errors[both]).mean()) > _SETTINGS.worse * float(np.sqrt(others[both]).mean()) + _SETTINGS.least_m
+    )
 
 
 def _clearly_worse(errors: FloatArray, others: FloatArray) -> bool:
     both = np.isfinite(errors) & np.isfinite(others)
     errors, others, count = errors[both], others[both], int(both.sum())
-    if count < FEWEST:
+    if count < _SETTINGS.fewest:
         return False
-    cap = _CAP * max(min(float(np.median(errors)), float(np.median(others))), _LEAST)
+    cap = _SETTINGS.cap * max(min(float(np.median(errors)), float(np.median(others))), _SETTINGS.least)
     losses = np.minimum(errors, cap) - np.minimum(others, cap)
     mean = float(losses.mean())
     # Few losses may be alike by chance: their spread is widened accordingly.

@@ -348,7 +348,7 @@ class Ladder:
             self._contest.add({name: float(values[k]) for name, values in squares.items()})
 
     def _teach(self, name: str, until: int) -> None:
-        """Let a model learn all pairs up to `until`, from its own count on."""
+        """Teach a model all pairs up to `until`, from its own count on."""
         model = self._rungs[name].model
         part = slice(model.pairs, until)
         told = ~np.isnan(self._sigma[part])
@@ -392,7 +392,7 @@ class Ladder:
         return self._rungs[self._best([name for name in self._working() if self._rungs[name].extrapolates])].model
 
     def _catch_up(self) -> None:
-        """Let the answering model learn all pairs; if it fails, continue with the next best."""
+        """Teach the answering model all pairs; if it fails, continue with the next best."""
         while self._working() and self._asked[self._answering] < self.pairs:
             self._teach(self._answering, self.pairs)
             self._choose()

@@ -12,9 +12,15 @@ from kbmaps.pairs import Pairs
 MEDIAN_NORM = 1.538
 # Residuals below a nanometre are rounding, even on noise-free data.
 ROUNDING_M = 1e-9
+# Variances [m² or rad²] below that of (1 pm)² are rounding.
+VARIANCE_FLOOR = 1e-24
 # A pair this many sigma from its prediction by the others is an outlier: 3 in 100,000 good ones are farther out (chi,
 # three dimensions).
 OUTLIER_SIGMAS = 4.8
+# An arm that is not calibrated has errors with long tails, which must not be rejected.
+UNCALIBRATED_SIGMAS = 15.0
+# Where single pairs are weighed, none counts for more than one this many sigmas away: it may be an outlier.
+CLIPPED_SIGMAS = 4.0
 _ONE_SIGMA = 0.841344746
 _HALVINGS = 40
 

@@ -7,7 +7,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from bodyschema.robot.toml_types import Count, Positive
+from bodyschema.robot.toml_file import Count, Positive
 
 
 class LearnerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

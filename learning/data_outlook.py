@@ -18,14 +18,22 @@ from kbmaps.chains.rigid_filter import LEAST_NOISE_M
 from kbmaps.planning.expected_gain import ALL, SAME
 from kbmaps.robust import OUTLIER_SIGMAS
 
-FURTHER = (100, 300)
-# Number of poses of a motion, and of the region where the arm is used. More would not make the figures steadier than
-# the posterior is.
-POSES = 100
-# A motion that gains this little more than continuing as so far is not reported.
-WORTH = 0.05
-# A gain below this share of the noise of a single measurement is not noticeable.
-NOTICED = 0.1
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the outlook."""
+
+    further: tuple[int, ...] = (100, 300)
+    # Number of poses of a motion, and of the region where the arm is used. More would not make the figures steadier
+    # than the posterior is.
+    poses: int = 100
+    # A motion that gains this little more than continuing as so far is not reported.
+    worth: float = 0.05
+    # A gain below this share of the noise of a single measurement is not noticeable.
+    noticed: float = 0.1
+
+
+_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,11 +109,11 @@ def forecast(known: LearnerEvidence, scatter: Scatter, joints: tuple[str, ...]) 
     floor = float(np.sqrt(np.square(claim.inside).mean()))
     noise = scatter.noise_m * math.sqrt(scatter.shared)
     posterior = ChainPosterior.of_belief(known.belief, noise=max(noise, floor), floor=floor)
-    motions = candidate_motions(known.seen, lower, upper, rng, names=joints, count=POSES)
-    forecast = expected_gain(posterior, known.region[:POSES], motions, FURTHER, rng)
+    motions = candidate_motions(known.seen, lower, upper, rng, names=joints, count=_SETTINGS.poses)
+    forecast = expected_gain(posterior, known.region[: _SETTINGS.poses], motions, _SETTINGS.further, rng)
     by_motion = {motion.motion: motion.errors for motion in forecast.motions}
     best = forecast.motions[0].motion
-    if by_motion[best][-1] > (1.0 - WORTH) * by_motion[SAME][-1]:
+    if by_motion[best][-1] > (1.0 - _SETTINGS.worth) * by_motion[SAME][-1]:
         best = SAME
     claimed = _mean_error_m(claim, known.region)
     scale = claimed / forecast.now if forecast.now > 0.0 else 1.0
@@ -114,12 +122,12 @@ def forecast(known: LearnerEvidence, scatter: Scatter, joints: tuple[str, ...]) 
         pairs=known.pairs,
         error_m=claimed,
         least_error_m=scale * forecast.least,
-        anywhere_m=_mean_error_m(claim, rng.uniform(lower, upper, (POSES, nominal.joints))),
-        further_pairs=list(FURTHER),
+        anywhere_m=_mean_error_m(claim, rng.uniform(lower, upper, (_SETTINGS.poses, nominal.joints))),
+        further_pairs=list(_SETTINGS.further),
         like_so_far_m=[scale * error for error in by_motion[SAME]],
         best_motion=_in_words(best),
         best_motion_m=[scale * error for error in by_motion[best]],
-        enough=forecast.is_enough() or gain < NOTICED * scatter.noise_m,
+        enough=forecast.is_enough() or gain < _SETTINGS.noticed * scatter.noise_m,
     )
 
 

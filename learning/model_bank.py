@@ -112,7 +112,7 @@ class ModelBank:
         self._asked = self.map(INSTANT)
 
     def take(self, name: str, solution: LearntModel) -> None:
-        """Take the solver's solution for one of the models."""
+        """Store the solver's solution for one of the models."""
         if isinstance(solution, KBMap):
             self._fixed[name] = solution
         else:

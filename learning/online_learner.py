@@ -247,7 +247,7 @@ class OnlineLearner:
                 self._core.regimes.present.solve_from_what_is_known()
 
     def solve_soon(self) -> None:
-        """Let the solver catch up even with fewer than `solve_every` new pairs. For the same thread."""
+        """Start the solver even with fewer than `solve_every` new pairs. For the same thread."""
         self._solving.solve_soon()
 
     def work(self) -> bool:

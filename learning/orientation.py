@@ -198,7 +198,7 @@ class Orientations:
         self._choose()
 
     def take(self, solution: OrientationSolution) -> None:
-        """Take the solver's solution for the orientations so far."""
+        """Store the solver's solution for the orientations so far."""
         self._chains[RIGID] = solution.chain
         self._map, self._map_noise = solution.map, solution.map_noise
         if solution.map is None and self.answering == EXACT:

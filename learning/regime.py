@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,14 +27,24 @@ from kbmaps import ChainBelief, KBMap, Recent, follow_a_path
 
 # Number of learnt pairs on which a model's fit is assessed.
 LOOKED_BACK = 500
-# Number of pairs that determine the errors of a refitted prior, and that are replayed on top of it.
-RECENT = 200
-REPLAY_STEPS = 64
-# Maximum number of pairs received during a solve that judge its solution.
-JUDGED_LATE = 100
-# With this share of new pairs, the last solution no longer applies: the new one is judged by these pairs alone.
-JUDGED_ANEW = 0.25
-LOOKED_BACK_IN_REPLAY = 4
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of a regime."""
+
+    # Number of pairs that determine the errors of a refitted prior, and that are replayed on top of it.
+    recent: int = 200
+    replay_steps: int = 64
+    # Maximum number of pairs received during a solve that judge its solution.
+    judged_late: int = 100
+    # With this share of new pairs, the last solution no longer applies: the new one is judged by these pairs alone.
+    judged_anew: float = 0.25
+    looked_back_in_replay: int = 4
+
+
+_SETTINGS = _Settings()
+
 NO_TURN = (math.nan,) * 4
 
 BoolArray = NDArray[np.bool_]
@@ -136,7 +147,7 @@ class Regime:
         return not doubted
 
     def meet(self, pair: Pair) -> None:
-        """Let the instant learner learn one pair, and no other model yet: `judge` will.
+        """Teach one pair to the instant learner alone; `judge` teaches the other models.
 
         Whether it is an outlier is not known yet. If it seems one by the pairs before, its step is no longer than any
         other.
@@ -237,9 +248,9 @@ class Regime:
         """Take some of the replay steps that are due; return their number."""
         if not self.owes_replays:
             return 0
-        places = self._order.take(min(REPLAY_STEPS, int(self._replays_due)), len(self.memory))
+        places = self._order.take(min(_SETTINGS.replay_steps, int(self._replays_due)), len(self.memory))
         q, x = self.memory.at(places)
-        seen = slice(LOOKED_BACK_IN_REPLAY)
+        seen = slice(_SETTINGS.looked_back_in_replay)
         self._claims.replayed(x[seen] - self.models.predict(INSTANT, q[seen]))
         self.models.replay(q, x)
         self._replays_due -= len(places)
@@ -265,9 +276,9 @@ class Regime:
         """Replace the prior by another one fitted to the same pairs."""
         q, x = self.memory.all()
         self.models.start_again(prior, q, x)
-        self._claims.prior_changed(x[-RECENT:] - prior.predict(q[-RECENT:]))
+        self._claims.prior_changed(x[-_SETTINGS.recent :] - prior.predict(q[-_SETTINGS.recent :]))
         self._choose_map()
-        self._replays_due += self._replays_per_pair * min(len(q), RECENT)
+        self._replays_due += self._replays_per_pair * min(len(q), _SETTINGS.recent)
 
     def ask(self) -> None:
         """Record that the solver works on all pairs so far."""
@@ -276,7 +287,7 @@ class Regime:
         self.monitor.asked()
 
     def take(self, solved: Solved, model: LearntModel, fed: int) -> None:
-        """Take a solution of this regime's task, for one of the models; the solver has `fed` pairs."""
+        """Store a solution of this regime's task, for one of the models; the solver has `fed` pairs."""
         self.models.take(solved.name, model)
         q, x = self.memory.some(fed, LOOKED_BACK)
         neighbours = follow_a_path(self.models.prior, q)
@@ -299,7 +310,7 @@ class Regime:
         self.monitor.offer(Reference(self.model, self.map, belief, wide, residual, claim, known, q, x, variance))
 
     def take_orientation(self, solution: OrientationSolution) -> None:
-        """Take a solution of this regime's task for the orientations."""
+        """Store a solution of this regime's task for the orientations."""
         self.orientations.take(solution)
 
     @property
@@ -308,7 +319,7 @@ class Regime:
         return self.orientations.model(self._claims.support)
 
     def solve_from_what_is_known(self) -> None:
-        """Let the last solutions stand for the pairs before them, if pairs are no longer kept."""
+        """Use the last solutions in place of the pairs before them, if pairs are no longer kept."""
         if EXACT in self.models.names and not self.memory.complete:
             self._solver_prior = self.models.map(EXACT)
             self.arm = self.arm.updated(self._claims.wide, self._claims.residual)
@@ -339,14 +350,14 @@ class Regime:
 
     def _judge_late(self, name: str, model: LearntModel, pairs: int, fed: int) -> None:
         """Compare a solution on the pairs received while the solver worked: it has not learnt them."""
-        q, x, _ = self.memory.since(max(pairs, self.memory.count - JUDGED_LATE))
+        q, x, _ = self.memory.since(max(pairs, self.memory.count - _SETTINGS.judged_late))
         if len(q) == 0:
             return
         instant = np.full(x.shape, math.nan)
         new = min(max(self.memory.count - fed, 0), len(q))
         if new and self.models.delayed is not None:
             instant[-new:] = x[-new:] - self.models.delayed.predict(q[-new:])
-        anew = len(q) >= JUDGED_ANEW * pairs
+        anew = len(q) >= _SETTINGS.judged_anew * pairs
         self._claims.predicted_late(name, model.predict, q, x - model.predict(q), instant, anew=anew)
 
     def _learn_turn(self, q: FloatArray, turn: FloatArray | None, cov: FloatArray | None = None) -> None:

@@ -350,7 +350,7 @@ class Regimes:
 
     @property
     def _hand(self) -> RigidChain:
-        """Chain that knows the orientation of the hand best."""
+        """Chain with the best estimate of the hand's orientation."""
         belief = self.claims.belief
         return self.fitting.chain if belief is None else belief.chain
 

@@ -8,14 +8,25 @@ from bodyschema.robot.hand_eye import HandEye
 
 
 class CurvePoint(msgspec.Struct, frozen=True, array_like=True):
-    """One point of the learning curve: prequential error, before the pair was learnt."""
+    """One point of the learning curve: a list of two numbers.
+
+    Attributes:
+        pairs: pairs learnt.
+        error_m: error on new pairs then, before each was learnt [m].
+    """
 
     pairs: int
     error_m: float
 
 
 class LearntFigure(msgspec.Struct, frozen=True):
-    """One value of the robot's files: nominal and learnt, with half the width of its 95 % interval."""
+    """One value of the robot's files, nominal and learnt.
+
+    Attributes:
+        drawn: from robot.toml.
+        learnt: from the pairs.
+        half_width: of its 95 % interval.
+    """
 
     drawn: float
     learnt: float
@@ -23,26 +34,34 @@ class LearntFigure(msgspec.Struct, frozen=True):
 
 
 class JointZero(msgspec.Struct, frozen=True):
-    """Joint offset to add to a joint's reading, with half the width of its 95 % interval [rad or m]."""
+    """Offset of a joint [rad, of a prismatic joint m].
+
+    Attributes:
+        value: to be added to the reading.
+        half_width: of its 95 % interval.
+    """
 
     value: float
     half_width: float
 
 
 class ChainCalibration(msgspec.Struct, frozen=True, kw_only=True):
-    """Pose of camera and tool, and the joint offsets, by the learnt rigid chain.
+    """Camera, tool and joint offsets of the learnt rigid chain, updated seconds after new pairs.
 
     Attributes:
-        pairs: number of pairs with the present tool used for it.
-        camera_link, camera_xyz, camera_rpy: pose of the measurement frame in this link (URDF convention) [m, rad].
-        marker_link, marker_xyz: the marker in this link [m].
-        zeros: by joint; null where the offset is not identifiable and kept at nominal. The other figures assume that.
-        axes_rad, points_m: estimated deviation from the URDF: 1-sigma of axis tilt and of axis shift; null where the
-            pairs do not determine it.
-        noise_m: 1-sigma of a measured coordinate.
-        outliers: number of outliers among the last 500 pairs: too far from the chain for this noise.
+        pairs: pairs with the present tool behind it.
+        camera_link: the camera's parent link.
+        camera_xyz: position of the measurement frame in that link [m].
+        camera_rpy: its orientation, as in URDF [rad].
+        marker_link: the link that carries the marker.
+        marker_xyz: the marker (TCP) in that link [m].
+        zeros: joint offsets, by joint; null where not identifiable and kept at nominal, which the other figures assume.
+        axes_rad, points_m: estimated deviation of axis directions [rad] and axis positions [m] from the URDF, 1-sigma;
+            null where the pairs do not determine it.
+        noise_m: 1-sigma of a measured coordinate [m].
+        outliers: among the last 500 pairs: too far from the chain for this noise.
         hand_eye: the camera's pose as ROS takes it; null from a learner of an earlier version.
-        marker_covariance: of the marker in its link, 3 x 3 row by row [m²]; null likewise.
+        marker_covariance: of the marker in its link, 3 × 3 row by row [m²]; null likewise.
     """
 
     pairs: int
@@ -64,16 +83,17 @@ class Outlook(msgspec.Struct, frozen=True, kw_only=True):
     """Expected gain of further pairs.
 
     Attributes:
-        pairs: pairs with the present tool used for the forecast.
-        error_m: expected mean distance to the ground truth where the arm has been [m].
-        least_error_m: the part of it that no further pair can reduce [m].
-        anywhere_m: expected mean distance to the ground truth over the full ranges of all joints [m].
+        pairs: pairs with the present tool behind it.
+        error_m: claimed error where data is [m].
+        least_error_m: part of it that further pairs cannot reduce [m].
+        anywhere_m: expected error over the full ranges of all joints [m].
         further_pairs: numbers of further pairs, ascending.
-        like_so_far_m: expected `error_m` after each number of further pairs, moving as so far [m].
-        best_motion: the motion that would reduce the error most, in words.
-        best_motion_m: expected `error_m` after each number of further pairs of that motion [m].
-        enough: True if no motion, with as many pairs as the last of `further_pairs`, would lower `error_m` by a tenth,
-            or by a tenth of a measurement's noise.
+        like_so_far_m: `error_m` after each, with motion as so far [m].
+        best_motion: most informative motion: `moving as so far`, `moving all joints over their ranges` or
+            `moving JOINT over its range`.
+        best_motion_m: `error_m` after each, with that motion [m].
+        enough: no motion would gain a tenth of `error_m`, or of the measurement noise, with as many pairs as the last
+            of `further_pairs`.
     """
 
     pairs: int
@@ -88,13 +108,13 @@ class Outlook(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class OrientationStatus(msgspec.Struct, frozen=True):
-    """The accuracy of the learnt marker orientation.
+    """Accuracy of the learnt marker orientation.
 
     Attributes:
-        pairs: pairs with the present tool that have an orientation.
-        answering: the model that answers.
-        prequential_rad: recent mean angle between prediction and measurement, before learning [rad], by model.
-        claimed_rad: predicted error angle [rad] within the support of the data; null before a few pairs.
+        pairs: pairs with an orientation, with the present tool.
+        answering: answering model.
+        prequential_rad: recent mean angle between prediction and new measurement, before learning, by model [rad].
+        claimed_rad: claimed mean angle to the truth where data is [rad]; null before a few pairs.
     """
 
     pairs: int

@@ -314,7 +314,7 @@ class UncertaintyTracker:
     def predicted_late(
         self, name: str, predict: Predict, q: FloatArray, errors: FloatArray, instant: FloatArray, *, anew: bool
     ) -> None:
-        """Record the errors of a new solution on the last pairs, none of which it knows.
+        """Record the errors of a new solution on the last pairs, none of which it was fitted to.
 
         Args:
             name: the model.

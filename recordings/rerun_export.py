@@ -29,8 +29,7 @@ from bodyschema.interfaces.errors import RecordingError
 from bodyschema.interfaces.extras import install_command
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.recordings.recording import Recording
-from bodyschema.robot.description import RobotDescription
-from bodyschema.robot.links import link_poses
+from bodyschema.robot.description import RobotDescription, link_poses
 from kbmaps.rotations import quaternions
 
 FRAME, JOINTS, ROBOT = "measurement_frame", "joints", "robot"

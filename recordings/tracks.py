@@ -16,14 +16,22 @@ from .recording import Recording
 
 log = logging.getLogger(__name__)
 
-# Between joint readings farther apart than this nothing is interpolated, as in the sampler.
-MAX_GAP_S = 0.1
-# A pause between marker positions longer than this begins another segment, as in the sampler.
-SEGMENT_GAP_S = 1.0
-# Rows whose interpolated joints are less sure than this are left out [rad, m]: the sampler's limit for late joints.
-MAX_SIGMA = np.radians(0.2)
-# A chord of the double interval misses its middle reading by four times what one of the single interval does.
-_CHORD = 0.25
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the interpolation of a recording's tracks."""
+
+    # Between joint readings farther apart than this nothing is interpolated, as in the sampler.
+    max_gap_s: float = 0.1
+    # A pause between marker positions longer than this begins another segment, as in the sampler.
+    segment_gap_s: float = 1.0
+    # Rows whose interpolated joints are less sure than this are left out [rad, m]: the sampler's limit for late joints.
+    max_sigma: float = np.radians(0.2)
+    # A chord of the double interval misses its middle reading by four times what one of the single interval does.
+    chord: float = 0.25
+
+
+_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +76,7 @@ def joined(names: tuple[str, ...], joints: JointTrack, marker: MarkerTrack, file
     """Return a recording with a row for each marker position that lies between two joint readings.
 
     The joints are interpolated linearly. How sure that is, is estimated by leaving out each reading in turn; rows
-    where it is worse than `MAX_SIGMA` are left out, and counted in the log.
+    where it is worse than `max_sigma` are left out, and counted in the log.
 
     Raises:
         RecordingError: no marker position lies between two joint readings.
@@ -83,7 +91,7 @@ def joined(names: tuple[str, ...], joints: JointTrack, marker: MarkerTrack, file
     rows = np.concatenate([rows for rows, _, _ in parts])
     q = np.concatenate([angles for _, angles, _ in parts])
     sigma = np.concatenate([sigma for _, _, sigma in parts])
-    sure = sigma <= MAX_SIGMA
+    sure = sigma <= _SETTINGS.max_sigma
     if not sure.any():
         raise RecordingError(
             f"the joints move too fast for how often they were read: {np.degrees(np.median(sigma)):.2g}° (1-sigma)",
@@ -120,7 +128,7 @@ def _interpolated(
     after = np.where(exact & (after == 0), 1, after)
     between = (after > 0) & (after < len(t))
     after, rows = after[between], rows[between]
-    near = t[after] - t[after - 1] <= MAX_GAP_S
+    near = t[after] - t[after - 1] <= _SETTINGS.max_gap_s
     after, rows = after[near], rows[near]
     share = ((at[rows] - t[after - 1]) / (t[after] - t[after - 1]))[:, None]
     found = q[after - 1] + share * (q[after] - q[after - 1])
@@ -133,12 +141,12 @@ def _bend(t: FloatArray, q: FloatArray) -> FloatArray:
     bend = np.zeros(len(t))
     if len(t) > 2:
         share = ((t[1:-1] - t[:-2]) / (t[2:] - t[:-2]))[:, None]
-        bend[1:-1] = _CHORD * np.abs(q[:-2] + share * (q[2:] - q[:-2]) - q[1:-1]).max(axis=1)
+        bend[1:-1] = _SETTINGS.chord * np.abs(q[:-2] + share * (q[2:] - q[:-2]) - q[1:-1]).max(axis=1)
     return bend
 
 
 def _segments(t: FloatArray, run: NDArray[np.int64]) -> NDArray[np.int64]:
-    begins = (np.diff(run) != 0) | (np.diff(t) > SEGMENT_GAP_S)
+    begins = (np.diff(run) != 0) | (np.diff(t) > _SETTINGS.segment_gap_s)
     return np.concatenate([[0], np.cumsum(begins)]).astype(np.int64)
 
 
@@ -154,7 +162,7 @@ def _tell(positions: int, between: int, sure: NDArray[np.bool_], sigma: FloatArr
 
 def _apart(joints: JointTrack, marker: MarkerTrack) -> str:
     return (
-        f"no marker position lies between two joint readings at most {MAX_GAP_S:g} s apart: the joints are from "
-        f"{joints.t.min():.3f} to {joints.t.max():.3f} s, "
+        f"no marker position lies between two joint readings at most {_SETTINGS.max_gap_s:g} s apart: the joints are "
+        f"from {joints.t.min():.3f} to {joints.t.max():.3f} s, "
         f"the marker from {marker.t.min():.3f} to {marker.t.max():.3f} s"
     )

@@ -18,12 +18,11 @@ from msgspec import Meta
 from bodyschema.interfaces.camera import LARGEST_SIDE_PX, StereoCalibration
 from bodyschema.interfaces.errors import ConfigError, RobotError
 from bodyschema.interfaces.records import FloatArray, frozen_array
-from bodyschema.robot.toml_types import Positive
 from kbmaps import RigidChain
 
 from .rpy import pose_of, rpy_of
-from .toml_file import convert, line_of, read_toml
-from .urdf import MOVING, UrdfJoint, UrdfTree, chain_between
+from .toml_file import Positive, convert, line_of, read_toml
+from .urdf import MOVING, UrdfJoint, UrdfTree, chain_between, motions
 
 Vector3 = tuple[float, float, float]
 Side = Annotated[int, Meta(ge=1, le=LARGEST_SIDE_PX)]
@@ -281,3 +280,22 @@ def _line_naming(text: str, name: str, first: int) -> int:
         if f'"{name}"' in line or f"'{name}'" in line:
             return number
     return first
+
+
+def link_poses(robot: RobotDescription, q: FloatArray) -> dict[str, FloatArray]:
+    """Return the poses (n, 4, 4) of all links in the root link's frame at readings q (n, d), parents first.
+
+    Joints that are not among the robot's stand where robot.toml holds them, else at 0.
+    """
+    columns = dict(zip(robot.joints, q.T, strict=True))
+    below: dict[str, list[UrdfJoint]] = {link: [] for link in robot.tree.links}
+    for joint in robot.tree.joints.values():
+        below[joint.parent].append(joint)
+    children = {joint.child for joint in robot.tree.joints.values()}
+    poses = {link: np.tile(np.eye(4), (len(q), 1, 1)) for link in below if link not in children}
+    for link in (open_ := list(poses)):  # grows during the loop
+        for joint in below[link]:
+            held = np.full(len(q), robot.robot.held_at.get(joint.name, 0.0))
+            poses[joint.child] = poses[link] @ joint.T_parent_joint @ motions(joint, columns.get(joint.name, held))
+            open_.append(joint.child)
+    return poses

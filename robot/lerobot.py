@@ -41,7 +41,7 @@ LARGEST_OFFSET: Mapping[Make, int] = {"feetech": 2047, "dynamixel": 1_044_479}
 
 @dataclass(frozen=True, slots=True)
 class LeRobotArm:
-    """An arm that LeRobot knows.
+    """An arm that LeRobot supports.
 
     Attributes:
         make: of its servos.

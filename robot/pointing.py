@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, frozen_array
 
-# Damping of the step [squared tangents of angle]; stabilises it where one of the head's axes points at the marker.
-_DAMPING = 1e-2
-_LONGEST_STEP = 0.4
-_NEAREST_M = 0.05
-_NUDGE = 1e-6
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the step towards the marker."""
+
+    # Damping of the step [squared tangents of angle]; stabilises it where one of the head's axes points at the marker.
+    damping: float = 1e-2
+    longest_step: float = 0.4
+    nearest_m: float = 0.05
+    nudge: float = 1e-6
+
+
+_SETTINGS = _Settings()
+
 
 Positions = Callable[[FloatArray], FloatArray]
 """From joint angles [rad] (n, d) the marker's positions in the measurement frame [m] (n, 3)."""
@@ -41,17 +51,17 @@ class Pointing:
     def step(self, q: FloatArray, positions: Positions) -> FloatArray:
         """Return damped least-squares steps (n, g) of the gazing joints from q (n, d) towards the centre [rad]."""
         # Derivative by finite differences: one batch of positions costs less than a Jacobian.
-        nudged = q[:, None] + _NUDGE * np.eye(q.shape[1])[self._joints]
+        nudged = q[:, None] + _SETTINGS.nudge * np.eye(q.shape[1])[self._joints]
         rows = np.concatenate([q, nudged.reshape(-1, q.shape[1])])
         missed = self._off_centre(positions(rows))
         off_centre = missed[: len(q)]
         changed = missed[len(q) :].reshape(*nudged.shape[:2], 2)
-        J = ((changed - off_centre[:, None]) / _NUDGE).swapaxes(1, 2)
+        J = ((changed - off_centre[:, None]) / _SETTINGS.nudge).swapaxes(1, 2)
         step = _damped_step(J, off_centre)
         # A joint that is blocked by its limit is excluded; the others take over.
         angles = q[:, self._joints]
         stuck = ((angles <= self._lower) & (step < 0)) | ((angles >= self._upper) & (step > 0))
-        return np.clip(_damped_step(J * ~stuck[:, None], off_centre), -_LONGEST_STEP, _LONGEST_STEP)
+        return np.clip(_damped_step(J * ~stuck[:, None], off_centre), -_SETTINGS.longest_step, _SETTINGS.longest_step)
 
     def clipped(self, angles: FloatArray) -> FloatArray:
         """Return angles (…, g) within the limits."""
@@ -63,10 +73,10 @@ class Pointing:
         They are seen from the middle of the baseline.
         """
         x = x - self._half_baseline
-        return x[:, :2] / np.maximum(x[:, 2:], _NEAREST_M) - self._centre
+        return x[:, :2] / np.maximum(x[:, 2:], _SETTINGS.nearest_m) - self._centre
 
 
 def _damped_step(J: FloatArray, error: FloatArray) -> FloatArray:
     """Return Levenberg-Marquardt steps (n, g) for Jacobians (n, 2, g) and errors (n, 2)."""
-    damped = J @ J.swapaxes(1, 2) + _DAMPING * np.eye(2)
+    damped = J @ J.swapaxes(1, 2) + _SETTINGS.damping * np.eye(2)
     return -(J.swapaxes(1, 2) @ np.linalg.solve(damped, error[..., None]))[..., 0]

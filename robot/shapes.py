@@ -36,7 +36,7 @@ class Shape:
 
 def link_shapes(root: Any) -> dict[str, list[Shape]]:
     """Return the shapes of all links of a parsed URDF, without those that are malformed: none is needed."""
-    colours = {material.get("name"): rgba for material in root.iter("material") if (rgba := _rgba(material))}
+    colours = {material.get("name"): rgba for material in root.iter("material") if (rgba := rgba_of(material))}
     return {
         link.get("name"): [shape for each in link.iterfind("visual") if (shape := _shape(each, colours)) is not None]
         for link in root.iterfind("link")
@@ -46,29 +46,30 @@ def link_shapes(root: Any) -> dict[str, list[Shape]]:
 def _shape(visual: Any, colours: dict[str, tuple[float, ...]]) -> Shape | None:
     geometry, origin, material = visual.find("geometry/*"), visual.find("origin"), visual.find("material")
     place = {} if origin is None else origin.attrib
-    xyz, rpy = (_floats(place.get(key, "0 0 0"), 3) for key in ("xyz", "rpy"))
+    xyz, rpy = (floats(place.get(key, "0 0 0"), 3) for key in ("xyz", "rpy"))
     if geometry is None or xyz is None or rpy is None:
         return None
     T = pose_of(np.array(xyz), np.array(rpy))
-    rgba = None if material is None else _rgba(material) or colours.get(material.get("name"))
+    rgba = None if material is None else rgba_of(material) or colours.get(material.get("name"))
     if geometry.tag == "mesh":
-        scale = _floats(geometry.get("scale", "1 1 1"), 3)
+        scale = floats(geometry.get("scale", "1 1 1"), 3)
         return Shape("mesh", scale, T, rgba, geometry.get("filename", "")) if scale and all(scale) else None
     words = " ".join(geometry.get(key, "") for key in _SIZES.get(geometry.tag, ()))
-    sizes = _floats(words, {"box": 3, "sphere": 1}.get(geometry.tag, 2))
+    sizes = floats(words, {"box": 3, "sphere": 1}.get(geometry.tag, 2))
     return Shape(geometry.tag, sizes, T, rgba) if sizes and min(sizes) > 0.0 else None
 
 
-def _rgba(material: Any) -> tuple[float, ...] | None:
+def rgba_of(material: Any) -> tuple[float, ...] | None:
+    """Return the colour of a <material>, each part from 0 to 1; None where it has none, or a malformed one."""
     colour = material.find("color")
-    values = None if colour is None else _floats(colour.get("rgba", ""), 4)
+    values = None if colour is None else floats(colour.get("rgba", ""), 4)
     return None if values is None else tuple(np.clip(values, 0.0, 1.0).tolist())
 
 
-def _floats(text: str, count: int) -> tuple[float, ...] | None:
+def floats(text: str | None, count: int) -> tuple[float, ...] | None:
     """Return the `count` finite numbers in a text; None if it is anything else."""
     try:
-        values = tuple(float(word) for word in text.split())
+        values = tuple(float(word) for word in (text or "").split())
     except ValueError:
         return None
     return values if len(values) == count and bool(np.isfinite(values).all()) else None

@@ -21,6 +21,12 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     return f"Known are: {', '.join(names) or 'none'}"
 
 
+def first_few(names: Sequence[str], between: str = ", ") -> str:
+    """Return the first three names, and how many more there are."""
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return between.join(names[:3]) + more
+
+
 def with_choices(message: str, kind: Any) -> str:
     """Return msgspec's message about an unknown value, with the known ones added."""
     wrong = _CHOICE.match(message)

@@ -7,7 +7,7 @@ import re
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 
@@ -17,6 +17,12 @@ from .limited import UnfitFile, read_at_most
 from .suggest import did_you_mean, hint_at, key_path, struct_in, with_choices
 
 T = TypeVar("T")
+
+# Numbers with limits.
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NonNegative = Annotated[float, msgspec.Meta(ge=0)]
+Fraction = Annotated[float, msgspec.Meta(ge=0, le=1)]
+Count = Annotated[int, msgspec.Meta(ge=1)]
 
 _UNKNOWN = re.compile(r"Object contains unknown field `(?P<field>[^`]*)`(?: - at `\$(?P<path>[^`]*)`)?")
 _HEADER = re.compile(r"\s*\[\[?([^\]]+)\]\]?")
@@ -70,7 +76,7 @@ def read_toml(
 
 
 def line_of_endless_key(text: str) -> int | None:
-    """Return the first line (from 1) with a key of so many parts that parsing it would take hours; else None."""
+    """Return the first line (from 1) with a key of more than `MOST_PARTS` parts, which parse slowly; else None."""
     for number, line in enumerate(without_quoted(text).split("\n"), 1):
         if line.count(".") > MOST_PARTS and any(piece.count(".") > MOST_PARTS for piece in _BETWEEN.split(line)):
             return number

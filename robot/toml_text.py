@@ -1,66 +1,73 @@
-"""Write tables as TOML text, for files that the program writes itself, without comments."""
+"""Write TOML: whole files, and values in a file that people have written, whose other text stays as it is."""
 
 from __future__ import annotations
 
-import json
-import re
+import difflib
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
-_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+import tomlkit
+from tomlkit.exceptions import TOMLKitError
+
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.whole_files import replace_kept
+
+from .toml_file import read_toml
+
+_BOM = "\ufeff"
 
 
 def toml_text(tables: Mapping[str, Any]) -> str:
     """Return the TOML text of `tables`, which may contain tables, lists, strings, numbers and booleans."""
-    return "\n".join("\n".join(lines) + "\n" for lines in _tables((), tables))
-
-
-def _tables(path: tuple[str, ...], table: Mapping[str, Any]) -> list[list[str]]:
-    """Return one list of lines for each table, beginning with its heading."""
-    heading = [f"[{_dotted(path)}]"] if path else []
-    own, inner = _parts(path, table)
-    return [heading + own, *inner] if heading or own else inner
-
-
-def _parts(path: tuple[str, ...], table: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
-    """Return the lines of a table's plain values, which must follow its heading, and the lines of its inner tables."""
-    own: list[str] = []
-    inner: list[list[str]] = []
-    for name, value in table.items():
-        below = (*path, name)
-        if isinstance(value, Mapping):
-            inner += _tables(below, value)
-        elif isinstance(value, list | tuple) and value and all(isinstance(entry, Mapping) for entry in value):
-            for entry in value:
-                plain, tables = _parts(below, entry)
-                inner += [[f"[[{_dotted(below)}]]", *plain], *tables]
-        else:
-            own.append(f"{_key(name)} = {toml_value(value)}")
-    return own, inner
-
-
-def _dotted(path: tuple[str, ...]) -> str:
-    return ".".join(map(_key, path))
+    return tomlkit.dumps(tables)
 
 
 def toml_value(value: object) -> str:
     """Return a value as TOML, in one line."""
-    match value:
-        case bool():
-            return "true" if value else "false"
-        case str():
-            # The only JSON escape that TOML lacks is that of a lone surrogate, which no file's text contains.
-            return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-        case int() | float():
-            return repr(value)
-        case Mapping():
-            return "{" + ", ".join(f"{_key(name)} = {toml_value(inner)}" for name, inner in value.items()) + "}"
-        case list() | tuple():
-            return "[" + ", ".join(map(toml_value, value)) + "]"
-        case _:
-            # Dates and times: TOML uses Python's ISO format.
-            return str(value)
+    return tomlkit.item(value).as_string()
 
 
-def _key(name: str) -> str:
-    return name if _BARE_KEY.fullmatch(name) else toml_value(name)
+def with_values(file: Path, table: str, values: Mapping[str, Any]) -> str:
+    """Return the text of a TOML file with values in a table, which has to be there; in the first of several.
+
+    Line ends and a byte order mark are those of the file.
+
+    Raises:
+        ConfigError: the file cannot be read, has no such table, or is written in a way that cannot be edited.
+    """
+    read_toml(file)
+    text = file.read_bytes().decode()
+    listed = ", ".join(f"{key} = {toml_value(value)}" for key, value in values.items())
+    by_hand = f"Nothing was changed. Write into [{table}] yourself: {listed}"
+    try:
+        document = tomlkit.parse(text.removeprefix(_BOM).replace("\r\n", "\n"))
+        found: Any = document
+        for part in table.split("."):
+            found = found.get(part)
+            found = found[0] if isinstance(found, list) and found else found
+            if not isinstance(found, Mapping):
+                raise ConfigError(f"there is no table [{table}]", file=file, remedy=by_hand)
+        found.update(values)  # pyright: ignore[reportAttributeAccessIssue]
+    except TOMLKitError as error:
+        raise ConfigError(f"cannot be edited: {error}", file=file, remedy=by_hand) from error
+    edited = tomlkit.dumps(document)
+    return _BOM * text.startswith(_BOM) + (edited.replace("\n", "\r\n") if "\r\n" in text else edited)
+
+
+def difference(file: Path, edited: str) -> list[str]:
+    """Return the lines of a unified diff from a file to its edited text."""
+    old, new = file.read_text(encoding="utf-8-sig").splitlines(), edited.removeprefix(_BOM).splitlines()
+    return list(difflib.unified_diff(old, new, str(file), str(file), n=1, lineterm=""))
+
+
+def write_edited(file: Path, edited: str) -> Path:
+    """Replace a file by its edited text; return the name under which the old one is kept.
+
+    Raises:
+        ConfigError: nothing could be written.
+    """
+    try:
+        return replace_kept(file, edited.encode())
+    except OSError as error:
+        raise ConfigError(f"cannot be written: {error.strerror}", file=file) from error

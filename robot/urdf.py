@@ -19,7 +19,7 @@ from kbmaps.rotations import exponentials
 
 from .limited import UnfitFile, read_at_most
 from .rpy import rotation_of
-from .suggest import did_you_mean
+from .suggest import did_you_mean, first_few
 
 REVOLUTE = frozenset({"revolute", "continuous"})
 MOVING = REVOLUTE | {"prismatic"}
@@ -146,7 +146,7 @@ class UrdfTree:
         roots = [link for link in self.links if link not in children]
         if len(roots) != 1:
             raise RobotError(
-                f"the links do not form one tree (roots: {_some(roots) or 'none'})",
+                f"the links do not form one tree (roots: {first_few(roots) or 'none'})",
                 file=self.file,
                 remedy="Every link but one needs a joint whose child it is",
             )
@@ -156,14 +156,10 @@ class UrdfTree:
         ring = sorted(links.difference(reached))
         if ring:
             raise RobotError(
-                f"the links {_some(ring)} hang on each other in a ring",
+                f"the links {first_few(ring)} hang on each other in a ring",
                 file=self.file,
                 remedy="Every link but one needs a joint whose parent is nearer to the root",
             )
-
-
-def _some(names: list[str]) -> str:
-    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
 
 
 def chain_between(

@@ -8,7 +8,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from bodyschema.robot.toml_types import Fraction, NonNegative, Positive
+from bodyschema.robot.toml_file import Fraction, NonNegative, Positive
 
 Rate = Annotated[int, Meta(ge=1, le=1000)]
 # The ball where neither [sim.camera] nor [vision] describes one.
@@ -83,7 +83,7 @@ class CameraConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
     @property
     def rgb(self) -> tuple[float, float, float]:
-        """The ball's colour, a red one where nothing is said of it."""
+        """The ball's colour; red by default."""
         return self.ball_rgb or BALL_RGB
 
     @property

@@ -16,18 +16,33 @@ from .bullet import Body
 from .config import GuideConfig
 from .truth import TrueRobot
 
-# Postures of one tour. With few, the nearest is farther away, so the tour covers the joint ranges sooner.
-POSTURES = 50
-_BATCH = 1000
-_AT_ONCE = 100  # of a batch: a tenth holds enough where the marker is in view at most postures
-_MOST_BATCHES = 40
-# Share of a joint's range left free at either end.
-_LIMIT_MARGIN = 0.04
-# Candidates for the next hop, and where along each the view is checked.
-_CANDIDATES = 8
-_CHECKS = (0.2, 0.4, 0.6, 0.8)
-# Spacing of the points of a hop in joint space [rad].
-_SPACING = 0.01
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the simulated hand that guides the arm."""
+
+    # Postures of one tour. With few, the nearest is farther away, so the tour covers the joint ranges sooner.
+    postures: int = 50
+    batch: int = 1000
+    # of a batch: a tenth holds enough where the marker is in view at most postures
+    at_once: int = 100
+    most_batches: int = 40
+    # Share of a joint's range left free at either end.
+    limit_margin: float = 0.04
+    # Candidates for the next hop, and where along each the view is checked.
+    candidates: int = 8
+    checks: tuple[float, ...] = (0.2, 0.4, 0.6, 0.8)
+    # Spacing of the points of a hop in joint space [rad].
+    spacing: float = 0.01
+    # Stiffness and damping follow from the arm's inertia: natural frequency [rad/s] and damping ratio of the hand's
+    # grip.
+    frequency: float = 16.0
+    damping_ratio: float = 0.8
+    # Time constant of the friction in the joints [s].
+    friction_time_s: float = 0.15
+
+
+_SETTINGS = _Settings()
 
 
 class Judge(Protocol):
@@ -72,7 +87,7 @@ class GuidePath:
         rng: np.random.Generator,
     ) -> None:
         self._judge, self._guided, self._step, self._rng = judge, list(guided), step, rng
-        margin = _LIMIT_MARGIN * (upper - lower)
+        margin = _SETTINGS.limit_margin * (upper - lower)
         self._lower, self._upper = lower + margin, upper - margin
         self._pool = self._visible_postures()
         self._unvisited = list(range(1, len(self._pool)))
@@ -104,7 +119,7 @@ class GuidePath:
     def _curve(self, start: FloatArray, end: FloatArray, after: FloatArray) -> FloatArray:
         """Return a cubic from start to end with Catmull-Rom tangents, so that the path is smooth at its end."""
         leave, arrive = (end - self._before) / 2, (after - start) / 2
-        count = max(2, int(np.linalg.norm((end - start)[self._guided]) / _SPACING))
+        count = max(2, int(np.linalg.norm((end - start)[self._guided]) / _SETTINGS.spacing))
         s = np.linspace(0.0, 1.0, count + 1)[1:, None]
         return (
             (2 * s**3 - 3 * s**2 + 1) * start
@@ -128,10 +143,10 @@ class GuidePath:
             self._pool = self._visible_postures()
             self._unvisited = list(range(len(self._pool)))
         hops = self._pool[self._unvisited] - start
-        nearest = np.argsort(np.linalg.norm(hops[:, self._guided], axis=1), kind="stable")[:_CANDIDATES]
+        nearest = np.argsort(np.linalg.norm(hops[:, self._guided], axis=1), kind="stable")[: _SETTINGS.candidates]
         best, best_share = int(nearest[0]), -1.0
         for candidate in nearest:
-            between = self._judge.gazed(start + np.array(_CHECKS)[:, None] * hops[candidate])
+            between = self._judge.gazed(start + np.array(_SETTINGS.checks)[:, None] * hops[candidate])
             share = float(self._judge.visible(between).mean())
             if share > best_share:
                 best, best_share = int(candidate), share
@@ -142,17 +157,17 @@ class GuidePath:
     def _visible_postures(self) -> FloatArray:
         """Sample postures (n, d) uniformly over the guided joints' ranges, and return those with a visible ball."""
         found: list[FloatArray] = []
-        for _ in range(_MOST_BATCHES):
-            q = np.tile((self._lower + self._upper) / 2, (_BATCH, 1))
+        for _ in range(_SETTINGS.most_batches):
+            q = np.tile((self._lower + self._upper) / 2, (_SETTINGS.batch, 1))
             q[:, self._guided] = self._rng.uniform(
-                self._lower[self._guided], self._upper[self._guided], (_BATCH, len(self._guided))
+                self._lower[self._guided], self._upper[self._guided], (_SETTINGS.batch, len(self._guided))
             )
-            for few in np.split(q, _BATCH // _AT_ONCE):
+            for few in np.split(q, _SETTINGS.batch // _SETTINGS.at_once):
                 few = self._judge.gazed(few)
                 for posture in few[self._judge.in_images(few)]:
                     if self._judge.clear(posture):
                         found.append(posture)
-                    if len(found) == POSTURES:
+                    if len(found) == _SETTINGS.postures:
                         return np.array(found)
         if len(found) < 2:
             raise ConfigError(
@@ -160,13 +175,6 @@ class GuidePath:
                 remedy="Check [camera] xyz and rpy, marker_xyz and the joint limits",
             )
         return np.array(found)
-
-
-# Stiffness and damping follow from the arm's inertia: natural frequency [rad/s] and damping ratio of the hand's grip.
-_FREQUENCY = 16.0
-_DAMPING_RATIO = 0.8
-# Time constant of the friction in the joints [s].
-_FRICTION_TIME_S = 0.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,7 +207,7 @@ class VirtualHand:
         inertias = _Inertias(body, roles, (self._wrist, self._elbow), postures - truth.offsets)
         self._wrist_mass, self._elbow_mass = inertias.masses
         self._wrist_inertia = inertias.turning
-        self.friction = inertias.joints / _FRICTION_TIME_S
+        self.friction = inertias.joints / _SETTINGS.friction_time_s
 
     def goals(self, postures: FloatArray) -> Goals:
         """Return the hand's targets along the postures (n, d), given by reported angles."""
@@ -215,14 +223,16 @@ class VirtualHand:
         v_goal = (x_goal - goals.wrist[k - 1, :3, 3]) / self._body.dt
         self._force(self._wrist, T[:3, 3], self._spring(self._wrist_mass, x_goal - T[:3, 3], v_goal - v))
         error = turn_between(T[:3, :3], goals.wrist[k, :3, :3])
-        torque = self._wrist_inertia * (_FREQUENCY**2 * error - 2 * _DAMPING_RATIO * _FREQUENCY * spin)
+        torque = self._wrist_inertia * (
+            _SETTINGS.frequency**2 * error - 2 * _SETTINGS.damping_ratio * _SETTINGS.frequency * spin
+        )
         self._torque(self._wrist, torque)
         T, v, _ = self._body.link_motion(self._elbow)
         v_goal = (goals.elbow[k] - goals.elbow[k - 1]) / self._body.dt
         self._force(self._elbow, T[:3, 3], self._spring(self._elbow_mass, goals.elbow[k] - T[:3, 3], v_goal - v))
 
     def _spring(self, mass: float, error: FloatArray, error_rate: FloatArray) -> FloatArray:
-        return mass * (_FREQUENCY**2 * error + 2 * _DAMPING_RATIO * _FREQUENCY * error_rate)
+        return mass * (_SETTINGS.frequency**2 * error + 2 * _SETTINGS.damping_ratio * _SETTINGS.frequency * error_rate)
 
     def _force(self, link: str, x: FloatArray, force: FloatArray) -> None:
         self._body.bullet.applyExternalForce(

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import deque
 from contextlib import ExitStack
 from math import ceil, lcm
-from types import TracebackType
 from typing import Self
 
 import numpy as np
@@ -204,10 +203,8 @@ class Physics:
             self._exit = stack.pop_all()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._exit.__exit__(kind, error, trace)
+    def __exit__(self, *_: object) -> None:
+        self._exit.close()
 
     def step(self) -> None:
         """Advance by one time step."""

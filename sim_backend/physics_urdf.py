@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import chain
+from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
 
@@ -15,14 +16,15 @@ import numpy as np
 from bodyschema.interfaces.errors import RobotError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.limited import read_at_most
-from bodyschema.robot.meshes import LARGEST_M
+from bodyschema.robot.meshes import LARGEST_M, MeshSet, stl_bytes
 from bodyschema.robot.rpy import rpy_of
+from bodyschema.robot.shapes import floats, rgba_of
+from bodyschema.robot.suggest import first_few
 from bodyschema.robot.urdf import MOVING, UrdfJoint, UrdfTree
 from bodyschema.sim_backend.truth import root_link
 
 from .bullet import PhysicsUrdf
 from .geometry import turn_of_z
-from .meshes import Meshes
 from .truth import TrueRobot
 
 # The link above the robot's root. It has no inertia, so that the world frame is the root's frame for pybullet too.
@@ -35,7 +37,14 @@ HEAVIEST_KG = 1e4
 _ROD_SHARE, _ROD_RADII_M, _SHORTEST_ROD_M = 0.1, (0.005, 0.04), 0.01
 _ROD_RGBA = "0.55 0.57 0.6 1"
 _SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length"), "capsule": ("radius", "length")}
-_NAMED = 3
+# TinyRenderer takes 0.3 µs for a triangle, and a stereo frame is four pictures: 8,000 cost some 10 ms of CPU a frame.
+MOST_TRIANGLES = 8_000
+# A hull tells what is in the way. It is that of the outermost points in these directions (Fibonacci's sphere).
+_TURNS, _HEIGHTS = np.pi * (1.0 + 5.0**0.5) * np.arange(100), np.linspace(-1.0, 1.0, 100)
+_RADII = np.sqrt(1.0 - _HEIGHTS**2)
+_DIRECTIONS = np.vstack(
+    [np.column_stack([_RADII * np.cos(_TURNS), _RADII * np.sin(_TURNS), _HEIGHTS]), np.eye(3), -np.eye(3)]
+)
 
 
 def physics_urdf(truth: TrueRobot) -> PhysicsUrdf:
@@ -145,7 +154,7 @@ class _Writer:
         element = _shape_at(source.tag, *pose)
         into = ElementTree.SubElement(element, "geometry")
         if geometry.tag == "mesh":
-            scale = _floats(geometry.get("scale", "1 1 1"), 3)
+            scale = floats(geometry.get("scale", "1 1 1"), 3)
             if scale is None or not all(scale):
                 self._leave_out(f"a mesh of the link {link!r} with the scale {geometry.get('scale')!r}")
                 return None
@@ -212,19 +221,69 @@ class _Writer:
                     link.remove(shape)
 
     def _said(self) -> Iterator[str]:
-        drawn = f", and draws rods for {_some(sorted(self._rods))}" if self._rods else ""
+        drawn = f", and draws rods for {first_few(sorted(self._rods))}" if self._rods else ""
         meshes = self._meshes
         if meshes.missing:
             yield (
-                f"missing meshes: {_some(meshes.missing)}. The simulation continues without{drawn}. It only looks "
+                f"missing meshes: {first_few(meshes.missing)}. The simulation continues without{drawn}. It only looks "
                 f"different. To see the robot's shape, put its meshes beside {self._file}"
             )
             drawn = ""
         if meshes.unusable:
             faults = [f"{name}: {why}" for name, why in meshes.unusable.items()]
-            yield f"meshes that cannot be used: {_some(faults, '; ')}. The simulation continues without{drawn}"
+            yield f"meshes that cannot be used: {first_few(faults, '; ')}. The simulation continues without{drawn}"
         if self._left_out:
-            yield f"the simulation leaves out what it cannot take of {self._file}: {_some(list(self._left_out), '; ')}"
+            left_out = first_few(list(self._left_out), "; ")
+            yield f"the simulation leaves out what it cannot take of {self._file}: {left_out}"
+
+
+class Meshes(MeshSet):
+    """The meshes of one URDF as files. Ask for each with `add`, then take all of them with `files`."""
+
+    def __init__(self, urdf: Path) -> None:
+        super().__init__(urdf, MOST_TRIANGLES)
+        self._drawn: list[int] = []
+
+    def add(self, name: str, scale: tuple[float, ...], *, drawn: bool) -> str | None:
+        """Return the name of the file that will show the mesh `name`, or its hull; None when it cannot be used.
+
+        Args:
+            scale: factors of x, y and z.
+            drawn: as it looks; else its convex hull, which is what pybullet makes of any mesh that may be touched.
+        """
+        number = self.number_of(name, scale)
+        if number is None:
+            return None
+        if drawn:
+            self._drawn.append(number)
+        return f"{'drawn' if drawn else 'hull'}_{number}.stl"
+
+    def files(self) -> tuple[dict[str, bytes], str]:
+        """Return the files by name, and a sentence on how much coarser than the meshes they are, if they are."""
+        drawn, before = self.coarser(self._drawn)
+        files = {}
+        for number, triangles in enumerate(self.shapes):
+            if len(drawn.get(number, ())):
+                files[f"drawn_{number}.stl"] = stl_bytes(drawn[number])
+            files[f"hull_{number}.stl"] = stl_bytes(_hull(triangles))
+        count = sum(len(drawn[number]) for number in self._drawn)
+        coarser = f"the meshes have {before:,} triangles. To be quick, the simulation draws the robot with {count:,}"
+        return files, coarser if count < before else ""
+
+
+def _hull(triangles: FloatArray) -> FloatArray:
+    """Return about the convex hull of triangles as triangles (m, 3, 3); of what is flat its box, 1 mm thick."""
+    from scipy.spatial import ConvexHull, QhullError  # only large meshes need it, and it takes half a second
+
+    points = triangles.reshape(-1, 3)
+    low, high = points.min(axis=0), points.max(axis=0)
+    corners = points[np.unique((points @ _DIRECTIONS.T).argmax(axis=0))]
+    try:
+        return corners[ConvexHull(corners).simplices]
+    except (QhullError, ValueError):
+        high = np.maximum(high, low + 0.001)
+        box = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+        return box[ConvexHull(box).simplices]
 
 
 def _moved(tree: UrdfTree) -> set[str]:
@@ -235,11 +294,6 @@ def _moved(tree: UrdfTree) -> set[str]:
         while (link := above.get(link, link)) in above and link not in moved:
             moved.add(link)
     return moved
-
-
-def _some(names: Sequence[str], between: str = ", ") -> str:
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return between.join(names[:_NAMED]) + more
 
 
 def _shape_at(kind: str, xyz: Sequence[float], rpy: Sequence[float]) -> ElementTree.Element:
@@ -263,18 +317,9 @@ def _numbers(values: Sequence[float] | FloatArray) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-def _floats(text: str | None, count: int) -> tuple[float, ...] | None:
-    """Return the `count` finite numbers in a text; None if it is anything else."""
-    try:
-        values = tuple(float(word) for word in (text or "").split())
-    except ValueError:
-        return None
-    return values if len(values) == count and all(np.isfinite(values)) else None
-
-
 def _sizes(text: str | None, count: int) -> tuple[float, ...] | None:
     """Return the `count` lengths [m] in a text, each possible for a link; None if it is anything else."""
-    values = _floats(text, count)
+    values = floats(text, count)
     return values if values is not None and all(0.0 < value <= LARGEST_M for value in values) else None
 
 
@@ -283,23 +328,22 @@ def _origin(element: ElementTree.Element) -> tuple[tuple[float, ...], tuple[floa
     origin = element.find("origin")
     if origin is None:
         return _ZERO, _ZERO
-    xyz, rpy = (_floats(origin.get(key, "0 0 0"), 3) for key in ("xyz", "rpy"))
+    xyz, rpy = (floats(origin.get(key, "0 0 0"), 3) for key in ("xyz", "rpy"))
     if xyz is None or rpy is None or max(map(abs, chain(xyz, rpy))) > FARTHEST_M:
         return None
     return xyz, rpy
 
 
 def _rgba(material: ElementTree.Element) -> str | None:
-    colour = material.find("color")
-    values = None if colour is None else _floats(colour.get("rgba"), 4)
-    return None if values is None else _numbers(np.clip(values, 0.0, 1.0))
+    colour = rgba_of(material)
+    return None if colour is None else _numbers(colour)
 
 
 def _inertia(inertial: ElementTree.Element) -> _Inertia | None:
     """Return what an <inertial> says, a small one where it is all zero; None where no body has such."""
     mass, tensor, pose = inertial.find("mass"), inertial.find("inertia"), _origin(inertial)
-    kilograms = (0.0,) if mass is None else _floats(mass.get("value"), 1)
-    moments = _floats(" ".join("0" if tensor is None else tensor.get(key, "0") for key in _MOMENTS), 6)
+    kilograms = (0.0,) if mass is None else floats(mass.get("value"), 1)
+    moments = floats(" ".join("0" if tensor is None else tensor.get(key, "0") for key in _MOMENTS), 6)
     if kilograms is None or moments is None or pose is None or not 0.0 <= kilograms[0] <= HEAVIEST_KG:
         return None
     if not (kilograms[0] and any(moments)):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from contextlib import ExitStack
-from types import TracebackType
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -34,8 +34,22 @@ log = logging.getLogger(__name__)
 
 # Time from one posture to the next [s].
 PERIOD_S = 1.0
-# Number of frames that are rendered ahead.
-_AHEAD = 2
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the search for postures."""
+
+    # Number of frames that are rendered ahead.
+    ahead: int = 2
+    batch: int = 500
+    most_batches: int = 400
+    # How far the head may be turned away from the marker [rad]: with it the head's angles say more than where the hand
+    # is.
+    wander: float = np.radians(20.0)
+
+
+_SETTINGS = _Settings()
 
 
 class PosedWorld:
@@ -88,11 +102,9 @@ class PosedWorld:
         self.clock.start(SystemClock())
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         with self._fetching:
-            self._exit.__exit__(kind, error, trace)
+            self._exit.close()
 
     def now(self) -> float:
         """Return the time of the posture seen last [s]."""
@@ -132,7 +144,7 @@ class PosedWorld:
             return stereo_frame(self.now(), images)
 
     def _ask_ahead(self) -> None:
-        while self._asked < min(self._delivered + _AHEAD, len(self._postures)):
+        while self._asked < min(self._delivered + _SETTINGS.ahead, len(self._postures)):
             self._renderer.request(self._asked, self.scene(self._asked))
             self._asked += 1
 
@@ -149,12 +161,6 @@ class PosedWorld:
         beyond, motion = self._truth.beyond, Motion(self._postures, times, np.zeros(count, dtype=np.int64))
         unloaded = beyond.unloaded(motion) - self._truth.offsets
         return unloaded + beyond.given_way(unloaded)
-
-
-_BATCH = 500
-_MOST_BATCHES = 400
-# How far the head may be turned away from the marker [rad]: with it the head's angles say more than where the hand is.
-_WANDER = np.radians(20.0)
 
 
 def visible_postures(
@@ -176,16 +182,16 @@ def visible_postures(
     with Body(physics_urdf(truth), robot.joints) as body:
         looking = Gaze(robot, calibration, roles.gaze, config.guide.gaze_speed_rad_s)
         sight = Sight(truth, calibration, roles, looking, body, config.camera)
-        for _ in range(_MOST_BATCHES):
-            q = np.tile((robot.lower + robot.upper) / 2, (_BATCH, 1))
-            q[:, guided] = rng.uniform(robot.lower[guided], robot.upper[guided], (_BATCH, len(guided)))
+        for _ in range(_SETTINGS.most_batches):
+            q = np.tile((robot.lower + robot.upper) / 2, (_SETTINGS.batch, 1))
+            q[:, guided] = rng.uniform(robot.lower[guided], robot.upper[guided], (_SETTINGS.batch, len(guided)))
             q = sight.gazed(q)
-            q[:, gaze] += rng.uniform(-_WANDER, _WANDER, (_BATCH, len(gaze)))
+            q[:, gaze] += rng.uniform(-_SETTINGS.wander, _SETTINGS.wander, (_SETTINGS.batch, len(gaze)))
             q = np.clip(q, robot.lower, robot.upper)
             found += list(q[sight.visible(q)])
             if len(found) >= count:
                 return np.array(found[:count])
     raise ConfigError(
-        f"the cameras see the marker in only {len(found)} of {_BATCH * _MOST_BATCHES} postures",
+        f"the cameras see the marker in only {len(found)} of {_SETTINGS.batch * _SETTINGS.most_batches} postures",
         remedy="Check [camera] xyz and rpy, marker_xyz and the joint limits",
     )

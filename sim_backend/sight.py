@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from bodyschema.interfaces.camera import StereoCalibration
@@ -17,8 +19,25 @@ from .bullet import Body
 from .config import CameraConfig
 from .truth import TrueRobot
 
-_SOLVE_STEPS = 12
-_TRACK_GAIN = 0.25
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the search for a line of sight."""
+
+    solve_steps: int = 12
+    track_gain: float = 0.25
+    # The marker stays this far inside the images [px], and between these distances from the eyes [m].
+    margin_px: float = 12.0
+    nearest_m: float = 0.25
+    farthest_m: float = 2.0
+    # A tag is shown to the eyes by up to this angle from its normal, so that it can be measured.
+    most_oblique: float = np.radians(50.0)
+    # Rays begin this far from the eye [m], outside of the head's own shape, and go to the ball's middle and rim.
+    ray_start_m: float = 0.06
+    rim: float = 0.8
+
+
+_SETTINGS = _Settings()
 
 
 class Gaze:
@@ -40,14 +59,14 @@ class Gaze:
         self._chain = robot.chain
 
     def hold_tool(self, marker_xyz: FloatArray) -> None:
-        """Look at a marker at `marker_xyz` (3,) [m] in the marker link from now on."""
+        """Set the marker to `marker_xyz` (3,) [m] in the marker link."""
         self._chain = nominal_chain(self._robot, marker_xyz)
 
     def solve(self, q: FloatArray) -> FloatArray:
         """Return q (n, d) with the gazing joints turned to the marker, each within its limits."""
         q = q.copy()
         if self._joints:
-            for _ in range(_SOLVE_STEPS):
+            for _ in range(_SETTINGS.solve_steps):
                 step = self._pointing.step(q, self._chain.positions)
                 q[:, self._joints] = self._pointing.clipped(q[:, self._joints] + step)
         return q
@@ -56,24 +75,13 @@ class Gaze:
         """Return the next command (g,) to the gazing joints' servos, from the reading q (d,) and the last command."""
         if not self._joints:
             return command
-        step = _TRACK_GAIN * self._pointing.step(q[None], self._chain.positions)[0]
+        step = _SETTINGS.track_gain * self._pointing.step(q[None], self._chain.positions)[0]
         return self._pointing.clipped(command + np.clip(step, -self._speed * dt, self._speed * dt))
 
 
 def nominal_chain(robot: RobotDescription, marker_xyz: FloatArray) -> RigidChain:
     """Return the robot's described chain with its marker at `marker_xyz` (3,) [m] in the marker link."""
     return robot.chain.with_tool(marker_xyz - np.array(robot.robot.marker_xyz))
-
-
-# The marker stays this far inside the images [px], and between these distances from the eyes [m].
-_MARGIN_PX = 12.0
-_NEAREST_M = 0.25
-_FARTHEST_M = 2.0
-# A tag is shown to the eyes by up to this angle from its normal, so that it can be measured.
-_MOST_OBLIQUE = np.radians(50.0)
-# Rays begin this far from the eye [m], outside of the head's own shape, and go to the ball's middle and rim.
-_RAY_START_M = 0.06
-_RIM = 0.8
 
 
 class Sight:
@@ -118,10 +126,10 @@ class Sight:
         x = T[:, :3, 3]
         deep = np.maximum(x[:, 2], 1e-3)
         pixels = self._calibration.project(np.column_stack([x[:, :2], deep]))
-        border = _MARGIN_PX + self._calibration.focal_px * self._radius / deep
+        border = _SETTINGS.margin_px + self._calibration.focal_px * self._radius / deep
         size = np.tile(self._calibration.image_size_px, 2)
         inside = ((pixels > border[:, None]) & (pixels < size - 1 - border[:, None])).all(axis=1)
-        return inside & (x[:, 2] > _NEAREST_M) & (x[:, 2] < _FARTHEST_M) & self._faced(T)
+        return inside & (x[:, 2] > _SETTINGS.nearest_m) & (x[:, 2] < _SETTINGS.farthest_m) & self._faced(T)
 
     def _faced(self, T: FloatArray) -> np.ndarray:
         """Return a mask (n,) of the marker's poses (n, 4, 4) with a tag that faces the midpoint between the eyes."""
@@ -130,7 +138,7 @@ class Sight:
         away = T[:, :3, 3] - [0.5 * self._calibration.baseline_m, 0.0, 0.0]
         to_eyes = -away / np.linalg.norm(away, axis=1, keepdims=True)
         cosines = np.einsum("nij,kj,ni->nk", T[:, :3, :3], self._facing, to_eyes)
-        return cosines.max(axis=1) > np.cos(_MOST_OBLIQUE)
+        return cosines.max(axis=1) > np.cos(_SETTINGS.most_oblique)
 
     def clear(self, q: FloatArray) -> bool:
         """Return True if, at one posture (d,), nothing hides the ball from the eyes and the arm touches nothing."""
@@ -155,8 +163,8 @@ class Sight:
             across = cross_matrix(away) @ (0.0, 1.0, 0.0)
             up = cross_matrix(away) @ across
             for rim in (np.zeros(3), across, -across, up, -up):
-                starts.append(eye + _RAY_START_M * away)
-                ends.append(x + self._radius * (_RIM * rim - away))
+                starts.append(eye + _SETTINGS.ray_start_m * away)
+                ends.append(x + self._radius * (_SETTINGS.rim * rim - away))
         starts, ends = (
             np.array(points) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3] for points in (starts, ends)
         )

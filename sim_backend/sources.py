@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from datetime import datetime, timedelta
-from types import TracebackType
 from typing import Protocol, Self
 
 import numpy as np
@@ -62,9 +61,7 @@ class SimJoints:
         self._world.open_joints(True)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._world.open_joints(False)
 
     def read(self, timeout_s: float) -> JointReading | None:
@@ -91,9 +88,7 @@ class SimStereoCamera:
         self._world.open_camera(True)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._world.open_camera(False)
 
     def read(self, timeout_s: float) -> StereoFrame | None:

@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Self
 
 import msgspec
@@ -99,14 +98,12 @@ class SimWorld:
         self._running = True
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         with self._moved:
             self._running = False
             self._moved.notify_all()
         with self._fetching:  # a reader may still wait for the renderer
-            self._exit.__exit__(kind, error, trace)
+            self._exit.close()
 
     def now(self) -> float:
         """Return the simulated time of the last step [s]; a frame may be up to two frame intervals older."""

@@ -8,7 +8,7 @@ import msgspec
 from msgspec import Meta
 
 from bodyschema.robot.plugins import PluginConfig
-from bodyschema.robot.toml_types import Fraction, Positive
+from bodyschema.robot.toml_file import Fraction, Positive
 from bodyschema.vision.cameras.config import CamerasConfig, FurtherCameras
 from bodyschema.vision.tags.config import ClusterConfig, TagConfig
 

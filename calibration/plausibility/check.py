@@ -30,46 +30,62 @@ from .reading import QUARTER, Reading
 ROWS = 80
 # With fewer rows nothing is refused: a wrong reading may fit by chance.
 FEWEST_ROWS = 40
-# Width and depth of the search over readings: offsets of up to four joints by a quarter turn are found.
-WIDTH, DEPTH = 4, 5
-# Readings whose errors differ by less count as one: offsets of the first and of the last joint make no difference.
-SAME = 0.005
-# The search ends at a fit with these shares of the positions' spread: of the columns as they are, and read otherwise.
-ENOUGH_AS_IT_IS, ENOUGH = 0.03, 0.01
-# Another reading is reported if the pairs fit this many times better, and mentioned from `AS_GOOD` times on. Arms with
-# tolerances of 0.5° and 1 mm, offsets of 10° and noise of 10 mm stay below 1.15 with all wrong readings.
-MUCH_BETTER, AS_GOOD = 1.5, 1.15
-# ... and if it is more probable by this much [nats], less a penalty for each change of the reading.
-CERTAIN, A_CHANGE = 10.0, 3.0
-# Rows on the way from one pose to another say together what one says: errors of links change slowly along a path. They
-# count as one within this distance, of the joint that moved farthest.
-APART_RAD = math.radians(10.0)
-# A fit with residuals above these shares of the positions' spread and of the arm's reach is not of this arm.
-UNEXPLAINED, OF_REACH = 0.25, 0.02
-# ... and above this multiple of the known noise.
-NOISES = 5.0
-# A reading with one change is reported if it leaves at most half of this share of the spread, with two a third, and so
-# on. Right readings of real arms leave up to 0.032, wrong ones down to 0.03 with four changes and 0.09 with two.
-NAMED = 0.12
-# A joint offset above this is mentioned: that of one in 300 generated arms with offsets of up to 10°.
-FAR_ZERO_RAD = math.radians(20.0)
-# ... unless the pairs fit about as well with half of it.
-NEAR_ZERO_RAD = FAR_ZERO_RAD / 2.0
-# A known camera pose is not off by this much.
-TURNED_RAD = math.radians(30.0)
-# A position belongs to the angles of a row this near at most: logs joined by row number lose one or two at the start.
-NEAR_ROWS = 3
-# Share of its tolerance that is left to a joint offset that is held.
-HELD = 1e-3
-# A zero of the last joint this far off is not fitted where the marker is known: its quarter turns are tried instead.
-LAST_ZERO_RAD = math.radians(3.0)
-# ... and named where the known marker comes out so many times nearer to its place: with 3, 2 of 32 markers that were
-# 50 mm off in each direction (1-sigma) came out so by chance.
-NEARER = 5.0
-# Maximum number of other, equally good readings that are listed.
-LISTED = 2
-# Distances below this share of the reach are not distinguished.
-EXACT = 1e-5
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the search for another reading of the columns."""
+
+    # Width and depth of the search over readings: offsets of up to four joints by a quarter turn are found.
+    width: int = 4
+    depth: int = 5
+    # Readings whose errors differ by less count as one: offsets of the first and of the last joint make no difference.
+    same: float = 0.005
+    # The search ends at a fit with these shares of the positions' spread: of the columns as they are, and read
+    # otherwise.
+    enough_as_it_is: float = 0.03
+    enough: float = 0.01
+    # Another reading is reported if the pairs fit this many times better, and mentioned from `as_good` times on. Arms
+    # with tolerances of 0.5° and 1 mm, offsets of 10° and noise of 10 mm stay below 1.15 with all wrong readings.
+    much_better: float = 1.5
+    as_good: float = 1.15
+    # ... and if it is more probable by this much [nats], less a penalty for each change of the reading.
+    certain: float = 10.0
+    a_change: float = 3.0
+    # Rows on the way from one pose to another say together what one says: errors of links change slowly along a path.
+    # They count as one within this distance, of the joint that moved farthest.
+    apart_rad: float = math.radians(10.0)
+    # A fit with residuals above these shares of the positions' spread and of the arm's reach is not of this arm.
+    unexplained: float = 0.25
+    of_reach: float = 0.02
+    # ... and above this multiple of the known noise.
+    noises: float = 5.0
+    # A reading with one change is reported if it leaves at most half of this share of the spread, with two a third, and
+    # so on. Right readings of real arms leave up to 0.032, wrong ones down to 0.03 with four changes and 0.09 with two.
+    named: float = 0.12
+    # A joint offset above this is mentioned: that of one in 300 generated arms with offsets of up to 10°.
+    far_zero_rad: float = math.radians(20.0)
+    # ... unless the pairs fit about as well with half of it.
+    near_zero_rad: float = far_zero_rad / 2.0
+    # A known camera pose is not off by this much.
+    turned_rad: float = math.radians(30.0)
+    # A position belongs to the angles of a row this near at most: logs joined by row number lose one or two at the start.
+    near_rows: int = 3
+    # Share of its tolerance that is left to a joint offset that is held.
+    held: float = 1e-3
+    # A zero of the last joint this far off is not fitted where the marker is known: its quarter turns are tried
+    # instead.
+    last_zero_rad: float = math.radians(3.0)
+    # ... and named where the known marker comes out so many times nearer to its place: with 3, 2 of 32 markers that
+    # were 50 mm off in each direction (1-sigma) came out so by chance.
+    nearer: float = 5.0
+    # Maximum number of other, equally good readings that are listed.
+    listed: int = 2
+    # Distances below this share of the reach are not distinguished.
+    exact: float = 1e-5
+
+
+_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,10 +172,10 @@ def plausibility(
     """
     chain = chain or robot.chain
     reach, spread = reach_m(robot), spread_m(x)
-    if 3 * len(q) < 2 * (chain.joints + 9) or spread < EXACT * reach:
+    if 3 * len(q) < 2 * (chain.joints + 9) or spread < _SETTINGS.exact * reach:
         return Plausibility()
     rows = np.unique(np.linspace(0, len(q) - 1, ROWS).astype(np.intp))
-    search = _Search(chain, q[rows], x[rows], EXACT * reach, robot.camera.pose_known)
+    search = _Search(chain, q[rows], x[rows], _SETTINGS.exact * reach, robot.camera.pose_known)
     as_it_is, chosen, others = search.verdict()
     fit, names = search.fits[chosen], robot.joints
     before, after = search.fits[as_it_is].error, fit.error / chosen.scale
@@ -168,13 +184,13 @@ def plausibility(
         shifted = _shifted(search, q, x, before)
         if shifted is not None:
             return shifted
-    noise = 0.0 if sigma_m is None else NOISES * sigma_m
-    if before <= MUCH_BETTER * fit.error and not _nameable(chosen, fit, spread):
+    noise = 0.0 if sigma_m is None else _SETTINGS.noises * sigma_m
+    if before <= _SETTINGS.much_better * fit.error and not _nameable(chosen, fit, spread):
         chosen, fit, after = as_it_is, search.fits[as_it_is], before
     held = search.with_marker_known(chosen) if robot.robot.marker_known else None
     if held is not None and chosen != as_it_is:
         chosen, fit = held[0], held[1]
-    unexplained = after > max(UNEXPLAINED * spread / chosen.scale, OF_REACH * reach, noise)
+    unexplained = after > max(_SETTINGS.unexplained * spread / chosen.scale, _SETTINGS.of_reach * reach, noise)
     if unexplained or (chosen != as_it_is and not _nameable(chosen, fit, spread) and after > noise):
         looks = "" if chosen == as_it_is else chosen.looks(names, fit.zeros)
         found = _hardly(_mm(before), _mm(after), looks)
@@ -187,7 +203,7 @@ def plausibility(
         either = "; or ".join(other.looks(names, search.fits[other].zeros) for other in others)
         either = f". These pairs fit as well if {either}" if others else ""
         remedy = chosen.remedy(names, fit.zeros) + either
-        if before > MUCH_BETTER * fit.error:
+        if before > _SETTINGS.much_better * fit.error:
             found = Plausibility(text, remedy, misread=True)
         else:
             found = Plausibility(warnings=(f"perhaps {text.removeprefix('it seems that ')}{either}",))
@@ -196,9 +212,9 @@ def plausibility(
             f"with the nominal links, the zero of {name} comes out {math.degrees(zero):+.0f}°: it is wrong, or the "
             "URDF is of another arm"
             for joint, (name, zero, slides) in enumerate(zip(names, fit.zeros, chain.prismatic, strict=True))
-            if not slides and abs(zero) > FAR_ZERO_RAD and search.nearer_is_worse(joint, fit)
+            if not slides and abs(zero) > _SETTINGS.far_zero_rad and search.nearer_is_worse(joint, fit)
         ]
-        if fit.error > max(NAMED * spread, noise):
+        if fit.error > max(_SETTINGS.named * spread, noise):
             far.append(f"{_drawn_arm_misses(_mm(before))}: they may be of another robot, or their columns misread")
         found = Plausibility(warnings=tuple(far), undirected=search.undirected(names))
         if robot.camera.pose_known:
@@ -233,7 +249,7 @@ def _drawn_arm_misses(before: str) -> str:
 
 def _nameable(reading: Reading, fit: _Fit, spread: float) -> bool:
     """Return True if a fit is better than that of any wrong reading with as many changes."""
-    return fit.error < NAMED / (1 + reading.changes) * spread
+    return fit.error < _SETTINGS.named / (1 + reading.changes) * spread
 
 
 def _shifted(search: _Search, q: FloatArray, x: FloatArray, before: float) -> Plausibility | None:
@@ -244,12 +260,12 @@ def _shifted(search: _Search, q: FloatArray, x: FloatArray, before: float) -> Pl
         q, x: all pairs (n, d) [rad, m] and (n, 3) [m].
         before: distance of the pairs as they are [m].
     """
-    shifts = [shift for shift in range(-NEAR_ROWS, NEAR_ROWS + 1) if shift]
-    rows = np.unique(np.linspace(NEAR_ROWS, len(q) - 1 - NEAR_ROWS, ROWS).astype(np.intp))
+    shifts = [shift for shift in range(-_SETTINGS.near_rows, _SETTINGS.near_rows + 1) if shift]
+    rows = np.unique(np.linspace(_SETTINGS.near_rows, len(q) - 1 - _SETTINGS.near_rows, ROWS).astype(np.intp))
     errors = search.errors(np.stack([q[rows + shift] for shift in shifts]), np.stack([x[rows]] * len(shifts)))
     best = int(errors.argmin())
     after, shift = float(errors[best]), shifts[best]
-    if after > NAMED / 2 * spread_m(x) or before < MUCH_BETTER * after:
+    if after > _SETTINGS.named / 2 * spread_m(x) or before < _SETTINGS.much_better * after:
         return None
     where, count = "later" if shift > 0 else "earlier", abs(shift)
     row = f"{count} row{'s' if count > 1 else ''} {where}"
@@ -265,10 +281,10 @@ def _shifted(search: _Search, q: FloatArray, x: FloatArray, before: float) -> Pl
 def _turned(chain: RigidChain, q: FloatArray, x: FloatArray, fit: _Fit) -> Plausibility | None:
     """Return a refusal if the measurement frame is turned against a pose that robot.toml declares known; else None."""
     angle = float(Rotation.from_matrix(fit.rotation).magnitude())
-    if angle < TURNED_RAD:
+    if angle < _SETTINGS.turned_rad:
         return None
     told, free = (align(chain, q, x, pose_known=known, marker_known=False).rms for known in (True, False))
-    if told < MUCH_BETTER * free:
+    if told < _SETTINGS.much_better * free:
         return None
     return Plausibility(
         f"it seems that the measurement frame is turned by {math.degrees(angle):.0f}° against [camera] of robot.toml"
@@ -293,7 +309,7 @@ def _frame(rotation: FloatArray, mirrored: bool) -> str:
     given = np.diag([-1.0 if mirrored else 1.0, 1.0, 1.0]) @ rotation
     which = np.abs(given).argmax(axis=1)
     along = np.abs(given).max(axis=1)
-    if len(set(which.tolist())) < 3 or along.min() < math.cos(TURNED_RAD):
+    if len(set(which.tolist())) < 3 or along.min() < math.cos(_SETTINGS.turned_rad):
         return ""
     order = ", ".join(f"{'-' if given[k, axis] < 0.0 else ''}{'xyz'[axis]}" for k, axis in enumerate(which))
     return f" (the columns x, y, z hold {order})"
@@ -318,10 +334,12 @@ class _Search:
             # With a marker far from nominal, the fit of the right reading may have ended in a local minimum.
             self._fit([as_it_is] * 6, tools=TOOL_M * np.concatenate([np.eye(3), -np.eye(3)]))
         expanded, spread = [as_it_is], spread_m(self._x)
-        for depth in range(1, DEPTH):
+        for depth in range(1, _SETTINGS.depth):
             best = self._best()[0]
             left = self.fits[best].error / spread
-            if best in expanded and (left < ENOUGH or (best == as_it_is and (left < ENOUGH_AS_IT_IS or depth > 1))):
+            if best in expanded and (
+                left < _SETTINGS.enough or (best == as_it_is and (left < _SETTINGS.enough_as_it_is or depth > 1))
+            ):
                 break
             new = self._distinct(expanded)
             expanded += new
@@ -329,7 +347,7 @@ class _Search:
                 self._try(as_it_is.doubles(slides))
             self._try(other for reading in new for other in reading.neighbours(slides))
         best = self._best()[0]
-        if self.fits[best].error > (ENOUGH_AS_IT_IS if best == as_it_is else ENOUGH) * spread:
+        if self.fits[best].error > (_SETTINGS.enough_as_it_is if best == as_it_is else _SETTINGS.enough) * spread:
             self._try(as_it_is.mixed(slides))
         best = self._best()[0]
         if not _nameable(best, self.fits[best], spread):
@@ -344,7 +362,7 @@ class _Search:
             key=lambda reading: (reading.changes, reading.quarters != as_it_is.quarters, self.fits[reading].nats),
         )
         others = [reading for reading in good[1:] if reading.changes <= good[0].changes + 1]
-        return as_it_is, good[0], others[:LISTED]
+        return as_it_is, good[0], others[: _SETTINGS.listed]
 
     def _aligned_tool(self) -> FloatArray:
         """Return the marker's offset (1, 3) [m] with nominal joint offsets: its fit starts from many places."""
@@ -354,14 +372,18 @@ class _Search:
             return np.zeros((1, 3))
 
     def nearer_is_worse(self, joint: int, fit: _Fit) -> bool:
-        """Return True if the unchanged columns fit clearly worse than `fit` with a joint's zero `NEAR_ZERO_RAD` off."""
+        """Return True if the unchanged columns fit clearly worse than `fit` with a joint's zero `near_zero_rad` off."""
         q, here = self._q.copy(), np.arange(self._chain.joints) == joint
-        q[:, joint] += math.copysign(NEAR_ZERO_RAD, fit.zeros[joint])
+        q[:, joint] += math.copysign(_SETTINGS.near_zero_rad, fit.zeros[joint])
         held = place(
-            self._chain, q[None], self._x[None], zeros_std=np.where(here, HELD, 1.0) * self._std, tool_std=TOOL_M
+            self._chain,
+            q[None],
+            self._x[None],
+            zeros_std=np.where(here, _SETTINGS.held, 1.0) * self._std,
+            tool_std=TOOL_M,
         )
         ratio = max(float(held.errors(MEASURED)[0]), self._exact_m) / fit.error
-        return ratio > MUCH_BETTER and 3.0 * MEASURED * self._poses * math.log(ratio) > CERTAIN
+        return ratio > _SETTINGS.much_better and 3.0 * MEASURED * self._poses * math.log(ratio) > _SETTINGS.certain
 
     def errors(self, q: FloatArray, x: FloatArray) -> FloatArray:
         """Return the distances (s,) [m] of sets of pairs q (s, n, d) and x (s, n, 3), with the columns as they are."""
@@ -376,15 +398,15 @@ class _Search:
         if self._chain.prismatic[-1]:
             return None
         last = np.arange(self._chain.joints) == self._chain.joints - 1
-        std = np.where(last, LAST_ZERO_RAD, self._std)
+        std = np.where(last, _SETTINGS.last_zero_rad, self._std)
         turned = [reading.turned((turns * last).tolist()) for turns in (0, 1, -1, 2)]
         fits = self._placed(turned, std=std, tool_m=KNOWN_TOOL_M)
         as_given = fits.pop(reading, None)
-        best = min(fits, key=lambda each: fits[each].nats + A_CHANGE * each.changes, default=reading)
+        best = min(fits, key=lambda each: fits[each].nats + _SETTINGS.a_change * each.changes, default=reading)
         if as_given is None or best not in turned:
             return None
         fit = fits[best]
-        clearly = fit.nats + CERTAIN < as_given.nats and NEARER * fit.tool_m < as_given.tool_m
+        clearly = fit.nats + _SETTINGS.certain < as_given.nats and _SETTINGS.nearer * fit.tool_m < as_given.tool_m
         return (best, fit) if clearly else None
 
     def undirected(self, names: tuple[str, ...]) -> tuple[str, ...]:
@@ -398,23 +420,23 @@ class _Search:
 
     def _best(self) -> list[Reading]:
         """Return all readings, the best first."""
-        return sorted(self.fits, key=lambda reading: self.fits[reading].nats + A_CHANGE * reading.changes)
+        return sorted(self.fits, key=lambda reading: self.fits[reading].nats + _SETTINGS.a_change * reading.changes)
 
     def _distinct(self, expanded: list[Reading]) -> list[Reading]:
         """Return the best readings whose fits differ from those already expanded, and from each other."""
         seen, new = [self.fits[reading].error for reading in expanded if reading in self.fits], list[Reading]()
         for reading in self._best():
             error = self.fits[reading].error
-            if all(abs(error - other) > SAME * other for other in seen):
+            if all(abs(error - other) > _SETTINGS.same * other for other in seen):
                 new.append(reading)
                 seen.append(error)
-            if len(new) == WIDTH:
+            if len(new) == _SETTINGS.width:
                 break
         return new
 
     @staticmethod
     def _as_good(fit: _Fit, best: _Fit) -> bool:
-        return fit.nats < best.nats + CERTAIN or fit.error < AS_GOOD * best.error
+        return fit.nats < best.nats + _SETTINGS.certain or fit.error < _SETTINGS.as_good * best.error
 
     def _try(self, readings: Iterable[Reading]) -> None:
         """Fit readings that were not tried yet."""
@@ -431,7 +453,7 @@ class _Search:
             held: keep the joint offsets at nominal.
             tools: marker offsets (s, 3) [m] to start from.
         """
-        std = self._std * (HELD if held else 1.0)
+        std = self._std * (_SETTINGS.held if held else 1.0)
         for reading, fit in self._placed(new, std=std, tools=tools).items():
             if reading not in self.fits or fit.nats < self.fits[reading].nats:
                 self.fits[reading] = fit
@@ -457,7 +479,10 @@ class _Search:
         cost = 0.5 * np.square(zeros / std).sum(axis=1) + 0.5 * np.square(moved / tool_m)
         if self._pose_known:
             turns = Rotation.from_matrix(placed.rotations).magnitude()
-            cost += [0.0 if r.mirrored else 0.5 * (turn / TURNED_RAD) ** 2 for r, turn in zip(new, turns, strict=True)]
+            cost += [
+                0.0 if r.mirrored else 0.5 * (turn / _SETTINGS.turned_rad) ** 2
+                for r, turn in zip(new, turns, strict=True)
+            ]
         nats = 3.0 * MEASURED * self._poses * np.log(errors) + cost
         fits: dict[Reading, _Fit] = {}
         for k, reading in enumerate(new):
@@ -469,8 +494,8 @@ class _Search:
 
 
 def _poses_apart(q: FloatArray) -> int:
-    """Return how many of the poses q (n, d) are `APART_RAD` from each other, in at least one joint."""
-    apart = np.abs(q[:, None] - q).max(axis=2) > APART_RAD
+    """Return how many of the poses q (n, d) are `apart_rad` from each other, in at least one joint."""
+    apart = np.abs(q[:, None] - q).max(axis=2) > _SETTINGS.apart_rad
     kept: list[int] = []
     for pose, far in enumerate(apart):
         if far[kept].all():

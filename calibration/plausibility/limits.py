@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +18,31 @@ from kbmaps import RigidChain
 
 BoolArray = NDArray[np.bool_]
 
-# Only in another unit can the median distance from the median position reach this many times the arm's reach.
-FARTHEST = 2.0
-# A joint of limited range is never this far beyond its limits [rad]: encoders wrap after a turn at the latest.
-BEYOND_LIMITS_RAD = 2.0 * math.pi
-# A share of rows this large indicates wrong units, not single wrong readings.
-MANY = 0.1
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the check of units."""
+
+    # Only in another unit can the median distance from the median position reach this many times the arm's reach.
+    farthest: float = 2.0
+    # A joint of limited range is never this far beyond its limits [rad]: encoders wrap after a turn at the latest.
+    beyond_limits_rad: float = 2.0 * math.pi
+    # A share of rows this large indicates wrong units, not single wrong readings.
+    many: float = 0.1
+    # Rows used to determine a unit of length; largest residual of a fit in it, as a share of the nominal positions'
+    # spread.
+    fitted_rows: int = 80
+    fitting: float = 0.1
+    # If none fits, the unit is guessed from the size of the positions: the next one too if it is off by less than a
+    # factor.
+    also: float = 2.0
+    # Median speed of an arm that is guided or goes from pose to pose [rad/s]: lower bound, and usual value.
+    slowest: float = 0.005
+    usual: float = 0.3
+
+
+_SETTINGS = _Settings()
+
 # Divisors that convert other units to metres.
 UNITS_PER_METRE = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 39.37, "feet": 3.281}
 # A fit is measured by this share of the rows, the nearest ones: outliers and rows with another tool are left out.
@@ -31,13 +51,7 @@ MEASURED = 0.7
 ZEROS_RAD, SLIDES_M, TOOL_M = 0.15, 0.05, 0.3
 # ... and a marker whose place is known, by ruler.
 KNOWN_TOOL_M = 0.01
-# Rows used to determine a unit of length; largest residual of a fit in it, as a share of the nominal positions' spread.
-FITTED_ROWS, FITTING = 80, 0.1
-# If none fits, the unit is guessed from the size of the positions: the next one too if it is off by less than a factor.
-ALSO = 2.0
 _UNITS_PER_SECOND = (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9))
-# Median speed of an arm that is guided or goes from pose to pose [rad/s]: lower bound, and usual value.
-SLOWEST, USUAL = 0.005, 0.3
 # Stroke that counts as one radian [m], and the minimum number of moves for a verdict.
 A_RADIAN_M, FEWEST_MOVES = 0.1, 20
 
@@ -84,9 +98,9 @@ def require_units(robot: RobotDescription, recording: Recording, file: Path) -> 
 
 
 def _require_radians(robot: RobotDescription, recording: Recording, file: Path) -> None:
-    beyond = beyond_limits(robot, recording.q, BEYOND_LIMITS_RAD).mean(axis=0)
+    beyond = beyond_limits(robot, recording.q, _SETTINGS.beyond_limits_rad).mean(axis=0)
     beyond[robot.chain.prismatic] = 0.0
-    if beyond.max() > MANY:
+    if beyond.max() > _SETTINGS.many:
         joint = int(beyond.argmax())
         extreme = recording.q[np.abs(recording.q[:, joint]).argmax(), joint]
         raise RecordingError(
@@ -99,7 +113,7 @@ def _require_radians(robot: RobotDescription, recording: Recording, file: Path) 
 
 def _require_metres(robot: RobotDescription, recording: Recording, file: Path) -> None:
     spread, reach = spread_m(recording.x), reach_m(robot)
-    if spread > FARTHEST * reach:
+    if spread > _SETTINGS.farthest * reach:
         units = _likely_units(robot.chain, recording)
         raise RecordingError(
             f"the positions x, y, z lie about {spread:.4g} m from their middle, and the arm reaches {reach:.3g} m: "
@@ -113,7 +127,7 @@ def _likely_units(chain: RigidChain, recording: Recording) -> list[str]:
     """Return the unit in which the nominal arm fits the positions; if it fits in none, one or two by their size."""
     from kbmaps.chains.placement import place  # imports scipy, which `predict` starts without
 
-    rows = np.unique(np.linspace(0, len(recording.q) - 1, FITTED_ROWS).astype(np.intp))
+    rows = np.unique(np.linspace(0, len(recording.q) - 1, _SETTINGS.fitted_rows).astype(np.intp))
     q, x, factors = recording.q[rows], recording.x[rows], np.array(list(UNITS_PER_METRE.values()))
     drawn = max(spread_m(chain.positions(q)), 1e-9)
     placed = place(
@@ -125,11 +139,11 @@ def _likely_units(chain: RigidChain, recording: Recording) -> list[str]:
     )
     errors = dict(zip(UNITS_PER_METRE, placed.errors(MEASURED).tolist(), strict=True))
     best = min(errors, key=errors.__getitem__)
-    if errors[best] < FITTING * drawn:
+    if errors[best] < _SETTINGS.fitting * drawn:
         return [best]
     off = {unit: abs(math.log(spread_m(x) / (factor * drawn))) for unit, factor in UNITS_PER_METRE.items()}
     nearest = sorted(off, key=off.__getitem__)
-    return nearest[: 2 if off[nearest[1]] < math.log(ALSO) else 1]
+    return nearest[: 2 if off[nearest[1]] < math.log(_SETTINGS.also) else 1]
 
 
 def _require_seconds(robot: RobotDescription, recording: Recording, file: Path) -> None:
@@ -143,8 +157,8 @@ def _require_seconds(robot: RobotDescription, recording: Recording, file: Path) 
     if inside.sum() < FEWEST_MOVES:
         return
     gap, speed = float(np.median(gaps[inside])), float(np.median(steps[inside] / gaps[inside]))
-    if speed < SLOWEST:
-        name, factor = min(_UNITS_PER_SECOND, key=lambda unit: abs(math.log(speed * unit[1] / USUAL)))
+    if speed < _SETTINGS.slowest:
+        name, factor = min(_UNITS_PER_SECOND, key=lambda unit: abs(math.log(speed * unit[1] / _SETTINGS.usual)))
         raise RecordingError(
             f"the times t are {gap:.4g} apart in the middle, in which the joints move by "
             f"{math.degrees(speed * gap):.2g}°: these look like {name}",

@@ -9,7 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from bodyschema.cli.cameras.calibration import AHEAD_M, CamerasFile, CheckFile
-from bodyschema.robot.interval import to_its_interval
+from bodyschema.vision.calibration.report.page import to_its_interval
 
 _WISHES = 3
 

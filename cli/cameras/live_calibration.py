@@ -145,7 +145,7 @@ class LiveCalibration:
         self._stopping = False
 
     def stop(self) -> None:
-        """Let `run` make the calibration of what is there. Only sets a flag."""
+        """End the collection of views, so that `run` calibrates from those it has. Sets a flag only."""
         self._stopping = True
 
     def run(self) -> tuple[Gathered, Calibrated]:

@@ -23,7 +23,7 @@ _DONE, _OPEN = ("✓", "green"), ("·", "yellow")
 
 
 def now_text(shown: Shown) -> str:
-    """Return in words the outcome of the last pair of images."""
+    """Return a sentence on the outcome of the last pair of images."""
     look = shown.look
     if shown.doing:
         return shown.doing
@@ -114,7 +114,7 @@ class Lines:
         self._wish = ""
 
     def __call__(self, shown: Shown) -> None:
-        """Say what is new."""
+        """Print what is new."""
         for text in (shown.refusal and f"not good enough yet: {shown.refusal}", *shown.trouble):
             self._once(text)
         if _is_taken(shown.look) or (shown.wish != self._wish and not shown.doing):
@@ -127,7 +127,7 @@ class Lines:
             self._once(now_text(shown))
 
     def _once(self, text: str) -> None:
-        """Say it, unless it was said since the last view."""
+        """Print the text, unless it was printed since the last view."""
         if text and text not in self._said:
             self._said.add(text)
             self._say(text)

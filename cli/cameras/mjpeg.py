@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from types import TracebackType
 from typing import Any, Self
 
 from bodyschema.daemon.service.local_web import HEADERS, LOOPBACK, host_refusal
@@ -52,9 +51,7 @@ class MjpegServer:
         threading.Thread(target=serve, args=(_END_CHECK_S,), name="pictures", daemon=True).start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         with self._changed:
             self._is_closing = True
             self._changed.notify_all()

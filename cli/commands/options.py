@@ -13,6 +13,7 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 if TYPE_CHECKING:
+    from bodyschema.cli.terminal.diagnosis_run import Asked
     from bodyschema.daemon.config import Config
     from bodyschema.recordings.recording import Recording
 
@@ -23,14 +24,6 @@ RobotFile = Annotated[Path, Parameter(env_var=VARIABLE, help="The robot's descri
 SourceRobotFile = Annotated[
     Path | None,
     Parameter(show_default=False, help=f"robot.toml; else the one beside the source, {VARIABLE}, or here."),
-]
-
-
-LeRobotFile = Annotated[
-    Path | None,
-    Parameter(
-        name="--lerobot", help="LeRobot's calibration file: show its homing offsets with the joint offsets found."
-    ),
 ]
 
 
@@ -91,6 +84,63 @@ class SourceOptions:
 AS_THEY_ARE = SourceOptions()
 
 
+@Parameter(name="*")
+@dataclass(frozen=True)
+class SearchOptions:
+    """What a diagnosis looks for."""
+
+    effects: Annotated[str | None, Parameter(help="Look for these alone, as in backlash,joint_offset.")] = None
+    exclude: Annotated[str | None, Parameter(help="Do not look for these.")] = None
+    seed: Annotated[int, Parameter(help="Of the resampling behind the intervals.", validator=Number(gte=0))] = 0
+
+    def asked(self) -> Asked:
+        """Return the effects to look for; RequestError for an unknown one."""
+        from bodyschema.cli.terminal.diagnosis_run import Asked
+
+        return Asked.of(self.effects, self.exclude, self.seed)
+
+
+ANYTHING = SearchOptions()
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class LeRobotOptions:
+    """What becomes of the joint offsets found in LeRobot's calibration file."""
+
+    lerobot: Annotated[
+        Path | None,
+        Parameter(
+            name="--lerobot", help="LeRobot's calibration file: show its homing offsets with the joint offsets found."
+        ),
+    ] = None
+    write: Annotated[
+        bool,
+        Parameter(help="Write the file of --lerobot; the old one is kept beside it.", negative="", show_default=False),
+    ] = False
+
+    def lines(self, config: Config, offsets_rad: Mapping[str, float], recording: Path | None) -> list[str]:
+        """Return what joint offsets change in the file, after writing it where asked; nothing without a file.
+
+        Where the file has the offsets of this `recording` already, this is said, and nothing is written.
+        """
+        from bodyschema.cli.hardware.lerobot_offsets import CorrectedCalibration, after_writing, difference
+
+        if self.lerobot is None:
+            return []
+        corrected = CorrectedCalibration.of(config, self.lerobot, offsets_rad)
+        if already := corrected.already(recording):
+            return already
+        lines = difference(corrected)
+        if not any(change.ticks for change in corrected.changes):
+            return lines
+        written = after_writing(corrected.write(recording)) if self.write else "Nothing is written without --write."
+        return [*lines, written]
+
+
+WITHOUT_LEROBOT = LeRobotOptions()
+
+
 def flag(text: str, *, name: str | None = None) -> Parameter:
     """Return an option without a value, off by default."""
     return Parameter(name=name, help=text, negative="", show_default=False)
@@ -119,21 +169,3 @@ def robot_file(given: Path | None, source: Path | None) -> Path:
     if source is not None and (beside := source.parent / HERE).exists():
         return beside
     return Path(os.environ.get(VARIABLE, HERE))
-
-
-def lerobot_lines(
-    config: Config, file: Path, offsets_rad: Mapping[str, float], recording: Path | None, *, write: bool
-) -> list[str]:
-    """Return what joint offsets change in LeRobot's calibration `file`, after writing it where `write` says so.
-
-    Where the file has the offsets of this `recording` already, this is said, and nothing is written.
-    """
-    from bodyschema.cli.hardware.lerobot_offsets import CorrectedCalibration, after_writing, difference
-
-    corrected = CorrectedCalibration.of(config, file, offsets_rad)
-    if already := corrected.already(recording):
-        return already
-    lines = difference(corrected)
-    if not any(change.ticks for change in corrected.changes):
-        return lines
-    return [*lines, after_writing(corrected.write(recording)) if write else "Nothing is written without --write."]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from contextlib import ExitStack
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Self
 
 import msgspec
@@ -27,13 +26,25 @@ from bodyschema.robot.urdf import chain_between
 from kbmaps import RigidChain
 
 READ_S = 0.1
-SPEED_OVER_S = 0.1
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the watch on joints."""
+
+    speed_over_s: float = 0.1
+    moved_rad: float = math.radians(3.0)
+    still_rad: float = math.radians(0.5)
+    still_s: float = 1.0
+    # [rad or m]: elasticity of a stop, resolution of an encoder
+    beyond: float = 0.01
+    # a marker that moved less shows no direction
+    seen_m: float = 0.01
+
+
+_SETTINGS = _Settings()
+
 TEMPERATURE_EVERY_S = 0.5  # one servo in turn
-MOVED_RAD = math.radians(3.0)
-STILL_RAD = math.radians(0.5)
-STILL_S = 1.0
-BEYOND = 0.01  # [rad or m]: elasticity of a stop, resolution of an encoder
-SEEN_M = 0.01  # a marker that moved less shows no direction
 WORDS = (("forward", "back"), ("left", "right"), ("up", "down"))  # REP 103: x, y, z
 
 
@@ -106,9 +117,7 @@ class JointsWatch:
         self._opened.enter_context(self._reading)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._opened.close()
 
     def look(self) -> Seen | None:
@@ -164,7 +173,7 @@ class JointsWatch:
             high=high,
             lower=lower,
             upper=upper,
-            within_limits=lower - BEYOND <= low and high <= upper + BEYOND,
+            within_limits=lower - _SETTINGS.beyond <= low and high <= upper + _SETTINGS.beyond,
         )
 
 
@@ -194,7 +203,7 @@ class Speeds:
     def take(self, t: float, q: FloatArray) -> None:
         """Add the joint angles `q` (d,) [rad] at `t` [s]."""
         passed = t - self._t
-        if passed < SPEED_OVER_S:
+        if passed < _SETTINGS.speed_over_s:
             return
         if math.isfinite(passed):
             self.v, self.are_known = (q - self._q) / passed, True
@@ -225,13 +234,13 @@ class SignCheck:
         """Add the joint angles `q` (d,) [rad] at `t` [s]."""
         if self._begin is None:
             self._begin = q
-        if self._rest is None or np.abs(q - self._rest.q).max() > STILL_RAD:
+        if self._rest is None or np.abs(q - self._rest.q).max() > _SETTINGS.still_rad:
             self._rest = _Rest(t, q)
         moved = q - self._begin
         place = int(np.abs(moved).argmax())
-        if abs(moved[place]) > MOVED_RAD:
+        if abs(moved[place]) > _SETTINGS.moved_rad:
             self.said = self._sentence(place, self._begin, float(moved[place]))
-        if t - self._rest.t > STILL_S:  # at rest: what follows is another move
+        if t - self._rest.t > _SETTINGS.still_s:  # at rest: what follows is another move
             self._begin = q
 
     def _sentence(self, place: int, begin: FloatArray, moved: float) -> str:
@@ -240,7 +249,7 @@ class SignCheck:
         end[place] += moved
         went = self._chain.positions(end[None])[0] - self._chain.positions(begin[None])[0]
         axis = int(np.abs(went).argmax())
-        if abs(went[axis]) < SEEN_M:
+        if abs(went[axis]) < _SETTINGS.seen_m:
             way = "counter-clockwise" if moved > 0 else "clockwise"
             return f"{joint} {turn}: by the URDF it turned {way}, its axis pointing at you"
         word, sign = WORDS[axis][int(went[axis] < 0)], "+-"[int(went[axis] < 0)]

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from bodyschema.daemon.wiring.servos import KnownModel, Servos, known_models
 from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.servos import ScannedBus
 from bodyschema.robot.lerobot import (
     ARMS,
     RAD_PER_TICK,
@@ -23,13 +24,12 @@ from bodyschema.robot.suggest import did_you_mean
 from bodyschema.robot.urdf import MOVING, UrdfTree
 
 from .robot_template import Seen, guess_of, key_name, quoted, robot_toml
-from .scan_report import ScannedPort
 
 BAUD = 1_000_000
 # Where the middle of a joint's limits is nearer to 0 than this, 0 is meant to be the middle: the URDF of SO-101 has
 # wrist_roll from -157° to 163°, and LeRobot's own kinematics gives it the degrees as they are.
 MIDDLE_WITHIN_RAD = math.radians(5.0)
-Scan = Callable[[Sequence[int]], Sequence[ScannedPort]]
+Scan = Callable[[Sequence[int]], Sequence[ScannedBus]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +110,7 @@ def _make(model: KnownModel) -> Make:
     return "feetech" if model.table.endswith("feetech") else "dynamixel"
 
 
-def _ids(bus: ScannedPort) -> str:
+def _ids(bus: ScannedBus) -> str:
     return ", ".join(f"ID {servo.id} ({servo.model})" for servo in bus.servos) or "none"
 
 

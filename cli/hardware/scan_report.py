@@ -5,52 +5,15 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from bodyschema.daemon.wiring.servos import known_models, require_servos
+from bodyschema.interfaces.servos import FoundServo, ScannedBus
 
 if TYPE_CHECKING:
     from bodyschema.daemon.config import Config
-
-
-class Servo(Protocol):
-    """A servo that answered; see `bodyschema.drivers.scan.FoundServo`."""
-
-    @property
-    def port(self) -> str: ...
-    @property
-    def baud(self) -> int: ...
-    @property
-    def protocol(self) -> str: ...
-    @property
-    def id(self) -> int: ...
-    @property
-    def model(self) -> str | None: ...
-    @property
-    def firmware(self) -> str | None: ...
-    @property
-    def voltage_v(self) -> float | None: ...
-    @property
-    def temperature_c(self) -> float | None: ...
-    @property
-    def has_torque(self) -> bool | None: ...
-    @property
-    def troubles(self) -> tuple[str, ...]: ...
-    @property
-    def is_double(self) -> bool: ...
-
-
-class ScannedPort(Protocol):
-    """Scan result of a port; see `bodyschema.drivers.scan.ScannedBus`."""
-
-    @property
-    def port(self) -> str: ...
-    @property
-    def servos(self) -> Sequence[Servo]: ...
-    @property
-    def trouble(self) -> str | None: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +33,7 @@ class JointFinding:
     model: str
     state: str
     fix: str = ""
-    servo: Servo | None = None
+    servo: FoundServo | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,13 +46,13 @@ class ScanReport:
         cameras: this machine's cameras, by their names in robot.toml.
     """
 
-    ports: Sequence[ScannedPort]
+    ports: Sequence[ScannedBus]
     joints: tuple[JointFinding, ...] | None = None
-    strangers: tuple[Servo, ...] = ()
+    strangers: tuple[FoundServo, ...] = ()
     cameras: tuple[str, ...] = ()
 
     @property
-    def servos(self) -> list[Servo]:
+    def servos(self) -> list[FoundServo]:
         """All servos found."""
         return [servo for port in self.ports for servo in port.servos]
 
@@ -101,7 +64,7 @@ class ScanReport:
         return self.joints is None or (not self.strangers and all(joint.state == "ok" for joint in self.joints))
 
 
-def report_of(ports: Sequence[ScannedPort], config: Config | None) -> ScanReport:
+def report_of(ports: Sequence[ScannedBus], config: Config | None) -> ScanReport:
     """Return the report; without `config`, of the ports alone.
 
     Raises:
@@ -122,7 +85,9 @@ def report_of(ports: Sequence[ScannedPort], config: Config | None) -> ScanReport
     return ScanReport(ports, tuple(joints), tuple(strangers))
 
 
-def _place(found: Sequence[Servo], id: int, model: str, port: str, baud: int) -> tuple[str, str, Servo | None]:
+def _place(
+    found: Sequence[FoundServo], id: int, model: str, port: str, baud: int
+) -> tuple[str, str, FoundServo | None]:
     """Return state, remedy and servo for a servo that should be on `port` at `baud`."""
     here = [servo for servo in found if servo.id == id and os.path.realpath(servo.port) == os.path.realpath(port)]
     if any(servo.is_double for servo in here) or len([servo for servo in here if servo.baud == baud]) > 1:

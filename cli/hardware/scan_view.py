@@ -8,7 +8,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from .scan_report import ScanReport, Servo
+from bodyschema.interfaces.servos import FoundServo
+
+from .scan_report import ScanReport
 
 HEADINGS = ("ID", "model", "fw", "protocol", "bit/s", "supply", "temp.", "torque", "joint")
 RIGHT = ("ID", "fw", "bit/s", "supply", "temp.")
@@ -33,7 +35,7 @@ def show(console: Console, report: ScanReport) -> None:
     console.print(_verdict(report, troubles), markup=False, soft_wrap=True)
 
 
-def _table(servos: Sequence[Servo], joints: dict[int, str], *, named: bool) -> Table:
+def _table(servos: Sequence[FoundServo], joints: dict[int, str], *, named: bool) -> Table:
     table = Table(box=None, padding=(0, 1, 0, 0), header_style="dim")
     for heading in HEADINGS if named else HEADINGS[:-1]:
         table.add_column(heading, justify="right" if heading in RIGHT else "left", no_wrap=True)

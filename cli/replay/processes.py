@@ -51,7 +51,7 @@ class Process:
             time.sleep(0.1)
 
     def end(self) -> None:
-        """Ask it to end; kill it after a time limit."""
+        """Terminate the process; kill it after a time limit."""
         if self.popen.poll() is None:
             self.popen.send_signal(signal.SIGTERM)
         try:

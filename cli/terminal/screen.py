@@ -46,7 +46,7 @@ def titled_table(title: str, *, numbers: bool = True) -> Table:
 
 
 def rejected(status: SamplerStatus) -> list[tuple[str, int]]:
-    """Return the rejected frames by reason in words, the most frequent first."""
+    """Return a text of the rejected frames by reason, the most frequent first."""
     return [
         (reason.replace("_", " "), count)
         for reason, count in sorted(status.rejected.items(), key=lambda item: -item[1])

@@ -103,7 +103,7 @@ class PairFeed:
         return self._paused
 
     def offer(self, payload: bytes) -> None:
-        """Take a published pair."""
+        """Accept a published pair."""
         self._published = payload, self._clock.now()
         if self._waiting.qsize() < WAITING:
             self._waiting.put(payload)
@@ -120,7 +120,7 @@ class PairFeed:
         self._paused = True
 
     def resume(self) -> None:
-        """Take pairs again, starting with the missed ones."""
+        """Accept pairs again, starting with the missed ones."""
         self._paused = False
         self.wake()
 

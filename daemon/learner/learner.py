@@ -342,7 +342,7 @@ class Learner:
         self._rested_with = None
 
     def solve_soon(self) -> None:
-        """Let the solver catch up, since there is no other work."""
+        """Start the solver on all pairs learnt so far, since there is no other work."""
         self._learning.solve_soon()
 
 

@@ -22,7 +22,7 @@ def find_powered(drives: Iterable[object], name: str, file: Path) -> Powered:
 
 
 def asked(drive: Powered, *, on: bool) -> str:
-    """Ask, and wait for the answer of the reading thread; a request that times out is cancelled.
+    """Send a request to the reading thread and wait for its answer; cancel it on a timeout.
 
     Raises:
         RequestError: it is refused, or the servos are not being read.

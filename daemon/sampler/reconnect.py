@@ -6,7 +6,6 @@ import logging
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from types import TracebackType
 from typing import Generic, Protocol, Self, TypeVar
 
 from bodyschema.interfaces.errors import SourceError, SourceLost, StoreUnwritable
@@ -71,9 +70,7 @@ class ReconnectingSource(Generic[R_co]):
         self._is_open = True
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._opened.close()
 
     @property

@@ -9,46 +9,9 @@ from typing import Protocol, runtime_checkable
 from bodyschema.daemon.transport.status import BusStatus, ServoStatus
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.protocols import JointSource
+from bodyschema.interfaces.servos import BusHealth, ServoHealth
 
 log = logging.getLogger(__name__)
-
-
-class ServoHealth(Protocol):
-    """See `bodyschema.drivers.servos.health.ServoHealth`."""
-
-    @property
-    def joint(self) -> str: ...
-    @property
-    def bus(self) -> str: ...
-    @property
-    def id(self) -> int: ...
-    @property
-    def model(self) -> str: ...
-    @property
-    def firmware(self) -> int: ...
-    @property
-    def homing_offset(self) -> int: ...
-    @property
-    def drive_mode(self) -> int: ...
-    @property
-    def voltage_v(self) -> float | None: ...
-    @property
-    def temperature_c(self) -> float | None: ...
-    @property
-    def current_a(self) -> float | None: ...
-    @property
-    def troubles(self) -> Sequence[str]: ...
-
-
-class BusHealth(Protocol):
-    """See `bodyschema.drivers.servos.health.BusHealth`."""
-
-    @property
-    def exchanges(self) -> int: ...
-    @property
-    def troubles(self) -> Mapping[str, int]: ...
-    @property
-    def way(self) -> str: ...
 
 
 @runtime_checkable
@@ -123,7 +86,7 @@ def _bus(bus: BusHealth) -> BusStatus:
 
 
 def accept_turns(encoders: object) -> str:
-    """Let encoders that lost their turn count assume the turns nearest to the last positions; return a message.
+    """Set lost turn counts to the turns nearest to the last positions; return a message.
 
     Raises:
         RequestError: no turn count was lost.

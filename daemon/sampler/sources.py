@@ -173,20 +173,26 @@ LONGEST_TOOL_M = 2.0
 
 
 class ToolRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`{"tool": [x, y, z]}`: the marker of the new tool in the marker link [m]."""
+    """Mounts another tool on the simulated hand. An empty request returns the truth instead.
+
+    Attributes:
+        tool: marker position in `marker_link`, at most 2 m from the hand [m].
+    """
 
     tool: tuple[float, float, float]
 
 
 class TruthReply(msgspec.Struct, frozen=True):
-    """The true chain from measurement frame to marker, as `kbmaps.RigidChain`.
+    """The simulated robot's ground truth: the exact chain from measurement frame to marker over the encoders' angles.
+
+    For evaluation only.
 
     Attributes:
-        fixed: shape (d + 1, 4, 4).
-        axes: shape (d, 3).
-        prismatic: shape (d,).
+        fixed: transform before each joint, and last the marker's [m], (d + 1) × 4 × 4.
+        axes: unit axis of each joint, d × 3.
+        prismatic: d booleans.
         t: simulated time [s].
-        turn: rotation of the marker in the chain's last frame, shape (3, 3).
+        turn: marker orientation in the chain's last frame, 3 × 3.
     """
 
     fixed: list[list[list[float]]]

@@ -12,7 +12,13 @@ from .wire import SCHEMA
 
 
 class JointRange(msgspec.Struct, frozen=True):
-    """The part of one joint's range that accepted pairs have covered [rad or m]."""
+    """The part of one joint's range that accepted pairs have covered [rad, of a prismatic joint m].
+
+    Attributes:
+        low: smallest angle of all accepted pairs.
+        high: largest.
+        lower_limit, upper_limit: from the URDF.
+    """
 
     low: float
     high: float
@@ -24,11 +30,15 @@ class ServoStatus(msgspec.Struct, frozen=True):
     """One joint's servo.
 
     Attributes:
-        firmware: version that it reports.
-        homing_offset: [ticks]; drive_mode: bits; both as stored in its EEPROM, 0 where it has none.
-        voltage_v, temperature_c: last reported values; null before the first.
-        current_a: null where it is not measured.
-        troubles: problems, with remedies; empty when it is well.
+        bus: its bus in robot.toml.
+        id: on the bus.
+        model, firmware: as it reports them.
+        homing_offset: [ticks]; 0 if the model has none.
+        drive_mode: bits; 0 if the model has none.
+        voltage_v: last value [V], updated every few seconds; null before the first.
+        temperature_c: likewise [°C].
+        current_a: [A]; null if not measured.
+        troubles: problems with remedies; empty if none.
     """
 
     bus: str
@@ -47,10 +57,10 @@ class BusStatus(msgspec.Struct, frozen=True):
     """One bus of servos since the start.
 
     Attributes:
-        exchanges: number of requests sent.
-        answered: share of them with a valid answer.
-        troubles: the failed ones, by kind of failure.
-        way: type of request used for reading its servos, such as Sync Read.
+        exchanges: requests sent.
+        answered: fraction answered correctly.
+        troubles: the others, by error.
+        way: read method, such as Sync Read; empty before the bus is open.
     """
 
     exchanges: int
@@ -63,17 +73,24 @@ class SamplerStatus(msgspec.Struct, frozen=True, kw_only=True):
     """State of the sampler.
 
     Attributes:
-        store: identity of the store.
-        state: running, paused, ended (the source is at its end) or failed.
-        pairs: sequence number of the newest pair in the store, which is the number of accepted pairs.
-        segment: number of the current segment.
-        frames: frames taken since the start.
+        robot: its name.
+        store: UUID of the store.
+        state: `running`, `paused`, `ended` (end of a recording) or `failed`.
+        pairs: number of the newest stored pair, which is the number of accepted pairs.
+        segment: present segment.
+        uptime_s: since the start [s].
+        frames: stereo frames since the start.
+        frames_per_s: over the last second.
+        readings_per_s: encoder readings over the last second.
+        pairs_per_s: over the last second.
         rejected: frames that did not become pairs, by reason.
-        coverage: by joint.
-        health: sentences about problems; empty when all is well.
-        servos: by joint; empty if the joints are no servos.
-        buses: by name; likewise.
-        unreadable: pairs in the store that the disk corrupted; they are left out.
+        coverage: by joint; empty before the first pair.
+        disk_free_bytes: on the store's disk.
+        health: problems; empty if none.
+        version: of bodyschema.
+        servos: by joint; empty without servos.
+        buses: by name; empty without servos.
+        unreadable: corrupted pairs in the store, left out.
     """
 
     robot: str
@@ -104,16 +121,16 @@ class Change(msgspec.Struct, frozen=True, kw_only=True):
     """The last change of the tool, of the camera or of a joint's offset.
 
     Attributes:
-        first_seq: sequence number of the most probable first pair after it.
+        first_seq: most probable first pair after it.
         earliest_seq, latest_seq: 95 % interval of that pair.
-        noticed_seq: the pair with which it was detected; for a change that was reported by a command, the last pair
-            before it.
-        found: True if it was detected in the pairs; False if it was reported by a command.
+        noticed_seq: pair at which it was detected, or the last one before it was reported.
+        found: detected (true) or reported by a command (false).
         kind: `tool`, `camera`, `joint NAME` (its offset), `other` or `undecided`.
         probabilities: by kind, those above 1 %.
-        alike: the kind that no motion can distinguish from this one; null if there is none.
-        moved_m: RMS displacement of the marker at the pairs since [m]; null where unknown.
-        can_roll_back: True if the previous model is kept.
+        alike: kind that is equivalent to it: the last joint's offset to a tool, the first one's to a camera; null if
+            none.
+        moved_m: RMS displacement of the marker at the pairs since [m]; null if unknown.
+        can_roll_back: the model before it is kept.
     """
 
     first_seq: int
@@ -136,34 +153,38 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
     """State of the learner.
 
     Attributes:
-        store: identity of the store the pairs came from, or null before any.
-        state: waiting (no pair yet), aligning (the measurement frame is not known yet), learning or paused.
-        pairs: number of pairs learnt online, each once.
-        last_seq: sequence number of the newest of them.
+        robot: its name.
+        store: UUID of the pairs' store; null before any.
+        state: `waiting` (no pair yet), `aligning` (frame still unknown), `learning` or `paused`.
+        pairs: pairs learnt online, each once.
+        last_seq: number of the newest of them.
+        pairs_since_change: since the last change, or the start.
+        sampler_alive: a sampler is visible.
         replayed: replay steps since the start.
-        pairs_since_change: pairs since the last change, or since the start.
-        answering: the model that answers queries.
-        prequential_m: error on new pairs, by model: mean distance [m] between the measurement, its noise included, and
-            the prediction made before the pair was learnt; over the same pairs for all models.
-        claimed_error_m: predicted mean distance to the ground truth [m], without measurement noise, within the support
-            of the data.
-        curve: error on new pairs of the answering model, over the number of pairs.
-        model: hash of the answering model.
-        calibration: camera and tool pose and joint offsets; null before the first solution with the present tool.
-        outlook: expected gain of further pairs; null until a solution with the present tool answers.
-        gaps_recovered: pairs that had to be fetched from the sampler's history.
-        refused: pairs that were not accepted.
-        doubted: pairs treated as likely outliers.
-        changes: changes reported by a command, or detected in the pairs.
-        last_change: the last change; null if there was none, or it was rolled back.
-        at_rest: True if all work on the received pairs is done: fitting, solving, replay and findings.
-        checkpoint_age_s: time since the last checkpoint, or null before any.
-        health: sentences about problems; empty when all is well.
-        orientation: null if no pair with the present tool has an orientation.
-        prequential_pairs: number of recent pairs that `prequential_m` averages over.
-        missed: pairs that the sampler had already deleted when this learner requested them.
-        behind: pairs known to be stored and not learnt yet.
-        age_s: age of the newest learnt pair, relative to the newest stored one; null before any since the start.
+        answering: answering model: `prior`, `nlms`, `rigid`, `residual` or `exact`.
+        prequential_m: error on new pairs, by model: mean distance between the measurement, its noise included, and the
+            prediction made before the pair was learnt, over the last `prequential_pairs`, the same for all models [m].
+        claimed_error_m: predicted mean distance to the truth, without measurement noise, where data is [m]; null
+            until a few pairs have been predicted.
+        curve: error on new pairs of the answering model.
+        model: its hash; empty before the first.
+        calibration: camera, tool and joint offsets; null before the first solution with the present tool.
+        outlook: expected gain of more data; null before such a solution.
+        gaps_recovered: pairs fetched from the sampler's history.
+        refused: unusable pairs.
+        doubted: suspected outliers.
+        changes: changes reported or detected.
+        last_change: the last one not rolled back; null if none.
+        at_rest: all pairs are fitted, solved and replayed.
+        checkpoint_age_s: [s]; null before the first, or after a failed one.
+        uptime_s: since the start [s].
+        health: problems; empty if none.
+        version: of bodyschema.
+        orientation: null without orientations with the present tool.
+        prequential_pairs: at most 50; fewer after a change or with a new model.
+        missed: pairs no longer available from the sampler.
+        behind: pairs stored but not yet learnt; a `health` problem from 100 on.
+        age_s: as in PredictReply.
     """
 
     robot: str

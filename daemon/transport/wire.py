@@ -33,9 +33,19 @@ _msgpack_encoder = msgspec.msgpack.Encoder()
 
 
 class PairMessage(msgspec.Struct, frozen=True):
-    """One pair: units and frames as in `bodyschema.interfaces.records.Pair`.
+    """One training pair, published once, after it was stored.
 
-    `cov` [m²] and `cov_R` [rad²] are upper triangles, row by row.
+    Attributes:
+        store: UUID of the store that numbered it.
+        seq: its number in that store, from 1, without gaps.
+        segment: shared by a run of pairs, each one step from its predecessor.
+        t: frame time on the sampler's monotonic clock [s]; may restart with the sampler.
+        utc: wall-clock time of acceptance, ISO 8601.
+        q: joint angles at `t` [rad], d numbers.
+        x: marker position [m].
+        cov: its covariance [m²].
+        R: marker orientation, a unit quaternion; null for a ball.
+        cov_R: covariance of a small rotation about the axes [rad²]; null if unknown.
     """
 
     store: str
@@ -52,7 +62,15 @@ class PairMessage(msgspec.Struct, frozen=True):
 
 
 class PairsReply(msgspec.Struct, frozen=True):
-    """Stored pairs in order. `last_seq` is the newest pair in the store; continue from where the reply ends."""
+    """Stored pairs in order, at most 1000; `from` and `to` are inclusive and optional.
+
+    A reply that begins after `from` means that older pairs were deleted (`[daemon] keep_days`, `keep_mb`).
+
+    Attributes:
+        store: UUID of the store.
+        last_seq: newest pair in the store, 0 if empty.
+        pairs: continue from where they end.
+    """
 
     store: str
     last_seq: int
@@ -61,24 +79,30 @@ class PairsReply(msgspec.Struct, frozen=True):
 
 
 class JointsRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`{"q": [rad…]}` or `{"q": [[rad…]…]}`."""
+    """Joint angles, of one configuration or of several.
+
+    Attributes:
+        q: joint angles [rad]: d numbers, or up to 10,000 such lists.
+    """
 
     q: list[float | list[float]]
 
 
 class PredictReply(msgspec.Struct, frozen=True):
-    """Predictions, a row for each row of the request.
+    """One row for each of the n rows of the request, also for a single vector.
+
+    Sigmas are errors against the truth, without the measurement's noise.
 
     Attributes:
-        x: marker positions in the measurement frame [m].
-        sigma: their 1-sigma per axis [m].
-        in_support: True where the joint angles lie within the support of the data.
+        x: marker positions [m], n × 3.
+        sigma: 1-sigma per axis [m], n × 3.
+        in_support: false where extrapolated, away from all data.
         model: hash of the answering model.
-        pairs: number of pairs it had learnt.
-        age_s: age of the newest of them: the time from it to the newest pair known to be stored, plus the time since
-            the learner heard of that one; null before any since the learner started.
-        R: orientations of the marker in the measurement frame, unit quaternions x, y, z, w; null if none is learnt.
-        sigma_R: their 1-sigma, of a small rotation about each axis of the measurement frame [rad]; null with R.
+        pairs: pairs that it has learnt.
+        age_s: age of the newest learnt pair: from it to the newest pair known to be stored, plus the time since the
+            learner heard of that one [s]; null before any pair.
+        R: marker orientations, n × 4; null where no pair with the present tool had one.
+        sigma_R: 1-sigma of a small rotation about each axis [rad], n × 3; null with `R`.
     """
 
     x: list[list[float]]
@@ -93,7 +117,13 @@ class PredictReply(msgspec.Struct, frozen=True):
 
 
 class JacobianReply(msgspec.Struct, frozen=True):
-    """Jacobians dx/dq [m/rad], a 3 × d matrix for each row of the request."""
+    """Jacobians dx/dq of the marker position.
+
+    Attributes:
+        J: a 3 × d matrix for each row of the request [m/rad].
+        model: hash of the answering model.
+        pairs: pairs that it has learnt.
+    """
 
     J: list[list[list[float]]]
     model: str
@@ -105,9 +135,9 @@ class IkRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The requested marker position.
 
     Attributes:
-        x: in the measurement frame [m].
-        start: current joint angles of the arm [rad]; the answer is close to them if possible.
-        posture: joint angles to stay close to where x leaves a choice [rad], or "middle" of the joint limits.
+        x: wanted marker position [m].
+        start: present joint angles [rad]; tried first, so that the answer is close to them if possible.
+        posture: preferred angles as far as `x` leaves a choice [rad], or "middle" of the limits.
     """
 
     x: tuple[float, float, float]
@@ -116,18 +146,21 @@ class IkRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class IkReply(msgspec.Struct, frozen=True):
-    """Joint angles within the limits, and the remaining distance.
+    """Joint angles within the URDF's limits, of a deterministic, bounded search.
+
+    If the position is unreachable, `q` is the nearest configuration found. Collisions are not checked, and nothing
+    moves.
 
     Attributes:
-        q: joint angles [rad].
-        x: position of the marker there, by the model [m].
-        distance: from x to the requested position [m].
-        converged: True if it is zero, to the solver's tolerance.
-        reason: `reached`, `out_of_reach` or `steps_ran_out`.
-        sigma: 1-sigma per axis of x relative to the ground truth [m].
-        in_support: True if q lies within the support of the data.
+        q: joint angles [rad], d numbers.
+        x: predicted marker position there [m].
+        distance: from it to the requested one [m].
+        converged: `distance` is at most 1e-7 m.
+        reason: `reached`, `out_of_reach` (a local minimum from every start) or `steps_ran_out`.
+        sigma: 1-sigma of `x` per axis against the truth [m].
+        in_support: `q` lies where data was.
         model: hash of the answering model.
-        pairs: number of pairs it had learnt.
+        pairs: pairs that it has learnt.
     """
 
     q: list[float]
@@ -143,13 +176,22 @@ class IkReply(msgspec.Struct, frozen=True):
 
 
 class CommandRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A command to one of the processes; each documents its commands."""
+    """A command to one of the processes.
+
+    Attributes:
+        command: its name.
+    """
 
     command: CommandName
 
 
 class CommandReply(msgspec.Struct, frozen=True):
-    """Confirmation of a command; `message` describes the result."""
+    """Confirmation of a command.
+
+    Attributes:
+        command: the command, which was carried out.
+        message: its effect, for people.
+    """
 
     command: str
     message: str
@@ -157,7 +199,11 @@ class CommandReply(msgspec.Struct, frozen=True):
 
 
 class ErrorReply(msgspec.Struct, frozen=True):
-    """Error in a request; nothing was changed."""
+    """Zenoh's error reply to a query that could not be carried out. Nothing was changed.
+
+    Attributes:
+        error: the error and its remedy, for people.
+    """
 
     error: str
     schema: int = SCHEMA

@@ -144,7 +144,7 @@ def _arm(hardware: OnPorts, angles: Mapping[str, Angle], *, return_delay_s: floa
 
 
 def bench_ports(bench: DryRun) -> list[str]:
-    """Describe in words the devices on each port."""
+    """Return a line on the devices of each port."""
     match bench.config:
         case SerialLinesConfig() as config:
             return [f"{_counted(len(config.encoders), 'encoder')} on {config.port} at {config.baud:,} bit/s"]

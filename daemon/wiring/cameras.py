@@ -258,7 +258,7 @@ def _told(figures: CameraFigures) -> str:
 
 
 def camera_lines(config: Config) -> Iterator[str]:
-    """Describe in words where images come from. Raise ConfigError if the calibration cannot be read."""
+    """Yield lines on the source of the images. Raise ConfigError if the calibration cannot be read."""
     yield from _lines_of(require_cameras(config), config.file.parent)
     for further in config.tables.vision.further_cameras:
         for line in _lines_of(further, config.file.parent):

@@ -328,7 +328,7 @@ def marker_source_checks(config: Config) -> Iterator[Check]:
 
 
 def marker_source_lines(config: Config) -> Iterator[str]:
-    """Describe in words where the marker's positions come from."""
+    """Yield lines on the source of the marker's positions."""
     for table in config.tables.marker_source:
         body = "" if table.body is None else f", body {table.body}"
         yield f"marker positions by {table.label} ({table.kind}) at {table.endpoint}{body}, in {table.unit}"

@@ -97,7 +97,7 @@ class WireFaults:
     """Faults of the packets on one bus."""
 
     def __init__(self, faults: Sequence[tuple[int | None, float, Fault]], rng: Random) -> None:
-        """Take triples of servo ID (None: all), probability and fault."""
+        """Store triples of servo ID (None: all), probability and fault."""
         self._faults, self._rng = tuple(faults), rng
 
     @classmethod

@@ -15,7 +15,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from heapq import heappop, heappush
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from .device import Device, Reply, byte_s
@@ -49,9 +48,7 @@ class PtyShell:
         self.plug_in()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.unplug()
 
     def plug_in(self) -> None:

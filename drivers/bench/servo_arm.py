@@ -6,6 +6,7 @@ import math
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from random import Random
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
@@ -21,10 +22,23 @@ from .chain import AnyServo, ServoChain
 from .device import Faults
 from .dry_run import BenchArm
 
-SLOWEST_S = 20.0  # period of the slowest swing
-PHASE_RAD = 2.4  # between neighbours: the golden angle, so that no two joints move together
-WIDEST_RAD = 1.0
-SHARE_OF_RANGE = 0.35
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the emulated arm."""
+
+    # period of the slowest swing
+    slowest_s: float = 20.0
+    # between neighbours: the golden angle, so that no two joints move together
+    phase_rad: float = 2.4
+    widest_rad: float = 1.0
+    share_of_range: float = 0.35
+    glitch_ticks: int = 700
+    # shaft angle of a second servo with the same ID
+    twin_rad: float = 0.1
+
+
+_SETTINGS = _Settings()
 
 
 def played(path: FloatArray, rate_hz: float, begin_s: float) -> list[Angle]:
@@ -51,16 +65,16 @@ def swinging(limits: Sequence[tuple[float, float]], begin_s: float) -> list[Angl
     def joint(place: int, lower: float, upper: float) -> Angle:
         bounded = math.isfinite(lower) and math.isfinite(upper)
         middle = (lower + upper) / 2 if bounded else 0.0
-        width = min(SHARE_OF_RANGE * (upper - lower), WIDEST_RAD) if bounded else WIDEST_RAD
-        pace = 2 * math.pi / (SLOWEST_S * (0.6 + 0.4 / (place + 1)))
-        return lambda t: middle + width * math.sin(pace * (t - begin_s) + PHASE_RAD * place)
+        width = (
+            min(_SETTINGS.share_of_range * (upper - lower), _SETTINGS.widest_rad) if bounded else _SETTINGS.widest_rad
+        )
+        pace = 2 * math.pi / (_SETTINGS.slowest_s * (0.6 + 0.4 / (place + 1)))
+        return lambda t: middle + width * math.sin(pace * (t - begin_s) + _SETTINGS.phase_rad * place)
 
     return [joint(place, lower, upper) for place, (lower, upper) in enumerate(limits)]
 
 
-GLITCH_TICKS = 700
 AT_THE_START = ("baud", "double", "torque")
-TWIN_RAD = 0.1  # shaft angle of a second servo with the same ID
 
 
 class BenchServo(AnyServo, Protocol):
@@ -160,7 +174,7 @@ class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
 
     def glitch(self, joint: str, is_wrong: bool) -> None:
         """Start or end an encoder error of one joint."""
-        self._servos[joint].glitch_ticks = GLITCH_TICKS if is_wrong else 0
+        self._servos[joint].glitch_ticks = _SETTINGS.glitch_ticks if is_wrong else 0
 
     def power_cycle(self, t: float) -> None:
         """Cut the power of all servos and restore it at `t`."""
@@ -176,7 +190,7 @@ class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
             self._change_rate(servo)
         elif kind == "double":
             entry = next(entry for entry in self._config.servos if entry.joint == joint)
-            self.chains[self._config.bus_of(entry)].servos.append(self._servo(entry, lambda _: TWIN_RAD))
+            self.chains[self._config.bus_of(entry)].servos.append(self._servo(entry, lambda _: _SETTINGS.twin_rad))
         elif kind == "torque":
             servo["torque"] = 1
 

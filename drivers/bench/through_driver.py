@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, Self
 
-from bodyschema.drivers.servos.health import BusHealth, ServoHealth
 from bodyschema.interfaces.protocols import JointSource
 from bodyschema.interfaces.records import JointReading, frozen_array
+from bodyschema.interfaces.servos import BusHealth, ServoHealth
 
 from .dry_run import Angle
 
@@ -88,9 +87,7 @@ class ThroughDriver:
         self._opened.enter_context(self._source)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._behind = None
         self._opened.close()
 

@@ -14,11 +14,10 @@ from bodyschema.drivers.servos.packets import Packets
 from bodyschema.drivers.servos.scan import HOST_S, IDS, Kind, PingScanner, heard
 from bodyschema.interfaces.protocols import Clock
 
+from .models import FAST_HEADER, FASTEST1, PING2
 from .packets import packets_of
 
 __all__ = ["Answer", "Bus", "Exchange", "Request", "Trouble", "sync_request"]
-
-FAST_HEADER = 8  # bytes before the first servo's part
 
 
 def sync_request(layout: Layout, ids: Sequence[int], *, fast: bool) -> Request:
@@ -67,9 +66,7 @@ class Bus(ServoBus):
 
 
 LIKELY_FIRST = (1_000_000, 57_600, 2_000_000, 115_200, 3_000_000, 4_000_000, 9_600)
-FASTEST1 = 3_000_000  # of Protocol 1.0
 SLOT_S = 3e-3  # a servo of Protocol 2.0 waits this long for each ID below its own
-PING2 = 10  # bytes
 
 
 def _kind(version: Version) -> Kind:

@@ -11,8 +11,7 @@ import msgspec
 from bodyschema.drivers.servos.config import ServoConfig, ServosConfig
 from bodyschema.drivers.servos.model import Model
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.robot.toml_file import line_of
-from bodyschema.robot.toml_types import NonNegative
+from bodyschema.robot.toml_file import NonNegative, line_of
 
 from .models import BY_NAME, UNSUPPORTED
 from .powered_config import GazeConfig, ZeroForceConfig

@@ -199,7 +199,7 @@ class Currents:
     def __init__(
         self, joints: Sequence[str], torque_constant: FloatArray, current_limit: FloatArray, ramp_s: float, share: float
     ) -> None:
-        """Take arrays of shape (n,).
+        """Store arrays of shape (n,).
 
         Args:
             joints: names.

@@ -25,12 +25,10 @@ from bodyschema.drivers.servos.settings import BAUD, HOMING_OFFSET, ID, Setting
 from bodyschema.drivers.servos.vendor import ServoVendor, Way
 from bodyschema.interfaces.protocols import Clock
 
+from .models import BAUDS1, CURRENT_MODES, MODES, NEAR_OFFSET, NUMBER1, SIGN1
+
 BAUDS2 = (9600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
-BAUDS1 = (9600, 57_600, 115_200, 1_000_000)  # the register allows others that robot.toml does not
-MODES = {"velocity": 1, "position": 3, "extended": 4, "pwm": 16}
-CURRENT_MODES = {"current": 0, "current_position": 5}
 FARTHEST_OFFSET = 1_044_479  # 255 turns
-NEAR_OFFSET = 1024  # a larger one is ignored in position mode
 LARGEST_ID = 252
 
 RENAMED = "set id in robot.toml"
@@ -111,7 +109,6 @@ def _of_protocol1(model: Model) -> Iterator[Setting]:
 BLOCK2 = struct.Struct("<HBBhhii")  # tick, moving, moving status, PWM, current, velocity, position
 BLOCK1 = struct.Struct("<hHHBBBBB")  # position, speed, load, voltage, temperature, registered, reserved, moving
 LARGEST_PWM = 2009  # of the P series; the others have less
-SIGN1, NUMBER1 = 0x400, 0x3FF  # sign and magnitude of Protocol 1.0
 LARGEST_POSITION1 = 28_672  # in multi-turn mode
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from types import MappingProxyType
 from typing import Annotated
 
 import msgspec
@@ -13,46 +12,9 @@ from msgspec import Meta
 from bodyschema.drivers.servos.config import ServoConfig
 from bodyschema.drivers.servos.model import Model
 from bodyschema.robot.suggest import did_you_mean
-from bodyschema.robot.toml_types import Positive
+from bodyschema.robot.toml_file import Positive
 
-# By model: torque [N·m] and the corresponding current [A].
-TORQUE_AT_CURRENT: Mapping[str, tuple[float, float]] = MappingProxyType(
-    {
-        "MX-64(2.0)": (6.0, 4.1),
-        "MX-106(2.0)": (8.4, 5.2),
-        "XL330-M077": (0.215, 1.47),
-        "XL330-M288": (0.52, 1.47),
-        "XC330-M181": (0.60, 1.80),
-        "XC330-M288": (0.93, 1.80),
-        "XC330-T181": (0.76, 0.80),
-        "XC330-T288": (0.92, 0.80),
-        "XM430-W210": (3.0, 2.3),
-        "XM430-W350": (4.1, 2.3),
-        "XH430-W210": (2.5, 1.3),
-        "XH430-W350": (3.4, 1.3),
-        "XH430-V210": (2.6, 0.7),
-        "XH430-V350": (3.3, 0.7),
-        "XD430-T210": (2.5, 1.3),
-        "XD430-T350": (3.4, 1.3),
-        "XW430-T333": (3.1, 1.3),
-        "XM540-W150": (7.3, 4.4),
-        "XM540-W270": (10.6, 4.4),
-        "XH540-W150": (7.1, 4.9),
-        "XH540-W270": (9.9, 4.9),
-        "XH540-V150": (6.4, 2.4),
-        "XH540-V270": (9.2, 2.4),
-        "XD540-T150": (7.1, 4.9),
-        "XD540-T270": (9.9, 4.9),
-        "XW540-T140": (6.9, 4.9),
-        "XW540-T260": (9.5, 4.9),
-        "PH42-020-S300": (5.1, 1.5),
-        "PH54-100-S500": (25.3, 5.5),
-        "PH54-200-S500": (44.7, 9.3),
-        "PM42-010-S260": (1.7, 0.6),
-        "PM54-040-S250": (3.9, 1.9),
-        "PM54-060-S250": (10.1, 3.0),
-    }
-)
+from .models import TORQUE_AT_CURRENT
 
 
 def torque_constant(model: str) -> float | None:

@@ -9,7 +9,7 @@ import msgspec
 
 from bodyschema.drivers.servos.config import ServoConfig, ServosConfig
 from bodyschema.drivers.servos.model import Model
-from bodyschema.robot.toml_types import NonNegative
+from bodyschema.robot.toml_file import NonNegative
 
 from .models import BY_NAME
 

@@ -22,8 +22,9 @@ from bodyschema.drivers.servos.settings import BAUD, HOMING_OFFSET, ID, Setting
 from bodyschema.drivers.servos.vendor import ServoVendor, Way
 from bodyschema.interfaces.protocols import Clock
 
+from .models import MODES, PING, READ, SYNC_READ, WRITE
+
 BROADCAST = 0xFE
-PING, READ, WRITE, SYNC_READ = 1, 2, 3, 0x82
 
 
 class FeetechPackets:
@@ -99,7 +100,6 @@ class Channel(ServoChannel):
 
 
 LARGEST_ID = 252  # 253 is legal, but no robot.toml can name it
-MODES = {"position": 0, "velocity": 1, "pwm": 2, "step": 3}
 FARTHEST_OFFSET = 2047
 
 RENAMED = "set id in robot.toml"

@@ -99,3 +99,5 @@ HARDWARE_ERRORS: Mapping[int, str] = MappingProxyType(
         0x20: "it is overloaded: free the joint, then switch its supply off and on",
     }
 )
+PING, READ, WRITE, SYNC_READ = 1, 2, 3, 0x82
+MODES = {"position": 0, "velocity": 1, "pwm": 2, "step": 3}

@@ -8,7 +8,6 @@ from collections import deque
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from types import TracebackType
 from typing import Self
 
 import numpy as np
@@ -20,17 +19,34 @@ from bodyschema.robot.rpy import rpy_of
 
 log = logging.getLogger(__name__)
 
-SLICE_S = 0.004  # of waiting for one source before the next is asked
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the fusion of several marker sources."""
+
+    # of waiting for one source before the next is asked
+    slice_s: float = 0.004
+    # without a position from it, another source leads
+    leads_for_s: float = 0.5
+    # acceleration of a guided hand: bounds the error of linear interpolation
+    hand_m_s2: float = 2.0
+    # common positions for the verdict on a source
+    judged: int = 300
+    fewest_judged: int = 30
+    # share of disagreeing positions that is reported; by chance it is 0.001
+    many: float = 0.05
+    # a rigid transform explains a disagreement that it brings below this multiple of the usual chi²
+    well_fitted: float = 3.0
+    # the positions have to span so much in two directions for the transform to be known
+    spread_m: float = 0.02
+
+
+_SETTINGS = _Settings()
+
 LONGEST_WAIT_S = 0.1  # for the other sources' positions of the same time
 LONGEST_GAP_S = 0.12  # between two positions that are interpolated: three frames at 30 Hz, of which one is missing
-LEADS_FOR_S = 0.5  # without a position from it, another source leads
 KEPT = 64
-HAND_M_S2 = 2.0  # acceleration of a guided hand: bounds the error of linear interpolation
 CHI2_999, CHI2_MEDIAN = 16.27, 2.37  # of 3 degrees of freedom
-JUDGED, FEWEST_JUDGED = 300, 30  # common positions for the verdict on a source
-MANY = 0.05  # share of disagreeing positions that is reported; by chance it is 0.001
-WELL_FITTED = 3.0  # a rigid transform explains a disagreement that it brings below this multiple of the usual chi²
-SPREAD_M = 0.02  # the positions have to span so much in two directions for the transform to be known
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +83,7 @@ class Member:
     def __init__(self, name: str, source: MarkerSource, pose: FloatArray) -> None:
         """Store the settings."""
         self.name, self.source, self.pose = name, source, pose
-        self.common: deque[Common] = deque(maxlen=JUDGED)
+        self.common: deque[Common] = deque(maxlen=_SETTINGS.judged)
         self.forget()
 
     def forget(self) -> None:
@@ -77,7 +93,7 @@ class Member:
         self.newest_t = self.fixed_at = -math.inf
 
     def take(self, seen: MarkerFix | MarkerMiss, now: float) -> None:
-        """Take a position or a miss that came at `now` [s]."""
+        """Store a position or a miss that arrived at `now` [s]."""
         self.newest_t = seen.t
         if isinstance(seen, MarkerFix):
             fix = _moved(seen, self.pose)
@@ -97,18 +113,18 @@ class Member:
         share = (t - first.t) / gap_s
         velocity = (second.x - first.x) / gap_s
         late_m = velocity * math.hypot(sigma_s, first.t_sigma, second.t_sigma)
-        bend_m = 0.5 * HAND_M_S2 * share * (1 - share) * gap_s**2
+        bend_m = 0.5 * _SETTINGS.hand_m_s2 * share * (1 - share) * gap_s**2
         cov = (1 - share) ** 2 * first.cov + share**2 * second.cov + np.outer(late_m, late_m) + bend_m**2 * np.eye(3)
         return first.x + share * (second.x - first.x), cov
 
     def verdict(self, leader: str) -> str | None:
         """Return what its positions disagree in with the leader's, with the remedy; None if they agree."""
         common = list(self.common)  # another thread may add to it
-        if len(common) < FEWEST_JUDGED:
+        if len(common) < _SETTINGS.fewest_judged:
             return None
         chi2 = np.array([pair.chi2 for pair in common])
         share = float((chi2 > CHI2_999).mean())
-        if share < MANY:
+        if share < _SETTINGS.many:
             return None
         apart = float(np.median([np.linalg.norm(pair.other - pair.lead) for pair in common]))
         return (
@@ -120,10 +136,10 @@ class Member:
     def _remedy(self, common: Sequence[Common]) -> str:
         lead, other = (np.array([getattr(pair, side) for pair in common]) for side in ("lead", "other"))
         T, spread = _rigid(other, lead)
-        if spread < SPREAD_M:
+        if spread < _SETTINGS.spread_m:
             return "move the marker through the whole workspace; then this message says what would make them agree"
         fitted = [replace(pair, other=T[:3, :3] @ pair.other + T[:3, 3]).chi2 for pair in common]
-        if float(np.median(fitted)) > WELL_FITTED * CHI2_MEDIAN:
+        if float(np.median(fitted)) > _SETTINGS.well_fitted * CHI2_MEDIAN:
             return (
                 "one of them follows another marker, or its latency_s or sigma_m is wrong; look at each alone, with "
                 "`bodyschema watch marker` and `bodyschema calibrate latency`"
@@ -167,9 +183,7 @@ class FusedMarkers:
             self._opened = stack.pop_all()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._opened.close()
 
     def read(self, timeout_s: float) -> MarkerFix | MarkerMiss | None:
@@ -190,7 +204,7 @@ class FusedMarkers:
         ended = 0
         for member in self.members:
             try:
-                seen = member.source.read(SLICE_S)
+                seen = member.source.read(_SETTINGS.slice_s)
             except SourceEnded:
                 ended += 1
                 continue
@@ -200,12 +214,12 @@ class FusedMarkers:
                 missed = seen
         if ended == len(self.members):
             raise SourceEnded
-        is_seen = any(self._clock.now() - member.fixed_at < LEADS_FOR_S for member in self.members)
+        is_seen = any(self._clock.now() - member.fixed_at < _SETTINGS.leads_for_s for member in self.members)
         return None if is_seen else missed
 
     def _next(self) -> MarkerFix | MarkerMiss | None:
         now = self._clock.now()
-        seeing = [member for member in self.members if now - member.fixed_at < LEADS_FOR_S]
+        seeing = [member for member in self.members if now - member.fixed_at < _SETTINGS.leads_for_s]
         if not seeing:
             return None
         leader, *others = seeing

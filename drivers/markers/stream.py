@@ -7,7 +7,7 @@ import math
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterable, Iterator
-from types import TracebackType
+from dataclasses import dataclass
 from typing import Protocol, Self
 
 import numpy as np
@@ -21,17 +21,38 @@ from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, frozen_array
 
-LATELY_S = 10.0
-BUCKET_S = 1.0
-# A share of faulty messages below this costs no pairs worth a message to a person.
-MANY = 0.02
-# The first messages of a clock that is not known yet may be refused.
-WORTH_A_WORD = 4
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the checks of a stream of positions."""
+
+    lately_s: float = 10.0
+    bucket_s: float = 1.0
+    # A share of faulty messages below this costs no pairs worth a message to a person.
+    many: float = 0.02
+    # The first messages of a clock that is not known yet may be refused.
+    worth_a_word: int = 4
+    # of a position without a stamp: the sender's computation and the network
+    arrival_sigma_s: float = 0.005
+    # with unit = "mm": metres, divided by 1000, are all nearer to the origin
+    nearest_m: float = 0.005
+    # a wider covariance is in mm², or useless
+    widest_sigma_m: float = 0.2
+    asymmetry: float = 1e-6
+    # quaternions of single precision, and those written with three digits
+    unit_length: float = 0.01
+    # consecutive lower numbers: the sender was started again
+    restart: int = 3
+    few_per_s: float = 15.0
+
+
+_SETTINGS = _Settings()
+
 USED = "used"
 
 
 class Ledger:
-    """Counters of used and unused messages, in total and of the last `LATELY_S`; for any thread.
+    """Counters of used and unused messages, in total and of the last `lately_s`; for any thread.
 
     Attributes:
         total: number of messages by fault, and the used ones.
@@ -46,22 +67,22 @@ class Ledger:
     def note(self, t: float, what: Fault | str, detail: str = "", count: int = 1) -> bool:
         """Count messages at time `t` [s]; return True once there are enough of this fault to tell a person."""
         with self._lock:
-            if not self._buckets or t - self._buckets[-1][0] >= BUCKET_S:
+            if not self._buckets or t - self._buckets[-1][0] >= _SETTINGS.bucket_s:
                 self._buckets.append((t, Counter()))
-                while t - self._buckets[0][0] > LATELY_S:
+                while t - self._buckets[0][0] > _SETTINGS.lately_s:
                     self._buckets.popleft()
             self._buckets[-1][1][what] += count
             self.total[what] += count
             if isinstance(what, Fault) and detail:
                 self._details[what] = detail
-            return self.total[what] - count < WORTH_A_WORD <= self.total[what]
+            return self.total[what] - count < _SETTINGS.worth_a_word <= self.total[what]
 
     def lately(self, now: float) -> Counter[str]:
         """Return the counts of the last seconds."""
         counts: Counter[str] = Counter()
         with self._lock:
             for t, bucket in self._buckets:
-                if now - t <= LATELY_S:
+                if now - t <= _SETTINGS.lately_s:
                     counts += bucket
         return counts
 
@@ -72,7 +93,7 @@ class Ledger:
         usual = {Fault.NOT_TRACKED} | ({Fault.OTHER_BODY} if counts[USED] or counts[Fault.NOT_TRACKED] else set())
         whole = sum(count for what, count in counts.items() if what not in usual)
         for fault in Fault:
-            if fault in usual or counts[fault] <= MANY * whole:
+            if fault in usual or counts[fault] <= _SETTINGS.many * whole:
                 continue
             yield f"{name}: {counts[fault]} of the last {whole} messages {self.explained(fault)}"
 
@@ -87,13 +108,7 @@ log = logging.getLogger(__name__)
 
 SILENT_AFTER_S = 2.0
 RIVAL_AFTER_S = 1.0  # after this silence of a sender another one is accepted
-ARRIVAL_SIGMA_S = 0.005  # of a position without a stamp: the sender's computation and the network
 FARTHEST_M = 50.0  # no arm is measured over a larger distance: such a number is in millimetres
-NEAREST_M = 0.005  # with unit = "mm": metres, divided by 1000, are all nearer to the origin
-WIDEST_SIGMA_M = 0.2  # a wider covariance is in mm², or useless
-ASYMMETRY = 1e-6
-UNIT_LENGTH = 0.01  # quaternions of single precision, and those written with three digits
-RESTART = 3  # consecutive lower numbers: the sender was started again
 STAMPS = {
     Refusal.NO_STAMP: Fault.NO_STAMP,
     Refusal.DUPLICATE: Fault.DUPLICATE,
@@ -168,9 +183,7 @@ class MarkerStream:
         self._is_open = True
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._is_open = False
         self._receiver.close()
 
@@ -204,7 +217,7 @@ class MarkerStream:
         self._turns = False
 
     def _note_silence(self) -> None:
-        """Ask once why nothing comes: the answer may take a second."""
+        """Find out once why nothing arrives; this may take a second."""
         if self._silence is None and self._clock.now() - self._heard > SILENT_AFTER_S:
             self._silence = self._receiver.silence()
 
@@ -290,7 +303,7 @@ class MarkerStream:
     def _time(self, report: Report, arrived: float) -> tuple[float, float]:
         """Return the time of the measurement and its 1-sigma [s]."""
         if report.stamp_ns is None:
-            return arrived - self._table.latency_s, math.hypot(ARRIVAL_SIGMA_S, self._table.sigma_s)
+            return arrived - self._table.latency_s, math.hypot(_SETTINGS.arrival_sigma_s, self._table.sigma_s)
         times_set = self._clock_of.times_set
         t = self._clock_of.time_of(report.stamp_ns, (0,), arrived)
         if self._clock_of.times_set != times_set:
@@ -317,7 +330,7 @@ class MarkerStream:
         x = self._table.metres * np.array(sent)
         if float(np.linalg.norm(x)) > FARTHEST_M:
             raise Unusable(Fault.UNIT, f"{float(np.linalg.norm(x)):.4g} m")
-        if self._table.unit == "mm" and float(np.linalg.norm(x)) < NEAREST_M:
+        if self._table.unit == "mm" and float(np.linalg.norm(x)) < _SETTINGS.nearest_m:
             raise Unusable(Fault.SMALL_UNIT, f"{1e3 * float(np.linalg.norm(x)):.2g} mm")
         return frozen_array(x)
 
@@ -329,7 +342,7 @@ class MarkerStream:
         size = math.isqrt(len(report.cov))
         whole = np.array(report.cov).reshape(size, size)
         cov = self._table.metres**2 * self._proper(whole[:3, :3])
-        if float(np.linalg.eigvalsh(cov)[-1]) > WIDEST_SIGMA_M**2:
+        if float(np.linalg.eigvalsh(cov)[-1]) > _SETTINGS.widest_sigma_m**2:
             raise Unusable(Fault.COVARIANCE, f"1-sigma {math.sqrt(float(np.linalg.eigvalsh(cov)[-1])):.3g} m")
         turn = whole[3:, 3:] if size == 6 and whole[3:, 3:].any() else None
         return frozen_array(cov), None if turn is None else frozen_array(self._proper(turn))
@@ -337,7 +350,7 @@ class MarkerStream:
     @staticmethod
     def _proper(cov: FloatArray) -> FloatArray:
         """Return a covariance that is symmetric and positive definite."""
-        if not np.isfinite(cov).all() or np.abs(cov - cov.T).max() > ASYMMETRY * np.abs(cov).max():
+        if not np.isfinite(cov).all() or np.abs(cov - cov.T).max() > _SETTINGS.asymmetry * np.abs(cov).max():
             raise Unusable(Fault.COVARIANCE, "not symmetric, or not finite")
         if float(np.linalg.eigvalsh(cov)[0]) <= 0.0:
             raise Unusable(Fault.COVARIANCE, "not positive definite")
@@ -348,7 +361,7 @@ class MarkerStream:
         if turn is None or not any(turn):
             return None
         length = math.sqrt(sum(part * part for part in turn))
-        if not abs(length - 1.0) < UNIT_LENGTH:
+        if not abs(length - 1.0) < _SETTINGS.unit_length:
             raise Unusable(Fault.TURN, f"length {length:.3g}")
         if self._first_turn is None:
             self._first_turn = turn
@@ -370,7 +383,7 @@ class _Numbers:
             self._newest, self._lower = seq, 0
             return 0 if before is None else seq - before - 1, None
         self._lower += seq < before
-        if self._lower >= RESTART:
+        if self._lower >= _SETTINGS.restart:
             self._newest, self._lower = seq, 0
             return 0, None
         return 0, Fault.DUPLICATE if seq == before else Fault.OUT_OF_ORDER
@@ -378,7 +391,6 @@ class _Numbers:
 
 READ_S = 2.5  # until the clock of the stamps is known to milliseconds
 WAIT_S = 0.1
-FEW_PER_S = 15.0
 
 
 def stream_checks(stream: MarkerStream, clock: Clock, read_s: float = READ_S) -> Iterator[Check]:
@@ -418,7 +430,7 @@ def _of_fixes(subject: str, fixes: list[MarkerFix]) -> Iterator[Check]:
     place = ", ".join(f"{1e3 * value:.1f}" for value in last.x)
     sigma = 1e3 * float(np.sqrt(np.linalg.eigvalsh(last.cov)[-1]))
     said = f"{rate:.0f} positions/s, last at ({place}) mm ± {sigma:.2g} mm, time known to {1e3 * last.t_sigma:.1f} ms"
-    if rate < FEW_PER_S:
+    if rate < _SETTINGS.few_per_s:
         yield Check(subject, "warning", said, "let the source send more often: 30 to 100 a second")
     else:
         yield Check(subject, "ok", said)

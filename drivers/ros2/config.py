@@ -12,8 +12,7 @@ from msgspec import Meta
 
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.suggest import did_you_mean
-from bodyschema.robot.toml_file import line_of
-from bodyschema.robot.toml_types import Positive
+from bodyschema.robot.toml_file import Positive, line_of
 
 TABLE = ("drivers", "ros2")
 TOPIC = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")

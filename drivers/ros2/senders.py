@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from statistics import median
 
@@ -12,15 +13,37 @@ from bodyschema.drivers.device_clock import DeviceClock
 from bodyschema.drivers.turns import SpeedGate
 
 TICK_S = 1e-9
-TICKS = 1 << 62  # 146 years: stamps do not wrap
-EARLY_S = 2e-3  # a message may be faster than all before by this much
-WORST_DRIFT = 5e-3  # plus this share of the time since the last one
-SURE_AFTER = 3  # consecutive early messages after which the others count as late, or the clock as set
-LATE_S = 5e-3  # if all are later than the first by this much
-LATE_FOR_S = 1.0  # for this long, then the first message's stamp was wrong
-LATELY = 51  # messages used to estimate the scatter of delays
-QUICKEST_SIGMA_S = 0.5e-3  # unobservable transit time of the fastest message: 0.2 ms on the loopback interface
-STEADY = 0.5  # times advance at half speed at least after a faster message shows that all others were late
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the fit of a sender's clock."""
+
+    # 146 years: stamps do not wrap
+    ticks: int = 1 << 62
+    # a message may be faster than all before by this much
+    early_s: float = 2e-3
+    # plus this share of the time since the last one
+    worst_drift: float = 5e-3
+    # consecutive early messages after which the others count as late, or the clock as set
+    sure_after: int = 3
+    # if all are later than the first by this much
+    late_s: float = 5e-3
+    # for this long, then the first message's stamp was wrong
+    late_for_s: float = 1.0
+    # messages used to estimate the scatter of delays
+    lately: int = 51
+    # unobservable transit time of the fastest message: 0.2 ms on the loopback interface
+    quickest_sigma_s: float = 0.5e-3
+    # times advance at half speed at least after a faster message shows that all others were late
+    steady: float = 0.5
+    # consecutive stamps that all disagree with the clock
+    anew_after: int = 3
+    # if they are late by less, the network was probably held up
+    stall_s: float = 5.0
+
+
+_SETTINGS = _Settings()
 
 
 class StampClock:
@@ -39,7 +62,7 @@ class StampClock:
         self._max_delay_s = max_delay_s
         self._last: tuple[int, float] | None = None  # stamp and time
         self._early: list[float] = []
-        self._delays: deque[float] = deque(maxlen=LATELY)
+        self._delays: deque[float] = deque(maxlen=_SETTINGS.lately)
         self._least_s = self._began = math.inf
         self._begin(0)
 
@@ -61,7 +84,7 @@ class StampClock:
             return None
         t = bounds[1]
         if self._last is not None:
-            t = max(t, self._last[1] + STEADY * (stamp_ns - self._last[0]) * TICK_S)
+            t = max(t, self._last[1] + _SETTINGS.steady * (stamp_ns - self._last[0]) * TICK_S)
         self._last = stamp_ns, t
         self._heard += 1
         self._delays.append(arrived - t)
@@ -76,7 +99,7 @@ class StampClock:
         `max_delay_s`, so the fastest of n messages is expected to have taken that divided by n + 1.
         """
         unseen_s = self._max_delay_s / (self._heard + 1)
-        return math.hypot(QUICKEST_SIGMA_S, unseen_s, median(self._delays) if self._delays else 0.0)
+        return math.hypot(_SETTINGS.quickest_sigma_s, unseen_s, median(self._delays) if self._delays else 0.0)
 
     def lateness_s(self, stamp_ns: int, arrived: float) -> float:
         """Return how much later a message arrived than the fastest would have [s]; infinite before any."""
@@ -90,10 +113,10 @@ class StampClock:
         This is done at the start only. Later on, when all are late, the network is slow.
         """
         self._least_s = min(self._least_s, delay_s) if arrived > self._began else math.inf
-        if arrived - self._began < LATE_FOR_S:
+        if arrived - self._began < _SETTINGS.late_for_s:
             return
         self._began = math.inf
-        if self._least_s > LATE_S:
+        if self._least_s > _SETTINGS.late_s:
             self._begin(stamp_ns)
 
     def _is_early(self, stamp_ns: int, arrived: float) -> bool:
@@ -103,12 +126,12 @@ class StampClock:
             self._began = arrived
             return False
         passed_s = (stamp_ns - self._last[0]) * TICK_S
-        if self.lateness_s(stamp_ns, arrived) >= -EARLY_S - WORST_DRIFT * abs(passed_s):
+        if self.lateness_s(stamp_ns, arrived) >= -_SETTINGS.early_s - _SETTINGS.worst_drift * abs(passed_s):
             self._early.clear()
             return False
         offset_s = arrived - (stamp_ns - self._first_ns) * TICK_S
         self._early = [early for early in self._early if abs(early - offset_s) < self._max_delay_s] + [offset_s]
-        if len(self._early) < SURE_AFTER:
+        if len(self._early) < _SETTINGS.sure_after:
             return True
         self._begin(stamp_ns)
         return False
@@ -117,15 +140,13 @@ class StampClock:
         return self._last is not None and self.lateness_s(stamp_ns, arrived) > self._max_delay_s
 
     def _begin(self, stamp_ns: int) -> None:
-        self._device, self._first_ns, self._last = DeviceClock(TICK_S, TICKS), stamp_ns, None
+        self._device, self._first_ns, self._last = DeviceClock(TICK_S, _SETTINGS.ticks), stamp_ns, None
         self._early.clear()
         self._delays.clear()
         self._heard = 0
 
 
-ANEW_AFTER = 3  # consecutive stamps that all disagree with the clock
 ANEW_AFTER_S = 0.5  # for this long: the sender's clock was set
-STALL_S = 5.0  # if they are late by less, the network was probably held up
 ANEW_AFTER_STALL_S = 10.0  # and catches up within this time
 
 
@@ -188,9 +209,9 @@ class Sender:
         off_s = self._clock.lateness_s(stamp_ns, arrived)
         if self._astray and abs(off_s - self._astray[0][1]) > self._max_delay_s:
             self._astray.clear()
-        self._astray = [*self._astray[: ANEW_AFTER - 1], (arrived, off_s)]
-        patience_s = ANEW_AFTER_STALL_S if 0 < off_s < STALL_S else ANEW_AFTER_S
-        if len(self._astray) == ANEW_AFTER and arrived - self._astray[0][0] > patience_s:
+        self._astray = [*self._astray[: _SETTINGS.anew_after - 1], (arrived, off_s)]
+        patience_s = ANEW_AFTER_STALL_S if 0 < off_s < _SETTINGS.stall_s else ANEW_AFTER_S
+        if len(self._astray) == _SETTINGS.anew_after and arrived - self._astray[0][0] > patience_s:
             self._clock, self._newest_ns, self._astray = StampClock(self._max_delay_s), {}, []
             self.times_set += 1
         return refusal

@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Self
 
 from bodyschema.drivers.checks import MANY_TROUBLES, READ_S, Check
@@ -27,13 +26,25 @@ from .lines import ASK_HEADER, Header
 
 log = logging.getLogger(__name__)
 
-HEADER_S = 4.0  # an Arduino restarts when its port is opened, which takes two seconds
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the reading of an encoder board."""
+
+    # an Arduino restarts when its port is opened, which takes two seconds
+    header_s: float = 4.0
+    anchor_s: float = 2.0
+    few_attempts: int = 3
+    # of a turn
+    slack_ticks_part: int = 1000
+    few_per_s: float = 50.0
+
+
+_SETTINGS = _Settings()
+
 ASK_EVERY_S = 0.5
-ANCHOR_S = 2.0
 LARGEST_SIGMA_S = 5e-3  # of a reading's time
 LOST_AFTER_S = 0.25  # without a reading; no joint makes half a turn unnoticed in this time
-FEW_ATTEMPTS = 3
-SLACK_TICKS_PART = 1000  # of a turn
 
 OpenPort = Callable[[SerialLinesConfig, Clock], Port]
 
@@ -178,9 +189,7 @@ class SerialLineJoints:
         log.info("%d encoders are read", len(self.encoders))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._port is not None:
             _close(self._port)
             self._port = None
@@ -215,7 +224,7 @@ class SerialLineJoints:
         self._failing.clear()
         self._gate = SpeedGate(
             [math.radians(self._config.max_speed_deg_s) / encoder.rad_per_tick for encoder in self.encoders],
-            [2 + encoder.ticks_per_turn / SLACK_TICKS_PART for encoder in self.encoders],
+            [2 + encoder.ticks_per_turn / _SETTINGS.slack_ticks_part for encoder in self.encoders],
         )
         self._anchor(port)
         self._believed_s = self._heard_s = self._clock.now()
@@ -223,7 +232,7 @@ class SerialLineJoints:
 
     def _introduced(self, port: Port) -> Header:
         """Return the board's header. Request it until it arrives."""
-        end, heard = self._clock.now() + HEADER_S, 0
+        end, heard = self._clock.now() + _SETTINGS.header_s, 0
         while self._clock.now() < end:
             port.write(ASK_HEADER)
             ask_again = min(end, self._clock.now() + ASK_EVERY_S)
@@ -256,7 +265,7 @@ class SerialLineJoints:
 
     def _anchor(self, port: Port) -> None:
         """Find the turn of each joint from two consistent readings; wait until the times are accurate."""
-        end, believed = self._clock.now() + ANCHOR_S, 0
+        end, believed = self._clock.now() + _SETTINGS.anchor_s, 0
         self._why = "no line"
         while self._clock.now() < end:
             while (timed := self._board.next()) is not None:
@@ -280,7 +289,7 @@ class SerialLineJoints:
 
     def _hear(self, port: Port, deadline: float) -> None:
         lost_at = self._believed_s + LOST_AFTER_S
-        data = port.receive(min(deadline, max(lost_at, self._clock.now() + LOST_AFTER_S / FEW_ATTEMPTS)))
+        data = port.receive(min(deadline, max(lost_at, self._clock.now() + LOST_AFTER_S / _SETTINGS.few_attempts)))
         garbled = self.counts.garbled
         self._board.hear(data, self._clock.now())
         if self._board.restarted:
@@ -292,7 +301,7 @@ class SerialLineJoints:
         elif self._clock.now() - self._heard_s > LOST_AFTER_S:
             self._why = "no line"
         self._attempts += 1
-        if self._clock.now() > lost_at and self._attempts >= FEW_ATTEMPTS and not self._board.is_waiting:
+        if self._clock.now() > lost_at and self._attempts >= _SETTINGS.few_attempts and not self._board.is_waiting:
             raise SourceLost(f"the encoders cannot be read: {self._why}", retry_s=RETRY_S)
 
     def _raw(self, timed: Timed) -> list[int] | None:
@@ -351,9 +360,6 @@ def _close(port: Port) -> None:
         port.close()
 
 
-FEW_PER_S = 50.0
-
-
 def encoder_checks(
     config: SerialLinesConfig, joints: Sequence[str], clock: Clock, *, read_s: float = READ_S
 ) -> Iterator[Check]:
@@ -376,7 +382,7 @@ def encoder_checks(
 
 def _rate(rate_hz: float) -> Check:
     said = f"{rate_hz:.0f} readings/s come"
-    if rate_hz < FEW_PER_S:
+    if rate_hz < _SETTINGS.few_per_s:
         return Check("rate", "warning", said, "a higher rate of the UART, fewer other things that the board does")
     return Check("rate", "ok", said)
 

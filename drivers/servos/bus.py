@@ -20,11 +20,24 @@ from .port import Port
 
 SLOWEST_DELAY_S = 510e-6  # largest Return Delay Time
 HOST_MARGIN_S = 3e-3  # the operating system's share of an answer's delay
-TOO_EARLY = 0.9  # an answer within this share of its time on the wire belongs to another request
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the timing of a servo bus."""
+
+    # an answer within this share of its time on the wire belongs to another request
+    too_early: float = 0.9
+    quiet_s: float = 2e-3
+    # longest delay of a late answer: above the 50 ms for which busy USB hosts were seen to hold bytes back
+    owed_s: float = 0.06
+    # number of recent requests whose size is avoided
+    asked_lately: int = 4
+
+
+_SETTINGS = _Settings()
+
 LONGEST_NOISE_S = 0.25
-QUIET_S = 2e-3
-OWED_S = 0.06  # longest delay of a late answer: above the 50 ms for which busy USB hosts were seen to hold bytes back
-ASKED_LATELY = 4  # number of recent requests whose size is avoided
 MOST_SPARE = 10  # bytes: from the end of a reading's block to that of the documented registers of the X and P series
 
 Taken = TypeVar("Taken")
@@ -208,7 +221,7 @@ class Bus(ABC):
     def send(self, request: Request) -> None:
         """Send a request. If overdue answers could pass for its answers, wait first until they can no longer arrive."""
         is_weak = self.is_weak(request)
-        lately = self._asked_lately.setdefault(request.ids, deque(maxlen=ASKED_LATELY)) if is_weak else ()
+        lately = self._asked_lately.setdefault(request.ids, deque(maxlen=_SETTINGS.asked_lately)) if is_weak else ()
         size = self._owed.size_for(request, self._clock.now(), lately)
         if size is None and is_weak:
             self._wait_out(self._owed.until(request))
@@ -254,7 +267,7 @@ class Bus(ABC):
 
     def settle(self) -> None:
         """Wait until the line has been silent for a while."""
-        quiet_s = max(QUIET_S, 2 * self._latency_s)
+        quiet_s = max(_SETTINGS.quiet_s, 2 * self._latency_s)
         end = self._clock.now() + LONGEST_NOISE_S
         while self._clock.now() < end and self._port.receive(self._clock.now() + quiet_s):
             pass
@@ -325,7 +338,7 @@ class Bus(ABC):
 
     def _note_owed(self, request: Request, ids: Iterable[int]) -> None:
         for id in ids:
-            self._owed.add(request.protocol, id, self._asked_size, self._clock.now() + OWED_S)
+            self._owed.add(request.protocol, id, self._asked_size, self._clock.now() + _SETTINGS.owed_s)
 
     def _doubt(self, request: Request, id: int, status: Status, answered_bytes: int) -> Trouble | None:
         if status.id != id:
@@ -335,7 +348,7 @@ class Bus(ABC):
         if len(status.data) != self._asked_size:
             return Trouble.WRONG_LENGTH
         wire_s = (self._question_size + answered_bytes) * self._byte_s
-        if self._clock.now() - self._sent < TOO_EARLY * wire_s:
+        if self._clock.now() - self._sent < _SETTINGS.too_early * wire_s:
             return Trouble.EARLY
         return None
 

@@ -16,12 +16,26 @@ from bodyschema.interfaces.records import JointReading
 
 from .bus import Answer
 
-# A position this far off the extrapolated one is requested again. Rounding of three positions alone makes two ticks.
-SURPRISE_RAD, SURPRISE_TICKS = math.radians(0.35), 2.0
-LATELY = 51  # readings that define the usual uncertainty
-HELD_UP_S = 0.3e-3
-SHORTEST_S = 1e-3  # shortest interval between two samples for a speed
-VOLTAGE_STEP, TEMPERATURE_STEP = 15, 3  # largest plausible changes, which are slow: 0.1 V, K
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the checks of one servo's readings."""
+
+    # A position this far off the extrapolated one is requested again. Rounding of three positions alone makes two
+    # ticks.
+    surprise_rad: float = math.radians(0.35)
+    surprise_ticks: float = 2.0
+    # readings that define the usual uncertainty
+    lately: int = 51
+    held_up_s: float = 0.3e-3
+    # shortest interval between two samples for a speed
+    shortest_s: float = 1e-3
+    # largest plausible changes, which are slow: 0.1 V, K
+    voltage_step: int = 15
+    temperature_step: int = 3
+
+
+_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +87,7 @@ class Channel(ABC):
         self.surprising = True
         self._trend: tuple[float, float, float] | None = None
         self._speed = 0.0
-        self._off_course = max(SURPRISE_RAD / servo.model.rad_per_tick, SURPRISE_TICKS)
+        self._off_course = max(_SETTINGS.surprise_rad / servo.model.rad_per_tick, _SETTINGS.surprise_ticks)
         self._supply: tuple[int, int] | None = None
 
     def take(self, answer: Answer) -> Sample | None:
@@ -114,7 +128,7 @@ class Channel(ABC):
             self._speed = speed
         moved = self._step(sample.ticks - before)
         self.surprising = abs(moved - speed * (t - before_t)) > self._off_course
-        self._trend = (t, sample.ticks, moved / max(t - before_t, SHORTEST_S))
+        self._trend = (t, sample.ticks, moved / max(t - before_t, _SETTINGS.shortest_s))
 
     def _step(self, ticks: float) -> float:
         turn = self.servo.model.ticks_per_turn
@@ -123,7 +137,8 @@ class Channel(ABC):
     def _is_steady(self, voltage: int, temperature: int) -> bool:
         before = self._supply
         if before is not None and (
-            abs(voltage - before[0]) > VOLTAGE_STEP or abs(temperature - before[1]) > TEMPERATURE_STEP
+            abs(voltage - before[0]) > _SETTINGS.voltage_step
+            or abs(temperature - before[1]) > _SETTINGS.temperature_step
         ):
             return False
         self._supply = (voltage, temperature)
@@ -155,13 +170,13 @@ class Punctuality:
 
     def __init__(self) -> None:
         """Start without readings."""
-        self._unsure: deque[float] = deque(maxlen=LATELY)
+        self._unsure: deque[float] = deque(maxlen=_SETTINGS.lately)
 
     def is_usual(self, unsure: float) -> bool:
         """Return True if a reading's time is about as certain as usual, and include it in the median."""
         self._unsure.append(unsure)
         usual = median(self._unsure)
-        return unsure <= max(usual + HELD_UP_S, 2 * usual)
+        return unsure <= max(usual + _SETTINGS.held_up_s, 2 * usual)
 
 
 class Drive(Protocol):

@@ -11,8 +11,7 @@ from msgspec import Meta
 
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.suggest import did_you_mean
-from bodyschema.robot.toml_file import line_in_entry, line_of
-from bodyschema.robot.toml_types import Positive
+from bodyschema.robot.toml_file import Positive, line_in_entry, line_of
 
 from .model import Model, no_driver
 

@@ -216,7 +216,7 @@ def _read_once(bus: Bus, model: Model, id: int, register: Register) -> tuple[byt
 
 
 def ask_again(bus: Bus, request: Request) -> Exchange:
-    """Ask until it is answered, several times at most."""
+    """Repeat a request until it is answered, a few times at most."""
     exchange = Exchange(())
     for _ in range(ATTEMPTS):
         exchange = bus.ask(request)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 
 from bodyschema.drivers.servos.bus import Bus, Exchange, Request
 from bodyschema.drivers.servos.channel import Drive
@@ -12,51 +11,13 @@ from bodyschema.drivers.servos.handshake import IdentifiedServo
 from bodyschema.drivers.servos.scan import VOLT_PER_UNIT
 from bodyschema.interfaces.errors import SourceLost
 from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.servos import ServoHealth
 
 from .channel import Sample
 from .handshake import Finding
 from .model import Model, Register
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class ServoHealth:
-    """State of one servo.
-
-    Attributes:
-        homing_offset, drive_mode: as stored in its EEPROM.
-        voltage_v, temperature_c: last reported; None before.
-        current_a: None where it is not measured.
-        troubles: what is wrong with it, and what to do.
-    """
-
-    joint: str
-    bus: str
-    id: int
-    model: str
-    firmware: int
-    homing_offset: int
-    drive_mode: int
-    voltage_v: float | None
-    temperature_c: float | None
-    current_a: float | None
-    troubles: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class BusHealth:
-    """Statistics of one bus since the start.
-
-    Attributes:
-        exchanges: number of requests.
-        troubles: number of failed requests, by kind of failure.
-        way: read method of its servos; empty before the first opening.
-    """
-
-    exchanges: int
-    troubles: Mapping[str, int]
-    way: str
 
 
 class Health:

@@ -6,8 +6,8 @@ import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 from itertools import zip_longest
-from types import TracebackType
 from typing import Any, Self
 
 from bodyschema.drivers.echo import without_echo
@@ -19,22 +19,35 @@ from bodyschema.drivers.turns import SpeedGate
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import JointReading, frozen_array
+from bodyschema.interfaces.servos import BusHealth, ServoHealth
 
 from .bus import Bus, Counts, Request
 from .channel import Channel, Punctuality, Sample, middle
 from .config import ServoConfig, ServosConfig
 from .handshake import RETRY_S, Finding, IdentifiedServo, identify, require_all, restore_torque, switch_torque_off
-from .health import BusHealth, Health, ServoHealth
+from .health import Health
 from .port import Port
 from .vendor import ServoVendor
 
 log = logging.getLogger(__name__)
 
 LOST_AFTER_S = 0.25  # without a reading; no joint makes half a turn unnoticed in this time
-FEW_POLLS = 3  # this many must fail as well: the program itself may have been delayed
-DOUBTS = 5  # consecutive implausible answers after which the servo was restarted
-ANCHOR_POLLS = 50
-SLACK_TICKS = 3
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the reading of servos."""
+
+    # this many must fail as well: the program itself may have been delayed
+    few_polls: int = 3
+    # consecutive implausible answers after which the servo was restarted
+    doubts: int = 5
+    anchor_polls: int = 50
+    slack_ticks: int = 3
+
+
+_SETTINGS = _Settings()
+
 IMPROVE_EVERY_S = 10.0  # a failed attempt costs a reading or two
 GOLDEN = 0.618034  # its multiples, modulo 1, are spread most evenly
 
@@ -171,9 +184,7 @@ class ServoJoints:
         self._say_opened()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._is_open = False
         self._opened.close()
 
@@ -240,7 +251,9 @@ class ServoJoints:
         self._channels = [self._make.channel(servo) for servo in self.servos]
         self._at = {(servo.bus, servo.id): place for place, servo in enumerate(self.servos)}
         speed = math.radians(self._config.max_speed_deg_s)
-        self._gate = SpeedGate([speed / s.model.rad_per_tick for s in self.servos], [SLACK_TICKS] * len(self.servos))
+        self._gate = SpeedGate(
+            [speed / s.model.rad_per_tick for s in self.servos], [_SETTINGS.slack_ticks] * len(self.servos)
+        )
         self._punctuality = Punctuality()
         now = self._clock.now()
         self._believed_s, self._failures, self._next_poll, self._polls = now, 0, now, 0
@@ -251,7 +264,7 @@ class ServoJoints:
     def _anchor(self) -> None:
         """Find the turn of each joint from two consistent readings."""
         believed = 0
-        for _ in range(ANCHOR_POLLS):
+        for _ in range(_SETTINGS.anchor_polls):
             samples = self._ask_all()
             if samples is None:
                 continue
@@ -392,16 +405,16 @@ class ServoJoints:
     def _dropped_one(self) -> None:
         self.dropped += 1
         self._failures += 1
-        if self._failures >= FEW_POLLS and self._clock.now() - self._believed_s > LOST_AFTER_S:
+        if self._failures >= _SETTINGS.few_polls and self._clock.now() - self._believed_s > LOST_AFTER_S:
             raise SourceLost(self._inspection.first_silent() or self._why, retry_s=RETRY_S)
 
     def _refuse_restarted(self, channel: Channel) -> None:
-        if channel.doubts >= DOUBTS:
+        if channel.doubts >= _SETTINGS.doubts:
             servo = channel.servo
             raise SourceLost(f"joint {servo.joint!r} (ID {servo.id}) was restarted", retry_s=RETRY_S)
 
     def _wait_until(self, t: float) -> bool:
-        """Wait. Return False when a servo sent bytes without being asked."""
+        """Wait until a time. Return False when a servo sent bytes that were not requested."""
         if t <= self._clock.now():
             return True
         bus, *_ = self._buses.values()

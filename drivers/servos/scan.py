@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from bodyschema.drivers.scan import FoundServo, ScannedPort
+from bodyschema.drivers.scan import ScannedPort
 from bodyschema.drivers.servos.handshake import ATTEMPTS
 from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.servos import FoundServo
 
 from .bus import BITS_PER_BYTE, SLOWEST_DELAY_S, Bus, Exchange, Request, Trouble
 from .model import Model, Register, no_driver
@@ -176,7 +177,7 @@ class PingScanner:
         return Register(0, max(layout[name].end for layout in layouts for name in ("model", "firmware", "id")))
 
     def _identity(self, head: bytes, id: int) -> Identity | None:
-        """Return the identity from the first kind that knows the model, else from the first possible kind."""
+        """Return the identity from the first kind with this model, else from the first possible kind."""
         told = [identity for kind in self._kinds if (identity := kind.told(head, id)) is not None]
         known = [identity for identity in told if identity.model is not None]
         return next(iter([*known, *told]), None)

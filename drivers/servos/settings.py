@@ -65,7 +65,7 @@ class Setting:
 
     @property
     def range(self) -> str:
-        """Allowed values, in words."""
+        """Allowed values, as text."""
         if self.name == BAUD:
             return f"Give one of {', '.join(self.words)}"
         if self.words:

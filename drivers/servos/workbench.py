@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from types import TracebackType
 from typing import Self
 
 from bodyschema.drivers.echo import without_echo
@@ -76,9 +75,7 @@ class EepromEditor:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         with ExitStack() as stack:
             for _, bus in self._buses.values():
                 stack.callback(bus.close)

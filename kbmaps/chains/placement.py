@@ -13,14 +13,26 @@ from kbmaps.chains.parameters import ChainParameters
 from kbmaps.robust import MEDIAN_NORM, ROUNDING_M
 from kbmaps.rotations import cross_matrix, exponentials, rotation_vectors
 
-_STEPS = 30
-# Weights start nearly as in least squares; their scale halves with each step down to this many sigma.
-_FIRST_REACH, _LEAST_REACH = 32.0, 4.0
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-9, 1e6
-# Once the weights have settled, a step that lowers the cost by less than this share is the last.
-_SMALL_GAIN, _SETTLING = 1e-3, 4
-# Holds undetermined directions; as a share of the largest diagonal entry.
-_RIDGE = 1e-9
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the fit of a placement."""
+
+    steps: int = 30
+    # Weights start nearly as in least squares; their scale halves with each step down to this many sigma.
+    first_reach: float = 32.0
+    least_reach: float = 4.0
+    first_damping: float = 1e-3
+    least_damping: float = 1e-9
+    most_damping: float = 1e6
+    # Once the weights have settled, a step that lowers the cost by less than this share is the last.
+    small_gain: float = 1e-3
+    settling: int = 4
+    # Holds undetermined directions; as a share of the largest diagonal entry.
+    ridge: float = 1e-9
+
+
+_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,9 +118,9 @@ class _Fitter:
         count = len(self._q)
         every = np.arange(count)
         state = self._start(every, np.zeros((count, 3)) if tools is None else tools)
-        damping, active = np.full(count, _FIRST_DAMPING), every
-        for k in range(_STEPS):
-            reach = max(_FIRST_REACH * 0.5**k, _LEAST_REACH)
+        damping, active = np.full(count, _SETTINGS.first_damping), every
+        for k in range(_SETTINGS.steps):
+            reach = max(_SETTINGS.first_reach * 0.5**k, _SETTINGS.least_reach)
             distances = state.distances[active]
             sigma = np.maximum(np.partition(distances, self._middle)[:, self._middle] / MEDIAN_NORM, ROUNDING_M)
             scale = np.square(reach * sigma)[:, None]
@@ -118,10 +130,10 @@ class _Fitter:
             better = after <= before
             state.put(active[better], tried, better)
             damping[active] = np.where(
-                better, np.maximum(0.1 * damping[active], _LEAST_DAMPING), 10.0 * damping[active]
+                better, np.maximum(0.1 * damping[active], _SETTINGS.least_damping), 10.0 * damping[active]
             )
-            settled = better & (k >= _SETTLING) & (before - after < _SMALL_GAIN * before)
-            active = active[~(settled | (damping[active] > _MOST_DAMPING))]
+            settled = better & (k >= _SETTINGS.settling) & (before - after < _SETTINGS.small_gain * before)
+            active = active[~(settled | (damping[active] > _SETTINGS.most_damping))]
             if not len(active):
                 break
         return Placements(state.rotations, state.shifts, state.zeros, state.tools, state.distances)
@@ -171,7 +183,7 @@ class _Fitter:
         slope[:, 6:] -= self._information[6:] * np.concatenate([state.zeros[rows], state.tools[rows]], axis=1)
         diagonal = np.einsum("sff->sf", gram)
         diagonal += self._information
-        diagonal += damping[:, None] * diagonal + _RIDGE * diagonal.max(axis=1, keepdims=True)
+        diagonal += damping[:, None] * diagonal + _SETTINGS.ridge * diagonal.max(axis=1, keepdims=True)
         return cast(FloatArray, np.linalg.solve(gram, slope[..., None])[..., 0])
 
     def _cost(self, state: _State, rows: IntArray | slice, weights: FloatArray) -> FloatArray:

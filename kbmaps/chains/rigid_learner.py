@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -29,10 +30,22 @@ from kbmaps.packed import complete, named, pack, restoring, unpack
 from kbmaps.pairs import Pairs, checked_pairs, of_covariances, stored_pairs, with_units
 from kbmaps.robust import claimed_sigma, student
 
-# A direction is open if at least this share of the prior's variance remains.
-_OPEN = 0.5
-# No step along a direction changes a parameter by more than this [rad, m]: beyond, the second order does not hold.
-_LONGEST_STEP = 0.1
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the learner's steps."""
+
+    # A direction is open if at least this share of the prior's variance remains.
+    open: float = 0.5
+    # No step along a direction changes a parameter by more than this [rad, m]: beyond, the second order does not hold.
+    longest_step: float = 0.1
+    # The curvature of the posterior is estimated from about this many evenly spread pairs.
+    followed: int = 100
+    # A parameter counts as undetermined if its standard deviation stayed above this share of the prior's.
+    hardly_narrower: float = 0.5
+
+
+_SETTINGS = _Settings()
 
 
 def deviations(belief: ChainBelief, pairs: Pairs, sigma: FloatArray) -> FloatArray:
@@ -55,7 +68,7 @@ def deviations(belief: ChainBelief, pairs: Pairs, sigma: FloatArray) -> FloatArr
     opened, closed, follow = _sides(belief, pairs, sigma)
     bend = np.empty((len(belief.mean), opened.shape[1], opened.shape[1]))
     for k, direction in enumerate(opened.T):
-        step = _LONGEST_STEP / max(float(np.abs(direction).max()), _LONGEST_STEP)
+        step = _SETTINGS.longest_step / max(float(np.abs(direction).max()), _SETTINGS.longest_step)
         _, ahead = belief.parameters.linearised(belief.mean + step * direction, q)
         _, behind = belief.parameters.linearised(belief.mean - step * direction, q)
         second = pairs.whitened((ahead - behind) @ opened) / (2.0 * step * sigma[:, None, None])
@@ -76,16 +89,12 @@ def _sides(belief: ChainBelief, pairs: Pairs, sigma: FloatArray) -> tuple[FloatA
     _, jacobian = belief.parameters.linearised(belief.mean, pairs.q)
     rows = (pairs.whitened(jacobian[:, :, free] @ triangle) / sigma[:, None, None]).reshape(-1, len(free))
     taken, vectors = np.linalg.eigh(rows.T @ rows)
-    opened, closed = vectors[:, taken <= 1.0 - _OPEN], vectors[:, taken > 1.0 - _OPEN]
-    follow = (rows @ closed / taken[taken > 1.0 - _OPEN]).T
+    opened, closed = vectors[:, taken <= 1.0 - _SETTINGS.open], vectors[:, taken > 1.0 - _SETTINGS.open]
+    follow = (rows @ closed / taken[taken > 1.0 - _SETTINGS.open]).T
     return root @ opened, root @ closed, follow
 
 
 _KIND = "rigid chain, batch, 2"
-# The curvature of the posterior is estimated from about this many evenly spread pairs.
-_FOLLOWED = 100
-# A parameter counts as undetermined if its standard deviation stayed above this share of the prior's.
-_HARDLY_NARROWER = 0.5
 
 
 class RigidLearner:
@@ -293,7 +302,7 @@ class RigidLearner:
         """Return True for each parameter (size,) that matters and was not determined; noise of a coordinate [m]."""
         before, after = (np.sqrt(np.square(belief.root).sum(axis=1)) for belief in (self._prior, fit.belief))
         lever = np.where(self._parameters.turning, self._parameters.reach, 1.0)
-        return (after > _HARDLY_NARROWER * before) & (before * lever > noise)
+        return (after > _SETTINGS.hardly_narrower * before) & (before * lever > noise)
 
     def to_bytes(self) -> bytes:
         """Return the learner with all its pairs; `from_bytes` restores the same predictions to the last bit."""
@@ -348,7 +357,7 @@ class RigidLearner:
 
     def _deviations(self, fit: RigidFit, pairs: Pairs) -> FloatArray:
         good = np.flatnonzero(fit.inliers)
-        some = good[:: max(len(good) // _FOLLOWED, 1)]
+        some = good[:: max(len(good) // _SETTINGS.followed, 1)]
         sigma = fit.noise * pairs.unit[some] * math.sqrt(len(some) / max(len(good), 1))
         return deviations(fit.belief, pairs.chosen(np.isin(np.arange(len(pairs)), some)), sigma)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -29,11 +30,27 @@ from kbmaps.model import Estimate, near_data, widest
 from kbmaps.packed import complete, count, named, pack, restoring, unpack
 from kbmaps.pairs import checked_pairs, stored_pairs, with_units
 
-LEAST_WINDOW = 16
-# With few pairs and no prior, an earlier fit may be far off: start from the nominal chain.
-_FRESH = 200
-# Upper bound of the number of coordinates that older pairs contribute to the noise estimate.
-_NOISE_MEMORY = 900.0
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the recursive learner.
+
+    Sensitivity: each at 0.3 and 3 times changes error and sigma of a bent arm's models at 150 pairs by less than 1 %,
+    but for `growth`, which then does not end, `first` by 4 %.
+    """
+
+    least_window: int = 16
+    # With few pairs and no prior, an earlier fit may be far off: start from the nominal chain.
+    fresh: int = 200
+    # The first refit comes with this pair, the next when the kept pairs have grown by this factor, or the window is
+    # full.
+    first: int = 8
+    growth: float = 1.5
+    # A noise estimated from fewer degrees of freedom is a guess: the next refit comes with the next pair.
+    sure_freedom: float = 12.0
+
+
+_SETTINGS = _Settings()
 
 
 class RigidWindow:
@@ -53,8 +70,8 @@ class RigidWindow:
     STORED_BELIEF = ("before_mean", "before_root")
 
     def __init__(self, parameters: ChainParameters, tolerances: ChainTolerances, size: int) -> None:
-        if size < LEAST_WINDOW:
-            raise SettingError(f"a window must hold at least {LEAST_WINDOW} pairs, got {size}")
+        if size < _SETTINGS.least_window:
+            raise SettingError(f"a window must hold at least {_SETTINGS.least_window} pairs, got {size}")
         self.size = size
         self.belief = ChainBelief.from_tolerances(parameters, tolerances)
         self.noise = NOTHING_KNOWN
@@ -98,7 +115,7 @@ class RigidWindow:
         """Return the fit to at least one pair; `near` (size,) is the expected change of the chain."""
         q, x, sigma = self._pairs()
         pairs = with_units(q, x, sigma)
-        if self._count > _FRESH:
+        if self._count > _SETTINGS.fresh:
             fit = fit_chain(self.belief, pairs, near, near=True, noise=self.noise)
         else:
             start = self.belief.mean if self._begun else self._place.change(q, x)
@@ -118,7 +135,7 @@ class RigidWindow:
         self.belief = folded(self.belief, pairs.chosen(good), fit.belief.mean, fit.noise)
         if not pairs.known:
             told = self.noise.coordinates + fit.freedom * count / self._count
-            self.noise = NoiseKnowledge(min(told, _NOISE_MEMORY), fit.noise**2)
+            self.noise = NoiseKnowledge(min(told, NOISE_MEMORY), fit.noise**2)
         self._begun = True
         self._count -= count
         self._rows[: self._count] = self._rows[count : count + self._count].copy()
@@ -171,10 +188,6 @@ class RigidWindow:
 
 _KIND = "rigid chain, recursive, 5"
 _COUNTS = ("pairs", "window", "due")
-# The first refit comes with this pair, the next when the kept pairs have grown by this factor, or the window is full.
-_FIRST, _GROWTH = 8, 1.5
-# A noise estimated from fewer degrees of freedom is a guess: the next refit comes with the next pair.
-_SURE_FREEDOM = 12.0
 
 
 class RecursiveRigidLearner:
@@ -219,7 +232,7 @@ class RecursiveRigidLearner:
         self._tolerances = tolerances
         self._filter = RigidFilter(self._parameters, tolerances, noise)
         self._window = RigidWindow(self._parameters, tolerances, window)
-        self._due = _FIRST
+        self._due = _SETTINGS.first
         self._pairs = 0
         self._widest: float | None = None
 
@@ -309,7 +322,7 @@ class RecursiveRigidLearner:
         """
         if not (tolerance > 0.0 and math.isfinite(tolerance)):
             raise SettingError(f"tolerance must be finite and greater than 0 m, got {tolerance!r}")
-        if self.kept >= _FIRST:
+        if self.kept >= _SETTINGS.first:
             self._window.fold(self._set_right(), self.kept)
         belief = ChainBelief.from_covariance(self._parameters, self._filter.change, self._filter.covariance)
         self._go_on_from(belief.with_other_tool(tolerance), fitted=False)
@@ -362,10 +375,10 @@ class RecursiveRigidLearner:
         if self.kept == self._window.size:
             self._window.fold(fit, self.kept // 2)
             self._due = self._window.size
-        elif self._window.finds_noise and fit.freedom + self._window.noise.coordinates < _SURE_FREEDOM:
+        elif self._window.finds_noise and fit.freedom + self._window.noise.coordinates < _SETTINGS.sure_freedom:
             self._due = self.kept + 1
         else:
-            self._due = min(math.ceil(_GROWTH * self.kept), self._window.size)
+            self._due = min(math.ceil(_SETTINGS.growth * self.kept), self._window.size)
 
     def _set_right(self) -> RigidFit:
         """Set the filter to a fit of the kept pairs, and return the fit."""
@@ -381,4 +394,4 @@ class RecursiveRigidLearner:
         self._filter.go_on_from(belief, fitted=fitted)
         self._window.begin_with(belief)
         self._widest = None
-        self._due = _FIRST
+        self._due = _SETTINGS.first

@@ -16,12 +16,26 @@ from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
 from kbmaps.robust import ROUNDING_M
 from kbmaps.rotations import cross_matrix
 
-_STEPS = 150
-_FIRST_DAMPING, _LEAST_DAMPING, _LEAST_RAISED_DAMPING, _MOST_DAMPING = 1e-2, 1e-14, 1e-8, 1e6
-# A start with a residual [m] this small has found the chain to the last digits.
-_EXACT_M = 1e-12
-# A start ends after this many steps that each reduce the squared residual by less than this share.
-_STALLED, _STALLED_STEPS = 1e-4, 8
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the search for a chain."""
+
+    steps: int = 150
+    first_damping: float = 1e-2
+    least_damping: float = 1e-14
+    least_raised_damping: float = 1e-8
+    most_damping: float = 1e6
+    # A start with a residual [m] this small has found the chain to the last digits.
+    exact_m: float = 1e-12
+    # A start ends after this many steps that each reduce the squared residual by less than this share.
+    stalled: float = 1e-4
+    stalled_steps: int = 8
+    # A start whose residual is below this multiple of the noise has found the chain.
+    explained: float = 1.2
+
+
+_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,9 +125,9 @@ class Descents:
         pairs = self._x.shape[1]
         reached = self._reach(arms)
         gram, slope = self._normal(arms, reached)
-        damping, squares = np.full(count, _FIRST_DAMPING), reached.squares.copy()
+        damping, squares = np.full(count, _SETTINGS.first_damping), reached.squares.copy()
         stalled, steps = np.zeros(count, dtype=np.intp), np.zeros(count, dtype=np.intp)
-        active = np.flatnonzero(squares > pairs * _EXACT_M**2)
+        active = np.flatnonzero(squares > pairs * _SETTINGS.exact_m**2)
         while len(active):
             change = self._step(gram[active], slope[active], damping[active])
             tried = arms[active].changed(change)
@@ -123,13 +137,15 @@ class Descents:
             if len(taken):
                 arms.axes[taken], arms.points[taken] = tried.axes[better], tried.points[better]
                 last, squares[taken] = squares[taken], reached.squares[better]
-                stalled[taken] = np.where(squares[taken] > (1.0 - _STALLED) * last, stalled[taken] + 1, 0)
-                damping[taken] = np.maximum(0.2 * damping[taken], _LEAST_DAMPING)
+                stalled[taken] = np.where(squares[taken] > (1.0 - _SETTINGS.stalled) * last, stalled[taken] + 1, 0)
+                damping[taken] = np.maximum(0.2 * damping[taken], _SETTINGS.least_damping)
                 steps[taken] += 1
                 gram[taken], slope[taken] = self._normal(arms[taken], reached[better])
-            damping[failed] = np.maximum(4.0 * damping[failed], _LEAST_RAISED_DAMPING)
-            ended = (stalled >= _STALLED_STEPS) | (steps >= _STEPS) | (damping > _MOST_DAMPING)
-            ended |= squares <= pairs * _EXACT_M**2
+            damping[failed] = np.maximum(4.0 * damping[failed], _SETTINGS.least_raised_damping)
+            ended = (
+                (stalled >= _SETTINGS.stalled_steps) | (steps >= _SETTINGS.steps) | (damping > _SETTINGS.most_damping)
+            )
+            ended |= squares <= pairs * _SETTINGS.exact_m**2
             if (squares[ended] <= pairs * enough**2).any():
                 break
             active = active[~ended[active]]
@@ -198,10 +214,6 @@ class Descents:
         return steps
 
 
-# A start whose residual is below this multiple of the noise has found the chain.
-_EXPLAINED = 1.2
-
-
 def find_chain(
     q: ArrayLike,
     x: ArrayLike,
@@ -262,7 +274,7 @@ def find_chain(
     size = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).mean())
     if not size > ROUNDING_M:
         raise DegenerateDataError("all positions lie in one place; record pairs that spread out")
-    enough = max(ROUNDING_M, _EXPLAINED * (sigma or 0.0) * math.sqrt(max(3.0 - unknowns / len(angles), 0.0)))
+    enough = max(ROUNDING_M, _SETTINGS.explained * (sigma or 0.0) * math.sqrt(max(3.0 - unknowns / len(angles), 0.0)))
     return _best_of(angles, positions, slides, size, rng, starts, enough)
 
 

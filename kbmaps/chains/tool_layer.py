@@ -14,18 +14,18 @@ from kbmaps.arrays import BoolArray, FloatArray, frozen, rows, rows_or_vector
 from kbmaps.chains.carried import packable, unpacked
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.marker_fit import MarkerKnowledge, MarkerPosterior, Residuals, fit_marker
+from kbmaps.chains.rigid_filter import NOISE_COORDINATES
 from kbmaps.errors import DegenerateDataError, ModelFormatError, SettingError
 from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap
 from kbmaps.model import Estimate, PoseModel
 from kbmaps.packed import complete, count, named, numbers, or_infinite, pack, restoring, unless_infinite, unpack
 from kbmaps.pairs import checked_pairs
+from kbmaps.robust import UNCALIBRATED_SIGMAS
 
 _KIND = "tool layer, 1"
 DEFAULT_OUTLIER_SIGMAS = 6.0
 # Finite stand-in for an infinite spread [m].
 _WIDE = 1e6
-# The initial noise has the weight of this many coordinates.
-_NOISE_COORDINATES = 6.0
 # Number of pairs kept to judge outliers; older ones remain in sums.
 _RECENT = 128
 _RESIDUALS = ("rotations", "residuals", "sigma")
@@ -76,7 +76,7 @@ class ToolLayer:
         self._model: PoseModel = model
         self._outlier_sigmas = float(outlier_sigmas)
         covariance = np.eye(3) * _checked_spread("spread", spread) ** 2
-        self._before = MarkerKnowledge.before(np.zeros(3), covariance, noise, _NOISE_COORDINATES)
+        self._before = MarkerKnowledge.before(np.zeros(3), covariance, noise, NOISE_COORDINATES)
         self._recent = self._residuals(np.empty((0, self.joints)), np.empty((0, 3)), np.empty(0))
         self._pairs = 0
         self._moved: KBMap | RigidChain | None = None
@@ -272,10 +272,6 @@ def _shaped(array: FloatArray, like: FloatArray) -> FloatArray:
     return array
 
 
-# The limit is wide because the errors of an uncalibrated arm have long tails, which must not be rejected.
-_OUTLIER_SIGMAS = 15.0
-
-
 def with_refitted_tool(
     kbmap: KBMap, chain: RigidChain, q: ArrayLike, x: ArrayLike, sigma: float | None = None
 ) -> KBMap:
@@ -299,7 +295,7 @@ def with_refitted_tool(
         raise DegenerateDataError("a marker's move needs at least 1 pair seen since; record more")
     positions_net = kbmap.net[:POSITION_OUTPUTS]
     oriented = KBMap(kbmap.bases, np.concatenate([positions_net, chain.orientation_maps(kbmap.bases)]))
-    layer = ToolLayer(oriented, spread=math.inf, outlier_sigmas=_OUTLIER_SIGMAS)
+    layer = ToolLayer(oriented, spread=math.inf, outlier_sigmas=UNCALIBRATED_SIGMAS)
     layer.learn(angles, positions, sigma)
     net = kbmap.net.copy()
     net[:POSITION_OUTPUTS] = oriented.with_tool(layer.shift).net[:POSITION_OUTPUTS]

@@ -9,15 +9,16 @@ import numpy as np
 from kbmaps.arrays import FloatArray, IntArray
 from kbmaps.changes.bends import Runs, log_evidence, probable_bends
 from kbmaps.changes.kinds import log_ratios
+from kbmaps.robust import CLIPPED_SIGMAS
 
 # Runs of neighbours count by their means; a run's length is this share of its age, at most this many pairs.
 _RUN_SHARE, _LONGEST_RUN = 0.04, 6
 # Any of this many newest runs may be the onset of a change; older onsets are spaced by this share of their age. A
 # change is best seen soon after it, when a wrongly counted pair costs most.
 _EACH, _SPACING = 30, 0.1
-# A pair farther than this many sigmas from the median of its neighbours is clipped: it may be an outlier. Where more
-# than half of them moved together, the median moved as well.
-_CLIPPED_SIGMAS, _NEIGHBOURS = 4.0, 5
+# A pair far from the median of this many neighbours is clipped. Where more than half of them moved together, the
+# median moved as well.
+_NEIGHBOURS = 5
 # Maximum number of pairs, the newest ones, that are evaluated.
 MOST_PAIRS = 1200
 
@@ -102,7 +103,7 @@ def _without_outliers(errors: FloatArray) -> FloatArray:
     middles = np.pad(middles, (ends, (0, 0)), mode="edge")
     off = errors - middles
     far = np.linalg.norm(off, axis=1, keepdims=True)
-    return middles + off * np.minimum(1.0, _CLIPPED_SIGMAS / np.maximum(far, 1e-300))
+    return middles + off * np.minimum(1.0, CLIPPED_SIGMAS / np.maximum(far, 1e-300))
 
 
 def _ages(pairs: int, share: float, longest: int) -> list[int]:

@@ -12,28 +12,38 @@ from scipy.special import ive  # pyright: ignore[reportMissingTypeStubs, reportU
 
 from kbmaps.arrays import FloatArray, IntArray
 
-# Correlation length of a bend [rad of all joints together], its size over the noise of a pair, the marker's motion from
-# a joint's own error over that noise, and the noise over its nominal value. All are equally probable, except an arm
-# without bends and such errors, which is as probable as all others together.
-LENGTHS = (0.7, 1.4)
-BENDS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-TURNS = (0.0, 0.5, 2.0, 8.0)
-NOISES = (0.5, 0.7, 1.0, 1.4)
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the model of bends."""
+
+    # Correlation length of a bend [rad of all joints together], its size over the noise of a pair, the marker's motion
+    # from a joint's own error over that noise, and the noise over its nominal value. All are equally probable, except
+    # an arm without bends and such errors, which is as probable as all others together.
+    lengths: tuple[float, ...] = (0.7, 1.4)
+    bends: tuple[float, ...] = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+    turns: tuple[float, ...] = (0.0, 0.5, 2.0, 8.0)
+    noises: tuple[float, ...] = (0.5, 0.7, 1.0, 1.4)
+    # Correlation length of a joint's own error over its value [rad], and the number of harmonics that describe it. A
+    # constant error is a joint offset, which the belief includes.
+    own_length: float = 0.7
+    harmonics: int = 3
+    # For pairs to which the belief was fitted, the known parameters may be off by this multiple of the belief's
+    # uncertainty.
+    open: float = 1e3
+    # A chain fitted to a bending arm has absorbed part of the bend: the belief's variance grows by this factor times
+    # the square of the bend over the noise.
+    taken_along: float = 3.0
+    # Hypotheses less probable than this without a change are left out: even with one they hardly count.
+    least: float = 1e-6
+
+
+_SETTINGS = _Settings()
+
 # Log evidence of other pairs about bends of each length, without any such pairs.
-NOTHING_SEEN = (0.0,) * len(LENGTHS)
-# Correlation length of a joint's own error over its value [rad], and the number of harmonics that describe it. A
-# constant error is a joint offset, which the belief includes.
-_OWN_LENGTH, _HARMONICS = 0.7, 3
+NOTHING_SEEN = (0.0,) * len(_SETTINGS.lengths)
 # 1-sigma that stands for an absent error.
 _NONE = 1e-3
-# For pairs to which the belief was fitted, the known parameters may be off by this multiple of the belief's
-# uncertainty.
-_OPEN = 1e3
-# A chain fitted to a bending arm has absorbed part of the bend: the belief's variance grows by this factor times the
-# square of the bend over the noise.
-_TAKEN_ALONG = 3.0
-# Hypotheses less probable than this without a change are left out: even with one they hardly count.
-_LEAST = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +105,7 @@ class Runs:
         on_circles = np.concatenate([np.cos(self.angles), np.sin(self.angles)], axis=1)
         alike, lengths = on_circles @ on_circles.T - self.angles.shape[1], self.lengths
         found = list[tuple[FloatArray, FloatArray]]()
-        for length in LENGTHS:
+        for length in _SETTINGS.lengths:
             kernel = np.exp(alike / length**2)
             summed = np.add.reduceat(np.add.reduceat(kernel, self.starts, axis=0), self.starts, axis=1)
             values, axes = np.linalg.eigh(summed / np.sqrt(lengths * lengths[:, None]))
@@ -141,7 +151,7 @@ def log_evidence(runs: Runs) -> list[FloatArray]:
         logs = 1.5 * np.log(weights).sum(axis=1) - 0.5 * runs.within / noises - alone * np.log(noises)
         crossed = sums[:, :known, known:]
         of_length: list[FloatArray] = []
-        for turn in TURNS:
+        for turn in _SETTINGS.turns:
             prior = _prior(runs, k, turn)
             precision = sums[:, :known, :known] + prior[:, None] * np.eye(known)
             left = sums[:, known:, known:] - crossed.transpose(0, 2, 1) @ np.linalg.solve(precision, crossed)
@@ -156,14 +166,16 @@ def probable_bends(runs: Runs, before: Sequence[FloatArray | float]) -> list[Ben
     evidence = zip(log_evidence(runs), before, strict=True)
     logs = [now + past + _log_prior(k) for k, (now, past) in enumerate(evidence)]
     total = np.logaddexp.reduce(np.concatenate(logs))
-    return [_chosen(runs, k, each - total) for k, each in enumerate(logs) if (each - total > np.log(_LEAST)).any()]
+    return [
+        _chosen(runs, k, each - total) for k, each in enumerate(logs) if (each - total > np.log(_SETTINGS.least)).any()
+    ]
 
 
 def _chosen(runs: Runs, k: int, logs: FloatArray) -> Bends:
     values, axes = runs.axes[k]
-    probable = np.flatnonzero(logs > np.log(_LEAST))
+    probable = np.flatnonzero(logs > np.log(_SETTINGS.least))
     every = _weights(k, values)[0]
-    weights, priors = every[probable % len(every)], np.concatenate([_prior(runs, k, turn) for turn in TURNS])
+    weights, priors = every[probable % len(every)], np.concatenate([_prior(runs, k, turn) for turn in _SETTINGS.turns])
     turned = np.tensordot(axes.T, runs.rows[..., :-1], axes=1)
     known = np.empty((len(probable), turned.shape[2], turned.shape[0] * 3))
     for h, (prior, weight) in enumerate(zip(priors[probable], weights, strict=True)):
@@ -175,28 +187,31 @@ def _chosen(runs: Runs, k: int, logs: FloatArray) -> Bends:
 
 def _log_prior(k: int) -> FloatArray:
     """Return the log prior of each hypothesis (h,) of the k-th length, not normalised."""
-    sizes, turns = np.tile(_sizes(k), len(TURNS) * len(NOISES)), np.repeat(TURNS, len(NOISES) * len(_sizes(k)))
+    sizes, turns = (
+        np.tile(_sizes(k), len(_SETTINGS.turns) * len(_SETTINGS.noises)),
+        np.repeat(_SETTINGS.turns, len(_SETTINGS.noises) * len(_sizes(k))),
+    )
     # A bend of size zero has no length: it counts once for each length.
-    shares = np.where(sizes == 0.0, float(len(LENGTHS)), 1.0)
-    return np.log(np.where(sizes + turns == 0.0, shares * (len(BENDS) * len(TURNS) - 1.0), shares))
+    shares = np.where(sizes == 0.0, float(len(_SETTINGS.lengths)), 1.0)
+    return np.log(np.where(sizes + turns == 0.0, shares * (len(_SETTINGS.bends) * len(_SETTINGS.turns) - 1.0), shares))
 
 
 def _sizes(k: int) -> FloatArray:
     """Return the sizes of bends of the k-th length."""
-    return np.array(BENDS if k == 0 else BENDS[1:])
+    return np.array(_SETTINGS.bends if k == 0 else _SETTINGS.bends[1:])
 
 
 def _weights(k: int, values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return inverse variances of runs (h, m) for each noise with each size of a bend, and the noises squared (h,)."""
-    noises = np.repeat(np.square(NOISES), len(_sizes(k)))
-    sizes = np.tile(np.square(_sizes(k)), len(NOISES))
+    noises = np.repeat(np.square(_SETTINGS.noises), len(_sizes(k)))
+    sizes = np.tile(np.square(_sizes(k)), len(_SETTINGS.noises))
     return 1.0 / (noises[:, None] * (1.0 + sizes[:, None] * values)), noises
 
 
 def _prior(runs: Runs, k: int, turn: float) -> FloatArray:
     """Return the prior precision (h, p) of the known parameters and joints' own errors, for each noise and bend."""
-    squares = np.tile(np.square(_sizes(k)), len(NOISES)) + turn**2
-    left_open = np.full(len(squares), _OPEN**2) if runs.fitted else 1.0 + _TAKEN_ALONG * squares
+    squares = np.tile(np.square(_sizes(k)), len(_SETTINGS.noises)) + turn**2
+    left_open = np.full(len(squares), _SETTINGS.open**2) if runs.fitted else 1.0 + _SETTINGS.taken_along * squares
     known = np.repeat(1.0 / left_open[:, None], runs.known, axis=1)
     own = np.full((len(known), runs.rows.shape[2] - 1 - runs.known), max(turn, _NONE) ** -2.0)
     return np.concatenate([known, own], axis=1)
@@ -209,8 +224,8 @@ def _own_errors(angles: FloatArray, turning: FloatArray) -> FloatArray:
     function I_n.
     """
     columns: list[FloatArray] = []
-    for wave in range(1, _HARMONICS + 1):
-        share = 2.0 * float(ive(wave, _OWN_LENGTH**-2.0))
+    for wave in range(1, _SETTINGS.harmonics + 1):
+        share = 2.0 * float(ive(wave, _SETTINGS.own_length**-2.0))
         for of_angle in (np.cos, np.sin):
             columns.append(np.sqrt(share) * of_angle(wave * angles)[:, None] * turning)
     return np.concatenate(columns, axis=2)

@@ -16,10 +16,30 @@ from kbmaps.changes.bends import NOTHING_SEEN
 from kbmaps.changes.kinds import JOINT, SIZES, ChangeKind, change_kinds, log_ratios
 from kbmaps.changes.shared_noise import SharedNoise
 from kbmaps.changes.white_noise import inverse_roots
+from kbmaps.robust import CLIPPED_SIGMAS
 
-# Each of the newest pairs may be the first of a change; older onsets are thinned to this share of their age.
-SPACING = 0.15
-_SLOTS = 96
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the detector of changes."""
+
+    # Each of the newest pairs may be the first of a change; older onsets are thinned to this share of their age.
+    spacing: float = 0.15
+    slots: int = 96
+    # The statistic often exceeds its limit by far, most of all for the large changes that it allows for. So the limit
+    # may be lower than that number of pairs, by this factor (`python -m benchmarks.false_alarms`).
+    overshoot: float = 0.33
+    # Number of the newest pairs that decide if the noise has grown.
+    recent: int = 50
+    clearly: float = 3.0
+    # Normally the statistic is evaluated once per this many pairs. After a pair beyond this many sigmas, or at log odds
+    # above this, it is evaluated for each pair.
+    look_every: int = 5
+    strange_sigmas: float = 3.0
+    look_closely: float = 4.0
+
+
+_SETTINGS = _Settings()
 
 
 class Onsets:
@@ -33,12 +53,12 @@ class Onsets:
     def __init__(self, known: int, changes: int) -> None:
         self._crossed, self._information = np.zeros((known, changes)), np.zeros((changes, changes))
         self._score = np.zeros(changes)
-        self._crossed_before = np.zeros((_SLOTS, known, changes))
-        self._information_before = np.zeros((_SLOTS, changes, changes))
-        self._score_before = np.zeros((_SLOTS, changes))
-        self._onset = np.zeros(_SLOTS, dtype=np.intp)
+        self._crossed_before = np.zeros((_SETTINGS.slots, known, changes))
+        self._information_before = np.zeros((_SETTINGS.slots, changes, changes))
+        self._score_before = np.zeros((_SETTINGS.slots, changes))
+        self._onset = np.zeros(_SETTINGS.slots, dtype=np.intp)
         self._slots: list[int] = []
-        self._free = list(range(_SLOTS))
+        self._free = list(range(_SETTINGS.slots))
         self.pairs = 0
 
     @property
@@ -74,7 +94,7 @@ class Onsets:
         """Drop the newest onset, except the first, whose neighbours are near enough to each other for their age."""
         for k in range(len(self._slots) - 2, 0, -1):
             before, after = self._onset[self._slots[k - 1]], self._onset[self._slots[k + 1]]
-            if after - before <= SPACING * (self.pairs - after):
+            if after - before <= _SETTINGS.spacing * (self.pairs - after):
                 self._free.append(self._slots.pop(k))
                 return
         if not self._free:
@@ -83,17 +103,6 @@ class Onsets:
 
 # Minimum average number of pairs between two false alarms, if the model's uncertainty is correct.
 PAIRS_BETWEEN_FALSE_ALARMS = 75_000.0
-# The statistic often exceeds its limit by far, most of all for the large changes that it allows for. So the limit may
-# be lower than that number of pairs, by this factor (`python -m benchmarks.false_alarms`).
-_OVERSHOOT = 0.33
-# No pair counts for more than one this many sigmas away: it may be an outlier.
-CLIPPED_SIGMAS = 4.0
-# Number of the newest pairs that decide if the noise has grown.
-_RECENT = 50
-_CLEARLY = 3.0
-# Normally the statistic is evaluated once per this many pairs. After a pair beyond this many sigmas, or at log odds
-# above this, it is evaluated for each pair.
-LOOK_EVERY, STRANGE_SIGMAS, LOOK_CLOSELY = 5, 3.0, 4.0
 # Number of the newest errors that are kept.
 MOST_SURPRISES = 3000
 
@@ -176,7 +185,7 @@ class ChangeDetector:
         # A root of the covariance: the difference of two covariances would lose all digits after thousands of pairs.
         self._posterior_root, self._mean = np.eye(known), np.zeros(known)
         self._onsets = Onsets(known, len(self._columns))
-        self._differences: deque[float] = deque(maxlen=_RECENT)
+        self._differences: deque[float] = deque(maxlen=_SETTINGS.recent)
         self._surprises: deque[FloatArray] = deque(maxlen=MOST_SURPRISES)
         self._rows: deque[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = deque(maxlen=MOST_PAIRS)
         self._strange, self._looked_at, self._log_odds = False, 0, -math.inf
@@ -186,7 +195,7 @@ class ChangeDetector:
     @staticmethod
     def log_limit(pairs_between_false_alarms: float) -> float:
         """Return the log odds above which there is an alarm."""
-        return math.log(_OVERSHOOT * pairs_between_false_alarms)
+        return math.log(_SETTINGS.overshoot * pairs_between_false_alarms)
 
     @property
     def pairs(self) -> int:
@@ -208,7 +217,7 @@ class ChangeDetector:
         return np.array(self._surprises).reshape(-1, 3)
 
     def add(self, q: FloatArray, errors: FloatArray, covariances: FloatArray) -> None:
-        """Add pairs that came after those that the model knows, in their order.
+        """Add pairs that came after those that the model was fitted to, in their order.
 
         Args:
             q: configurations (n, d) [rad, m].
@@ -252,7 +261,7 @@ class ChangeDetector:
             self._differences.append(apart)
         self._surprises.append(off * math.sqrt(self._noise.single) / spread)
         error = expected + off
-        self._strange = float(np.linalg.norm(off)) > STRANGE_SIGMAS * spread
+        self._strange = float(np.linalg.norm(off)) > _SETTINGS.strange_sigmas * spread
         self._onsets.add(known.T @ changed, changed.T @ changed, changed.T @ error)
         step = np.linalg.solve(covariance + self._noise.whole * np.eye(3), seen)
         self._mean = self._mean + self._posterior_root @ (off @ step)
@@ -263,8 +272,8 @@ class ChangeDetector:
     @property
     def due(self) -> bool:
         """True if `suspicion` may have grown enough to be worth evaluating."""
-        late = self.pairs - self._looked_at >= LOOK_EVERY
-        return self.pairs > self._looked_at and (late or self._strange or self._log_odds > LOOK_CLOSELY)
+        late = self.pairs - self._looked_at >= _SETTINGS.look_every
+        return self.pairs > self._looked_at and (late or self._strange or self._log_odds > _SETTINGS.look_closely)
 
     def sums(self) -> tuple[IntArray, FloatArray, FloatArray]:
         """Return the information about all possible changes in the pairs since each onset (m,).
@@ -332,7 +341,7 @@ class ChangeDetector:
 
     def _grown_noise(self) -> SharedNoise:
         """Return the noise, or more where the newest pairs scatter more: that is not a change of the arm."""
-        if len(self._differences) < _RECENT:
+        if len(self._differences) < _SETTINGS.recent:
             return self._noise
-        chance = 1.0 + _CLEARLY * math.sqrt(1.0 / _RECENT)
+        chance = 1.0 + _SETTINGS.clearly * math.sqrt(1.0 / _SETTINGS.recent)
         return self._noise.times(max(1.0, float(np.mean(self._differences)) / (self._noise.single * chance)))

@@ -10,21 +10,30 @@ from scipy.special import ndtr, stdtrit  # pyright: ignore[reportMissingTypeStub
 
 from kbmaps.arrays import FloatArray, frozen
 
-# Default number of neighbours of a path that share a model's error: 20 degrees of it.
-USUALLY_SHARED = 10
-# Sums over longer lags than this, or than this share of the series, would be dominated by noise.
-_LONGEST_LAG, _LONGEST_LAG_SHARE = 200, 0.125
-# Neighbours share an error if their products are this many standard errors above 0.
-_CLEARLY = 2.0
-# The estimated variance must hold in the tail [sigmas], where a Gaussian coordinate falls once in as many pairs as lie
-# between false alarms.
-_TAIL_SIGMAS = 4.5
-# Longer runs are treated as this long.
-_LONGEST_RUN = 1000
-# Lower bound: residuals of 0 determine no variance, and no model is this much better than its claim.
-_LEAST = 1e-12
-# A fit absorbs at most this share of the error that neighbours share.
-_MOST_TAKEN = 0.8
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the estimate of shared noise."""
+
+    # Default number of neighbours of a path that share a model's error: 20 degrees of it.
+    usually_shared: int = 10
+    # Sums over longer lags than this, or than this share of the series, would be dominated by noise.
+    longest_lag: int = 200
+    longest_lag_share: float = 0.125
+    # Neighbours share an error if their products are this many standard errors above 0.
+    clearly: float = 2.0
+    # The estimated variance must hold in the tail [sigmas], where a Gaussian coordinate falls once in as many pairs as
+    # lie between false alarms.
+    tail_sigmas: float = 4.5
+    # Longer runs are treated as this long.
+    longest_run: int = 1000
+    # Lower bound: residuals of 0 determine no variance, and no model is this much better than its claim.
+    least: float = 1e-12
+    # A fit absorbs at most this share of the error that neighbours share.
+    most_taken: float = 0.8
+
+
+_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +69,8 @@ class SharedNoise:
         Args:
             share: of the variance, due to the model's error.
         """
-        alike = 1.0 + share * np.arange(_LONGEST_RUN if share > 0.0 else 1, dtype=np.float64)
-        return cls(alike, 1.0 + share * (USUALLY_SHARED - 1))
+        alike = 1.0 + share * np.arange(_SETTINGS.longest_run if share > 0.0 else 1, dtype=np.float64)
+        return cls(alike, 1.0 + share * (_SETTINGS.usually_shared - 1))
 
     @classmethod
     def repeated(cls, share: float) -> SharedNoise:
@@ -72,7 +81,7 @@ class SharedNoise:
         Args:
             share: of the variance, due to that rounding.
         """
-        alike = 1.0 + share * np.arange(USUALLY_SHARED, dtype=np.float64)
+        alike = 1.0 + share * np.arange(_SETTINGS.usually_shared, dtype=np.float64)
         return cls(alike, float(alike[-1]))
 
     @classmethod
@@ -89,21 +98,21 @@ class SharedNoise:
             used: number of parameters fitted to the residuals.
         """
         n = len(residuals)
-        square = max(float(np.square(residuals).mean()), _LEAST) * 3 * n / max(3 * n - used, n)
-        kept = _autocovariances(residuals, _CLEARLY * square * math.sqrt(2.0 / (3.0 * n)))
+        square = max(float(np.square(residuals).mean()), _SETTINGS.least) * 3 * n / max(3 * n - used, n)
+        kept = _autocovariances(residuals, _SETTINGS.clearly * square * math.sqrt(2.0 / (3.0 * n)))
         lengths = np.arange(1, len(kept) + 2)
         shares = np.maximum(1.0 - np.arange(1, len(kept) + 1) / lengths[:, None], 0.0)
         variances = square + 2.0 * shares @ kept
         together = np.maximum(variances / square, 1.0)
         if len(kept):
             # A shared error has fewer independent parts, of which a fit absorbs more: new pairs show more of it.
-            taken = min(used * float(together[-1]) / (3.0 * n), _MOST_TAKEN)
+            taken = min(used * float(together[-1]) / (3.0 * n), _SETTINGS.most_taken)
             alone = max(square - max(float(kept[0]), 0.0), 0.0)
             variances = alone + (variances - alone) / (1.0 - taken)
         variances = np.maximum.accumulate(variances * _raised(3.0 * n / together))
         whole = float(variances[-1])
         if len(kept):
-            longer = np.append(variances, np.full(max(_LONGEST_RUN - len(variances), 0), whole))
+            longer = np.append(variances, np.full(max(_SETTINGS.longest_run - len(variances), 0), whole))
             variances = np.maximum(longer, square + max(float(kept[0]), 0.0) * np.arange(len(longer)))
         return cls(variances, whole)
 
@@ -124,7 +133,7 @@ def _autocovariances(residuals: FloatArray, chance: float) -> FloatArray:
     May be empty.
     """
     n = len(residuals)
-    longest = min(int(n * _LONGEST_LAG_SHARE), _LONGEST_LAG) // 2 * 2
+    longest = min(int(n * _SETTINGS.longest_lag_share), _SETTINGS.longest_lag) // 2 * 2
     lags = np.array([float(np.vdot(residuals[k:], residuals[:-k])) / (3 * (n - k)) for k in range(1, longest + 1)])
     pairs = lags.reshape(-1, 2).sum(axis=1)
     if not len(pairs) or pairs[0] <= chance:
@@ -135,5 +144,5 @@ def _autocovariances(residuals: FloatArray, chance: float) -> FloatArray:
 
 def _raised(parts: FloatArray) -> FloatArray:
     """Return the factor that raises variances estimated from this many independent parts."""
-    tail = float(ndtr(-_TAIL_SIGMAS))
-    return np.square(stdtrit(np.maximum(parts, 3.0), 1.0 - tail) / _TAIL_SIGMAS)
+    tail = float(ndtr(-_SETTINGS.tail_sigmas))
+    return np.square(stdtrit(np.maximum(parts, 3.0), 1.0 - tail) / _SETTINGS.tail_sigmas)

@@ -8,11 +8,10 @@ from typing import Self
 import numpy as np
 
 from kbmaps.arrays import FloatArray, frozen
+from kbmaps.robust import CLIPPED_SIGMAS
 
 # Number of steps towards the maximum likelihood; each increases it.
 _STEPS = 60
-# A difference of neighbours is clipped to this many sigmas: it may be an outlier.
-_CLIPPED_SIGMAS = 4.0
 # Minimum number of pairs for each estimated variance.
 _FEWEST = 10
 # Lower bound of a variance as a share of all: it would vanish in rounding.
@@ -102,8 +101,8 @@ def _most_probable(spread: FloatArray, off: FloatArray) -> tuple[FloatArray, flo
         whitened = _turned(root, off.T)
         far = np.square(whitened).sum(axis=0)
         likelihood = float(np.log(root[0] * root[2] * root[5]).sum())
-        likelihood -= 0.5 * float(np.minimum(far, _CLIPPED_SIGMAS**2).sum())
-        whitened *= np.minimum(1.0, _CLIPPED_SIGMAS / np.sqrt(np.maximum(far, 1e-300)))
+        likelihood -= 0.5 * float(np.minimum(far, CLIPPED_SIGMAS**2).sum())
+        whitened *= np.minimum(1.0, CLIPPED_SIGMAS / np.sqrt(np.maximum(far, 1e-300)))
         x, y, z = _turned_back(root, whitened)
         seen = parts @ np.concatenate([x * x, y * y, z * z, 2.0 * y * z, 2.0 * x * z, 2.0 * x * y])
         expected = parts @ _inverse_of(root).ravel()

@@ -79,18 +79,35 @@ class PoseGoal:
         return bool(distance <= self.tolerance and angle <= self.angle_tolerance)
 
 
-# The damping is this share of the error's square, times a factor adapted to the gain of the last steps.
-_FIRST_SHARE, _LEAST_SHARE, _MOST_SHARE = 0.1, 1e-4, 1e6
-_DAMPING_FLOOR_M2 = 1e-18
-# No joint moves by more than this share of its half range in one step: the derivative does not hold farther.
-_LONGEST_STEP = 0.5
-# An error is stuck when its direction is this nearly perpendicular to the motion of every free joint.
-_STUCK_COSINE = 1e-5
-_LEAST_GAIN = 1e-4
-# The descent to a posture has settled when its squared distance falls by less than this share a step.
-_SETTLED = 1e-6
-_LEAST_PORTION = 1e-3
-_CORRECTIONS = 4
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the inverse kinematics."""
+
+    # The damping is this share of the error's square, times a factor adapted to the gain of the last steps.
+    first_share: float = 0.1
+    least_share: float = 1e-4
+    most_share: float = 1e6
+    damping_floor_m2: float = 1e-18
+    # No joint moves by more than this share of its half range in one step: the derivative does not hold farther.
+    longest_step: float = 0.5
+    # An error is stuck when its direction is this nearly perpendicular to the motion of every free joint.
+    stuck_cosine: float = 1e-5
+    least_gain: float = 1e-4
+    # The descent to a posture has settled when its squared distance falls by less than this share a step.
+    settled: float = 1e-6
+    least_portion: float = 1e-3
+    corrections: int = 4
+    samples: int = 4096
+    starts: int = 16
+    pose_starts: int = 48
+    max_steps: int = 3000
+    tolerance_m: float = 1e-7
+    tolerance_rad: float = 1e-7
+    # Starts are chosen among this many times as many samples near the target.
+    candidates: int = 8
+
+
+_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +119,7 @@ class JointRange:
     scale: FloatArray
 
     def step_bounds(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        longest = _LONGEST_STEP * self.scale
+        longest = _SETTINGS.longest_step * self.scale
         return np.maximum(self.lower - q, -longest), np.minimum(self.upper - q, longest)
 
 
@@ -126,7 +143,7 @@ class Descent:
 def descend(goal: Goal, start: FloatArray, joints: JointRange, max_steps: int) -> Descent:
     """Run Levenberg–Marquardt on the error, the damping proportional to the error's square (Sugihara 2011)."""
     q = np.clip(start, joints.lower, joints.upper)
-    error, share = goal.error(q), _FIRST_SHARE
+    error, share = goal.error(q), _SETTINGS.first_share
     none = np.zeros(len(q))
     for step_number in range(max_steps):
         square = float(error @ error)
@@ -136,19 +153,19 @@ def descend(goal: Goal, start: FloatArray, joints: JointRange, max_steps: int) -
         if _is_stuck(jacobian * joints.scale, error, q, joints):
             return Descent(q, error, step_number + 1, True)
         while True:
-            damping = share * square + _DAMPING_FLOOR_M2
+            damping = share * square + _SETTINGS.damping_floor_m2
             step = bounded_step(jacobian, error, damping, joints.step_bounds(q), none, joints.scale)
             new_q = np.clip(q + step, joints.lower, joints.upper)
             new_error = goal.error(new_q)
             left = error - jacobian @ step
             expected, gained = square - float(left @ left), square - float(new_error @ new_error)
-            if gained > _LEAST_GAIN * expected and gained > 0.0:
+            if gained > _SETTINGS.least_gain * expected and gained > 0.0:
                 break
             share *= 8.0
-            if share > _MOST_SHARE:
+            if share > _SETTINGS.most_share:
                 return Descent(q, error, step_number + 1, True)
         if gained > 0.75 * expected:
-            share = max(share / 8.0, _LEAST_SHARE)
+            share = max(share / 8.0, _SETTINGS.least_share)
         elif gained < 0.25 * expected:
             share *= 2.0
         q, error = new_q, new_error
@@ -160,7 +177,7 @@ def _is_stuck(scaled_jacobian: FloatArray, error: FloatArray, q: FloatArray, joi
     pull = scaled_jacobian.T @ error
     forbidden = ((q <= joints.lower) & (pull < 0.0)) | ((q >= joints.upper) & (pull > 0.0))
     reach = np.linalg.norm(scaled_jacobian, axis=0) * float(np.linalg.norm(error))
-    return bool((forbidden | (np.abs(pull) <= _STUCK_COSINE * reach)).all())
+    return bool((forbidden | (np.abs(pull) <= _SETTINGS.stuck_cosine * reach)).all())
 
 
 def settle(goal: Goal, reached: Descent, posture: FloatArray, joints: JointRange, max_steps: int) -> Descent:
@@ -172,22 +189,22 @@ def settle(goal: Goal, reached: Descent, posture: FloatArray, joints: JointRange
     q, steps, portion = reached.q, reached.steps, 1.0
     error = reached.error
     far = _square(q - posture, joints)
-    while steps < max_steps and portion > _LEAST_PORTION:
+    while steps < max_steps and portion > _SETTINGS.least_portion:
         jacobian = goal.jacobian(q)
-        damping = 1e-10 * float(np.square(jacobian * joints.scale).sum()) + _DAMPING_FLOOR_M2
+        damping = 1e-10 * float(np.square(jacobian * joints.scale).sum()) + _SETTINGS.damping_floor_m2
         towards = portion * (posture - q)
         step = bounded_step(jacobian, error, damping, joints.step_bounds(q), towards, joints.scale)
-        tried = descend(goal, q + step, joints, min(_CORRECTIONS, max_steps - steps))
+        tried = descend(goal, q + step, joints, min(_SETTINGS.corrections, max_steps - steps))
         steps += tried.steps + 1
         new_far = _square(tried.q - posture, joints)
         if not goal.reached(tried.error) or new_far >= far:
             portion *= 0.5
             continue
-        settled = far - new_far <= _SETTLED * far
+        settled = far - new_far <= _SETTINGS.settled * far
         q, error, far = tried.q, tried.error, new_far
         if settled:
             return Descent(q, error, steps, True)
-    return Descent(q, error, steps, portion <= _LEAST_PORTION)
+    return Descent(q, error, steps, portion <= _SETTINGS.least_portion)
 
 
 def _square(way: FloatArray, joints: JointRange) -> float:
@@ -195,14 +212,6 @@ def _square(way: FloatArray, joints: JointRange) -> float:
 
 
 Reason = Literal["reached", "out_of_reach", "steps_ran_out"]
-
-SAMPLES = 4096
-STARTS, POSE_STARTS = 16, 48
-MAX_STEPS = 3000
-TOLERANCE_M = 1e-7
-TOLERANCE_RAD = 1e-7
-# Starts are chosen among this many times as many samples near the target.
-_CANDIDATES = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,11 +284,11 @@ class InverseKinematics:
         upper: ArrayLike,
         *,
         seed: int = 0,
-        samples: int = SAMPLES,
+        samples: int = _SETTINGS.samples,
         starts: int | None = None,
-        max_steps: int = MAX_STEPS,
-        tolerance: float = TOLERANCE_M,
-        angle_tolerance: float = TOLERANCE_RAD,
+        max_steps: int = _SETTINGS.max_steps,
+        tolerance: float = _SETTINGS.tolerance_m,
+        angle_tolerance: float = _SETTINGS.tolerance_rad,
     ) -> None:
         if min(samples, 1 if starts is None else starts, max_steps) < 1 or not min(tolerance, angle_tolerance) > 0.0:
             raise SettingError("samples, starts, max_steps and both tolerances must be greater than 0")
@@ -384,11 +393,11 @@ class InverseKinematics:
     def _most_starts(self, goal: PositionGoal | PoseGoal) -> int:
         if self._starts is not None:
             return self._starts
-        return POSE_STARTS if isinstance(goal, PoseGoal) else STARTS
+        return _SETTINGS.pose_starts if isinstance(goal, PoseGoal) else _SETTINGS.starts
 
     def _nearest(self, goal: PositionGoal | PoseGoal) -> IntArray:
         """Return indices of the samples nearest to the goal, the nearest first."""
-        count = min(_CANDIDATES * self._most_starts(goal), len(self._samples))
+        count = min(_SETTINGS.candidates * self._most_starts(goal), len(self._samples))
         # Among some thousand points a search tree would not be faster.
         if isinstance(goal, PoseGoal):
             far = self._pose_features(goal.model) - _pose_features(goal.x, goal.rotation, goal.lever)

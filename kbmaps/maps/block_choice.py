@@ -8,6 +8,7 @@ shares none of its errors with the others.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
@@ -18,19 +19,29 @@ from kbmaps.errors import ShapeError
 from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap
 from kbmaps.maps.stack import BasisStack
 
-MOST_BLOCKS = 20
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the choice by blocks."""
+
+    most_blocks: int = 20
+    # Precision used while there are too few pairs for blocks.
+    first_precision: float = 1e-3
+    # Neighbours on a path are nearly the same configuration: they share this much of their prior variance. In bases
+    # over the whole turn that is a step of 8 degrees, along which a function that bends three times as fast still
+    # shares 0.95.
+    path_correlation: float = 0.995
+    # Relative to the largest eigenvalue of the kernel: smaller ones are rounding.
+    smallest_eigenvalue: float = 1e-15
+
+
+_SETTINGS = _Settings()
+
 FEWEST_BLOCKS = 4
 # Along a guided path, pairs this far apart share little of their errors.
 BLOCK_PAIRS = 30
 # Candidate precisions, relative to the kernel's mean diagonal: from almost no prior to hardly any learning.
 PRECISIONS = 10.0 ** np.arange(-13.0, 3.25, 0.5)
-# Precision used while there are too few pairs for blocks.
-FIRST_PRECISION = 1e-3
-# Neighbours on a path are nearly the same configuration: they share this much of their prior variance. In bases over
-# the whole turn that is a step of 8 degrees, along which a function that bends three times as fast still shares 0.95.
-PATH_CORRELATION = 0.995
-# Relative to the largest eigenvalue of the kernel: smaller ones are rounding.
-_SMALLEST_EIGENVALUE = 1e-15
 
 
 def follow_a_path(prior: KBMap, q: ArrayLike) -> bool:
@@ -38,7 +49,7 @@ def follow_a_path(prior: KBMap, q: ArrayLike) -> bool:
     left, right = BasisStack(prior.bases).halves(rows("q", q, len(prior.bases)))
     square = (left * left).sum(axis=1) * (right * right).sum(axis=1)
     inner = (left[:-1] * left[1:]).sum(axis=1) * (right[:-1] * right[1:]).sum(axis=1)
-    return bool(len(inner)) and bool(np.median(inner / np.sqrt(square[:-1] * square[1:])) > PATH_CORRELATION)
+    return bool(len(inner)) and bool(np.median(inner / np.sqrt(square[:-1] * square[1:])) > _SETTINGS.path_correlation)
 
 
 def blockwise_precision(prior: KBMap, q: ArrayLike, x: ArrayLike) -> float:
@@ -58,9 +69,13 @@ def blockwise_precision(prior: KBMap, q: ArrayLike, x: ArrayLike) -> float:
     angles, positions = rows("q", q, len(prior.bases)), rows("x", x, POSITION_OUTPUTS)
     if len(angles) != len(positions):
         raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
-    count = min(len(angles) // BLOCK_PAIRS, MOST_BLOCKS)
+    count = min(len(angles) // BLOCK_PAIRS, _SETTINGS.most_blocks)
     if count < FEWEST_BLOCKS:
-        return FIRST_PRECISION * float(np.diag(_kernel(prior, angles)).mean()) if len(angles) else FIRST_PRECISION
+        return (
+            _SETTINGS.first_precision * float(np.diag(_kernel(prior, angles)).mean())
+            if len(angles)
+            else _SETTINGS.first_precision
+        )
     runs = [run[:BLOCK_PAIRS] for run in np.array_split(np.arange(len(angles)), count)]
     chosen = np.concatenate(runs)
     kernel = _kernel(prior, angles[chosen])
@@ -90,7 +105,7 @@ def _left_out_errors(kernel: FloatArray, errors: FloatArray, blocks: int, precis
     components = directions.T @ errors
     means = np.full((len(precisions), blocks), math.inf)
     for row, precision in enumerate(precisions):
-        if variances[0] + precision <= _SMALLEST_EIGENVALUE * variances[-1]:
+        if variances[0] + precision <= _SETTINGS.smallest_eigenvalue * variances[-1]:
             continue
         inverses = 1.0 / (variances + precision)
         multipliers = parts @ (inverses[:, None] * components)

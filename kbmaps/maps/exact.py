@@ -20,16 +20,26 @@ from kbmaps.maps.factor import ShiftedGram
 from kbmaps.maps.kbmap import POSE_OUTPUTS, POSITION_OUTPUTS, KBMap
 from kbmaps.maps.targets import pose_targets
 from kbmaps.memory import Memory
+from kbmaps.robust import VARIANCE_FLOOR
 
-# Below this reciprocal condition number a triangular solve would return rounding errors.
-_SMALLEST_RCOND = 1e-13
-# The same for a Gram matrix, of which the refinement through the pairs needs only the first digits.
-_SMALLEST_GRAM_RCOND = 1e-15
-# Refinement must gain this factor per step; otherwise the Gram matrix is too near to singular.
-_LEAST_GAIN = 10.0
-# Relative to the trace of the Gram matrix: just enough for a stable Cholesky factorisation.
-_VANISHING_RIDGE = 1e-13
-_REFINEMENTS = 30
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the exact least squares."""
+
+    # Below this reciprocal condition number a triangular solve would return rounding errors.
+    smallest_rcond: float = 1e-13
+    # The same for a Gram matrix, of which the refinement through the pairs needs only the first digits.
+    smallest_gram_rcond: float = 1e-15
+    # Refinement must gain this factor per step; otherwise the Gram matrix is too near to singular.
+    least_gain: float = 10.0
+    # Relative to the trace of the Gram matrix: just enough for a stable Cholesky factorisation.
+    vanishing_ridge: float = 1e-13
+    refinements: int = 30
+    first_precision: float = 1e-2
+
+
+_SETTINGS = _Settings()
 
 
 def nearest_solution(design: Design, errors: FloatArray) -> FloatArray:
@@ -39,7 +49,7 @@ def nearest_solution(design: Design, errors: FloatArray) -> FloatArray:
     factorisation (corrected seminormal equations, Björck 1987), at a tenth of its cost.
     """
     gram = ShiftedGram(design.gram())
-    if gram.factorise(0.0) and gram.rcond > _SMALLEST_GRAM_RCOND:
+    if gram.factorise(0.0) and gram.rcond > _SETTINGS.smallest_gram_rcond:
         change = _refined(design, gram, errors)
         if change is not None:
             return change
@@ -59,10 +69,10 @@ def _refined(design: Design, gram: ShiftedGram, errors: FloatArray) -> FloatArra
     left = float(np.linalg.norm(change))
     if left == 0.0:
         return change
-    for done in range(_REFINEMENTS):
+    for done in range(_SETTINGS.refinements):
         correction = step(errors - design.times(change))
         size = float(np.linalg.norm(correction))
-        if not size * _LEAST_GAIN < left:
+        if not size * _SETTINGS.least_gain < left:
             return change if done else None
         change, left = change + correction, size
     return change
@@ -73,10 +83,10 @@ def _by_rows(design: Design, errors: FloatArray) -> FloatArray:
     if design.overdetermined:
         factor = design.factor(errors)
         rows, targets = factor.rows, factor.targets
-        change = lapack.triangular_solve(rows, targets, _SMALLEST_RCOND)
+        change = lapack.triangular_solve(rows, targets, _SETTINGS.smallest_rcond)
     else:
         rows, targets = design.rows(), errors
-        change = lapack.smallest_solution(rows, targets, _SMALLEST_RCOND)
+        change = lapack.smallest_solution(rows, targets, _SETTINGS.smallest_rcond)
     return _nearest(rows, targets) if change is None else change
 
 
@@ -87,12 +97,12 @@ def _nearest(rows: FloatArray, errors: FloatArray) -> FloatArray:
     corrects the rounding of the pass before. Directions with σ² far below λ stay at the prior.
     """
     gram = ShiftedGram((rows @ rows.T).T)
-    ridge = _VANISHING_RIDGE * gram.trace
+    ridge = _SETTINGS.vanishing_ridge * gram.trace
     while not gram.factorise(ridge):
         ridge *= 10.0
     change = rows.T @ gram.solve(errors)
     left = float("inf")
-    for _ in range(_REFINEMENTS):
+    for _ in range(_SETTINGS.refinements):
         remaining = errors - rows @ change
         size = float(np.linalg.norm(remaining))
         if not size < 0.5 * left:
@@ -103,10 +113,7 @@ def _nearest(rows: FloatArray, errors: FloatArray) -> FloatArray:
 
 
 # Limits of the evidence's search for lambda, relative to the mean diagonal of the Gram matrix.
-_SEARCH_LIMITS = (1e-12, 1e6)
-_FIRST_PRECISION = 1e-2
-# Variances below (1 pm)² are rounding.
-_VARIANCE_FLOOR = 1e-24
+SEARCH_LIMITS = (1e-12, 1e6)
 
 
 @dataclass(frozen=True)
@@ -197,7 +204,7 @@ class ExactLearner:
         self._pairs = 0
         # Original weights of the kept pairs; the design holds them after forgetting.
         self._told = np.empty(0)
-        self._last_precision = _FIRST_PRECISION
+        self._last_precision = _SETTINGS.first_precision
         self.rebase(prior)
 
     @property
@@ -320,7 +327,7 @@ class ExactLearner:
         else:
             squares = precision * np.einsum("ko,ko->o", errors, solution)
         spread = gram.log_determinant - gram.size * math.log(precision)
-        variances = [max(float(squares[part].mean()) / self._count, _VARIANCE_FLOOR) for part in self._parts]
+        variances = [max(float(squares[part].mean()) / self._count, VARIANCE_FLOOR) for part in self._parts]
         log_evidence = 0.0
         for part, variance in zip(self._parts, variances, strict=True):
             outputs = part.stop - part.start
@@ -346,7 +353,7 @@ class ExactLearner:
     def _most_evident(self, gram: ShiftedGram, errors: FloatArray, rhs: FloatArray) -> _Fit:
         """Return the fit at λ of the greatest evidence, searched from the last λ on."""
         mean = gram.trace / gram.size
-        low, high = (limit * mean for limit in _SEARCH_LIMITS)
+        low, high = (limit * mean for limit in SEARCH_LIMITS)
         fits: dict[float, _Fit] = {}
 
         def log_evidence(precision: float) -> float:

@@ -13,14 +13,13 @@ from scipy.special import gammaln  # pyright: ignore[reportMissingTypeStubs, rep
 from kbmaps.arrays import FloatArray, rows, vector
 from kbmaps.errors import SettingError
 from kbmaps.planning.posterior import Posterior
+from kbmaps.robust import VARIANCE_FLOOR
 
 _EYE = np.eye(3)
 # Values tried per joint when a chosen pose is improved within its limits.
 _EXCHANGE_VALUES = 9
 # Rounds in which each pose of a plan is improved in the presence of the others; a third gains 2 % at most.
 _PLAN_ROUNDS = 2
-# Variance [m²] below which an error counts as zero.
-_TINY_VARIANCE = 1e-24
 
 
 class ExperimentDesign:
@@ -91,7 +90,7 @@ class ExperimentDesign:
     def _settle(self) -> None:
         self._left = self._reduced(self._region)
         variances: FloatArray = np.einsum("tip,tip->t", self._left, self._left) + 3.0 * self._floor_square
-        weights = 0.5 / np.sqrt(np.maximum(variances, _TINY_VARIANCE)) / len(variances)
+        weights = 0.5 / np.sqrt(np.maximum(variances, VARIANCE_FLOOR)) / len(variances)
         flat = (self._left * np.sqrt(weights)[:, None, None]).reshape(-1, self._left.shape[2])
         self._moment = flat.T @ flat
 
@@ -183,7 +182,7 @@ def mean_distances(covariances: FloatArray) -> FloatArray:
     """
     traces = np.einsum("nii->n", covariances)
     squares = np.einsum("nij,nij->n", covariances, covariances)
-    shape = np.square(traces) / (2.0 * np.maximum(squares, _TINY_VARIANCE**2))
+    shape = np.square(traces) / (2.0 * np.maximum(squares, VARIANCE_FLOOR**2))
     shape = np.maximum(shape, 0.5)
     ratio = np.exp(gammaln(shape + 0.5) - gammaln(shape))
     return cast(FloatArray, np.sqrt(traces / shape) * ratio)

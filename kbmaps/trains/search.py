@@ -17,27 +17,36 @@ from kbmaps.trains.core_prior import CorePrior
 from kbmaps.trains.fit import LevenbergMarquardt, TensorProblem, alternate
 from kbmaps.trains.train import TensorTrain
 
-# Relative to the spread of the positions: smaller residuals are rounding.
-_NOISE_FLOOR = 1e-13
-# With residuals below this share of the positions' spread, no further start is needed.
-_EXPLAINED = 1e-4
-_FIRST_NOISE = 2e-2
-_SWEEPS = 40
-_FIRST_STEPS = 30
-_ROUND_STEPS = 6
-_ROUNDS = 40
-_SAME_NOISE = 0.02
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the search for cores."""
+
+    # Relative to the spread of the positions: smaller residuals are rounding.
+    noise_floor: float = 1e-13
+    # With residuals below this share of the positions' spread, no further start is needed.
+    explained: float = 1e-4
+    first_noise: float = 2e-2
+    sweeps: int = 40
+    first_steps: int = 30
+    round_steps: int = 6
+    rounds: int = 40
+    same_noise: float = 0.02
+    # A pair farther than this many robust standard deviations is an outlier: 1.5e-5 of good pairs are.
+    outlier_distance: float = 5.0
+    weight_scale: float = 4.0
+    # Reweighting ends when no residual moves by more than this many standard deviations.
+    same_lengths: float = 0.05
+    # Random starts use at most this many pairs per joint.
+    search_pairs: int = 40
+    # With fewer degrees of freedom per pair, residuals cannot separate noise from outliers.
+    least_freedom: float = 0.2
+
+
+_SETTINGS = _Settings()
+
 # Failed starts leave a tenth or more of the spread, and may agree on it by chance.
 PLAUSIBLE = 0.1
-# A pair farther than this many robust standard deviations is an outlier: 1.5e-5 of good pairs are.
-_OUTLIER_DISTANCE = 5.0
-_WEIGHT_SCALE = 4.0
-# Reweighting ends when no residual moves by more than this many standard deviations.
-_SAME_LENGTHS = 0.05
-# Random starts use at most this many pairs per joint.
-_SEARCH_PAIRS = 40
-# With fewer degrees of freedom per pair, residuals cannot separate noise from outliers.
-_LEAST_FREEDOM = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +77,7 @@ class Pairs:
     @property
     def noise_floor(self) -> float:
         """Size below which residuals are rounding [m]."""
-        return _NOISE_FLOOR * self.size
+        return _SETTINGS.noise_floor * self.size
 
     def chosen(self, mask: BoolArray) -> Pairs:
         return Pairs(self.weights[mask], self.x[mask], self.sigma[mask])
@@ -122,17 +131,17 @@ def search(
     Ends early when one explains the pairs, or two agree.
     """
     some = pairs
-    if len(pairs.x) > _SEARCH_PAIRS * len(bases):
+    if len(pairs.x) > _SETTINGS.search_pairs * len(bases):
         mask = np.zeros(len(pairs.x), dtype=np.bool_)
-        mask[rng.permutation(len(pairs.x))[: _SEARCH_PAIRS * len(bases)]] = True
+        mask[rng.permutation(len(pairs.x))[: _SETTINGS.search_pairs * len(bases)]] = True
         some = pairs.chosen(mask)
     best = _from_a_random_chain(some, prior, bases, rng)
     for _ in range(starts - 1):
-        if best.noise < _EXPLAINED * pairs.size:
+        if best.noise < _SETTINGS.explained * pairs.size:
             break
         fit = _from_a_random_chain(some, prior, bases, rng)
         plausible = best.noise < PLAUSIBLE * pairs.size
-        agrees = plausible and abs(fit.noise / best.noise - 1.0) < _SAME_NOISE
+        agrees = plausible and abs(fit.noise / best.noise - 1.0) < _SETTINGS.same_noise
         best = min(best, fit, key=lambda candidate: candidate.noise)
         if agrees:
             break
@@ -140,12 +149,12 @@ def search(
 
 
 def _from_a_random_chain(pairs: Pairs, prior: CorePrior, bases: Sequence[JointBasis], rng: np.random.Generator) -> Fit:
-    noise = _FIRST_NOISE * pairs.size
+    noise = _SETTINGS.first_noise * pairs.size
     chain = random_chain(bases, pairs.size / math.sqrt(len(bases)), rng)
     # A small given sigma would make the objective of the first steps rugged.
     problem = TensorProblem(pairs.weights, pairs.x, np.full(len(pairs.x), noise), prior)
-    z = alternate(problem, prior.whitened(TensorTrain.from_chain(chain, bases).cores), _SWEEPS)
-    z, _ = LevenbergMarquardt().run(problem, z, _FIRST_STEPS)
+    z = alternate(problem, prior.whitened(TensorTrain.from_chain(chain, bases).cores), _SETTINGS.sweeps)
+    z, _ = LevenbergMarquardt().run(problem, z, _SETTINGS.first_steps)
     left = math.sqrt(float(np.square(problem.residuals(z)).mean()))
     if left > PLAUSIBLE * pairs.size:
         # Most failed starts show by now; settling them would take longer than the next start.
@@ -201,16 +210,16 @@ def _settle(pairs: Pairs, prior: CorePrior, z: FloatArray, noise: float) -> Fit:
     """
     optimiser = LevenbergMarquardt()
     used = np.ones(len(pairs.x), dtype=np.bool_)
-    for _ in range(_ROUNDS):
+    for _ in range(_SETTINGS.rounds):
         problem = pairs.problem(prior, noise)
-        z, _ = optimiser.run(problem, z, _ROUND_STEPS)
+        z, _ = optimiser.run(problem, z, _SETTINGS.round_steps)
         if not pairs.unknown.any():
             noise = math.sqrt(float(np.square(pairs.sigma).mean()))
             if optimiser.converged:
                 break
             continue
         found = max(_noise(pairs, problem, z), pairs.noise_floor)
-        steady = abs(found / noise - 1.0) < _SAME_NOISE
+        steady = abs(found / noise - 1.0) < _SETTINGS.same_noise
         noise = found
         if (optimiser.converged and steady) or found == pairs.noise_floor:
             break
@@ -232,28 +241,28 @@ def _distances(pairs: Pairs, prior: CorePrior, fit: Fit) -> tuple[FloatArray, bo
     problem = pairs.problem(prior, fit.noise)
     freedom = 1.0 - effective_parameters(problem, fit.z) / (3.0 * len(pairs.x))
     lengths = np.linalg.norm(problem.residuals(fit.z), axis=1) / problem.std
-    unit = float(np.median(lengths)) / (MEDIAN_NORM * math.sqrt(max(freedom, _LEAST_FREEDOM)))
+    unit = float(np.median(lengths)) / (MEDIAN_NORM * math.sqrt(max(freedom, _SETTINGS.least_freedom)))
     rounding = fit.noise <= 2.0 * pairs.noise_floor
     least = pairs.noise_floor / fit.noise if pairs.unknown.any() else 1.0
-    return lengths / max(unit, least), freedom >= _LEAST_FREEDOM and not rounding
+    return lengths / max(unit, least), freedom >= _SETTINGS.least_freedom and not rounding
 
 
 def _good(pairs: Pairs, prior: CorePrior, fit: Fit) -> BoolArray:
     """Return True for each pair (n,) whose distance from the fit is within the noise."""
     lengths, telling = _distances(pairs, prior, fit)
-    return lengths <= _OUTLIER_DISTANCE if telling else np.ones(len(lengths), dtype=np.bool_)
+    return lengths <= _SETTINGS.outlier_distance if telling else np.ones(len(lengths), dtype=np.bool_)
 
 
 def _reweighted(pairs: Pairs, prior: CorePrior, fit: Fit) -> Fit:
     """Return an iteratively reweighted fit with Geman and McClure's weights (1 + r²)⁻²."""
     optimiser = LevenbergMarquardt()
     z = fit.z
-    for _ in range(_ROUNDS):
+    for _ in range(_SETTINGS.rounds):
         lengths, _ = _distances(pairs, prior, replace(fit, z=z))
-        trust = 1.0 / np.square(1.0 + np.square(lengths / _WEIGHT_SCALE))
+        trust = 1.0 / np.square(1.0 + np.square(lengths / _SETTINGS.weight_scale))
         problem = pairs.problem(prior, fit.noise, trust)
-        z, _ = optimiser.run(problem, z, _ROUND_STEPS)
+        z, _ = optimiser.run(problem, z, _SETTINGS.round_steps)
         moved = float(np.abs(_distances(pairs, prior, replace(fit, z=z))[0] - lengths).max())
-        if optimiser.converged and moved < _SAME_LENGTHS:
+        if optimiser.converged and moved < _SETTINGS.same_lengths:
             break
     return replace(fit, z=z)

@@ -14,16 +14,25 @@ from bodyschema.learning.changes.record import NAMED, TOOL
 from bodyschema.learning.solvers.solver import fitted_belief
 from kbmaps import ChainBelief, ChangeKind, Explanation, KBMap, any_change, explanations
 
-# An unnamed change widens every kind at least this probable.
-IMPROBABLE = 0.02
-# 1-sigma of the changed part: this multiple of its most probable change, and at least this many noises.
-WIDER, LEAST_NOISES = 3.0, 3.0
-# Number of runs of neighbours left out in turn to compare the new model with the old one.
-FOLDS = 4
-# Pairs farther from a prediction than this many sigmas are clipped.
-_CLIPPED = 5.0
-# Minimum number of pairs before the change that update the previous posterior.
-_FEWEST_BEFORE = 10
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the adaptation to a change."""
+
+    # An unnamed change widens every kind at least this probable.
+    improbable: float = 0.02
+    # 1-sigma of the changed part: this multiple of its most probable change, and at least this many noises.
+    wider: float = 3.0
+    least_noises: float = 3.0
+    # Number of runs of neighbours left out in turn to compare the new model with the old one.
+    folds: int = 4
+    # Pairs farther from a prediction than this many sigmas are clipped.
+    clipped: float = 5.0
+    # Minimum number of pairs before the change that update the previous posterior.
+    fewest_before: int = 10
+
+
+_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +63,7 @@ class Origin:
         quiet = [k for k in range(min(noticed.earliest, noticed.first)) if noticed.kept[k]]
         q, x = noticed.q[quiet], noticed.x[quiet]
         wide = self._reference.wide
-        if len(quiet) >= _FEWEST_BEFORE:
+        if len(quiet) >= _SETTINGS.fewest_before:
             wide = fitted_belief(wide, q, self._of_chain(q, x))
         self._before = arm.updated(wide, self._reference.residual)
 
@@ -90,10 +99,10 @@ class Origin:
         Runs of q (n, d) [rad] and x (n, 3) [m], n at least 2, are left out in turn.
         """
         arm, y = self._forgetful(found), self._of_chain(q, x)
-        limit = _CLIPPED * self._noticed.noise_m
+        limit = _SETTINGS.clipped * self._noticed.noise_m
         old = np.minimum(np.linalg.norm(y - self._reference.belief.predict(q), axis=1), limit)
         new = np.empty(len(q))
-        for left_out in np.array_split(np.arange(len(q)), min(FOLDS, len(q))):
+        for left_out in np.array_split(np.arange(len(q)), min(_SETTINGS.folds, len(q))):
             others = np.setdiff1d(np.arange(len(q)), left_out)
             belief = fitted_belief(arm.chain, q[others], y[others])
             new[left_out] = np.minimum(np.linalg.norm(y[left_out] - belief.predict(q[left_out]), axis=1), limit)
@@ -105,7 +114,9 @@ class Origin:
 
     def _forgetful(self, found: Sequence[Explanation]) -> KnownArm:
         arm = self._before
-        kinds = found[:1] if found[0].probability >= NAMED else [e for e in found if e.probability >= IMPROBABLE]
+        kinds = (
+            found[:1] if found[0].probability >= NAMED else [e for e in found if e.probability >= _SETTINGS.improbable]
+        )
         for each in kinds:
             if each.kind.name == TOOL:
                 arm = arm.with_other_tool()
@@ -115,5 +126,5 @@ class Origin:
 
     def _widths(self, kind: ChangeKind, change: FloatArray) -> FloatArray:
         moves = change / kind.units
-        size = WIDER * float(np.sqrt(np.square(moves).mean()))
-        return kind.units * min(max(size, LEAST_NOISES * self._noticed.noise_m), OTHER_TOOL_M)
+        size = _SETTINGS.wider * float(np.sqrt(np.square(moves).mean()))
+        return kind.units * min(max(size, _SETTINGS.least_noises * self._noticed.noise_m), OTHER_TOOL_M)

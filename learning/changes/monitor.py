@@ -17,11 +17,25 @@ from kbmaps import ChainBelief, ChangeDetector, ChangeKind, ChangeScore, KBMap, 
 from kbmaps.changes.detector import MOST_SURPRISES
 from kbmaps.changes.white_noise import inverse_roots
 
-# Minimum number of pairs of a reference model: with fewer it may be too far off.
-FEWEST_KNOWN = 100
-# A newer model replaces the reference after half as many pairs as it knows, within these limits. It would absorb a
-# change that took longer to show.
-SHORTEST_TRIAL, LONGEST_TRIAL = 50, 1000
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the monitor of changes."""
+
+    # Minimum number of pairs of a reference model: with fewer it may be too far off.
+    fewest_known: int = 100
+    # A newer model replaces the reference after half as many pairs as it knows, within these limits. It would absorb a
+    # change that took longer to show.
+    shortest_trial: int = 50
+    longest_trial: int = 1000
+    # A model counts as the chain alone if it is this near to it, over the noise of a pair.
+    alone: float = 0.1
+    # Lower bound of a measurement's noise, whatever it claims [m].
+    smallest_m: float = 1e-6
+
+
+_SETTINGS = _Settings()
+
 # If no newer model comes, the older half of this many pairs is dropped.
 MOST_WATCHED = 5000
 # Number of the model's own pairs that show its noise.
@@ -29,15 +43,11 @@ LOOKED_BACK = 1000
 # An alarm that a bent arm explains is evaluated again when the pairs since the change have grown by this factor, or the
 # alarm's log odds by this much.
 LOOK_AGAIN, GROWN_ODDS = 1.25, 4.0
-# A model counts as the chain alone if it is this near to it, over the noise of a pair.
-_ALONE = 0.1
-# Lower bound of a measurement's noise, whatever it claims [m].
-SMALLEST_M = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Model that knows none of the monitored pairs, with its posterior.
+    """Model fitted to none of the monitored pairs, with its posterior.
 
     Attributes:
         model: the answering model.
@@ -83,10 +93,10 @@ class Reference:
         """
         more = np.maximum((white - claimed).diagonal(axis1=1, axis2=2), 0.0)
         missed = np.maximum(self.claim.beyond_chain(q) - more, 0.0)
-        return white + np.eye(3) * np.maximum(missed, SMALLEST_M**2)[:, None, :]
+        return white + np.eye(3) * np.maximum(missed, _SETTINGS.smallest_m**2)[:, None, :]
 
     def noise(self, covariances: FloatArray, white: FloatArray) -> SharedNoise:
-        """Return the noise of the reference's whitened errors at pairs that it knows.
+        """Return the noise of the reference's whitened errors at pairs that it was fitted to.
 
         Args:
             covariances: of these errors (n, 3, 3) [m²].
@@ -216,7 +226,7 @@ class ChangeMonitor:
 
     def offer(self, reference: Reference) -> None:
         """Offer a model of the pairs up to the last `asked`."""
-        if reference.known < FEWEST_KNOWN or not self.wants_reference:
+        if reference.known < _SETTINGS.fewest_known or not self.wants_reference:
             return
         self._next, self._next_at = reference, self._asked_at
 
@@ -338,7 +348,7 @@ class ChangeMonitor:
         noise_m = float(np.sqrt(noise.single * _traces(covariances).mean() / 3.0))
         distance_m = float(np.linalg.norm(reference.x, axis=1).mean())
         self._detector = ChangeDetector(reference.belief, noise, noise_m, distance_m)
-        if float(np.square(reference.beyond_chain(q)).mean()) < (_ALONE * noise_m) ** 2:
+        if float(np.square(reference.beyond_chain(q)).mean()) < (_SETTINGS.alone * noise_m) ** 2:
             # Terms that another model learnt from these pairs would hide the arm's bends.
             self._detector.recall(q, reference.x - reference.belief.predict(q), covariances)
         self._change, self._look_at = None, 0
@@ -375,4 +385,4 @@ def _traces(covariances: FloatArray) -> FloatArray:
 
 
 def _trial(known: int) -> int:
-    return min(max(known // 2, SHORTEST_TRIAL), LONGEST_TRIAL)
+    return min(max(known // 2, _SETTINGS.shortest_trial), _SETTINGS.longest_trial)

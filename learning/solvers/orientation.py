@@ -21,9 +21,10 @@ from kbmaps import (
     rotation_matrices,
 )
 
-# Number of the newest pairs that the maps are fitted to.
+# Number of the newest pairs that exact maps are fitted to, which bounds time and memory. Measured where a chain misses
+# 10 mm (docs/results/learning.md).
 WINDOW = 20_000
-# Number of the newest orientations that are kept, and of those that a chain is fitted to, evenly spread.
+# Number of the newest pairs kept as pairs, and of those that a chain is fitted to, evenly spread.
 KEPT, FITTED = 4000, 1000
 # Growth of the number of pairs before the next solution, with a new search for the maps' precision.
 GROWTH = 1.15

@@ -12,7 +12,7 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.model_bank import EXACT, RESIDUAL, RIGID, LearntModel
-from bodyschema.learning.solvers.orientation import OrientationSolution, OrientationSolver
+from bodyschema.learning.solvers.orientation import KEPT, WINDOW, OrientationSolution, OrientationSolver
 from bodyschema.learning.solvers.tolerance_selection import Tolerances, best_tolerances, workmanship
 from kbmaps import (
     ChainBelief,
@@ -34,22 +34,32 @@ log = logging.getLogger(__name__)
 
 # Memory and time grow with the square and the cube of the control points: 3^7 take 77 MB and 0.2 s.
 LARGEST_NET = 2187
-# Number of the newest pairs that the exact map is fitted to, which bounds time and memory; the chain keeps the
-# information of older ones. Measured where a chain misses 10 mm (docs/results/learning.md).
-WINDOW = 20_000
-# Growth of the number of pairs before the next search for the prior's precision.
-RETUNE = 1.25
-# Number of the newest pairs kept as pairs; the information of older ones about the chain is folded into its prior, this
-# many at a time.
-KEPT, FOLDED = 4000, 2000
-# Number of pairs that a chain is fitted to, evenly spread.
-FITTED = 2000
-# The chain with residual takes longest, up to a second: it waits for this growth of the number of pairs.
-RESIDUAL_GROWTH = 1.15
-# With this growth of the number of pairs, this share of them is solved for first, if it is at least this many.
-FIRST_GROWTH, FIRST_SHARE, FEWEST_FIRST = 1.5, 0.75, 5
-# Minimum number of neighbours counting as one at which their correlation is not chance.
-SHARED = 1.5
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the solver."""
+
+    # Growth of the number of pairs before the next search for the prior's precision.
+    retune: float = 1.25
+    # Number of pairs that a chain is fitted to, evenly spread.
+    fitted: int = 2000
+    # The chain with residual takes longest, up to a second: it waits for this growth of the number of pairs.
+    residual_growth: float = 1.15
+    # With this growth of the number of pairs, this share of them is solved for first, if it is at least this many.
+    first_growth: float = 1.5
+    first_share: float = 0.75
+    fewest_first: int = 5
+    # Minimum number of neighbours counting as one at which their correlation is not chance.
+    shared: float = 1.5
+    # While pairs are few, a solution is cheap, and renewed after this growth of their number.
+    growth: float = 0.1
+
+
+_SETTINGS = _Settings()
+
+# The information about the chain of pairs older than those kept is folded into its prior, this many at a time.
+FOLDED = 2000
 
 
 @dataclass(frozen=True)
@@ -178,12 +188,12 @@ class DirectSolver:
     def solutions(self) -> Iterator[Solved]:
         """Yield each model's solution as it is found, the rigid chain first: it is the quickest."""
         task = self._started
-        if self._pairs >= FIRST_GROWTH * self._solved_at:
+        if self._pairs >= _SETTINGS.first_growth * self._solved_at:
             yield from self._solved_of_some(task)
         self._solved_at = self._pairs
         wide = fitted_belief(self._before, self._q, self._x)
         made = _ways_made(wide, task)
-        residual_due = self._pairs >= RESIDUAL_GROWTH * self._residual_at
+        residual_due = self._pairs >= _SETTINGS.residual_growth * self._residual_at
         turns = self._orientations if self._orientations is not None and self._orientations.due else None
         rigid = _solved_chain(task, self._pairs, wide, made)
         yield replace(rigid, last=self._exact is None and not residual_due and turns is None)
@@ -203,8 +213,8 @@ class DirectSolver:
 
     def _solved_of_some(self, task: Task) -> Iterator[Solved]:
         """Yield the chain of the first pairs only: the others can judge it, even if none come after them."""
-        some = int(len(self._q) * FIRST_SHARE)
-        if some >= FEWEST_FIRST:
+        some = int(len(self._q) * _SETTINGS.first_share)
+        if some >= _SETTINGS.fewest_first:
             wide = fitted_belief(self._before, self._q[:some], self._x[:some])
             pairs = self._pairs - len(self._q) + some
             yield replace(_solved_chain(task, pairs, wide, _ways_made(wide, task)), last=False)
@@ -215,7 +225,7 @@ class DirectSolver:
         The evidence finds the prior's precision if pairs are apart. On a guided path, neighbours share their errors,
         which the evidence would take for shape: there, left-out blocks choose it.
         """
-        retune = self._precision is None or learner.pairs >= RETUNE * self._tuned_at
+        retune = self._precision is None or learner.pairs >= _SETTINGS.retune * self._tuned_at
         try:
             solution = learner.solve(self._sought_precision(learner.prior) if retune else self._precision)
         except SettingError:
@@ -274,7 +284,7 @@ def fitted_belief(prior: ChainBelief, q: FloatArray, x: FloatArray) -> ChainBeli
     learner.learn(q, x)
     inliers = learner.inliers
     shared = shared_by(x[inliers] - learner.predict(q[inliers]))
-    if shared < SHARED:
+    if shared < _SETTINGS.shared:
         return learner.belief
     again = RigidLearner(prior.parameters.reference, ChainTolerances(), prior)
     again.learn(q[inliers], x[inliers], learner.scatter.noise * math.sqrt(shared))
@@ -298,13 +308,9 @@ def fitted_residual(prior: ChainBelief | ResidualModel, q: FloatArray, x: FloatA
 
 
 def _spread(q: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return at most `FITTED` of the pairs, evenly spread."""
-    chosen = np.linspace(0, len(q) - 1, min(len(q), FITTED)).round().astype(np.intp)
+    """Return at most `fitted` of the pairs, evenly spread."""
+    chosen = np.linspace(0, len(q) - 1, min(len(q), _SETTINGS.fitted)).round().astype(np.intp)
     return q[chosen], x[chosen]
-
-
-# While pairs are few, a solution is cheap, and renewed after this growth of their number.
-GROWTH = 0.1
 
 
 class SolverClient:
@@ -331,7 +337,7 @@ class SolverClient:
     @property
     def due(self) -> bool:
         """True if it is time to ask."""
-        enough = min(self._every, max(GROWTH * self._solved_at, 1.0))
+        enough = min(self._every, max(_SETTINGS.growth * self._solved_at, 1.0))
         return self._fed > 0 and (self._soon or self._fed - self._solved_at >= enough)
 
     def works_on(self, task: int) -> bool:
@@ -349,7 +355,7 @@ class SolverClient:
         self._busy = self._soon = False
 
     def solve_soon(self) -> None:
-        """Ask even though fewer pairs than usual are new."""
+        """Request a solution although fewer pairs than usual are new."""
         self._soon = self._soon or self._fed > self._solved_at or self._task is None
 
     def begin(self, task: Task) -> bool:

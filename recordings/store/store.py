@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from itertools import islice, takewhile
 from pathlib import Path
 from threading import Lock
-from types import TracebackType
 from typing import Any, Self
 
 import msgspec
@@ -165,9 +164,7 @@ class PairReader:
         self._given_up_to = store_schema.given_up_to(meta)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._close()
 
     def read(self, from_seq: int = 1, to_seq: int | None = None, limit: int | None = None) -> list[Pair]:
@@ -341,9 +338,7 @@ class PairStore:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._close()
 
     def append(self, segment: int, utc: str, q: FloatArray, fix: MarkerFix) -> Pair:

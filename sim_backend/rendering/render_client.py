@@ -7,7 +7,6 @@ import os
 import select
 import subprocess
 from contextlib import ExitStack
-from types import TracebackType
 from typing import Self
 
 import numpy as np
@@ -76,13 +75,11 @@ class RenderProcess:
             self._exit = stack.pop_all()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._exit.__exit__(kind, error, trace)
+    def __exit__(self, *_: object) -> None:
+        self._exit.close()
 
     def request(self, number: int, scene: Scene) -> None:
-        """Ask for frame `number`, with a stick from the hand to where the tool ends."""
+        """Request frame `number`, with a stick from the hand to where the tool ends."""
         tip = (float(scene.tip[0]), float(scene.tip[1]), float(scene.tip[2]))
         if tip != self._tip:
             self._send(Tool(tip=tip))

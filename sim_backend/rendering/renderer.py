@@ -36,7 +36,7 @@ class Stick:
         self._T_link_stick: tuple[FloatArray, FloatArray] = (np.zeros(3), np.eye(3))
 
     def change(self, tip: FloatArray) -> None:
-        """Take a rod to `tip` (3,) [m] in the link."""
+        """Replace the stick by one to `tip` (3,) [m] in the link."""
         bullet, client = self._body.bullet, self._body.client
         if self._id >= 0:
             bullet.removeBody(self._id, physicsClientId=client)

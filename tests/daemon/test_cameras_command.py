@@ -16,8 +16,8 @@ from shown_board import photographed, true_vector
 from bodyschema.cli.cameras.calibration import NORMAL_95, CamerasFile, CheckFile
 from bodyschema.cli.main import app
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.robot.interval import to_its_interval
 from bodyschema.vision.calibration.images import Images
+from bodyschema.vision.calibration.report.page import to_its_interval
 from bodyschema.vision.rig.rig_file import read_rig
 from bodyschema.vision.rig.stereo_rig import CalibrationError
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodyschema.cli.commands.options import lerobot_lines
+from bodyschema.cli.commands.options import LeRobotOptions
 from bodyschema.cli.hardware.lerobot_offsets import CorrectedCalibration
 from bodyschema.cli.main import command_line
 from bodyschema.daemon.config import Config
@@ -215,20 +215,20 @@ def test_offsets_of_one_recording_are_written_once(tmp_path, capsys, monkeypatch
     shutil.copy(SO101 / "follower.json", mine)
     robot, offsets = robot_of("follower", Path("robot.toml")), {"shoulder_lift": math.radians(2.0)}
     planted(file, robot)
-    lerobot_lines(robot, mine, offsets, file, write=True)
+    LeRobotOptions(mine, True).lines(robot, offsets, file)
     once = mine.read_bytes()
     told = (
         "follower.json already has the offsets of r.csv in it (follower.json.before is the file without them). Record "
         "again with the new calibration; or delete follower.json.recordings to write all the same."
     )
-    assert lerobot_lines(robot, mine, offsets, file, write=False) == [told]
+    assert LeRobotOptions(mine, False).lines(robot, offsets, file) == [told]
     capsys.readouterr()
     calibrate(file, "--lerobot", mine, "--write")
     assert f"{told}\n" in capsys.readouterr().out
     assert mine.read_bytes() == once
     assert not Path("follower.json.before2").exists()
     Path("follower.json.recordings").unlink()
-    lerobot_lines(robot, mine, offsets, file, write=True)
+    LeRobotOptions(mine, True).lines(robot, offsets, file)
     assert Path("follower.json.before2").read_bytes() == once != mine.read_bytes()
 
 

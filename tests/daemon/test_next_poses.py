@@ -21,8 +21,7 @@ from bodyschema.calibration.rigid_chain import Calibration
 from bodyschema.cli.main import command_line
 from bodyschema.interfaces.errors import RecordingError
 from bodyschema.recordings.recording import Recording
-from bodyschema.robot.description import RobotDescription
-from bodyschema.robot.links import link_poses
+from bodyschema.robot.description import RobotDescription, link_poses
 from kbmaps import ChainParameters, ChainTolerances
 
 DESK_ARM = Path(__file__).parents[2] / "examples" / "desk_arm"

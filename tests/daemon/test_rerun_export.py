@@ -18,7 +18,7 @@ from bodyschema.interfaces.errors import RecordingError
 from bodyschema.recordings import files as recordings
 from bodyschema.recordings.recording import Recording
 from bodyschema.recordings.rerun_export import runs
-from bodyschema.robot.links import link_poses
+from bodyschema.robot.description import link_poses
 
 CAMERA = """xyz = [1.2, 0.3, 0.5]
 rpy = [-1.9, 0.1, 1.5]

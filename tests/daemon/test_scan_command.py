@@ -15,8 +15,8 @@ from bodyschema.cli.hardware.scan_report import ScanReport, as_json, report_of
 from bodyschema.cli.hardware.scan_view import show
 from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config
-from bodyschema.drivers.scan import FoundServo, ScannedBus
 from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.servos import FoundServo, ScannedBus
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "desk_arm" / "servos.toml"
 JOINTS = ("base_yaw", "shoulder_pitch", "elbow_pitch", "wrist_roll")

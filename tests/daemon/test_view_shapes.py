@@ -12,7 +12,7 @@ from small_arm import ROBOT, URDF
 from bodyschema.dashboard import shapes
 from bodyschema.dashboard.shapes import MOST_TRIANGLES, Body, mesh_buffer, read_shapes
 from bodyschema.robot.description import RobotDescription
-from bodyschema.robot.mesh_file import stl_bytes
+from bodyschema.robot.meshes import stl_bytes
 
 # Corner k of a unit cube lies at the bits of k; its faces, two triangles each, wound to the outside.
 FACES = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]])

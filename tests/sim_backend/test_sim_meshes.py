@@ -7,12 +7,11 @@ import pytest
 from guided_run import described
 
 from bodyschema.interfaces.errors import RobotError
-from bodyschema.robot import mesh_file, meshes
-from bodyschema.robot.mesh_file import MeshError, read_mesh, stl_bytes
+from bodyschema.robot import meshes
+from bodyschema.robot.meshes import MeshError, read_mesh, stl_bytes
 from bodyschema.sim_backend import SimConfig
 from bodyschema.sim_backend.bullet import Body
-from bodyschema.sim_backend.meshes import MOST_TRIANGLES, Meshes
-from bodyschema.sim_backend.physics_urdf import MOST_LINKS, physics_urdf
+from bodyschema.sim_backend.physics_urdf import MOST_LINKS, MOST_TRIANGLES, Meshes, physics_urdf
 from bodyschema.sim_backend.truth import TrueRobot
 
 WEDGE = np.array([[[0, 0, 0], [0, 2, 0], [3, 0, 0]], [[0, 0, 0], [3, 0, 0], [0, 0, 5]]], dtype=float)
@@ -116,7 +115,7 @@ def test_malformed_files_are_told_apart(tmp_path, name) -> None:
 
 
 def test_files_beyond_the_limit_are_not_read(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(mesh_file, "LARGEST_MESH_BYTES", 1 << 20)
+    monkeypatch.setattr(meshes, "LARGEST_MESH_BYTES", 1 << 20)
     (tmp_path / "endless.stl").symlink_to("/dev/zero")
     (tmp_path / "large.stl").write_bytes(bytes(2 << 20))
     for name, why in (("endless.stl", "a device"), ("large.stl", "larger than 1 MiB")):
@@ -125,7 +124,7 @@ def test_files_beyond_the_limit_are_not_read(tmp_path, monkeypatch) -> None:
 
 
 def test_too_many_triangles_are_refused(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(mesh_file, "MOST_TRIANGLES", 1)
+    monkeypatch.setattr(meshes, "MOST_TRIANGLES", 1)
     for name, data in (("a.stl", stl(WEDGE)), ("a.obj", obj(np.tile(WEDGE, (3, 1, 1)))), ("a.dae", collada())):
         (tmp_path / name).write_bytes(data)
         with pytest.raises(MeshError, match=r"more than 1 triangles|too long"):
@@ -151,7 +150,7 @@ def ball(count):
 
 
 def triangles_of(data):
-    return np.frombuffer(data, dtype=mesh_file._STL_TRIANGLE, offset=84)["corners"]
+    return np.frombuffer(data, dtype=meshes._STL_TRIANGLE, offset=84)["corners"]
 
 
 def test_heavy_meshes_keep_their_shape(tmp_path) -> None:

@@ -14,8 +14,7 @@ from bodyschema.interfaces.camera import LARGEST_SIDE_PX
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.rpy import rotation_of
-from bodyschema.robot.toml_file import line_of
-from bodyschema.robot.toml_types import NonNegative, Positive
+from bodyschema.robot.toml_file import NonNegative, Positive, line_of
 
 Side = Annotated[int, Meta(ge=16, le=LARGEST_SIDE_PX)]
 

@@ -13,9 +13,8 @@ from msgspec import Meta
 from bodyschema.interfaces.camera import LARGEST_SIDE_PX
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.robot.toml_file import convert, line_of, read_toml
+from bodyschema.robot.toml_file import Positive, convert, line_of, read_toml
 from bodyschema.robot.toml_text import toml_text
-from bodyschema.robot.toml_types import Positive
 
 from .lens import DISTORTION_NAMES, Lens, Model
 from .stereo_rig import Made, OneEyeRig, Rig, StereoRig, parameter_names

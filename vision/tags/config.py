@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from bodyschema.robot.toml_types import Positive
+from bodyschema.robot.toml_file import Positive
 
 # Of six by six modules: what is between the black borders. All are in every OpenCV from 4.11 on.
 Dictionary = Literal[

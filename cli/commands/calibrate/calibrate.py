@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -13,11 +15,11 @@ from bodyschema.cli.commands.calibrate.calibrate_cameras import cameras
 from bodyschema.cli.commands.calibrate.latency import latency
 from bodyschema.cli.commands.options import (
     AS_THEY_ARE,
-    LeRobotFile,
+    WITHOUT_LEROBOT,
+    LeRobotOptions,
     SourceOptions,
     SourceRobotFile,
     flag,
-    lerobot_lines,
     print_json,
     robot_file,
 )
@@ -30,6 +32,85 @@ if TYPE_CHECKING:
     from bodyschema.robot.description import RobotDescription
 
 CAMERA_FRAME = "calibrated_camera"
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class FitOptions:
+    """What is fitted, and what is known beforehand."""
+
+    sigma_mm: Annotated[
+        float | None,
+        Parameter(
+            help="1-sigma of a measured coordinate where the source has none [mm]; else estimated.",
+            validator=Number(gt=0, lte=1000),
+        ),
+    ] = None
+    zeros_deg: Annotated[
+        float, Parameter(help="How far joint zeros may be off, 1-sigma [°].", validator=Number(gt=0, lte=60))
+    ] = 3.0
+    trust_urdf: Annotated[
+        bool, flag("Camera and tool alone: links and joint zeros are right as the URDF has them.")
+    ] = False
+    only: Annotated[
+        Literal["offsets"] | None,
+        Parameter(help="offsets: joint offsets, camera and tool; the links are right as the URDF has them."),
+    ] = None
+
+    @property
+    def sigma_m(self) -> float | None:
+        """1-sigma of a measured coordinate [m]; None to estimate it."""
+        return None if self.sigma_mm is None else 1e-3 * self.sigma_mm
+
+    def trusted(self) -> Trusted:
+        """Return what of the URDF is right."""
+        from bodyschema.interfaces.errors import RequestError
+
+        if self.trust_urdf and self.only is not None:
+            raise RequestError("--trust-urdf has no offsets to find. Give it, or --only offsets")
+        return "urdf" if self.trust_urdf else "nothing" if self.only is None else "links"
+
+    def fitted(self, description: RobotDescription, recording: Recording) -> tuple[Calibration, Calibration | None]:
+        """Return the calibration, and that with everything free where the URDF is trusted."""
+        from bodyschema.calibration.rigid_chain import Calibration
+
+        def of(trusted: Trusted) -> Calibration:
+            zeros_rad = math.radians(self.zeros_deg)
+            return Calibration.of(description, recording, sigma_m=self.sigma_m, zeros_rad=zeros_rad, trusted=trusted)
+
+        trusted = self.trusted()
+        return of(trusted), None if trusted == "nothing" else of("nothing")
+
+
+AS_USUAL = FitOptions()
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class PlanOptions:
+    """Poses to measure next."""
+
+    next_poses: Annotated[
+        Path | None,
+        Parameter(help="Write the poses to visit next into this file (.json, .csv), the most informative first."),
+    ] = None
+    poses: Annotated[int, Parameter(help="How many poses of --next-poses.", validator=Number(gte=1, lte=200))] = 20
+
+    def written(self, found: Calibration) -> list[str]:
+        """Write the poses, if asked for; return what they would gain."""
+        from bodyschema.calibration.next_poses import NextPoses
+
+        if self.next_poses is None:
+            return []
+        plan = NextPoses.of(found, self.poses)
+        plan.write(self.next_poses, replace=True)
+        return [
+            f"{self.poses} poses written to {self.next_poses}. Model error over the range, without noise: "
+            f"{1e3 * plan.expected_m:.2g} mm expected now, {1e3 * plan.expected_after_m:.2g} mm with them."
+        ]
+
+
+NO_PLAN = PlanOptions()
 
 # Without a help of its own its page shows what `arm` says, beside the commands.
 calibrate = cyclopts.App(name="calibrate")
@@ -49,16 +130,7 @@ def arm(
     /,
     *,
     robot: SourceRobotFile = None,
-    sigma_mm: Annotated[
-        float | None,
-        Parameter(
-            help="1-sigma of a measured coordinate where the source has none [mm]; else estimated.",
-            validator=Number(gt=0, lte=1000),
-        ),
-    ] = None,
-    zeros_deg: Annotated[
-        float, Parameter(help="How far joint zeros may be off, 1-sigma [°].", validator=Number(gt=0, lte=60))
-    ] = 3.0,
+    fit: FitOptions = AS_USUAL,
     first: Annotated[
         int | None,
         Parameter(
@@ -70,22 +142,10 @@ def arm(
     out: Annotated[
         Path | None, Parameter(help="Write the calibrated robot into this folder: a URDF and a robot.toml.")
     ] = None,
-    trust_urdf: Annotated[
-        bool, flag("Camera and tool alone: links and joint zeros are right as the URDF has them.")
-    ] = False,
-    only: Annotated[
-        Literal["offsets"] | None,
-        Parameter(help="offsets: joint offsets, camera and tool; the links are right as the URDF has them."),
-    ] = None,
-    next_poses: Annotated[
-        Path | None,
-        Parameter(help="Write the poses to visit next into this file (.json, .csv), the most informative first."),
-    ] = None,
-    poses: Annotated[int, Parameter(help="How many poses of --next-poses.", validator=Number(gte=1, lte=200))] = 20,
+    plan: PlanOptions = NO_PLAN,
     camera_frame: Annotated[str, Parameter(help="What ROS calls the measurement frame, for TF.")] = CAMERA_FRAME,
     taken: SourceOptions = AS_THEY_ARE,
-    lerobot: LeRobotFile = None,
-    write: Annotated[bool, flag("Write the file of --lerobot; the old one is kept beside it.")] = False,
+    servos: LeRobotOptions = WITHOUT_LEROBOT,
     as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
     force: Annotated[
         bool,
@@ -123,27 +183,27 @@ def arm(
     from bodyschema.calibration.report import CalibrationReport
     from bodyschema.daemon.config import Config
 
-    _require_one_target(lerobot, out, write=write)
-    trusted = _trusted(only, trust_urdf=trust_urdf)
-    if next_poses is not None:
-        check_target(next_poses, replace=force)
+    _require_one_target(servos, out)
+    fit.trusted()
+    if plan.next_poses is not None:
+        check_target(plan.next_poses, replace=force)
     config = Config.load(robot_file(robot, source))
     description, source = config.robot, source or config.store_file
-    recording, first = _rows(config, source, taken, lerobot, (first, last))
-    sigma_m = None if sigma_mm is None else 1e-3 * sigma_mm
+    recording, first = _rows(config, source, taken, servos.lerobot, (first, last))
     require_units(description, recording, source)
-    seen = plausibility(description, recording.q, recording.x, sigma_m=told_sigma(recording) or sigma_m)
+    seen = plausibility(description, recording.q, recording.x, sigma_m=told_sigma(recording) or fit.sigma_m)
     if seen.misread:
         seen.require(source, force=force)
-    found, free = _fitted(description, recording, sigma_m, zeros_deg, trusted)
+    found, free = fit.fitted(description, recording)
     report = CalibrationReport.of(found, seen, source.name, first, camera_frame, free)
     if report.other_tool_from is None:
         seen.require(source, force=force)
-    if out is not None or write:
+    if out is not None or servos.write:
         _require_writable(report, force=force)
     told = [] if out is None else _written(config, found, report, out, replace=force)
-    lines = [] if next_poses is None else _planned(found, next_poses, poses)
-    changed = [] if lerobot is None else _into_servos(config, report, lerobot, source, write=write)
+    lines = plan.written(found)
+    offsets = {zero.joint: math.radians(zero.zero) for zero in report.zeros if zero.half_width is not None}
+    changed = servos.lines(config, offsets, source)
     if as_json:
         print_json(report)
         sys.stderr.writelines(f"{line}\n" for line in changed)
@@ -151,22 +211,13 @@ def arm(
         _show(report, [*lines, *changed], told)
 
 
-def _require_one_target(lerobot: Path | None, out: Path | None, *, write: bool) -> None:
+def _require_one_target(servos: LeRobotOptions, out: Path | None) -> None:
     from bodyschema.interfaces.errors import RequestError
 
-    if write and (lerobot is None or out is not None):
+    if servos.write and (servos.lerobot is None or out is not None):
         raise RequestError(
             "--write is for --lerobot FILE, and without --out: offsets belong into the servos or into a URDF, not both"
         )
-
-
-def _trusted(only: str | None, *, trust_urdf: bool) -> Trusted:
-    """Return what of the URDF is right."""
-    from bodyschema.interfaces.errors import RequestError
-
-    if trust_urdf and only is not None:
-        raise RequestError("--trust-urdf has no offsets to find. Give it, or --only offsets")
-    return "urdf" if trust_urdf else "nothing" if only is None else "links"
 
 
 def _rows(
@@ -185,21 +236,6 @@ def _rows(
         recording = taken.opened(config, source, lerobot)
     first = first or 1
     return recordings.between(recording, first, last, source), first
-
-
-def _fitted(
-    description: RobotDescription, recording: Recording, sigma_m: float | None, zeros_deg: float, trusted: Trusted
-) -> tuple[Calibration, Calibration | None]:
-    """Return the calibration, and that with everything free where the URDF is trusted."""
-    import math
-
-    from bodyschema.calibration.rigid_chain import Calibration
-
-    zeros_rad = math.radians(zeros_deg)
-    found = Calibration.of(description, recording, sigma_m=sigma_m, zeros_rad=zeros_rad, trusted=trusted)
-    if trusted == "nothing":
-        return found, None
-    return found, Calibration.of(description, recording, sigma_m=sigma_m, zeros_rad=zeros_rad)
 
 
 def _require_writable(report: CalibrationReport, *, force: bool) -> None:
@@ -225,26 +261,6 @@ def _written(config: Config, found: Calibration, report: CalibrationReport, out:
         f"\n{written} written. Next: stop what runs with {config.file.name} (the new one has its ports), then "
         f"`bodyschema run --robot {written}`",
     ]
-
-
-def _planned(found: Calibration, file: Path, count: int) -> list[str]:
-    """Write the poses to measure next into `file`; return what they would gain."""
-    from bodyschema.calibration.next_poses import NextPoses
-
-    plan = NextPoses.of(found, count)
-    plan.write(file, replace=True)
-    return [
-        f"{count} poses written to {file}. Model error over the range, without noise: "
-        f"{1e3 * plan.expected_m:.2g} mm expected now, {1e3 * plan.expected_after_m:.2g} mm with them."
-    ]
-
-
-def _into_servos(config: Config, report: CalibrationReport, lerobot: Path, source: Path, *, write: bool) -> list[str]:
-    """Return what the joint offsets change in LeRobot's calibration file."""
-    import math
-
-    offsets = {zero.joint: math.radians(zero.zero) for zero in report.zeros if zero.half_width is not None}
-    return lerobot_lines(config, lerobot, offsets, source, write=write)
 
 
 def _show(report: CalibrationReport, lines: list[str], written: list[str]) -> None:

@@ -8,20 +8,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
-from cyclopts.validators import Number
 
 from bodyschema.cli.commands.options import (
+    ANYTHING,
     AS_THEY_ARE,
-    LeRobotFile,
+    WITHOUT_LEROBOT,
+    LeRobotOptions,
+    SearchOptions,
     SourceOptions,
     SourceRobotFile,
     flag,
-    lerobot_lines,
     robot_file,
 )
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from bodyschema.cli.terminal.diagnosis_run import Found
 
 
 def diagnose(
@@ -39,12 +42,9 @@ def diagnose(
         Path | None,
         Parameter(help="Write diagnosis.json, report.html, extended.toml and perhaps a corrected URDF here."),
     ] = None,
-    effects: Annotated[str | None, Parameter(help="Look for these alone, as in backlash,joint_offset.")] = None,
-    exclude: Annotated[str | None, Parameter(help="Do not look for these.")] = None,
-    seed: Annotated[int, Parameter(help="Of the resampling behind the intervals.", validator=Number(gte=0))] = 0,
+    search: SearchOptions = ANYTHING,
     taken: SourceOptions = AS_THEY_ARE,
-    lerobot: LeRobotFile = None,
-    write: Annotated[bool, flag("Write the file of --lerobot; the old one is kept beside it.")] = False,
+    servos: LeRobotOptions = WITHOUT_LEROBOT,
     as_json: Annotated[bool, flag("Print diagnosis.json.", name="--json")] = False,
     force: Annotated[bool, flag("Go on although the pairs do not seem to be of this robot.")] = False,
 ) -> None:
@@ -66,16 +66,15 @@ def diagnose(
 
     from rich.console import Console
 
-    from bodyschema.cli.terminal.diagnosis_run import Asked, measured, results_in, run, written
-    from bodyschema.cli.terminal.diagnosis_view import view
+    from bodyschema.cli.terminal.diagnosis_run import measured, results_in, run, written
     from bodyschema.daemon.config import Config
     from bodyschema.interfaces.errors import RequestError
 
-    if write and lerobot is None:
+    if servos.write and servos.lerobot is None:
         raise RequestError("--write is for --lerobot FILE. Give LeRobot's calibration file")
     config = Config.load(robot_file(robot, recording))
-    asked = Asked.of(effects, exclude, seed)
-    source = measured(config, recording, lambda file: taken.opened(config, file, lerobot), live=live)
+    asked = search.asked()
+    source = measured(config, recording, lambda file: taken.opened(config, file, servos.lerobot), live=live)
     told = Console(stderr=True, highlight=False)
     with results_in(out), _progress(told) as tell:
         found = run(config, source, asked, tell, force=force)
@@ -84,18 +83,28 @@ def diagnose(
             written(found, out)
     for warning in found.warnings:
         told.print(f"Warning: {warning}", markup=False, soft_wrap=True)
-    lines: list[str] = []
-    if lerobot is not None:
-        offsets = {
-            cause.where: cause.parameters["offset_rad"].value
-            for cause in found.file.causes
-            if cause.effect == "joint_offset" and cause.where is not None and "offset_rad" in cause.parameters
-        }
-        lines = lerobot_lines(config, lerobot, offsets, recording, write=write)
+    lines = servos.lines(config, _joint_offsets(found), recording)
     if as_json:
         sys.stdout.write(found.json + "\n")
         sys.stderr.writelines(f"{line}\n" for line in lines)
         return
+    _show(found, lines, out)
+
+
+def _joint_offsets(found: Found) -> dict[str, float]:
+    """Return the joint offsets among the causes [rad], by joint."""
+    return {
+        cause.where: cause.parameters["offset_rad"].value
+        for cause in found.file.causes
+        if cause.effect == "joint_offset" and cause.where is not None and "offset_rad" in cause.parameters
+    }
+
+
+def _show(found: Found, lines: list[str], out: Path | None) -> None:
+    from rich.console import Console
+
+    from bodyschema.cli.terminal.diagnosis_view import view
+
     console = Console(highlight=False)
     console.print(view(found.file, found.remedies, timed=found.timed))
     for line in ["", *lines] if lines else []:

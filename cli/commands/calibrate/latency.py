@@ -49,7 +49,7 @@ def latency(
     from bodyschema.cli.hardware.wiggling import write_wiggle
     from bodyschema.daemon.config import Config
     from bodyschema.interfaces.errors import ConfigError
-    from bodyschema.robot.toml_edit import difference, with_values, write_edited
+    from bodyschema.robot.toml_text import difference, with_values, write_edited
 
     config = Config.load(robot)
     is_sent = not sim and config.tables.vision.cameras is None and bool(config.tables.marker_source)

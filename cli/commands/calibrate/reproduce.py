@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -41,32 +43,42 @@ def reproduce(
 
     Next: docs/results/paper.md describes what the paper leaves open, how it was interpreted, and what --json prints.
     """
-    import sys
-    import time
     from importlib.metadata import version
 
     import msgspec
-    import numpy as np
-    from rich.console import Console
 
-    from bodyschema.cli.terminal.progress import shown_on
     from bodyschema.interfaces.errors import ConfigError
     from bodyschema.interfaces.extras import require_extra
-    from bodyschema.reproduce import EXPERIMENTS, Run
-    from bodyschema.reproduce.plot import plot
-    from bodyschema.reproduce.show import show
 
     require_extra("plots", "a figure")
     if seed < 0:
         raise ConfigError(f"--seed is {seed}", remedy="Give 0 or more")
     if real and name in ("fig5", "fig7", "all"):
         require_extra("sim", "a measured curve (--no-real leaves it out)")
-    progress, console = Console(stderr=True), Console()
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"cannot be made: {error.strerror}", file=out, remedy="Give another --out") from error
-    done = []
+    done = list(_experiments(name, out, seed, real=real, quiet=as_json))
+    if as_json:
+        told = {"schema": 3, "version": version("bodyschema"), "seed": seed, "real": real, "experiments": done}
+        sys.stdout.write(msgspec.json.encode(told).decode() + "\n")
+
+
+def _experiments(name: Name, out: Path, seed: int, *, real: bool, quiet: bool) -> Iterator[dict[str, object]]:
+    """Run the experiments and plot each into `out`; yield curves and figures, which are shown unless `quiet`."""
+    import time
+
+    import msgspec
+    import numpy as np
+    from rich.console import Console
+
+    from bodyschema.cli.terminal.progress import shown_on
+    from bodyschema.reproduce import EXPERIMENTS, Run
+    from bodyschema.reproduce.plot import plot
+    from bodyschema.reproduce.show import show
+
+    progress, console = Console(stderr=True), Console()
     for number, (key, run) in enumerate(EXPERIMENTS.items()):
         if name not in (key, "all"):
             continue
@@ -77,10 +89,7 @@ def reproduce(
         file = out / f"{key}.png"
         plot(experiment, file)
         took = time.perf_counter() - begin
-        if not as_json:
+        if not quiet:
             show(console, experiment, file)
             console.print(f"took  {took:.0f} s", highlight=False)
-        done.append({**msgspec.to_builtins(experiment), "plot": str(file), "took_s": round(took, 1)})
-    if as_json:
-        told = {"schema": 3, "version": version("bodyschema"), "seed": seed, "real": real, "experiments": done}
-        sys.stdout.write(msgspec.json.encode(told).decode() + "\n")
+        yield {**msgspec.to_builtins(experiment), "plot": str(file), "took_s": round(took, 1)}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from bodyschema.cli.commands.options import HERE, VARIABLE, flag, print_json, several
+from bodyschema.cli.commands.options import ANYTHING, HERE, VARIABLE, SearchOptions, flag, print_json, several
 
 if TYPE_CHECKING:
     from bodyschema.cli.terminal.diagnosis_run import Asked
@@ -44,9 +44,7 @@ def fleet(
     workers: Annotated[
         int | None, Parameter(help="Processes on this machine; else one for each core.", validator=Number(gte=1))
     ] = None,
-    effects: Annotated[str | None, Parameter(help="Look for these alone, as in backlash,joint_offset.")] = None,
-    exclude: Annotated[str | None, Parameter(help="Do not look for these.")] = None,
-    seed: Annotated[int, Parameter(help="Of the resampling behind the intervals.", validator=Number(gte=0))] = 0,
+    search: SearchOptions = ANYTHING,
     as_json: Annotated[bool, flag("Print it as JSON.", name="--json")] = False,
 ) -> None:
     """List all running robots; compare them; or diagnose many recordings in parallel.
@@ -76,14 +74,13 @@ def fleet(
             raise RequestError("recordings do not go with --connect, --compare or --watch")
         if len(robot) > 1:
             raise RequestError("recordings take one --robot, that of all")
-        from bodyschema.cli.terminal.diagnosis_run import Asked
         from bodyschema.fleet.recordings import jobs
         from bodyschema.interfaces.extras import require_extra
 
         require_extra("fleet", "diagnosing many recordings")
         wanted = jobs(recordings, folder, robot[0] if robot else None)
-        _diagnose(wanted, Asked.of(effects, exclude, seed), out, scheduler, workers, as_json=as_json)
-    elif out is not None or scheduler is not None or effects is not None or exclude is not None:
+        _diagnose(wanted, search.asked(), out, scheduler, workers, as_json=as_json)
+    elif any(given is not None for given in (out, scheduler, search.effects, search.exclude)):
         raise RequestError("--out, --scheduler, --effects and --exclude go with recordings; give some, or --from")
     elif compare:
         _compare(_places(connect, robot), as_json=as_json)

@@ -41,7 +41,7 @@ class NatnetReceiver:
         self._heard = self._asked = self._asked_names = -math.inf
 
     def open(self) -> None:
-        """Ask the server for its version and join its stream.
+        """Request the server's version and join its stream.
 
         Raises:
             SourceLost: it does not answer.
@@ -136,7 +136,7 @@ class NatnetReceiver:
             )
 
     def _await_names(self) -> None:
-        """Ask for the rigid bodies' names; without an answer they go by their IDs."""
+        """Request the rigid bodies' names; without an answer their IDs are used."""
         until = self._clock.now() + ANSWER_S
         while not self.names and self._clock.now() < until:
             self._ask(packets.packet(Message.REQUEST_MODEL), lambda: bool(self.names))

@@ -234,7 +234,7 @@ class _Reader:
         self.go_to(self.at + size)
 
     def go_to(self, at: int) -> None:
-        """Go on at the byte `at`."""
+        """Continue at the byte `at`."""
         if not self.at <= at <= len(self._data):
             raise Unusable(Fault.MALFORMED, "the packet ends too early")
         self.at = at

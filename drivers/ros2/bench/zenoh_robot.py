@@ -6,7 +6,6 @@ import json
 import threading
 import time
 from collections.abc import Sequence
-from types import TracebackType
 from typing import Any, Literal, Self
 
 import zenoh
@@ -72,9 +71,7 @@ class ZenohRobot:
         self._publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stop.set()
         for thread in self._threads:
             thread.join()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from html import escape
 from importlib.resources import files
@@ -9,7 +10,6 @@ from importlib.resources import files
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.robot.interval import to_its_interval
 from bodyschema.vision.calibration.calibrate import Calibrated
 from bodyschema.vision.calibration.gather import Gathered
 from bodyschema.vision.calibration.report import pictures
@@ -163,3 +163,11 @@ def _size(found: Calibrated) -> tuple[int, int]:
 def _round(value: float) -> float:
     """Round to one digit."""
     return float(f"{value:.0e}")
+
+
+def to_its_interval(value: float, half_width: float) -> tuple[str, str]:
+    """Format a value and the half width of its interval: the latter with two digits, both with as many decimals."""
+    if not 0.0 < half_width < math.inf:
+        return f"{value:.6g}", f"± {half_width:g}"
+    places = max(0, 1 - math.floor(math.log10(half_width)))
+    return f"{value:.{places}f}", f"± {half_width:.{places}f}"

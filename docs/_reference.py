@@ -1,8 +1,9 @@
-"""Write reference/robot_toml.md from the classes that read robot.toml: `python docs/_robot_toml.py`."""
+"""Write the pages of reference/ from the classes that they describe: `python docs/_reference.py`."""
 
 from __future__ import annotations
 
 import re
+import types
 import typing
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,15 +11,23 @@ from pathlib import Path
 import msgspec
 
 from bodyschema.daemon.config import Tables
+from bodyschema.daemon.sampler import sources
+from bodyschema.daemon.transport import status, wire
 from bodyschema.robot.description import CameraSection, RobotSection
 
-PAGE = Path(__file__).parent / "reference" / "robot_toml.md"
-HEAD = """# robot.toml
+FOLDER = Path(__file__).parent / "reference"
+TOML_HEAD = """# robot.toml
 
-Every table and key. `python docs/_robot_toml.py` writes this page from the source. Unknown keys are errors.
+Every table and key. `python docs/_reference.py` writes this page from the source. Unknown keys are errors.
 `bodyschema config --json` prints the values in force; an environment variable such as
 `BODYSCHEMA_DAEMON_MAX_STEP_DEG=5` overrides one. `[[effects]]`, `[[background]]` and `[unexplained]` are written by
 `diagnose` ([effects](../effects.md)).
+"""
+MESSAGES_HEAD = """# Messages
+
+Every message over zenoh, by its name. `python docs/_reference.py` writes this page from the source.
+[Talking over zenoh](../zenoh.md) has keys, encodings, frames and examples. d is the number of joints, n that of the
+request's rows.
 """
 # These are plain dictionaries in `Tables`: the robot's description reads them.
 SECTIONS = {"robot": RobotSection, "camera": CameraSection}
@@ -26,8 +35,8 @@ SEVERAL = (tuple, list)
 Table = tuple[str, type[msgspec.Struct]]
 
 
-def page() -> str:
-    """Return the text of the page."""
+def robot_toml() -> str:
+    """Return the text of the page on robot.toml."""
     sections, first = [], dict[type[msgspec.Struct], str]()
     for heading, kind in _tables("", Tables):
         if kind in first:
@@ -35,7 +44,7 @@ def page() -> str:
         else:
             first[kind] = heading
             sections.append(_table(heading, kind))
-    return HEAD + "".join(sections)
+    return TOML_HEAD + "".join(sections)
 
 
 def _tables(prefix: str, kind: type[msgspec.Struct]) -> Iterator[Table]:
@@ -107,5 +116,59 @@ def _documented(kind: type[msgspec.Struct]) -> dict[str, str]:
     return told
 
 
+def messages() -> str:
+    """Return the text of the page on messages: those of the modules, and what they contain."""
+    kinds = dict[type[msgspec.Struct], None]()
+    for module in (wire, status, sources):
+        for kind in vars(module).values():
+            if isinstance(kind, type) and issubclass(kind, msgspec.Struct) and kind.__module__ == module.__name__:
+                kinds |= dict.fromkeys([kind, *_within(kind)])
+    return MESSAGES_HEAD + "".join(map(_message, kinds))
+
+
+def _within(kind: type[msgspec.Struct]) -> Iterator[type[msgspec.Struct]]:
+    for annotation in typing.get_type_hints(kind).values():
+        for inner in _structs(annotation):
+            yield inner
+            yield from _within(inner)
+
+
+def _message(kind: type[msgspec.Struct]) -> str:
+    """Return the section of one message; `schema` is described once, for all."""
+    told, hints = _documented(kind), typing.get_type_hints(kind)
+    about = " ".join((kind.__doc__ or "").partition("Attributes:")[0].split())
+    fields = [field for field in msgspec.structs.fields(kind) if field.name != "schema"]
+    rows = [f"| `{field.encode_name}` | {_form(hints[field.name])} | {told[field.name]} |" for field in fields]
+    return (
+        f"\n## {kind.__name__}\n\n{about}\n\n| field | type | meaning |\n| --- | --- | --- |\n" + "\n".join(rows) + "\n"
+    )
+
+
+_FORMS = {str: "text", int: "integer", float: "number", bool: "boolean", type(None): "null"}
+
+
+def _form(annotation: object) -> str:
+    """Return a type as JSON has it."""
+    origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
+    if annotation in _FORMS:
+        return _FORMS[annotation]  # pyright: ignore[reportArgumentType]
+    if isinstance(annotation, type) and issubclass(annotation, msgspec.Struct):
+        return f"[{annotation.__name__}](#{annotation.__name__.lower()})"
+    if origin in (types.UnionType, typing.Union):
+        return " or ".join(map(_form, parts))
+    if origin is typing.Literal:
+        return ", ".join(f"`{part}`" for part in parts)
+    if origin is tuple:
+        return f"{len(parts)} {_several(parts[0])}"
+    return f"{_form(parts[-1])} by name" if origin is dict else f"list of {_several(parts[0])}"
+
+
+def _several(annotation: object) -> str:
+    return f"{_form(annotation)}s" if annotation in (int, float, bool) else _form(annotation)
+
+
+PAGES = {"robot_toml.md": robot_toml, "messages.md": messages}
+
 if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
+    for name, page in PAGES.items():
+        (FOLDER / name).write_text(page(), encoding="utf-8")
