@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from bodyschema.vision.calibration.check import Check, check
 from bodyschema.vision.calibration.gather import Gathered, gathered, require_both
 from bodyschema.vision.calibration.images import ImagePair, Images, read_pairs, write_pair
 from bodyschema.vision.calibration.live import LiveViews
+from bodyschema.vision.calibration.refocus import refocused
 from bodyschema.vision.calibration.report import page as report_page
 from bodyschema.vision.calibration.view import EYES, ONE_EYE
 from bodyschema.vision.printing.sheet import rulers_mm
@@ -80,7 +81,8 @@ class UnusableImage(msgspec.Struct):
 class CamerasFile(msgspec.Struct):
     """Output of `bodyschema calibrate cameras --json`. Half widths are those of 95 % intervals.
 
-    One camera alone has no baseline. `right_camera` is the pose of the right optical frame in the left one.
+    One camera alone has no baseline. `right_camera` is the pose of the right optical frame in the left one. `refocused`
+    has a sentence for each sign that a lens refocused between the views, or was free to.
     """
 
     model: str
@@ -101,6 +103,7 @@ class CamerasFile(msgspec.Struct):
     missing: list[str]
     size_was_measured: bool
     right_camera: HandEye | None
+    refocused: list[str]
     schema: int = 1
 
 
@@ -236,10 +239,13 @@ def write_calibrated_cameras(result: Calibrated, found: Gathered, out: Path) -> 
     return report
 
 
-def figures(result: Calibrated, found: Gathered, *, size_was_measured: bool) -> CamerasFile:
+def figures(
+    result: Calibrated, found: Gathered, *, size_was_measured: bool, autofocus: Sequence[str] = ()
+) -> CamerasFile:
     """Return the figures of a calibration.
 
     Args:
+        autofocus: what live cameras reported of their focus.
         size_was_measured: the board, or the distance between the lenses, was measured with a ruler.
     """
     rig, fitted = result.rig, result.fitted
@@ -265,6 +271,7 @@ def figures(result: Calibrated, found: Gathered, *, size_was_measured: bool) -> 
         missing=result.coverage.missing(),
         size_was_measured=size_was_measured,
         right_camera=None if pair is None else _right_camera(pair),
+        refocused=[*([] if result.focal_spread is None else [refocused(result.focal_spread)]), *autofocus],
     )
 
 

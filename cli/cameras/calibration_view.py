@@ -62,6 +62,7 @@ def _sentences(found: CamerasFile) -> list[str]:
         f"Views that were not fitted are foretold to {found.held_out_px:.3f} px (RMS per coordinate; fitted "
         f"{found.reprojection_px:.3f}); {len(found.views)} views of {found.board}. {_rivals(found)}"
     )
+    said.extend(f"Warning: {text}." for text in found.refocused)
     if found.left_out:
         names = "; ".join(f"{each.name} ({each.rms_px:.2f} px, others {each.usual_px:.2f})" for each in found.left_out)
         said.append(f"Left out, since they do not fit the others: {names}.")

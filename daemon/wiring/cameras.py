@@ -64,6 +64,11 @@ def open_eyes(config: Config, clock: Clock) -> Eyes:
     return eyes_of(require_cameras(config), config.file.parent, clock)
 
 
+def focus_complaints(eyes: Eyes) -> tuple[str, ...]:
+    """Return what live cameras reported of lenses that moved or may move."""
+    return eyes.focus_complaints if isinstance(eyes, LiveEyes) else ()
+
+
 def calibration_file(config: Config) -> Path:
     """Return the calibration file named in robot.toml; by default cameras.toml beside it."""
     cameras = require_cameras(config)

@@ -111,6 +111,10 @@ def families(run: Simulated) -> list[Family]:
     if timed:
         for what, moves in (("the tool changes with time", _tool), ("the camera moves with time", _camera)):
             found.append(Family(what, "body", None, (), True, moves, _warming_or_any_of_time))
+        if robot.calibration is not None:
+            what = "the lens refocuses: its focal length wanders"
+            for count in (count for count in _JOINT_TIMES if _ROWS_A_WAVE * count < len(motion)):
+                found.append(Family(what, "place", None, (), True, _along_axis, _any_of_time(count)))
     for degree in (2, 3):
         what = "an error of depth that depends on where the marker is in the image"
         found.append(Family(what, "place", None, (), False, _in_depth, _places_in_image(degree)))
@@ -186,6 +190,11 @@ def _anywhere(run: Simulated) -> FloatArray:
 def _in_depth(run: Simulated) -> FloatArray:
     """Return unit displacements along the ray on which the left camera sees the marker."""
     return run.measured[:, :, None]
+
+
+def _along_axis(run: Simulated) -> FloatArray:
+    """Return displacements by a shorter focal length: along the optical axis, in proportion to the distance."""
+    return run.measured[:, 2:, None] * np.eye(3)[:, 2:]
 
 
 def _any_of_joint(j: int) -> Columns:

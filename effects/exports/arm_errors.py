@@ -103,9 +103,9 @@ def residual_note(simulation: Simulation) -> list[str]:
 
 
 def moment_notes(simulation: Simulation) -> Iterator[str]:
-    """Yield a sentence on each effect that began at a moment."""
+    """Yield a sentence on each effect that began at a moment and stays."""
     for effect in simulation.all_effects:
-        if effect.kind.begins:
+        if effect.kind.stays_as is not None:
             at = "" if effect.where is None else f" at {effect.where}"
             yield f"{effect.name}{at}: the file has the arm as it is after t0 = {effect.value('t0'):g}"
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from planted_cases import desk_arm, start_of, walk
+from planted_cases import desk_arm, measured, start_of, walk
 
+from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.fit import Fit
+from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.unnamed.families import Family, families
-from bodyschema.diagnosis.unnamed.unknown import Way
+from bodyschema.diagnosis.unnamed.unknown import Unknowns, Way
+from bodyschema.effects import Simulation
 from bodyschema.robot.description import RobotDescription
 from bodyschema.sim_backend import model_file
 
@@ -55,3 +58,14 @@ def test_a_link_that_gives_at_its_near_end_turns_about_what_carries_it() -> None
         turned = np.cross(np.swapaxes(axes, 1, 2), lever[:, None, :]).swapaxes(1, 2)
         np.testing.assert_allclose(family.moves(run)[:, :, 3:], turned, atol=1e-9)
         np.testing.assert_allclose(family.moves(run)[:, :, :3], axes, atol=1e-9)
+
+
+def test_a_focal_length_that_wanders_is_told_from_all_other_families() -> None:
+    robot = desk_arm()
+    motion, rng = walk(robot, 1, rows=150), np.random.default_rng(1)
+    x = Simulation(robot).positions(motion) + 3e-4 * rng.normal(size=(len(motion), 3))
+    wander = np.convolve(rng.normal(size=len(motion) + 40), np.full(41, 41**-0.5), mode="valid")
+    x[:, 2] /= 1.0 + 0.01 * wander
+    start = aligned(Observations.of(measured(robot, motion, x), Simulation(robot)), Simulation(robot))
+    way, _ = Unknowns(start).nearest(start)[0]
+    assert way.family.what == "the lens refocuses: its focal length wanders"

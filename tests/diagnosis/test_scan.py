@@ -39,6 +39,7 @@ SMALL = (
     ("encoder_jump", ELBOW, None, [0.002, 35.1]),
     ("link_geometry", ELBOW, None, [3e-4, 0.0, 3e-4, 0.001, 0.001, 0.001]),
     ("camera_moved", None, None, [3e-4, 3e-4, 0.0, 5e-4, 0.0, 5e-4, 35.1]),
+    ("camera_refocused", None, None, [0.002, 35.1]),
     ("thermal_drift", None, None, [5e-4, 2e-4, 0.0, 30.0]),
     ("lens_distortion", None, None, [0.005, 0.0]),
 )
@@ -87,6 +88,7 @@ def test_the_gain_of_a_large_effect_is_within_a_quarter_of_that(robot, name) -> 
         ("encoder_jump", ELBOW, [0.03]),
         ("tool_slip", None, [0.004, 0.003, -0.004]),
         ("camera_moved", None, [0.005, 0.0, 0.003, 0.01, 0.0, 0.01]),
+        ("camera_refocused", None, [0.01]),
     ],
 )
 def test_a_moment_is_found_between_the_rows_where_it_was(robot, name, where, amounts) -> None:

@@ -37,7 +37,7 @@ def test_the_row_of_an_effect_names_its_numbers(name: str) -> None:
 
 
 def test_the_page_counts_what_the_change_log_says() -> None:
-    assert len(EFFECT_TYPES) == 22
+    assert len(EFFECT_TYPES) == 23
 
 
 def test_the_page_s_extended_toml_can_be_read(tmp_path) -> None:

@@ -19,7 +19,8 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 
 READERS = Path(__file__).resolve().parents[2] / "examples" / "correction"
-NOT_OF_THE_ARM = {"camera_scale", "camera_focal", "lens_distortion", "camera_latency", "thermal_drift"}
+OPTICAL = {"camera_scale", "camera_focal", "camera_refocused", "lens_distortion"}
+NOT_OF_THE_ARM = {*OPTICAL, "camera_latency", "thermal_drift"}
 NAMES = tuple(name for name in EFFECT_TYPES if name not in NOT_OF_THE_ARM)
 
 

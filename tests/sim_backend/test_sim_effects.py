@@ -54,6 +54,7 @@ EFFECTS = [
     ("camera_moved", None, None, SHIFT | TURN | {"t0": 0.8}),
     ("camera_scale", None, None, {"scale_error": 0.02}),
     ("camera_focal", None, None, {"focal_error": 0.015}),
+    ("camera_refocused", None, None, {"focal_error": 0.015, "t0": 0.8}),
     ("lens_distortion", None, None, {"k1": 0.08, "k2": -0.03}),
     ("camera_latency", None, None, {"latency_s": 0.0125}),
     ("thermal_drift", None, None, SHIFT | {"time_constant_s": 0.5}),
@@ -68,7 +69,7 @@ TOGETHER = (
     {"joint_compliance", "payload"},
     {"tool_offset", "camera_pose", "camera_scale", "camera_focal", "lens_distortion"},
     {"joint_offset", "link_geometry"},
-    {"tool_slip", "camera_moved", "thermal_drift"},
+    {"tool_slip", "camera_moved", "camera_refocused", "thermal_drift"},
     {"backlash"},
 )
 

@@ -30,8 +30,6 @@ _LEAST_DETERMINANT = 1e-6
 # waves are small is no sign that it is. Beside that it is this part of what the few waves tell, and where they tell of
 # far more it is the square, over the last: a bend that shows is a sign of one that the fit has removed.
 _LEAST_DENSITY, _NOISE, _TOLD, _USUAL_DENSITY = 0.5, 1.75, 0.4, 12.0
-# If a smaller share of the rays carries the circle, their errors are not averaged out: sigma grows in proportion.
-_LEAST_EVENNESS = 0.5
 # Of an estimate's slope by its residuals (1 where none is far off, 0 where all are) at least this part counts.
 _LEAST_SLOPE = 0.4
 # What covers a ball breaks its limb at sharp corners, which shows in the quick waves; what is behind it bends whole
@@ -40,12 +38,8 @@ _LEAST_SLOPE = 0.4
 _LARGEST_DENSITY = 10.0
 # A larger deviation from the circle (RMS without noise, share of the radius, and of the blur) is angular: a square.
 _MOST_ANGULAR, _MOST_ANGULAR_BLURS = 0.05, 0.25
-# What a lens leaves of its distortion makes a limb oval, by this part of its radius at most, but fits all around.
-_MOST_OVAL, _CLEAN_DENSITY = 0.015, 3.0
 # Smaller deviations (RMS, share of the radius) occur on every ball (seams, dust, dents) and are no occlusion.
 _ROUND = 0.0075
-# An oval is tried if the slow waves are this large.
-_BENT_DENSITY = 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +73,6 @@ class _Fit:
         inverse: inverse normal matrix (3, 3) [px²].
         waves: waves of the residuals.
         pulls: influence of the rays on the circle, shape (n,), see `_pulls`.
-        first: slowest wave that the fit left in.
         off_px: RMS residual without noise [px].
     """
 
@@ -88,7 +81,6 @@ class _Fit:
     inverse: FloatArray
     waves: Waves
     pulls: FloatArray
-    first: int
     off_px: float
 
 
@@ -102,15 +94,14 @@ def fit_limb(
     """
     blur_px = USUAL_BLUR_PX
     fit: _Fit | None = None
-    unsettled, noise, excess, fewer = np.zeros(3), 1.0, 1.0, 1.0
+    unsettled, noise, excess = np.zeros(3), 1.0, 1.0
     for _ in range(_LOOKS):
         limb = find_limb(image, gate, centre_px, radius_px, shape, blur_px)
         fit = None if limb is None else _fit(limb, radius_px)
         if limb is None or fit is None:
             return None
         centre_px, radius_px = centre_px + shape @ fit.shift_px, radius_px + fit.growth_px
-        excess, fewer = limb.excess, max(1.0, _LEAST_EVENNESS / limb.evenness)
-        noise = limb.noise_share * excess
+        excess, noise = limb.excess, limb.noise_share * limb.excess
         last_blur_px, blur_px = blur_px, min(max(limb.blur_px, _SHARPEST_PX), _WIDEST_PX)
         moved_px = max(float(np.linalg.norm(fit.shift_px)), abs(fit.growth_px))
         if moved_px < _SETTLED_PX and abs(blur_px - last_blur_px) < _SETTLED_BLUR_PX:
@@ -123,10 +114,10 @@ def fit_limb(
     is_angular = fit.off_px > max(_MOST_ANGULAR * radius_px, _MOST_ANGULAR_BLURS * blur_px)
     if (is_angular or fit.waves.quick > _LARGEST_DENSITY * excess) and not aliased:
         return None
-    told = waves(fit.pulls, radius_px, fit.first).mean
+    told = waves(fit.pulls, radius_px).mean
     usual = _LEAST_DENSITY + _NOISE * noise
     density = math.hypot(usual, (_TOLD + told / _USUAL_DENSITY) * told)
-    cov = fewer**2 * density * fit.inverse + np.outer(unsettled, unsettled)
+    cov = density * fit.inverse + np.outer(unsettled, unsettled)
     # A blurred disc's edge, where it is steepest, is nearer to the centre than the disc's.
     radius_px += blur_px**2 / (2.0 * radius_px)
     is_round = fit.off_px < _ROUND * radius_px
@@ -135,21 +126,8 @@ def fit_limb(
 
 
 def _fit(limb: Limb, radius_px: float) -> _Fit | None:
-    """Fit a circle to the limb, or an oval if no circle fits and the oval fits all around."""
-    fit = _least_squares(limb, radius_px, oval=False)
-    if fit is None or fit.waves.slow < _BENT_DENSITY:
-        return fit
-    other = _least_squares(limb, radius_px, oval=True)
-    return other if other is not None and other.waves.slow < _CLEAN_DENSITY else fit
-
-
-def _least_squares(limb: Limb, radius_px: float, *, oval: bool) -> _Fit | None:
-    """Fit by robust weighted least squares: outliers get low weight."""
-    design = limb.rays
-    if oval:
-        cos, sin = design[:, 0], design[:, 1]
-        design = np.column_stack([design, cos**2 - sin**2, 2.0 * sin * cos])
-    told = limb.weight > 0
+    """Fit a circle by robust weighted least squares: outliers get low weight."""
+    design, told = limb.rays, limb.weight > 0
     if np.count_nonzero(told) < len(told) // 2:
         return None
     weight = used = limb.weight
@@ -166,14 +144,13 @@ def _least_squares(limb: Limb, radius_px: float, *, oval: bool) -> _Fit | None:
         square = residual**2 * limb.weight
         usual = max(1.0, 1.4826**2 * median(square[told]))
         weight = np.where(np.abs(residual) < _FARTHEST_PX, limb.weight / (1.0 + square / usual / _FREEDOM), 0.0)
-    if inverse is None or np.abs(solution[3:]).max(initial=0.0) > _MOST_OVAL * radius_px:
+    if inverse is None:
         return None
-    first = 3 if oval else 2
-    around = waves(np.sqrt(used) * residual, radius_px, first)
+    around = waves(np.sqrt(used) * residual, radius_px)
     pulls = _pulls(limb.weight, weight, residual)
     off = np.minimum(np.abs(residual[told]), _FARTHEST_PX)
     off_px = math.sqrt(max(0.0, float(np.mean(off**2 - 1.0 / limb.weight[told]))))
-    return _Fit(solution[:2], float(solution[2]), inverse[:3, :3], around, pulls, first, off_px)
+    return _Fit(solution[:2], float(solution[2]), inverse, around, pulls, off_px)
 
 
 def _pulls(full: FloatArray, used: FloatArray, residual: FloatArray) -> FloatArray:

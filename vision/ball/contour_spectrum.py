@@ -48,11 +48,9 @@ class Waves:
         return (1.0 + 0.25 / self.count) ** 2 * (self.slow + max(0.0, self.slow - self.quick))
 
 
-def waves(residual: FloatArray, radius_px: float, first: int = 2) -> Waves:
-    """Return the waves in the residuals (n,) of an outline's points, evenly spread around it; 0 if there are none.
-
-    `first` is the slowest wave that the fit left in.
-    """
+def waves(residual: FloatArray, radius_px: float) -> Waves:
+    """Return the waves in the residuals (n,) of an outline's points, evenly spread around it; 0 if there are none."""
+    first = 2  # the fit of a circle takes the slower ones out
     quickest = len(residual) // 2
     last_slow = min(max(first + _LEAST_WAVES - 1, round(radius_px / _WAVE_RADIUS_PX)), quickest - 1)
     last_quick = min(max(last_slow + 1, min(2 * last_slow, round(radius_px))), quickest)

@@ -8,11 +8,7 @@ from bodyschema.interfaces.records import FloatArray
 
 
 def inverse_of_normal(normal: FloatArray, least_determinant: float) -> FloatArray | None:
-    """Invert a normal matrix (k, k); None if its determinant, relative to its trace to the power k, is smaller."""
-    if len(normal) != 3:
-        if np.linalg.det(normal) < least_determinant * np.trace(normal) ** len(normal):
-            return None
-        return np.linalg.inv(normal).astype(np.float64)
+    """Invert a normal matrix (3, 3); None if its determinant, relative to its trace cubed, is smaller."""
     (a, b, c), (_, d, e), (_, _, f) = normal.tolist()
     # Cofactors of a symmetric matrix.
     A, B, C = d * f - e * e, c * e - b * f, b * e - c * d

@@ -19,6 +19,7 @@ from .bundle import Bundle, solve
 from .guidance import Coverage
 from .held_out import HeldOut, held_out
 from .influence import covariance
+from .refocus import focal_spread, refocused
 from .requirements import contradicts, lacking, misplaced, together, unsure
 from .start import start
 from .view import EYES, ONE_EYE, Eye, View
@@ -90,6 +91,7 @@ class Calibrated:
         fitted: the selected model.
         rivals_px: held-out error of each candidate model that fits the cameras [px].
         coverage: image coverage of the views.
+        focal_spread: relative 1-sigma of the focal lengths over the views; None if nothing shows that a lens refocused.
     """
 
     rig: Rig
@@ -97,6 +99,7 @@ class Calibrated:
     fitted: Fitted
     rivals_px: dict[Model, float]
     coverage: Coverage
+    focal_spread: float | None
 
 
 def calibrate(
@@ -121,10 +124,11 @@ def calibrate(
         and (reason := contradicts(rig, asked.baseline_m)) is not None
     ):
         reasons.append(reason)
+    spread = focal_spread(fits[model].views, board.corners_m, fits[model].bundle)
     if reasons:
-        raise CalibrationError(together(reasons))
+        raise CalibrationError(together(reasons if spread is None else [refocused(spread), *reasons]))
     rivals: dict[Model, float] = {each: found.held_out.rms_px for each, found in fits.items()}
-    return Calibrated(rig, board, fits[model], rivals, coverage)
+    return Calibrated(rig, board, fits[model], rivals, coverage, spread)
 
 
 def _fits(
@@ -201,6 +205,8 @@ def _fit(
         rms = bundle.view_rms_px()
         left_out.append(LeftOut(kept.pop(worst).name, float(rms[worst]), float(np.median(rms))))
         if len(left_out) > _MOST_LEFT_OUT * len(views):
+            if (spread := focal_spread(kept, corners_m, solve(kept, corners_m, model, vector, poses))) is not None:
+                raise CalibrationError(refocused(spread))
             raise CalibrationError(
                 f"{len(left_out)} of {len(views)} views do not fit the others, {left_out[0].name} with "
                 f"{left_out[0].rms_px:.1f} px the least. Is the board flat, held still, and are both images of one "

@@ -16,6 +16,7 @@ from .config import SideBySideConfig, UvcSettings
 EXPOSURE_UNIT_S = 1e-4  # V4L2_CID_EXPOSURE_ABSOLUTE
 MANUAL_EXPOSURE = 1  # V4L2_EXPOSURE_MANUAL
 ROUNDING = 0.05  # cameras round to their own steps
+FOCUS_EVERY_S = 0.5  # between two readings of the focus: a request to the camera
 
 
 class VideoCapture(Protocol):
@@ -115,6 +116,47 @@ def _control_complaints(capture: VideoCapture, settings: UvcSettings, name: str)
             yield (
                 f"the {name} does not take {control.key} = {control.value:g}: it has {got * control.unit:g}. "
                 "`v4l2-ctl -l` shows its range"
+            )
+
+
+class FocusWatch:
+    """Monitor of a camera's focus: whether the camera may move its lens, and whether it did.
+
+    Replugged, a lens may stand elsewhere than before, so the first position of all is the one to keep.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._autofocus = False
+        self._first: float | None = None
+        self._farthest: float | None = None
+        self._read_s = -np.inf
+
+    def look(self, capture: VideoCapture, now_s: float) -> None:
+        """Read the focus of the open camera, if it was not just read."""
+        if now_s - self._read_s < FOCUS_EVERY_S:
+            return
+        self._read_s = now_s
+        # A camera without such a control answers with 0 or -1.
+        self._autofocus = self._autofocus or capture.get(cv2.CAP_PROP_AUTOFOCUS) == 1
+        position = capture.get(cv2.CAP_PROP_FOCUS)
+        if self._first is None or self._farthest is None:
+            self._first = self._farthest = position
+        elif abs(position - self._first) > abs(self._farthest - self._first):
+            self._farthest = position
+
+    def complaints(self) -> Iterator[str]:
+        """Yield each problem with its remedy."""
+        if self._autofocus:
+            yield (
+                f"the {self._name}'s autofocus is on: when its lens moves, the calibration no longer holds. Set focus "
+                "in [vision.cameras.…] before calibrating"
+            )
+        first, farthest = self._first, self._farthest
+        if first is not None and farthest is not None and abs(farthest - first) > max(1.0, ROUNDING * abs(first)):
+            yield (
+                f"the {self._name}'s lens moved, its focus from {first:g} to {farthest:g}: the focal length changed. "
+                "Set focus in [vision.cameras.…], and calibrate again"
             )
 
 

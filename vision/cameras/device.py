@@ -15,7 +15,7 @@ from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import ImageArray
 
 from .config import UvcSettings
-from .controls import VideoCapture, apply, raw_size_px, sends_jpeg
+from .controls import FocusWatch, VideoCapture, apply, raw_size_px, sends_jpeg
 from .shot import Shot
 from .stamps import Stamps
 
@@ -38,7 +38,6 @@ class CameraDevice:
 
     Attributes:
         name: display name for messages.
-        complaints: messages for settings that it did not accept.
         damaged: number of truncated images.
     """
 
@@ -50,8 +49,19 @@ class CameraDevice:
         self._capture: VideoCapture | None = None
         self._is_jpeg = False
         self.stamps = Stamps()
-        self.complaints: list[str] = []
+        self._unaccepted: list[str] = []
+        self._focus = FocusWatch(name)
         self.damaged = 0
+
+    @property
+    def complaints(self) -> list[str]:
+        """Messages for settings that it did not accept, and for a lens that may move."""
+        return [*self._unaccepted, *self.focus_complaints]
+
+    @property
+    def focus_complaints(self) -> list[str]:
+        """Messages for a lens that moves or may move."""
+        return list(self._focus.complaints())
 
     def __enter__(self) -> Self:
         if not os.path.exists(self._device):
@@ -68,7 +78,7 @@ class CameraDevice:
                 brief=f"the {self.name} cannot be opened",
             )
         try:
-            self.complaints = apply(capture, self._settings, self.name)
+            self._unaccepted = apply(capture, self._settings, self.name)
             self._is_jpeg = sends_jpeg(capture)
             if self._is_jpeg:  # decoded here, to detect truncated images
                 capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
@@ -102,6 +112,7 @@ class CameraDevice:
                 brief=f"the {self.name} sends no images",
             )
         arrival_s = self._clock.now()
+        self._focus.look(capture, arrival_s)
         kernel_s = 1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC)
         t = self.stamps.stamp(kernel_s, arrival_s)
         if t is None:

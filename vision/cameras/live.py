@@ -92,6 +92,11 @@ class LiveEyes:
         return tuple(self._complaints())
 
     @property
+    def focus_complaints(self) -> tuple[str, ...]:
+        """Messages for lenses that moved or may move since the cameras were first opened, each with its remedy."""
+        return tuple(text for capture in self._captures for text in capture.device.focus_complaints)
+
+    @property
     def figures(self) -> tuple[CameraFigures, ...]:
         """State of each camera."""
         return tuple(_figures(capture) for capture in self._captures)

@@ -356,8 +356,13 @@ class _Problem:
         return float(np.sqrt(residuals @ residuals / max(len(residuals) - J.shape[1], 1)))
 
     def worst(self) -> tuple[str, int] | None:
-        """Return the view's name and the tag's number of the worst outlier, or None."""
-        residuals = self._linearised()[0]
+        """Return the view's name and the tag's number of the worst outlier, or None.
+
+        Squares that are all larger or smaller than stated are no outliers: that is free here.
+        """
+        residuals, J, grown = self._linearised()
+        full = np.column_stack([J, grown])
+        residuals = residuals - full @ np.linalg.solve(full.T @ full, full.T @ residuals)
         squares: dict[tuple[str, int], list[FloatArray]] = {}
         place = 0
         for block in self._blocks:

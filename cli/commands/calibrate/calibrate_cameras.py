@@ -137,16 +137,17 @@ def _calibrate(
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.wiring.cameras import calibration_file, names_calibration
 
-    board, wanted, named = printed.board(), known.wanted(), True
+    board, wanted, named, autofocus = printed.board(), known.wanted(), True, ()
     if images is not None:
         found, result = _of_images(images, files, board, wanted)
         out = out or CAMERAS
     else:
         config = Config.load(robot)
-        found, result = _live(config, board, wanted, save)
+        found, result, autofocus = _live(config, board, wanted, save)
         out, named = out or calibration_file(config), names_calibration(config)
     report = write_calibrated_cameras(result, found, out)
-    told = figures(result, found, size_was_measured=printed.ruler_mm is not None or known.baseline_mm is not None)
+    measured = printed.ruler_mm is not None or known.baseline_mm is not None
+    told = figures(result, found, size_was_measured=measured, autofocus=autofocus)
     if as_json:
         print_json(told)
         return
@@ -215,24 +216,27 @@ def _of_images(images: Path, files: EyeFiles, board: Board, wanted: Wanted) -> t
     return found, calibrated(found, wanted, tell)
 
 
-def _live(config: Config, board: Board, wanted: Wanted, save: Path | None) -> tuple[Gathered, Calibrated]:
+def _live(
+    config: Config, board: Board, wanted: Wanted, save: Path | None
+) -> tuple[Gathered, Calibrated, tuple[str, ...]]:
+    """Return the views, their calibration, and what the cameras reported of their focus."""
     from rich.console import Console
 
     from bodyschema.cli.cameras.calibration import kept_in, live_views, of_cameras
     from bodyschema.cli.cameras.live_calibration import LiveCalibration
     from bodyschema.cli.cameras.live_calibration_view import guidance_on
     from bodyschema.daemon.service.signals import on_termination
-    from bodyschema.daemon.wiring.cameras import open_eyes, require_cameras
+    from bodyschema.daemon.wiring.cameras import focus_complaints, open_eyes, require_cameras
     from bodyschema.interfaces.clock import SystemClock
 
-    clock, eyes = SystemClock(), require_cameras(config).eyes
-    views = live_views(board, eyes)
+    clock = SystemClock()
+    eyes = open_eyes(config, clock)
+    views = live_views(board, require_cameras(config).eyes)
     with guidance_on(Console(stderr=True, highlight=False), board.name, clock) as show:
-        calibration = LiveCalibration(
-            open_eyes(config, clock), views, of_cameras(wanted), show, clock, keep=kept_in(save)
-        )
+        calibration = LiveCalibration(eyes, views, of_cameras(wanted), show, clock, keep=kept_in(save))
         with on_termination(calibration.stop):
-            return calibration.run()
+            found, result = calibration.run()
+    return found, result, focus_complaints(eyes)
 
 
 def _checked_live(config: Config, file: Path, board: Board, seconds: float) -> tuple[CheckFile, str]:

@@ -49,6 +49,8 @@ def _tiles(found: Calibrated) -> str:
         (rig.model, f"lens model, by the error of views not fitted: {rivals}"),
         (f"{calibration.focal_px:.1f} px", "focal length of the rectified images"),
     )
+    if found.focal_spread is not None:
+        tiles = (*tiles, (f"{found.focal_spread:.1%}", "1-sigma of the focal length over the views: a lens refocused"))
     shown = "".join(f"<div><b>{escape(value)}</b><span>{escape(what)}</span></div>" for value, what in tiles)
     return f'<section><div class="tiles">{shown}</div></section>'
 
