@@ -183,9 +183,8 @@ def test_predictions_and_solutions_have_poses_in_json(learner: Config, capsys) -
 
 def test_an_orientation_makes_a_matrix_and_covariance() -> None:
     pose = MarkerPose.of([0.1, 0.2, 0.3], [1e-3, 2e-3, 3e-3], [0.0, 0.0, 1.0, 0.0], [0.01, 0.02, 0.03])
-    assert np.array(pose.matrix) == pytest.approx(
-        np.array([[-1, 0, 0, 0.1], [0, -1, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]])
-    )
+    wanted = [[-1, 0, 0, 0.1], [0, -1, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]]
+    assert np.array(pose.matrix) == pytest.approx(np.array(wanted))
     sigmas = np.sqrt(np.array(pose.covariance).reshape(6, 6).diagonal())
     assert sigmas == pytest.approx([1e-3, 2e-3, 3e-3, 0.01, 0.02, 0.03])
 
