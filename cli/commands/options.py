@@ -121,6 +121,14 @@ def robot_file(given: Path | None, source: Path | None) -> Path:
     return Path(os.environ.get(VARIABLE, HERE))
 
 
+def require_lerobot(config: Config, file: Path | None) -> None:
+    """Raise ConfigError if joint offsets could not be put into LeRobot's calibration `file`, if there is one."""
+    from bodyschema.cli.hardware.lerobot_offsets import CorrectedCalibration
+
+    if file is not None:
+        CorrectedCalibration.of(config, file, {})
+
+
 def lerobot_lines(
     config: Config, file: Path, offsets_rad: Mapping[str, float], recording: Path | None, *, write: bool
 ) -> list[str]:

@@ -28,6 +28,9 @@ _HOMING_SIGN = {"dynamixel": 1, "feetech": -1}
 _ONCE = "Correct a zero in one place only: a driver that has it, and extended.toml beside it, count it twice."
 
 
+IN_DRIVERS = frozenset({"joint_offset", "joint_scale"})
+
+
 def write_snippets(simulation: Simulation, file: Path, heading: str) -> list[str]:
     """Write the part of the simulation that drivers can represent to `file`, as text to copy from.
 
@@ -43,7 +46,7 @@ def write_snippets(simulation: Simulation, file: Path, heading: str) -> list[str
     parts = [f"{heading}\n{_ONCE}", _zeros(with_ratios), _ros2_control(with_ratios)]
     parts += [*_servos(simulation, with_ratios), *_kinematics(errors)]
     file.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
-    others = {effect.name for effect in errors.simulation.all_effects} - {"joint_offset", "joint_scale"}
+    others = {effect.name for effect in errors.simulation.all_effects} - IN_DRIVERS
     return [f"in no driver's settings: {', '.join(sorted(others))}; correction.json has them"] if others else []
 
 

@@ -19,6 +19,7 @@ from bodyschema.cli.commands.options import (
     flag,
     lerobot_lines,
     print_json,
+    require_lerobot,
     robot_file,
 )
 
@@ -128,6 +129,7 @@ def arm(
     if next_poses is not None:
         check_target(next_poses, replace=force)
     config = Config.load(robot_file(robot, source))
+    require_lerobot(config, lerobot)
     description, source = config.robot, source or config.store_file
     recording, first = _rows(config, source, taken, lerobot, (first, last))
     sigma_m = None if sigma_mm is None else 1e-3 * sigma_mm

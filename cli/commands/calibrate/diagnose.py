@@ -17,6 +17,7 @@ from bodyschema.cli.commands.options import (
     SourceRobotFile,
     flag,
     lerobot_lines,
+    require_lerobot,
     robot_file,
 )
 
@@ -74,6 +75,7 @@ def diagnose(
     if write and lerobot is None:
         raise RequestError("--write is for --lerobot FILE. Give LeRobot's calibration file")
     config = Config.load(robot_file(robot, recording))
+    require_lerobot(config, lerobot)
     asked = Asked.of(effects, exclude, seed)
     source = measured(config, recording, lambda file: taken.opened(config, file, lerobot), live=live)
     told = Console(stderr=True, highlight=False)
