@@ -107,8 +107,9 @@ def compared(simulation: Simulation, recording: Recording, out: Path) -> tuple[l
         else:
             predicted[f"{out.name} in MuJoCo {version_}"] = replayed(out, simulation.robot.joints, motion)
     elif out.suffix.lower() == DRIVERS:
-        kept = [effect for effect in simulation.all_effects if effect.name in IN_DRIVERS]
-        settings = Simulation(simulation.robot, tuple(kept))
+        # Beside the fit of camera and marker, which changes no background.
+        kept = tuple(effect for effect in simulation.all_effects if effect.name in IN_DRIVERS)
+        settings = Simulation(simulation.robot, (), None, kept)
         predicted[f"zeros and scales of {out.name}"] = aligned(Observations.of(recording, settings), settings).predicted
     elif out.suffix.lower() == CORRECTION:
         predicted[f"what {out.name} holds"] = held_by_correction(simulation).positions(motion)

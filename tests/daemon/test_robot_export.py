@@ -52,12 +52,23 @@ def test_gain_of_the_file_itself_is_printed(extended, measured, tmp_path, capsys
     assert "not in the file: settling" in told
 
 
+def rms_mm(told: str) -> list[float]:
+    return [float(line.split("│")[2]) for line in told.splitlines() if line.count("│") > 3]
+
+
 def test_gain_of_settings_of_drivers_is_printed(extended, measured, tmp_path, capsys) -> None:
     export(extended, tmp_path / "drivers.txt", "--measured", measured)
     told = capsys.readouterr().out
-    nominal, _, drivers = (float(line.split("│")[2]) for line in told.splitlines() if line.count("│") > 3)
+    nominal, _, drivers = rms_mm(told)
     assert drivers < nominal
     assert "zeros and scales of drivers.txt" in told
+
+
+def test_settings_of_drivers_that_are_wrong_gain_nothing(extended, measured, tmp_path, capsys) -> None:
+    extended.write_text(extended.read_text().replace("offset_rad = 0.05", "offset_rad = 0.5"))
+    export(extended, tmp_path / "drivers.txt", "--measured", measured)
+    nominal, _, drivers = rms_mm(capsys.readouterr().out)
+    assert drivers > nominal
 
 
 def test_small_errors_within_tolerance_are_counted_apart(extended, tmp_path, capsys) -> None:
