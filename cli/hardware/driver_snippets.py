@@ -28,6 +28,10 @@ _HOMING_SIGN = {"dynamixel": 1, "feetech": -1}
 _ONCE = "Correct a zero in one place only: a driver that has it, and extended.toml beside it, count it twice."
 
 
+_LEROBOT = (
+    "  (LeRobot's homing_offset is the Homing Offset: "
+    "`bodyschema calibrate RECORDING --only offsets --lerobot FILE --write` puts it into its file)"
+)
 IN_DRIVERS = frozenset({"joint_offset", "joint_scale"})
 
 
@@ -82,7 +86,7 @@ def _servos(simulation: Simulation, joints: dict[str, JointErrors]) -> Iterator[
         table = getattr(drivers, make)
         if table is None:
             continue
-        lines = [f"{make}: one of the two, in ticks; then torque off, and `bodyschema servos`"]
+        lines = [f"{make}: one of the two, in ticks; then torque off, and `bodyschema servos`", _LEROBOT]
         for servo in table.servos:
             if servo.joint not in joints or not joints[servo.joint].offset:
                 continue
