@@ -54,7 +54,7 @@ class CorrectedJoints:
             readings = [message.positions[place] for place in places]
             if not np.isfinite(readings).all():
                 return
-            angles, pose = self.arm.read(readings, pace=None)
+            angles, pose = self.arm.read(readings, pace=-1.0)
         except (Malformed, ValueError, IndexError):
             return
         positions = list(message.positions)
