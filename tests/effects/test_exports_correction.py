@@ -268,6 +268,16 @@ def test_lines_are_read_alike(commands, robot, tmp_path) -> None:
             assert read_lines(command, tmp_path / "c.json", " ".join([word] * d)).returncode != 0, (language, word)
 
 
+def test_settling_is_left_out_where_each_reading_is_an_interruption(robot, tmp_path) -> None:
+    play, settling = Effect.at(robot, "backlash", "elbow", values=[0.02]), ("settling", "wrist", [0.1, 0.5])
+    found = []
+    for effects in ((play,), (play, Effect.at(robot, *settling[:2], values=settling[2]))):
+        write_correction(Simulation(robot, effects), tmp_path / "c.json", "")
+        reader = correction(tmp_path / "c.json")
+        found.append([reader.read(row.tolist(), pace=None)[0] for row in steady(12).q])
+    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-15)
+
+
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
 def test_a_reading_that_is_not_finite_is_not_remembered(wrong, commands, robot, tmp_path) -> None:
     pairs = [
