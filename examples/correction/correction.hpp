@@ -50,8 +50,9 @@ class Correction {
     for (double x; text >> mark && mark == due && text >> x; due = ',') r.push_back(x);
     bool good = format != file.npos && mark == ']' && r.size() > 2 && whole(r[1], double(r.size()));
     good = good && whole(r[0], (r[1] - 28) / 2) && std::fmod(double(r.size()) - r[1], 5) == 0;
+    // A step takes up to 13 registers in a row, and sets none of the first two.
     for (size_t k = good ? size_t(r[1]) : 0, n = 0; good && k < r.size(); ++k, ++n)
-      good = whole(r[k], n % 5 > 0 ? r[1] - 13 : 9);  // a step takes up to 13 registers in a row
+      good = whole(r[k], n % 5 > 0 ? r[1] - 13 : 9) && (n % 5 != 1 || r[k] > 1);
     if (!good) throw std::runtime_error("not a correction of version 3: use `bodyschema export`");
   }
 

@@ -194,6 +194,7 @@ def test_a_file_of_an_older_version_says_what_to_do(commands, robot, tmp_path) -
         ("step", 10),
         ("step", -1),
         ("to", -1),
+        ("to", 1),
         ("to", 0.5),
         ("to", "registers"),
         ("to", None),
