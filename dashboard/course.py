@@ -112,7 +112,7 @@ def expected_outlook(status: LearnerStatus) -> OutlookDocument | None:
     def expected(claimed: list[float]) -> list[float]:
         return [status.expected_error_m(each_m) or each_m for each_m in claimed]
 
-    sentence = "Enough data where the arm was."
+    sentence = "Enough data to predict where the arm was. Where intervals are still wide, move to other poses."
     if not outlook.enough:
         more = outlook.best_motion_m != outlook.like_so_far_m
         sentence = f"More data would help{f'; {outlook.best_motion} gains most' if more else ''}."

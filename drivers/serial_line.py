@@ -21,12 +21,12 @@ LATENCY_OF = "/sys/bus/usb-serial/devices/{}/latency_timer"
 
 
 class BusLost(SourceLost):
-    """The port, or the device behind it, was lost."""
+    """The port, or the device behind it, was lost, or is not there yet."""
 
-    def __init__(self, port: str, error: Exception) -> None:
+    def __init__(self, port: str, error: Exception, state: str = "is gone") -> None:
         number = next((part for part in error.args if isinstance(part, int)), None)
         why = os.strerror(number) if number else str(error) or "it was unplugged"
-        super().__init__(f"{port} is gone: {why}", retry_s=RETRY_S)
+        super().__init__(f"{port} {state}: {why}", retry_s=RETRY_S)
 
 
 def adapter_latency_s(port: str, latency_of: str = LATENCY_OF) -> float:
@@ -119,4 +119,4 @@ def _refused(port: str, baud: int, error: Exception) -> SourceError:
         return SourceError(f"{port} is in use by another program. End that one (fuser {port} shows it)")
     if isinstance(error, ValueError):
         return SourceError(f"{port} cannot be opened at {baud} bit/s: {error}")
-    return BusLost(port, error)
+    return BusLost(port, error, "is not there" if number == errno.ENOENT else "cannot be opened")

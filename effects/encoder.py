@@ -17,10 +17,9 @@ if TYPE_CHECKING:
     from .effect import Effect
     from .simulation import Simulated
 
-# Rows of the tables of correction.json, by the table's name.
+# What an effect adds to correction.json: "ratios" (joint, source, factor), "waves" (joint, amplitude, frequency,
+# phase), "memories" (joint, kind, amount, scale) and "loose" (joint, half of the width, hold).
 Rows = dict[str, list[list[Any]]]
-# State of a memory in correction.json before the first reading.
-UNKNOWN_STATE = (0, 0.0, 0.0)
 # Share of a past move below which it is ignored.
 _FORGOTTEN = 1e-17
 

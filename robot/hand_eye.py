@@ -12,7 +12,7 @@ import numpy as np
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.interfaces.whole_files import write_whole
-from kbmaps.rotations import quaternions, rotation_vector
+from kbmaps.rotations import quaternions, rotation_matrices, rotation_vector
 
 LAUNCH = "hand_eye.launch.py"
 _STEP = 1e-6  # of the numerical derivative of a pose [m, rad]
@@ -54,6 +54,36 @@ class HandEye(msgspec.Struct, frozen=True):
             None if covariance is None else covariance.ravel().tolist(),
             " ".join(["ros2 run tf2_ros", _PUBLISHER, *_arguments(place, quaternion, parent, child)]),
         )
+
+
+class MarkerPose(msgspec.Struct, frozen=True):
+    """A predicted pose of the marker in the measurement frame, in SI.
+
+    Attributes:
+        translation_m: x, y, z.
+        quaternion_xyzw, matrix: orientation, and homogeneous matrix of four rows of four; null where no orientation is
+            learnt.
+        covariance: 6 x 6, row by row, as that of `HandEye`; null likewise. A prediction has no correlations.
+        translation_covariance: 3 x 3, row by row [m²].
+    """
+
+    translation_m: list[float]
+    quaternion_xyzw: list[float] | None
+    matrix: list[list[float]] | None
+    covariance: list[float] | None
+    translation_covariance: list[float]
+
+    @classmethod
+    def of(
+        cls, x: list[float], sigma: list[float], quaternion: list[float] | None, sigma_R: list[float] | None
+    ) -> Self:
+        """Return a pose from a position with its 1-sigma [m], and an orientation with its own [rad], if any."""
+        narrow = np.diag(np.square(sigma)).ravel().tolist()
+        if quaternion is None or sigma_R is None:
+            return cls(x, None, None, None, narrow)
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = rotation_matrices("R", quaternion), x
+        return cls(x, quaternion, T.tolist(), np.diag(np.square([*sigma, *sigma_R])).ravel().tolist(), narrow)
 
 
 def in_shell_lines(pose: HandEye) -> str:

@@ -69,7 +69,7 @@ class _Settings:
     near_zero_rad: float = far_zero_rad / 2.0
     # A known camera pose is not off by this much.
     turned_rad: float = math.radians(30.0)
-    # A position belongs to the angles of a row this near at most: logs joined by row number lose one or two at the start.
+    # A position belongs to the angles of a row this near at most: logs joined by row number lose one or two.
     near_rows: int = 3
     # Share of its tolerance that is left to a joint offset that is held.
     held: float = 1e-3

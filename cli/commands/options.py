@@ -119,6 +119,13 @@ class LeRobotOptions:
         Parameter(help="Write the file of --lerobot; the old one is kept beside it.", negative="", show_default=False),
     ] = False
 
+    def require(self, config: Config) -> None:
+        """Raise ConfigError if joint offsets could not be put into the file, if there is one."""
+        from bodyschema.cli.hardware.lerobot_offsets import CorrectedCalibration
+
+        if self.lerobot is not None:
+            CorrectedCalibration.of(config, self.lerobot, {})
+
     def lines(self, config: Config, offsets_rad: Mapping[str, float], recording: Path | None) -> list[str]:
         """Return what joint offsets change in the file, after writing it where asked; nothing without a file.
 

@@ -28,6 +28,13 @@ _HOMING_SIGN = {"dynamixel": 1, "feetech": -1}
 _ONCE = "Correct a zero in one place only: a driver that has it, and extended.toml beside it, count it twice."
 
 
+_LEROBOT = (
+    "  (LeRobot's homing_offset is the Homing Offset: "
+    "`bodyschema calibrate RECORDING --only offsets --lerobot FILE --write` puts it into its file)"
+)
+IN_DRIVERS = frozenset({"joint_offset", "joint_scale"})
+
+
 def write_snippets(simulation: Simulation, file: Path, heading: str) -> list[str]:
     """Write the part of the simulation that drivers can represent to `file`, as text to copy from.
 
@@ -43,7 +50,7 @@ def write_snippets(simulation: Simulation, file: Path, heading: str) -> list[str
     parts = [f"{heading}\n{_ONCE}", _zeros(with_ratios), _ros2_control(with_ratios)]
     parts += [*_servos(simulation, with_ratios), *_kinematics(errors)]
     file.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
-    others = {effect.name for effect in errors.simulation.all_effects} - {"joint_offset", "joint_scale"}
+    others = {effect.name for effect in errors.simulation.all_effects} - IN_DRIVERS
     return [f"in no driver's settings: {', '.join(sorted(others))}; correction.json has them"] if others else []
 
 
@@ -79,7 +86,7 @@ def _servos(simulation: Simulation, joints: dict[str, JointErrors]) -> Iterator[
         table = getattr(drivers, make)
         if table is None:
             continue
-        lines = [f"{make}: one of the two, in ticks; then torque off, and `bodyschema servos`"]
+        lines = [f"{make}: one of the two, in ticks; then torque off, and `bodyschema servos`", _LEROBOT]
         for servo in table.servos:
             if servo.joint not in joints or not joints[servo.joint].offset:
                 continue

@@ -38,8 +38,7 @@ def sentences(report: CalibrationReport) -> list[str]:
     """Return the report as sentences."""
     said = [_expected(report)] if report.expected_mm is not None else []
     said += [
-        f"Mean distance to the pairs: {report.drawn_error_mm:.3f} mm for the nominal arm, best placed, "
-        f"{report.learnt_error_mm:.3f} mm for the learnt one. {_noise(report)} {_outliers(report)}",
+        f"Mean distance to the pairs: {_distances(report)}. {_noise(report)} {_outliers(report)}",
         _workmanship(report),
     ]
     if report.trusted == "nothing":
@@ -79,8 +78,18 @@ def two_tools(report: CalibrationReport) -> str:
     )
 
 
+def _distances(report: CalibrationReport) -> str:
+    if report.trusted == "urdf":
+        return f"{report.learnt_error_mm:.3f} mm"
+    return (
+        f"{report.drawn_error_mm:.3f} mm for the nominal arm, best placed, {report.learnt_error_mm:.3f} mm for the "
+        "learnt one"
+    )
+
+
 def _noise(report: CalibrationReport) -> str:
-    scatter = f"Noise of a coordinate, as the pairs scatter: {report.noise_mm:.3f} mm"
+    cause = "Noise" if report.trusted == "nothing" else "Noise and errors of the URDF"
+    scatter = f"{cause} in a coordinate, as the pairs scatter: {report.noise_mm:.3f} mm"
     if report.told_noise_mm is None:
         return f"{scatter}."
     return f"{scatter}; as stated with them: {report.told_noise_mm:.3f} mm, on which the intervals rest."

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyschema.cli.hardware.driver_snippets import write_snippets
+from bodyschema.cli.hardware.driver_snippets import IN_DRIVERS, write_snippets
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.effects import Motion, Simulation
@@ -62,6 +62,13 @@ def write(simulation: Simulation, out: Path) -> list[str]:
     return told
 
 
+def effects_of(simulation: Simulation) -> str:
+    """Return how many effects a simulation has; those within tolerance of all links and drives are counted apart."""
+    count, small = len(simulation.effects), len(simulation.background)
+    told = "without effects" if not count else f"with {count} effect{'s' if count > 1 else ''}"
+    return f"{told} and {small} small error{'s' if small > 1 else ''} within tolerance" if small else told
+
+
 @dataclass(frozen=True)
 class Row:
     """Errors of one model on measured positions.
@@ -99,6 +106,11 @@ def compared(simulation: Simulation, recording: Recording, out: Path) -> tuple[l
             why_not = _WITHOUT_MUJOCO
         else:
             predicted[f"{out.name} in MuJoCo {version_}"] = replayed(out, simulation.robot.joints, motion)
+    elif out.suffix.lower() == DRIVERS:
+        # Beside the fit of camera and marker, which changes no background.
+        kept = tuple(effect for effect in simulation.all_effects if effect.name in IN_DRIVERS)
+        settings = Simulation(simulation.robot, (), None, kept)
+        predicted[f"zeros and scales of {out.name}"] = aligned(Observations.of(recording, settings), settings).predicted
     elif out.suffix.lower() == CORRECTION:
         predicted[f"what {out.name} holds"] = held_by_correction(simulation).positions(motion)
     else:

@@ -82,7 +82,8 @@ def _tolerances(diagnosis: Diagnosis) -> Tolerances:
     sizes = units * np.asarray(found.scales)
     wide = np.exp(_HALF_WIDTH_95 * found.unsure)
     lowest = np.where(found.seen, sizes / wide, 0.0)
-    ends = zip(sizes.tolist(), lowest.tolist(), (sizes * wide).tolist(), strict=True)
+    highest = np.where(found.seen, sizes * wide, units * found.most)
+    ends = zip(sizes.tolist(), lowest.tolist(), highest.tolist(), strict=True)
     intervals = [Interval(size, (low, high)) for size, low, high in ends]
     shares = diagnosis.shares
     in_extended = diagnosis.stored is diagnosis.extended or diagnosis.stored.background.scales is not None

@@ -168,7 +168,7 @@ def made_to(tolerances: Tolerances) -> str:
     def told(size: Interval, unit: str, sign: str = "") -> str:
         low, high = size.ci95
         if high > _UNTOLD * low:
-            return f"{sign}{high:.1g}{unit} or better"
+            return f"at most {sign}{high:.1g}{unit}"
         return f"about {sign}{size.value:.1g}{unit}"
 
     length, angle = told(tolerances.length_mm, " mm"), told(tolerances.angle_deg, "°")
@@ -249,8 +249,8 @@ def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
                 pairs.setdefault(_motion(diagnosis, rival), []).append(pair)
             elif not rival.is_one:
                 told.append(
-                    f"{rival.described} can do all that {describe(cause)} does, and more: "
-                    "a longer recording of the same kind would show whether it does."
+                    f"No motion tells {describe(cause)} from {rival.described}, which can do more besides: "
+                    "a longer recording of the same kind would show whether it does that."
                 )
             elif rival.effect is not None:
                 told.append(f"No motion tells {describe(cause)} from {rival.described}: fix whichever is easier.")

@@ -42,6 +42,8 @@ _MAY_BE_EXACT = 0.5
 _ROUNDED_OFF, _ONE_BEYOND_ROUNDING = 1e-13, 1e-8
 # Evidence loss without a scale's tolerances from which they show in the data [nats].
 _SHOWN = 3.0
+# Loss of evidence that rules a scale out with 95 % (a likelihood ratio on one side), and the step of logarithms tried.
+_RULED_OUT, _FINER = 1.35, 0.2
 # Maximum of changes to a set of causes, and of its causes for more to be added: beyond, the first order is not enough.
 _MOST_MOVES, _MOST_TOGETHER = 60, 8
 # Maximum of refitted sets, and the margin to the best within which a set is refitted [nats].
@@ -60,12 +62,14 @@ class Tolerated:
     Attributes:
         scales: the most probable ones.
         unsure: standard deviations of their logarithms (3,).
-        seen: True for scales that show in the data (3,); the others are upper bounds.
+        seen: True for scales that show in the data (3,).
+        most: the largest ones (3,) that the data do not rule out with 95 %; of use where they do not show.
     """
 
     scales: Scales
     unsure: FloatArray
     seen: NDArray[np.bool_]
+    most: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -330,6 +334,21 @@ class Sets:
             without.append(self._worth(inner, toward, group, logs, here.sigma)[0])
         return whole - np.array(without) > _SHOWN
 
+    def largest(self, here: Together) -> FloatArray:
+        """Return the largest scales (3,), each beside the others as they are, that the data do not rule out."""
+        inner, toward = self._inner[np.ix_(here.columns, here.columns)], self._toward[here.columns]
+        group, found = self._group(here.columns), np.array(here.scales)
+        for g in range(3):
+            logs, best = np.log(here.scales), -np.inf
+            while logs[g] < np.log(MOST):
+                worth = self._worth(inner, toward, group, logs, here.sigma)[0]
+                best = max(best, worth)
+                if worth < best - _RULED_OUT:
+                    break
+                logs[g] = min(logs[g] + _FINER, np.log(MOST))
+            found[g] = np.exp(logs[g])
+        return found
+
     def _group(self, columns: NDArray[np.intp]) -> NDArray[np.int64]:
         """Return the scale of each column (p,); -1 where it is not a tolerance."""
         group = np.full(len(columns), -1)
@@ -442,11 +461,12 @@ def together(start: Fit, hypotheses: Sequence[Effect], tell: Callable[[str], Non
 def tolerated(fit: Fit) -> Tolerated:
     """Return the scales of tolerances with the most evidence beside the causes of a fit."""
     if fit.background.scales is None:
-        return Tolerated(Scales(), np.full(3, SPREAD), np.zeros(3, dtype=np.bool_))
+        return Tolerated(Scales(), np.full(3, SPREAD), np.zeros(3, dtype=np.bool_), np.full(3, MOST))
     causes = [Candidate(cause, 0.0, 1) for cause in fit.causes]
     sets = Sets(fit, causes, 0.0)
     here = sets.of(tuple(range(len(causes))))
-    return Tolerated(here.scales, 1.0 / np.sqrt(2.0 * here.spent + 1.0 / SPREAD**2), sets.shown(here))
+    unsure = 1.0 / np.sqrt(2.0 * here.spent + 1.0 / SPREAD**2)
+    return Tolerated(here.scales, unsure, sets.shown(here), sets.largest(here))
 
 
 def is_at_limit(scales: Scales | None) -> bool:

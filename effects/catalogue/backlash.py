@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyschema.effects.encoder import UNKNOWN_STATE, EncoderEffect, Place, Rows
+from bodyschema.effects.encoder import EncoderEffect, Place, Rows
 from bodyschema.effects.joint_errors import JointErrors
 from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter
@@ -62,7 +62,7 @@ class Backlash(EncoderEffect):
 
     def correction_rows(self, effect: Effect, place: Place) -> Rows:
         half = 0.5 * float(effect.values[0])
-        return {"memories": [[place.joint, 0, half, abs(half), list(UNKNOWN_STATE)]] if half else []}
+        return {"memories": [[place.joint, 0, half, abs(half)]] if half else []}
 
     def add_to(self, joint: JointErrors, effect: Effect) -> str | None:
         if joint.play or effect.values[0] < 0.0:

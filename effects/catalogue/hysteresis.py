@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyschema.effects.encoder import UNKNOWN_STATE, EncoderEffect, Place, Rows, carried_on
+from bodyschema.effects.encoder import EncoderEffect, Place, Rows, carried_on
 from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter
 from bodyschema.interfaces.records import FloatArray, frozen_array
@@ -61,7 +61,7 @@ class Hysteresis(EncoderEffect):
         return _LENGTHS
 
     def correction_rows(self, effect: Effect, place: Place) -> Rows:
-        return {"memories": [[place.joint, 1, *effect.values.tolist(), list(UNKNOWN_STATE)]]}
+        return {"memories": [[place.joint, 1, *effect.values.tolist()]]}
 
     def unknown_state(self, run: Simulated, effect: Effect) -> NDArray[np.bool_]:
         """Return rows (n,) before the joint has gone far enough one way in a run."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyschema.effects.encoder import UNKNOWN_STATE, EncoderEffect, Place, Rows, carried_on
+from bodyschema.effects.encoder import EncoderEffect, Place, Rows, carried_on
 from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter
 from bodyschema.interfaces.records import FloatArray, frozen_array
@@ -67,7 +67,7 @@ class Settling(EncoderEffect):
         return rows
 
     def correction_rows(self, effect: Effect, place: Place) -> Rows:
-        return {"memories": [[place.joint, 2, *effect.values.tolist(), list(UNKNOWN_STATE)]]}
+        return {"memories": [[place.joint, 2, *effect.values.tolist()]]}
 
 
 @lru_cache(maxsize=_MEMORIES_KEPT)

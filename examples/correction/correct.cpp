@@ -2,6 +2,7 @@
 // Build: g++ -std=c++17 -O2 correct.cpp -o correct
 #include "correction.hpp"
 
+#include <algorithm>
 #include <cstdio>
 #include <cstdlib>
 #include <fstream>
@@ -22,8 +23,8 @@ int main(int argc, char** argv) {
       if (*end) throw std::invalid_argument("not a number: " + word);
     }
     if (readings.empty()) continue;
-    arm.read(readings);
-    for (double angle : arm.angles) std::printf("%.17g ", angle);
-    for (size_t k = 0; k < 12; ++k) std::printf("%.17g%c", arm.pose[k], k == 11 ? '\n' : ' ');
+    const double *pose = arm.read(readings), *angles = pose + 12;
+    for (size_t k = 0; k < readings.size(); ++k) std::printf("%.17g ", angles[k]);
+    for (size_t k = 0; k < 12; ++k) std::printf("%.17g%c", pose[k], k == 11 ? '\n' : ' ');
   }
 }

@@ -3,71 +3,65 @@
 
 class Correction {
   constructor(text) {
-    Object.assign(this, JSON.parse(text));
-    if (this.format !== "bodyschema correction" || this.version !== 2)
-      throw new Error("not a correction of version 2: write it again with `bodyschema export`");
+    const { format, numbers } = JSON.parse(text);
+    if (format !== "bodyschema correction 3")
+      throw new Error("not a correction of version 3: write it again with `bodyschema export`");
+    [this.joints, this.end] = numbers;
+    this.numbers = Float64Array.from(numbers);  // registers, then the program: steps of five whole numbers
   }
 
   // True joint angles, and the marker's pose (3 rows of 4) in the measurement frame, at the next readings.
   // pace: time since the last readings, as a multiple of the usual one; null after an interruption.
   // A reading that is not finite makes what depends on it NaN, and is not remembered.
   read(readings, pace = 1) {
-    const angles = this.zeros.slice(), q = readings.map((x) => (Number.isFinite(x) ? x : NaN));
-    if (q.length !== angles.length) throw new Error("another number of readings than of joints");
-    for (const [joint, source, factor] of this.ratios) angles[joint] += factor * q[source];
-    for (const [joint, size, rate, phase] of this.waves) angles[joint] += size * Math.sin(rate * q[joint] + phase);
-    for (const [joint, kind, amount, scale, state] of this.memories)
-      if (!Number.isNaN(q[joint])) angles[joint] -= amount * strain(kind, scale, state, q[joint], pace);
-    const free = angles.slice(), loads = this.loads.slice();  // a load is mass times place, and mass
-    for (const [joint, body, ...rest] of this.carried) carry(loads, body, ...rest, angles[joint]);
-    for (const [loose, inside] of this.passes) this.giveWay(loose, inside, free, loads.slice(), angles);
-    const columns = this.chain.reduceRight((c, [slides, pose], k) => through(pose, slides, angles[k], c), this.marker);
-    return { angles, pose: [0, 1, 2].flatMap((row) => columns.map((column) => column[row])) };
-  }
-
-  giveWay(loose, inside, free, loads, angles) {  // let the springs yield to gravity, or all that is loose
-    const downs = [this.gravity];
-    for (const [joint, parent, slides, [a, b, c, , d, e, f, , g, h, i]] of this.bodies) {
-      const [p, q, r] = downs[parent], turn = slides ? 0 : angles[joint], u = Math.cos(turn), v = Math.sin(turn);
-      const x = a * p + d * q + g * r, y = b * p + e * q + h * r, z = c * p + f * q + i * r;
-      downs.push([u * x + v * y, u * y - v * x, z]);
-    }
-    for (let body = this.bodies.length; body > inside; body--) {
-      const [joint, parent, slides, pose, spring] = this.bodies[body - 1], [compliance, half, hold, side] = spring;
-      const [a, b, , mass] = loads[body], [x, y, z] = downs[body], torque = slides ? mass * z : a * y - b * x;
-      carry(loads, body, parent, slides, pose, angles[joint]);
-      if (loose && Math.abs(torque) > (side ? hold : -1)) spring[3] = torque < 0 ? -1 : 1;  // where it rests
-      angles[joint] = loose ? angles[joint] + half * spring[3] : free[joint] + compliance * torque;
-    }
+    const r = this.numbers, d = this.joints;
+    if (readings.length !== d) throw new Error("another number of readings than of joints");
+    if (!readings.every((x) => typeof x === "number")) throw new TypeError("a reading is not a number");
+    r.set(readings.map((x) => (Number.isFinite(x) ? x : NaN)), 15 + d);
+    r[2] = pace === null ? -1 : pace;
+    for (let k = this.end; k < r.length; k += 5) run(r, r[k], r[k + 1], r[k + 2], r[k + 3], r[k + 4]);
+    return { angles: [...r.subarray(15, 15 + d)], pose: [...r.subarray(3, 15)] };
   }
 }
 
-function carry(loads, body, parent, slides, pose, angle) {  // add the load of a body to that of its parent
-  const [load] = through(pose, slides, angle, [loads[body]]);
-  loads[parent] = loads[parent].map((own, n) => own + load[n]);
+function run(r, step, to, a, b, c) {
+  if (step < 2) for (let k = 0; k < 1 + 2 * step; k++) r[to + k] = r[a + k] + r[c] * r[b + k];
+  else if (step === 2) r[to] = r[a] + r[c] * Math.sin(r[c + 1] * r[b] + r[c + 2]);
+  else if (step === 3 && !Number.isNaN(r[a])) remember(r, to, r[a], r[b], r[c], r[c + 1]);
+  else if (step === 4) r[to] = r[c] ? r[a + 3] * r[b + 2] : r[a] * r[b + 1] - r[a + 1] * r[b];
+  else if (step === 5) r[to] = Math.abs(r[a]) > (r[b] ? r[c] : -1) ? (r[a] < 0 ? -1 : 1) : r[b];
+  else if (step > 5) move(r, step, to, a, r[b], c + 1, r[c]);
 }
 
-function strain(kind, scale, state, reading, pace) {  // of a memory: 0 play, 1 hysteresis, 2 settling
-  const [begun, last, before] = state, move = begun ? reading - last : 0, way = Math.sign(move);
-  const x = (way * move) / scale, left = begun > 1 ? 1 - way * before : 0;  // the first move shows the side
-  if (kind === 2) state[2] = pace === null ? 0 : move + Math.sign(scale) * Math.abs(scale) ** pace * before;
-  else if (move) state[2] = way * (1 - (kind ? left * Math.exp(-x) : Math.max(left - x, 0)));
-  [state[0], state[1]] = [move ? 2 : Math.max(begun, 1), reading];
-  return state[2];
+// Set a strain (kind 0 play, 1 hysteresis, 2 settling), its last reading, and how far it has begun.
+function remember(r, to, reading, pace, kind, scale) {
+  const move = r[to + 2] ? reading - r[to + 1] : 0, way = Math.sign(move), x = (way * move) / scale;
+  const left = r[to + 2] > 1 ? 1 - way * r[to] : 0;  // the first move shows the side
+  if (kind === 2) r[to] = pace < 0 ? 0 : move + Math.sign(scale) * Math.abs(scale) ** pace * r[to];
+  else if (move) r[to] = way * (1 - (kind ? left * Math.exp(-x) : Math.max(left - x, 0)));
+  r[to + 1] = reading;
+  r[to + 2] = move ? 2 : Math.max(r[to + 2], 1);
 }
 
-// Vectors (x, y, z, w) after a joint's motion, in the frame in which its own has this pose.
-function through([a, b, c, p, d, e, f, q, g, h, i, r], slides, angle, vectors) {
-  const u = slides ? 1 : Math.cos(angle), v = slides ? 0 : Math.sin(angle), shift = slides ? angle : 0;
-  return vectors.map(([s, t, l, w]) => {
-    const x = u * s - v * t, y = v * s + u * t, z = l + shift * w;
-    return [a * x + b * y + c * z + p * w, d * x + e * y + f * z + q * w, g * x + h * y + i * z + r * w, w];
-  });
+// Set by a joint's motion and pose what a body weighs, inwards, or rows of a pose, outwards.
+function move(r, step, to, a, by, P, slides) {
+  const u = slides ? 1 : Math.cos(by), v = slides ? 0 : Math.sin(by), shift = slides ? by : 0;
+  const x = u * r[a] - v * r[a + 1], y = v * r[a] + u * r[a + 1], z = r[a + 2] + shift * r[a + 3];
+  for (let k = 0; step === 6 && k < 3; k++, P += 4)
+    r[to + k] = r[P] * x + r[P + 1] * y + r[P + 2] * z + r[P + 3] * r[a + 3];
+  for (let row = 6; row < step; row++, a += 4, to += 4) {
+    const [x, y, z, w] = [0, 1, 2, 3].map((k) => r[P + k] * r[a] + r[P + 4 + k] * r[a + 1] + r[P + 8 + k] * r[a + 2]);
+    r.set([u * x + v * y, u * y - v * x, z, w + r[a + 3] + shift * z], to);
+  }
 }
 
 module.exports = { Correction };
 if (require.main === module) {
   const fs = require("fs"), correction = new Correction(fs.readFileSync(process.argv[2], "utf8"));
+  const number = (word) => {
+    if (Number.isNaN(Number(word)) && !/^[+-]?(nan|inf|infinity)$/i.test(word)) throw new Error("no number: " + word);
+    return Number(word);
+  };
   for (const line of fs.readFileSync(0, "utf8").split("\n").filter((each) => each.trim()))
-    console.log(Object.values(correction.read(line.match(/[^\s,]+/g).map(Number))).flat().join(" "));
+    console.log(Object.values(correction.read(line.match(/[^\s,]+/g).map(number))).flat().join(" "));
 }

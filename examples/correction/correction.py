@@ -5,6 +5,7 @@ python correction.py correction.json < readings.txt    # readings in each line; 
 
 import json
 import sys
+from functools import partial
 from math import copysign, cos, exp, isfinite, nan, sin
 
 
@@ -12,9 +13,13 @@ class Correction:
     """True joint angles and marker pose of an arm from its readings, with the effects that bodyschema found."""
 
     def __init__(self, text):
-        self.file = json.loads(text)
-        if (self.file.get("format"), self.file.get("version")) != ("bodyschema correction", 2):
-            raise ValueError("not a correction of version 2: write it again with `bodyschema export`")
+        file = json.loads(text)
+        if file.get("format") != "bodyschema correction 3":
+            raise ValueError("not a correction of version 3: write it again with `bodyschema export`")
+        self.joints, end = file["numbers"][:2]
+        self.registers, numbers = file["numbers"][:end], file["numbers"][end:]
+        steps = zip(*[iter(numbers)] * 5, strict=True)
+        self.steps = [(STEPS[step], to, a, b, self.registers[c : c + 13]) for step, to, a, b, c in steps]
 
     def read(self, q, pace=1.0):
         """Return true joint angles, and the marker's pose (3 rows of 4) in the measurement frame, at the next readings.
@@ -22,64 +27,68 @@ class Correction:
         pace: time since the last readings, as a multiple of the usual one; None after an interruption. A reading that
         is not finite makes what depends on it NaN, and is not remembered.
         """
-        angles, q = list(self.file["zeros"]), [reading if isfinite(reading) else nan for reading in q]
-        if len(q) != len(angles):
+        r, d, q = self.registers, self.joints, [reading if isfinite(reading) else nan for reading in q]
+        if len(q) != d:
             raise ValueError("another number of readings than of joints")
-        for joint, source, factor in self.file["ratios"]:
-            angles[joint] += factor * q[source]
-        for joint, amplitude, frequency, phase in self.file["waves"]:
-            angles[joint] += amplitude * sin(frequency * q[joint] + phase)
-        for joint, kind, amount, scale, state in self.file["memories"]:
-            angles[joint] -= amount * strain(kind, scale, state, q[joint], pace)
-        free, loads, columns = list(angles), list(self.file["loads"]), self.file["marker"]
-        for joint, body, parent, slides, pose in self.file["carried"]:
-            carry(loads, body, parent, slides, pose, angles[joint])
-        for loose, inside in self.file["passes"]:  # what gives moves its own load
-            self.give_way(loose, inside, free, list(loads), angles)
-        for angle, (slides, pose) in zip(reversed(angles), reversed(self.file["chain"]), strict=True):
-            columns = through(pose, slides, angle, columns)
-        return angles, [number for row in list(zip(*columns, strict=True))[:3] for number in row]
-
-    def give_way(self, loose, inside, free, loads, angles):
-        """Let the springs yield to gravity, or all that is loose."""
-        downs = [self.file["gravity"]]
-        for joint, parent, slides, (a, b, c, _, d, e, f, _, g, h, i, _), _ in self.file["bodies"]:
-            (x, y, z), turn = downs[parent], 0.0 if slides else angles[joint]
-            u, v, x, y, z = cos(turn), sin(turn), a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z
-            downs.append((u * x + v * y, u * y - v * x, z))
-        for body, (joint, parent, slides, pose, spring) in reversed(list(enumerate(self.file["bodies"], 1))[inside:]):
-            (compliance, half, hold, side), (a, b, _, mass), (x, y, z) = spring, loads[body], downs[body]
-            torque = mass * z if slides else a * y - b * x
-            carry(loads, body, parent, slides, pose, angles[joint])
-            spring[3] = (-1.0 if torque < 0.0 else 1.0) if loose and abs(torque) > (hold if side else -1.0) else side
-            angles[joint] = angles[joint] + half * spring[3] if loose else free[joint] + compliance * torque
+        r[2], r[15 + d : 15 + 2 * d] = -1.0 if pace is None else pace, q
+        for step, to, a, b, c in self.steps:
+            step(r, to, a, b, c)
+        return r[15 : 15 + d], r[3:15]
 
 
-def carry(loads, body, parent, slides, pose, angle):
-    """Add the load of a body to that of its parent."""
-    [(x, y, z, mass)], (a, b, c, own) = through(pose, slides, angle, (loads[body],)), loads[parent]
-    loads[parent] = a + x, b + y, c + z, own + mass
+def add(r, to, a, b, c):
+    r[to] = r[a] + c[0] * r[b]
 
 
-def strain(kind, scale, state, reading, pace):
-    """Return the strain of a memory (0 play, 1 hysteresis, 2 settling) at its joint's next reading."""
-    (begun, _, strain), move = state, reading - state[1] if state[0] else 0.0
+def add_three(r, to, a, b, c):
+    r[to : to + 3] = r[a] + c[0] * r[b], r[a + 1] + c[0] * r[b + 1], r[a + 2] + c[0] * r[b + 2]
+
+
+def wave(r, to, a, b, c):
+    r[to] = r[a] + c[0] * sin(c[1] * r[b] + c[2])
+
+
+def remember(r, to, reading, pace, c):
+    """Set a strain (0 play, 1 hysteresis, 2 settling), its last reading, and how far it has begun."""
+    (strain, last, begun), now, (kind, scale) = r[to : to + 3], r[reading], c[:2]
+    move = now - last if begun else 0.0
+    way, x, left = copysign(1.0, move), abs(move) / scale, 1.0 - copysign(1.0, move) * strain if begun > 1 else 0.0
     if kind == 2:
-        strain = 0.0 if pace is None else move + copysign(abs(scale) ** pace, scale) * strain
-    elif move:  # the first move shows the side
-        x, left = abs(move) / scale, 1.0 - copysign(1.0, move) * strain if begun > 1 else 0.0
-        strain = copysign(1.0, move) * (1.0 - (left * exp(-x) if kind else max(left - x, 0.0)))
-    state[:] = (2 if move else max(begun, 1), reading, strain) if isfinite(reading) else state
-    return strain
+        strain = 0.0 if r[pace] < 0 else move + copysign(abs(scale) ** r[pace], scale) * strain
+    elif move:  # the first shows the side
+        strain = way * (1.0 - (left * exp(-x) if kind else max(left - x, 0.0)))
+    if isfinite(now):
+        r[to : to + 3] = strain, now, 2 if move else max(begun, 1)
 
 
-def through(pose, slides, by, vectors):
-    """Yield vectors (x, y, z, w) after a joint's motion `by`, in the frame in which its own has this pose."""
-    (a, b, c, p, d, e, f, q, g, h, i, r), (u, v, s) = pose, (1.0, 0.0, by) if slides else (cos(by), sin(by), 0.0)
-    for x, y, z, w in vectors:
-        x, y, z = u * x - v * y, v * x + u * y, z + s * w
-        yield a * x + b * y + c * z + p * w, d * x + e * y + f * z + q * w, g * x + h * y + i * z + r * w, w
+def torque(r, to, load, down, c):
+    r[to] = r[load + 3] * r[down + 2] if c[0] else r[load] * r[down + 1] - r[load + 1] * r[down]
 
+
+def side(r, to, torque, before, c):
+    turns = abs(r[torque]) > (c[0] if r[before] else -1.0)
+    r[to] = (-1.0 if r[torque] < 0.0 else 1.0) if turns else r[before]
+
+
+def inwards(r, to, load, by, numbers):
+    """Set what a body weighs, (mass times place, mass), as its parent has it."""
+    (x, y, z, m), (slides, a, b, c, p, d, e, f, q, g, h, i, s) = r[load : load + 4], numbers
+    u, v, z = (1.0, 0.0, z + r[by] * m) if slides else (cos(r[by]), sin(r[by]), z)
+    x, y = u * x - v * y, v * x + u * y
+    r[to : to + 3] = a * x + b * y + c * z + p * m, d * x + e * y + f * z + q * m, g * x + h * y + i * z + s * m
+
+
+def outwards(r, to, row, by, numbers, places=(0,)):
+    """Set rows of a pose to the next joint's."""
+    slides, a, b, c, p, d, e, f, q, g, h, i, s = numbers
+    u, v, shift = (1.0, 0.0, r[by]) if slides else (cos(r[by]), sin(r[by]), 0.0)
+    for k in places:
+        x, y, z, w = r[row + k : row + k + 4]
+        w, x, y, z = w + p * x + q * y + s * z, a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z
+        r[to + k : to + k + 4] = u * x + v * y, u * y - v * x, z, w + shift * z
+
+
+STEPS = add, add_three, wave, remember, torque, side, inwards, outwards, None, partial(outwards, places=(0, 4, 8))
 
 if __name__ == "__main__":
     with open(sys.argv[1], encoding="utf-8") as stream:

@@ -27,7 +27,6 @@ from bodyschema.robot.calibrated_files import CAMERA_LINK, MARKER_LINK
 from bodyschema.robot.hand_eye import HandEye
 
 NODE = "bodyschema_correction"
-SETTLING = 2  # the kind of a memory
 
 
 class CorrectedJoints:
@@ -36,7 +35,6 @@ class CorrectedJoints:
     def __init__(self, session, file, domain, topic):
         contents = json.loads(file)
         self.arm, self.names = Correction(file), contents["joints"]
-        self.arm.file["memories"] = [memory for memory in contents["memories"] if memory[1] != SETTLING]
         self.session, self.sequence = session, 0
         corrected, name = f"{topic}_corrected", str(session.info.zid())
         tokens = rmw.node_token(domain, name, NODE), rmw.publisher_token(domain, name, NODE, corrected, JOINT_STATE)
@@ -56,7 +54,7 @@ class CorrectedJoints:
             readings = [message.positions[place] for place in places]
             if not np.isfinite(readings).all():
                 return
-            angles, pose = self.arm.read(readings)
+            angles, pose = self.arm.read(readings, pace=-1.0)
         except (Malformed, ValueError, IndexError):
             return
         positions = list(message.positions)

@@ -102,6 +102,12 @@ def test_a_urdf_that_is_wrong_is_told() -> None:
     assert any("with nothing held, expect" in sentence for sentence in told)
 
 
+def test_errors_of_a_trusted_urdf_are_not_called_noise() -> None:
+    told = " ".join(sentences(report_on(calibrated("with offsets", "urdf"))))
+    assert "Noise and errors of the URDF in a coordinate" in told
+    assert len(re.findall(r"Mean distance to the pairs: [\d.]+ mm\.", told)) == 1
+
+
 def test_a_urdf_that_is_right_is_not_doubted() -> None:
     told = sentences(report_on(calibrated("as drawn", "urdf"), calibrated("as drawn")))
     assert not any("with nothing held" in sentence for sentence in told)

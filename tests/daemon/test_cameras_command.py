@@ -223,7 +223,7 @@ def test_a_value_has_as_many_places_as_its_interval(value, half_width, shown) ->
 def test_the_board_is_written(tmp_path, ending, capsys) -> None:
     called("calibrate", "cameras", "--print-board", "--out", tmp_path / f"board.{ending}")
     assert (tmp_path / f"board.{ending}").stat().st_size > 4000
-    assert "the line below the board is 240 mm" in capsys.readouterr().out
+    assert "measure both rulers: 240 mm below, 180 mm beside the board" in capsys.readouterr().out
 
 
 def test_a_board_of_another_ending_is_refused(tmp_path) -> None:

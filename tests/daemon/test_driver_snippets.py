@@ -32,6 +32,7 @@ def test_servo_zeros_are_in_ticks(file, homing, tmp_path) -> None:
     assert "zero_ticks = 2068 in robot.toml" in line
     assert f"{homing:+d} on its Homing Offset" in line
     assert "0.018 deg left over" in line
+    assert "LeRobot's homing_offset is the Homing Offset" in text
 
 
 def test_ros2_control_gives_the_true_angle(tmp_path) -> None:

@@ -199,6 +199,15 @@ def test_calibrate_shows_the_difference_and_writes_nothing(tmp_path, capsys) -> 
     assert mine.read_bytes() == (SO101 / "follower.json").read_bytes()
 
 
+@pytest.mark.parametrize("command", ["calibrate", "diagnose"])
+def test_a_wrong_calibration_is_told_before_the_recording_is_read(command, tmp_path) -> None:
+    robot_of("follower", tmp_path / "robot.toml")
+    (tmp_path / "r.csv").write_text("unread")
+    words = [command, str(tmp_path / "r.csv"), "--lerobot", str(tmp_path / "none.json")]
+    with pytest.raises(ConfigError, match=r"none\.json"):
+        command_line(command)(words, exit_on_error=False, result_action="return_value")
+
+
 def test_calibrate_writes_and_keeps_the_old_file(tmp_path) -> None:
     mine = tmp_path / "follower.json"
     shutil.copy(SO101 / "follower.json", mine)

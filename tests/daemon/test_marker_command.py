@@ -53,7 +53,8 @@ def test_the_tables_of_a_printed_cube_are_those_of_its_size_on_paper(tmp_path, c
 
 
 @pytest.mark.parametrize(
-    ("ids", "said"), [("5", "both rulers are 50 mm."), ("0-5", "the line below is 160 mm, the other 110 mm.")]
+    ("ids", "said"),
+    [("5", "both rulers: each is 50 mm."), ("0-5", "both rulers: 160 mm below, 110 mm beside the tags.")],
 )
 def test_what_to_measure_on_the_print_is_said(ids, said, tmp_path, capsys) -> None:
     called("marker", "print", "--ids", ids, "--out", tmp_path / "tags.svg")

@@ -52,6 +52,34 @@ def test_gain_of_the_file_itself_is_printed(extended, measured, tmp_path, capsys
     assert "not in the file: settling" in told
 
 
+def rms_mm(told: str) -> list[float]:
+    return [float(line.split("│")[2]) for line in told.splitlines() if line.count("│") > 3]
+
+
+def test_gain_of_settings_of_drivers_is_printed(extended, measured, tmp_path, capsys) -> None:
+    export(extended, tmp_path / "drivers.txt", "--measured", measured)
+    told = capsys.readouterr().out
+    nominal, _, drivers = rms_mm(told)
+    assert drivers < nominal
+    assert "zeros and scales of drivers.txt" in told
+
+
+def test_settings_of_drivers_that_are_wrong_gain_nothing(extended, measured, tmp_path, capsys) -> None:
+    extended.write_text(extended.read_text().replace("offset_rad = 0.05", "offset_rad = 0.5"))
+    export(extended, tmp_path / "drivers.txt", "--measured", measured)
+    nominal, _, drivers = rms_mm(capsys.readouterr().out)
+    assert drivers > nominal
+
+
+def test_small_errors_within_tolerance_are_counted_apart(extended, tmp_path, capsys) -> None:
+    simulation = load_simulation(extended)
+    robot = simulation.robot
+    small = Effect.at(robot, "joint_offset", robot.joints[1], values=[1e-5])
+    again = write_extended(simulation.with_background([small]), tmp_path / "again", "made by a test")
+    export(again, tmp_path / "model.urdf")
+    assert "with 3 effects and 1 small error within tolerance written" in capsys.readouterr().out
+
+
 def test_without_mujoco_the_file_is_written_and_not_replayed(extended, measured, tmp_path, capsys, monkeypatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "mujoco", None)
     export(extended, tmp_path / "model.xml", "--measured", measured)

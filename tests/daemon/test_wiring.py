@@ -163,7 +163,7 @@ model = "MX-28"
 def test_servos_in_robot_toml_are_the_joint_source(tmp_path) -> None:
     source = open_joints(load(tmp_path, SERVOS), SystemClock())
     assert source.joints == ("waist", "shoulder")
-    with pytest.raises(SourceLost, match=r"by-id/none is gone: No such file"), source:
+    with pytest.raises(SourceLost, match=r"by-id/none is not there: No such file"), source:
         pass
 
 
@@ -223,7 +223,7 @@ encoder = "upper"
 def test_other_hardware_in_robot_toml_is_the_joint_source(tmp_path, tables) -> None:
     source = open_joints(load(tmp_path, tables), SystemClock())
     assert source.joints == ("waist", "shoulder")
-    with pytest.raises(SourceLost, match=r"by-id/none is gone: No such file"), source:
+    with pytest.raises(SourceLost, match=r"by-id/none is not there: No such file"), source:
         pass
 
 

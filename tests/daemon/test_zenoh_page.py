@@ -34,6 +34,7 @@ from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import FARTHEST_M, Reason
 from bodyschema.learning.state import MOST_POINTS
 from bodyschema.recordings.store.store import PairStore
+from bodyschema.robot.hand_eye import MarkerPose
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "zenoh.md").read_text(encoding="utf-8")
@@ -143,6 +144,29 @@ def test_joint_values_that_the_arm_cannot_have_are_named_with_their_limits_and_d
 def test_degrees_beyond_the_limits_are_named_without_the_option_that_was_given(learner: Config, capsys) -> None:
     said = predicted(learner, capsys, "--deg", "--", "0", "900")
     assert "shoulder cannot be at 15.71 rad: its limits are -2 to 2 rad (-114.6° to 114.6°). The answer" in said
+
+
+def test_predictions_and_solutions_have_poses_in_json(learner: Config, capsys) -> None:
+    [pose] = json.loads(predicted(learner, capsys, "--json", "--", "0", "0"))["poses"]
+    app(
+        ["ik", "0.3", "0", "0", "--json", "--robot", str(learner.file)],
+        exit_on_error=False,
+        result_action="return_value",
+    )
+    found = json.loads(capsys.readouterr().out)
+    for told in (pose, found["pose"]):
+        assert told["translation_m"] == pytest.approx([0.3, 0.0, 0.0], abs=1e-6)
+        assert np.array(told["translation_covariance"]).reshape(3, 3).diagonal().min() > 0.0
+        assert told["matrix"] is told["covariance"] is None  # this marker is a point
+    assert found["schema"] == 1
+
+
+def test_an_orientation_makes_a_matrix_and_covariance() -> None:
+    pose = MarkerPose.of([0.1, 0.2, 0.3], [1e-3, 2e-3, 3e-3], [0.0, 0.0, 1.0, 0.0], [0.01, 0.02, 0.03])
+    wanted = [[-1, 0, 0, 0.1], [0, -1, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]]
+    assert np.array(pose.matrix) == pytest.approx(np.array(wanted))
+    sigmas = np.sqrt(np.array(pose.covariance).reshape(6, 6).diagonal())
+    assert sigmas == pytest.approx([1e-3, 2e-3, 3e-3, 0.01, 0.02, 0.03])
 
 
 def ask_ik(learner: Config, request: IkRequest) -> IkReply:

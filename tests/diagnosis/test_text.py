@@ -90,5 +90,5 @@ def test_a_slides_ripple_is_told_where_its_pitch_is_unsure():
 def test_tolerances_that_do_not_show_are_told_by_what_they_are_at_most():
     size, none = Interval(0.3, (0.2, 0.4)), Interval(0.01, (0.0, 0.02))
     assert made_to(Tolerances(size, none, none)) == (
-        "The arm is made to about 0.3 mm and 0.02° or better; its drives run true to ±0.02° or better."
+        "The arm is made to about 0.3 mm and at most 0.02°; its drives run true to at most ±0.02°."
     )

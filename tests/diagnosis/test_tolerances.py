@@ -16,7 +16,7 @@ from bodyschema.diagnosis.fit.background import Scales
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.diagnosis.report.result import DiagnosisFile
-from bodyschema.diagnosis.search.together import beyond_tolerances
+from bodyschema.diagnosis.search.together import beyond_tolerances, tolerated
 from bodyschema.effects import Effect, Simulation, load_simulation, write_extended
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.description import RobotDescription
@@ -157,6 +157,19 @@ def test_a_ratio_is_named_though_large_drive_errors_could_follow_it(robot: Robot
     start = aligned(Observations.of(recording, Simulation(robot)), Simulation(robot))
     fit = start.with_causes([ratio]).tolerating(Scales())
     assert beyond_tolerances(fit, fit.causes[0], doubt=4.0)
+
+
+def test_sizes_that_do_not_show_are_bounded_by_the_data_alone(robot: RobotDescription) -> None:
+    rng, found = np.random.default_rng([7, 9]), []
+    q = rng.uniform(0.7 * robot.lower, 0.7 * robot.upper, (ROWS, len(robot.joints)))
+    noise = rng.normal(size=(ROWS, 3))
+    for noise_m in (NOISE_M, 20.0 * NOISE_M):
+        recording = measured(robot, motion_of(q), Simulation(robot).positions(motion_of(q)) + noise_m * noise)
+        start = aligned(Observations.of(recording, Simulation(robot)), Simulation(robot))
+        found.append(tolerated(start.tolerating(Scales())))
+    assert not any(one.seen.any() for one in found)
+    quiet, noisy = (one.most for one in found)
+    assert (noisy > 4.0 * quiet).all()
 
 
 def test_tolerances_cannot_stand_for_a_moment(robot: RobotDescription) -> None:

@@ -201,4 +201,4 @@ def test_the_doctor_leaves_torque_as_it_is(make, tmp_path) -> None:
 def test_a_port_that_cannot_be_opened_is_one_finding(make) -> None:
     _, config, the_make, open_port, *_ = MAKES[make]
     (check,) = servo_checks(the_make, config, SystemClock(), open_port)
-    assert (check.state, "elsewhere is gone" in check.said) == ("wrong", True)
+    assert (check.state, "elsewhere is not there" in check.said) == ("wrong", True)

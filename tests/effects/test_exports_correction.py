@@ -7,7 +7,9 @@ import re
 import shutil
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +23,14 @@ from bodyschema.robot.description import RobotDescription
 READERS = Path(__file__).resolve().parents[2] / "examples" / "correction"
 OPTICAL = {"camera_scale", "camera_focal", "camera_refocused", "lens_distortion"}
 NOT_OF_THE_ARM = {*OPTICAL, "camera_latency", "thermal_drift"}
+# The program in C++, in a locale whose numbers have decimal commas.
+WITH_DECIMAL_COMMAS = """
+#include "READERS/correct.cpp"
+struct Commas : std::numpunct<char> {
+  char do_decimal_point() const override { return ','; }
+};
+static const auto before = std::locale::global(std::locale(std::locale(), new Commas));
+"""
 NAMES = tuple(name for name in EFFECT_TYPES if name not in NOT_OF_THE_ARM)
 
 
@@ -32,8 +42,10 @@ def commands(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
         found["javascript"] = [node, str(READERS / "correction.js")]
     if compiler := shutil.which("g++"):
         built = str(tmp_path_factory.mktemp("built") / "correct")
+        program = Path(built + ".cpp")
+        program.write_text(WITH_DECIMAL_COMMAS.replace("READERS", str(READERS)))
         warnings = ["-Wall", "-Wextra", "-Werror"]
-        subprocess.run([compiler, "-std=c++17", *warnings, str(READERS / "correct.cpp"), "-o", built], check=True)
+        subprocess.run([compiler, "-std=c++17", *warnings, str(program), "-o", built], check=True)
         found["c++"] = [built]
     return found
 
@@ -66,18 +78,22 @@ def began(effect: Effect) -> Effect:
     return effect.with_values(np.append(effect.values[:-1], -1.0)) if effect.kind.begins else effect
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_python_agrees_effect_by_effect(name, robot, tmp_path) -> None:
+def correction(file: Path) -> Any:
+    """Return the reader in Python, as an import."""
     sys.path.insert(0, str(READERS))
     try:
-        from correction import Correction
+        return import_module("correction").Correction(file.read_text())
     finally:
         sys.path.remove(str(READERS))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_python_agrees_effect_by_effect(name, robot, tmp_path) -> None:
     motion = steady()
     for place in [where for where in everywhere(robot) if where[0] == name]:
         simulation = Simulation(robot, (began(sized(robot, place, 1.0)),))
         assert not [told for told in write_correction(simulation, tmp_path / "c.json", "") if told.startswith("not")]
-        reader = Correction((tmp_path / "c.json").read_text())
+        reader = correction(tmp_path / "c.json")
         found = [reader.read(row.tolist()) for row in motion.q]
         run = simulation.run(motion)
         # The side on which a backlash starts is known once the joint has moved.
@@ -141,12 +157,10 @@ def test_memory_goes_on_from_a_state_in_the_file(commands, robot, tmp_path) -> N
     write_correction(simulation, file, "")
     contents = json.loads(file.read_text())
     whole = corrected(commands["python"], file, q)[0]
-    lag = whole[19] - q[19]
-    states = [[2, q[19, 4], -lag[4] / 0.01], [2, q[19, 6], -lag[6] / 0.1], [2, q[19, 5], -lag[5] / 0.001]]
-    for memory, state in zip(contents["memories"], states, strict=True):
-        memory[-1] = state
-    shoulder = next(body for body in contents["bodies"] if body[0] == 3)
-    shoulder[-1][-1] = lag[3] / 0.01
+    reader = correction(file)
+    for row in q[:20]:
+        reader.read(row.tolist())
+    contents["numbers"][: len(reader.registers)] = reader.registers
     file.write_text(json.dumps(contents))
     for command in commands.values():
         np.testing.assert_allclose(corrected(command, file, q[20:])[0], whole[20:], rtol=0, atol=1e-14)
@@ -162,7 +176,7 @@ def test_what_is_no_error_of_the_arm_is_listed(name, robot, tmp_path) -> None:
 
 def test_a_file_of_an_older_version_says_what_to_do(commands, robot, tmp_path) -> None:
     write_correction(Simulation(robot), tmp_path / "c.json", "")
-    old = (tmp_path / "c.json").read_text().replace('"version": 2', '"version": 1')
+    old = (tmp_path / "c.json").read_text().replace('correction 3"', 'correction", "version": 2')
     (tmp_path / "c.json").write_text(old)
     for command in commands.values():
         run = read_lines(command, tmp_path / "c.json", "")
@@ -171,41 +185,62 @@ def test_a_file_of_an_older_version_says_what_to_do(commands, robot, tmp_path) -
 
 
 @pytest.mark.parametrize(
-    ("key", "table"),
+    ("place", "wrong"),
     [
-        ("ratios", [[999, 0, 1.0]]),
-        ("ratios", [[0, 999, 1.0]]),
-        ("ratios", [[-1, 0, 1.0]]),
-        ("ratios", [[0.5, 0, 1.0]]),
-        ("ratios", [[0, 0]]),
-        ("ratios", [[0, 0, float("nan")]]),
-        ("waves", [[0, 1.0]]),
-        ("waves", [[999, 1.0, 1.0, 0.0]]),
-        ("memories", [[0, 0, 1.0, 1.0, [0, 0.0]]]),
-        ("carried", [[0, 999, 0, 0, [0.0] * 12]]),
-        ("bodies", [[0, 999, 0, [0.0] * 12, [0.0] * 4]]),
-        ("passes", [[0, 999]]),
-        ("zeros", [0.0]),
-        ("zeros", []),
-        ("zeros", 0.0),
-        ("gravity", [0.0]),
-        ("loads", []),
-        ("chain", []),
-        ("chain", [[0, [0.0] * 12]]),
-        ("marker", []),
-        ("marker", [[0.0] * 4] * 3),
-        ("marker", None),
+        ("joints", -1),
+        ("joints", 1.5),
+        ("joints", 10_000),
+        ("registers", 2),
+        ("registers", 10_000_000),
+        ("step", 10),
+        ("step", -1),
+        ("to", -1),
+        ("to", 1),
+        ("to", 0.5),
+        ("to", "registers"),
+        ("to", None),
+        ("to", [3]),
+        ("to", float("nan")),
+        ("to", "3"),
     ],
 )
-def test_a_malformed_table_is_refused_in_cpp(key, table, commands, robot, tmp_path) -> None:
+def test_a_number_out_of_bounds_is_refused_in_cpp(place, wrong, commands, robot, tmp_path) -> None:
     if "c++" not in commands:
         pytest.skip("no compiler of c++; to run it: apt install g++")
     write_correction(Simulation(robot), tmp_path / "c.json", "")
-    contents = json.loads((tmp_path / "c.json").read_text()) | {key: table}
+    contents = json.loads((tmp_path / "c.json").read_text())
+    registers = contents["numbers"][1]
+    at = {"joints": 0, "registers": 1, "step": registers, "to": registers + 1}[place]
+    contents["numbers"][at] = registers if wrong == "registers" else wrong
     (tmp_path / "c.json").write_text(json.dumps(contents))
-    run = read_lines(commands["c++"], tmp_path / "c.json", "")
+    refused_in_cpp(commands, tmp_path / "c.json")
+
+
+@pytest.mark.parametrize("numbers", [None, 0.0, [], [8.0], [[0.0]], "[8]"])
+def test_what_is_no_list_of_numbers_is_refused(numbers, commands, robot, tmp_path) -> None:
+    if "c++" not in commands:
+        pytest.skip("no compiler of c++; to run it: apt install g++")
+    write_correction(Simulation(robot), tmp_path / "c.json", "")
+    contents = json.loads((tmp_path / "c.json").read_text()) | {"numbers": numbers}
+    (tmp_path / "c.json").write_text(json.dumps(contents))
+    refused_in_cpp(commands, tmp_path / "c.json")
+
+
+@pytest.mark.parametrize("missing", range(1, 5))
+def test_half_a_step_is_refused_in_cpp(missing, commands, robot, tmp_path) -> None:
+    if "c++" not in commands:
+        pytest.skip("no compiler of c++; to run it: apt install g++")
+    write_correction(Simulation(robot), tmp_path / "c.json", "")
+    contents = json.loads((tmp_path / "c.json").read_text())
+    contents["numbers"] = contents["numbers"][:-missing]
+    (tmp_path / "c.json").write_text(json.dumps(contents))
+    refused_in_cpp(commands, tmp_path / "c.json")
+
+
+def refused_in_cpp(commands: dict[str, list[str]], file: Path) -> None:
+    run = read_lines(commands["c++"], file, "")
     assert run.returncode != 0
-    assert "a table is not as it should be" in run.stderr or "do not belong together" in run.stderr
+    assert "not a correction of version 3" in run.stderr
 
 
 def test_a_file_that_ends_too_soon_is_refused(commands, robot, tmp_path) -> None:
@@ -231,8 +266,18 @@ def test_lines_are_read_alike(commands, robot, tmp_path) -> None:
         first, second = run.stdout.splitlines()
         assert first == second, language
         assert read_lines(command, tmp_path / "c.json", "\n").stdout == "", language
-        if language != "javascript":  # which has NaN for it
-            assert read_lines(command, tmp_path / "c.json", " ".join(["0.1x"] * d)).returncode != 0, language
+        for word in ("0.1x", "word", "1,,x"):
+            assert read_lines(command, tmp_path / "c.json", " ".join([word] * d)).returncode != 0, (language, word)
+
+
+def test_settling_is_left_out_where_each_reading_is_an_interruption(robot, tmp_path) -> None:
+    play, settling = Effect.at(robot, "backlash", "elbow", values=[0.02]), ("settling", "wrist", [0.1, 0.5])
+    found = []
+    for effects in ((play,), (play, Effect.at(robot, *settling[:2], values=settling[2]))):
+        write_correction(Simulation(robot, effects), tmp_path / "c.json", "")
+        reader = correction(tmp_path / "c.json")
+        found.append([reader.read(row.tolist(), pace=None)[0] for row in steady(12).q])
+    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
@@ -275,6 +320,6 @@ def test_the_readers_are_short(commands) -> None:
     for name, comment in (("correction.py", "#"), ("correction.js", "//"), ("correction.hpp", "//")):
         text = re.sub(r'"""[\s\S]*?"""', "", (READERS / name).read_text())
         lengths[name] = sum(bool(line.strip()) and not line.strip().startswith(comment) for line in text.splitlines())
-    assert lengths["correction.py"] <= 60
-    assert lengths["correction.js"] <= 60
-    assert lengths["correction.hpp"] <= 115  # 27 of them read and check JSON
+        assert all(len(line) <= 120 for line in text.splitlines())
+    assert max(lengths.values()) <= 60
+    assert max(map(len, (READERS / "correction.hpp").read_text().splitlines())) <= 100

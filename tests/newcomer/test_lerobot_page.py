@@ -20,9 +20,9 @@ PAGE = (DOCS / "lerobot.md").read_text(encoding="utf-8")
 SO101 = DOCS.parent / "examples" / "so101"
 ROWS = 300
 TRUST, AGAIN = (f"bodyschema calibrate {name}.csv --trust-urdf" for name in ("so101", "again"))
-INIT, SIMULATE, EXPORT, DIFFERENCE, WRITE = (
+INIT, SIMULATE, EXPORT, DIFFERENCE, WRITE, SIMULATE_AGAIN = (
     next(command for command in commands_of(PAGE) if re.search(word, command))
-    for word in ("init", "simulate", "--markers", r"\.json$", r"\.json --write")
+    for word in ("init", "simulate", "--markers", r"\.json$", r"\.json --write", "mended.toml")
 )
 
 
@@ -47,24 +47,24 @@ def test_offsets_go_into_the_servos_and_errors_fall(page: TypedPage) -> None:
     arm.record(config, ROWS).write_csv(Path("so101.csv"))
 
     before = expected_mm(page.type(TRUST))
-    assert before == pytest.approx(expected_mm(page.shown(TRUST)), rel=0.2)
-    assert offsets(page.type(DIFFERENCE)) == pytest.approx(offsets(page.shown(DIFFERENCE)), abs=3)
+    assert offsets(page.type(DIFFERENCE)) == pytest.approx(offsets(page.shown(DIFFERENCE)), abs=10)
     page.type(WRITE)
 
     arm.give(read_calibration(Path("follower.json"))).record(config, ROWS).write_csv(Path("again.csv"))
     after = expected_mm(page.type(AGAIN))
-    assert after == pytest.approx(expected_mm(page.shown(AGAIN)), rel=0.2)
     assert after[0] < before[0] / 2
 
 
-def test_without_an_arm_the_offsets_are_found(page: TypedPage) -> None:
-    page.type(INIT)
+def test_without_an_arm_every_number_is_the_page_s(page: TypedPage) -> None:
+    assert page.type(INIT) == page.shown(INIT)
     assert page.type(SIMULATE) == page.shown(SIMULATE)
-    before = expected_mm(page.type(TRUST))
-    found = page.type(DIFFERENCE)
-    read = [float(degrees) for degrees in re.findall(r"readings ([+-][\d.]+)°", found)]
-    assert read == pytest.approx([2.5, -3.0, 1.5], abs=0.15)
-    assert expected_mm(found)[0] < before[0] / 3
+    assert expected_mm(page.type(TRUST)) == expected_mm(page.shown(TRUST))
+    lines = page.type(DIFFERENCE).splitlines()
+    assert [line for line in page.shown(DIFFERENCE).splitlines() if line != "…" and line not in lines] == []
+    page.type(WRITE)
+    exec(Path("mended.py").read_text(), {})
+    assert page.type(SIMULATE_AGAIN) == page.shown(SIMULATE_AGAIN)
+    assert expected_mm(page.type(AGAIN)) == expected_mm(page.shown(AGAIN))
 
 
 def offsets(text: str) -> list[int]:

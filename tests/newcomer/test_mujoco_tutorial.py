@@ -48,7 +48,7 @@ def test_the_tutorial_ends_with_its_numbers(tmp_path: Path, monkeypatch, capfd) 
         assert run.returncode == 0, run.stderr
         told = run.stdout
     for name, numbers in figures(SHOWN).items():
-        assert figures(told)[name] == pytest.approx(numbers, rel=0.01)
+        assert figures(told)[name] == pytest.approx(numbers, abs=0.002)
     assert "RMS [mm]" in told
     exec(use, {})
     assert "in the camera's frame" in capfd.readouterr().out

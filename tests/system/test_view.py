@@ -278,6 +278,7 @@ def test_nothing_is_wider_than_the_screen_and_all_text_can_be_read(page, size: s
     page.emulate_media(color_scheme=scheme)
     says(page, "#cloud-text", "median")
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert page.evaluate("(e => e.scrollHeight <= e.clientHeight)(document.querySelector('.calibration .scroll'))")
     assert page.evaluate(CONTRASTS) == []
 
 

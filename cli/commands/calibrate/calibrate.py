@@ -188,6 +188,7 @@ def arm(
     if plan.next_poses is not None:
         check_target(plan.next_poses, replace=force)
     config = Config.load(robot_file(robot, source))
+    servos.require(config)
     description, source = config.robot, source or config.store_file
     recording, first = _rows(config, source, taken, servos.lerobot, (first, last))
     require_units(description, recording, source)

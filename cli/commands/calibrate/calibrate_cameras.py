@@ -195,8 +195,8 @@ def _print_board(made: Board, paper: str, out: Path) -> None:
 
     across, upright = write_board(made, paper, out)
     Console(highlight=False).print(
-        f"{out} written: {made.name}. Print it at 100 %, then measure: the line below the board is {across:g} mm, the "
-        f"one beside it {upright:g} mm.",
+        f"{out} written: {made.name}. Print it at 100 %, then measure both rulers: {across:g} mm below, {upright:g} mm "
+        "beside the board.",
         markup=False,
         soft_wrap=True,
     )

@@ -73,6 +73,7 @@ def diagnose(
     if servos.write and servos.lerobot is None:
         raise RequestError("--write is for --lerobot FILE. Give LeRobot's calibration file")
     config = Config.load(robot_file(robot, recording))
+    servos.require(config)
     asked = search.asked()
     source = measured(config, recording, lambda file: taken.opened(config, file, servos.lerobot), live=live)
     told = Console(stderr=True, highlight=False)

@@ -82,10 +82,8 @@ def print_tags(
     drawn = Tags(shape, ids, family, side_mm, columns, rows, fold_deg)
     across, upright = write_tags(drawn, paper, out)
     tags = drawn if ruler_mm is None else as_printed(drawn, across, ruler_mm)
-    rulers = f"the line below is {across:g} mm, the other {upright:g} mm"
-    if across == upright:
-        rulers = f"both rulers are {across:g} mm"
-    said = f"{out} written. Print it at 100 %, then measure: {rulers}."
+    rulers = f"each is {across:g} mm" if across == upright else f"{across:g} mm below, {upright:g} mm beside the tags"
+    said = f"{out} written. Print it at 100 %, then measure both rulers: {rulers}."
     if drawn.body is not None:
         said += f" Each face is {face_mm(tags):.1f} mm wide."
     Console(stderr=True, highlight=False).print(said, markup=False, soft_wrap=True)

@@ -84,12 +84,9 @@ def _export_robot(source: Path, out: Path, measured: Path | None, console: Conso
     from bodyschema.calibration.plausibility.limits import require_units
     from bodyschema.cli.terminal import robot_export
     from bodyschema.effects import load_simulation
-    from bodyschema.interfaces.errors import RequestError
     from bodyschema.recordings import files as recordings
 
     robot_export.check_target(out, force=force)
-    if measured is not None and out.suffix.lower() == robot_export.DRIVERS:
-        raise RequestError("--measured goes with a model: settings of drivers (.txt) predict nothing")
     simulation = load_simulation(source)
     recording = None
     if measured is not None:
@@ -97,8 +94,7 @@ def _export_robot(source: Path, out: Path, measured: Path | None, console: Conso
         require_units(simulation.robot, recording, measured)
     for sentence in robot_export.write(simulation, out):
         console.print(sentence, markup=False)
-    count = len(simulation.all_effects)
-    console.print(f"{simulation.robot.name} with {count} effects written to {out}", markup=False)
+    console.print(f"{simulation.robot.name} {robot_export.effects_of(simulation)} written to {out}", markup=False)
     if recording is None:
         return
     rows, why_not = robot_export.compared(simulation, recording, out)
