@@ -66,7 +66,7 @@ _MOST_SPENT = 0.9
 # Smallest change of the instrument's noise (in logarithms) that triggers a refit.
 _SAME_NOISE = 0.1
 # In more than twice as many rows, causes are sought in runs of neighbouring rows, and fitted to all of them.
-_MOST_ROWS, _RUN = 2000, 100
+_MOST_ROWS, _RUN = 1000, 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +85,7 @@ class Diagnosis:
         left: residual structure that no effect fits.
         blocks: blocks of time for held-out errors.
         seed: seed of the resampling.
+        part: the observations in which causes were sought; None for all.
         ended_early: True if the causes describe the error and do not explain it, as there are too many.
     """
 
@@ -99,6 +100,7 @@ class Diagnosis:
     left: Leftover
     blocks: Blocks
     seed: int
+    part: Observations | None = None
     ended_early: bool = False
 
     @property
@@ -236,15 +238,19 @@ class Diagnosis:
         """Confounded effects beside the best geometry."""
         named = {cause.key for cause in self.causes}
         joints = {cause.where for cause in self.causes}
-        pairs = alike(self.geometry, (effect for effect in self.hypotheses.effects if effect.where in joints))
+        geometry = self.geometry if self.part is None else self.geometry.over(self.part)
+        pairs = alike(geometry, (effect for effect in self.hypotheses.effects if effect.where in joints))
         return tuple(pair for pair in pairs if named & {pair.one.key, pair.other.key})
 
     @cached_property
     def rejected(self) -> list[tuple[Candidate, Added]]:
         """Rejected hypotheses, each with its best fit beside the causes."""
         present = {cause.key for cause in self.causes}
-        candidates = Scan(self.extended).candidates(h for h in self.hypotheses.effects if h.key not in present)
-        return list(zip(candidates, added(self.extended, candidates, self.blocks), strict=True))
+        fit, blocks = self.extended, self.blocks
+        if self.part is not None:
+            fit, blocks = fit.over(self.part), Blocks.cut(len(self.part))
+        candidates = Scan(fit).candidates(h for h in self.hypotheses.effects if h.key not in present)
+        return list(zip(candidates, added(fit, candidates, blocks), strict=True))
 
 
 def diagnose(
@@ -277,7 +283,7 @@ def diagnose(
     else:
         part = _found(observations.some(rows), simulation, hypotheses.effects, Blocks.cut(len(rows)), seed, told)
         told(f"the same in all {len(observations)} rows")
-        found = part.over(observations, simulation, blocks, seed, told)
+        found = part.over(observations, simulation)
     start, explanation, search = found.start, found.explanation, found.search
     left = found.left(blocks)
     fit = (explanation.fit if left.model is None else left.model.fit).settled()
@@ -296,6 +302,7 @@ def diagnose(
         left=left,
         blocks=blocks,
         seed=seed,
+        part=None if found.part is None else found.part.start.observations,
         ended_early=search.ended_early or are_a_description(fit.causes),
     )
 
@@ -327,10 +334,11 @@ class _Found:
         asked = self if self.part is None or self.explanation.unknown else self.part
         return leftover(asked.explanation, asked.unknowns, blocks, self.loose)
 
-    def over(self, observations: Observations, simulation: Simulation, blocks: Blocks, seed: int, told: Told) -> _Found:
-        """Return the same in all observations, of which these were a part.
+    def over(self, observations: Observations, simulation: Simulation) -> _Found:
+        """Return the same causes, fitted to all observations of which these were a part.
 
-        Causes that only all rows show are added. Where something without a name is at work they would describe it.
+        No further ones are sought: no model is exact, and in many rows its smallest error looks like a cause (Miller
+        and Dunson 2019). Moments are sought again, since they may lie between the parts.
         """
         before = self.start.observations
         fit = self.explanation.fit.over(observations.with_factor(before.stated_factor))
@@ -342,18 +350,18 @@ class _Found:
         if loose is not None:
             loose = rattle(fit) or loose
             observations = observations.with_rattle(loose.ratio, loose.ways_of(fit))
-        start, search = aligned(observations, simulation), self.search.again()
-        unknowns, fit = Unknowns(start), fit.to(observations)
+        start = aligned(observations, simulation)
+        unknowns, fit, stands = Unknowns(start), fit.to(observations), list(self.standings)
+        for k, cause in enumerate(fit.causes):
+            again = Scan(fit, [cause]).without(cause).candidate(cause) if cause.kind.begins else None
+            if again is not None:
+                causes = [*fit.causes]
+                causes[k] = again.effect
+                fit, stands[k] = fit.with_causes(causes), replace(stands[k], itself=again)
         chosen = unknowns.again(self.explanation.unknown)
-        if chosen:
-            explanation = replace(self.explanation, fit=fit, apart=unknowns.apart(fit, chosen))
-        else:
-            if not search.ended_early:
-                fit = _searched(fit, search, lambda *_: False)
-            explanation = useful(replace(self.explanation, fit=fit), search, blocks, told)
-        told.begin(RIVALS, NAMELESS)
-        stands = standings(explanation.beside, search, blocks, seed, None if chosen else unknowns)
-        return _Found(start, search, unknowns, explanation, stands, loose, self.is_reshaped, self)
+        apart = unknowns.apart(fit, chosen) if chosen else None
+        explanation = replace(self.explanation, fit=fit, apart=apart)
+        return _Found(start, self.search, unknowns, explanation, stands, loose, self.is_reshaped, self)
 
 
 def _part_of(rows: int) -> IntArray:

@@ -166,12 +166,6 @@ class Search:
         self.ended_early = is_long or len(fit.causes) > _MOST_CAUSES
         return fit
 
-    def again(self) -> Search:
-        """Return a search of the same hypotheses in other observations; it has ended early if this one has."""
-        other = Search(self._hypotheses, self._tell)
-        other._trials, other.ended_early = dict(self._trials), self.ended_early
-        return other
-
     def _went_to(self, fit: Fit) -> None:
         """Append a fit to the path; the one before drops its cached results, which are large for many rows."""
         self.path[-1] = replace(self.path[-1])
