@@ -46,7 +46,7 @@ _SHOWN = 3.0
 _RULED_OUT, _FINER = 1.35, 0.2
 # Maximum of changes to a set of causes, and of its causes for more to be added: beyond, the first order is not enough.
 _MOST_MOVES, _MOST_TOGETHER = 60, 8
-# Maximum of refitted sets, and the margin to the best within which a set is refitted [nats].
+# Maximum of refitted sets, and the margin to the best within which a set is refitted, and a change tried [nats].
 _MOST_REFITTED, _COMES_NEAR = 8, 15.0
 
 # Tolerances may stand for a cause of which they leave less than this share of the squares; a third is left of a jump.
@@ -112,25 +112,26 @@ class Sets:
     """
 
     def __init__(self, fit: Fit, candidates: Sequence[Candidate], doubt: float) -> None:
-        self._fit = fit
         columns, amounts = fit.columns, fit.effect_columns.shape[2]
         causes = sum(len(effect.amounts) for effect in fit.causes)
         own = [effect.values[effect.amounts] for effect in fit.simulation.effects]
         now = np.concatenate([*own, fit.tolerated])
         rows = fit.left.size
-        self._target = fit.left.ravel() + columns.reshape(rows, -1) @ now
+        target = fit.left.ravel() + columns.reshape(rows, -1) @ now
         parts = [columns[:, :, : amounts - causes], columns[:, :, amounts:]]
         self.effects = [candidate.effect for candidate in candidates]
         parts += [*_columns(fit, self.effects)]
         self._nuisances, self._tolerances = amounts - causes, len(fit.tolerated)
+        self._of_scale, self._noise = fit.background.group, fit.noise.sigma
+        scales = np.asarray(fit.background.scales or Scales())[fit.background.group]
         flat = np.concatenate(parts, axis=2).reshape(rows, -1)
         usual = [effect.parameters[k].usual for effect in self.effects for k in effect.amounts]
-        self._units = np.concatenate([np.ones(self._nuisances), fit.background.tolerances / self._scales_now, usual])
+        self._units = np.concatenate([np.ones(self._nuisances), fit.background.tolerances / scales, usual])
         lengths = np.linalg.norm(flat[:, : self._nuisances], axis=0)
         self._units[: self._nuisances] = 1e4 / np.where(lengths > 0.0, lengths, 1.0) * fit.noise.sigma * np.sqrt(rows)
         flat *= self._units
-        self._inner, self._toward = flat.T @ flat, flat.T @ self._target
-        self._square, self._rows = float(self._target @ self._target), 3.0 * float(fit.noise.weights.sum())
+        self._inner, self._toward = flat.T @ flat, flat.T @ target
+        self._square, self._rows = float(target @ target), 3.0 * float(fit.noise.weights.sum())
         self._kinds, self._keys = [one.kind for one in self.effects], [one.key for one in self.effects]
         self._trials = [float(np.log(candidate.trials)) for candidate in candidates]
         self._first = doubt + NAMED
@@ -147,11 +148,6 @@ class Sets:
         known = {cause.identity for cause in fit.causes}
         # The moment of each was sought without the others, so it is right for one of them at most.
         self._begins = {k for k, one in enumerate(self.effects) if one.kind.begins and one.identity not in known}
-
-    @cached_property
-    def _scales_now(self) -> FloatArray:
-        scales = self._fit.background.scales
-        return np.asarray(scales if scales is not None else Scales())[self._fit.background.group]
 
     def climbed(self, starts: Iterable[tuple[int, ...]]) -> list[Together]:
         """Improve each start by single changes, and return the sets reached."""
@@ -173,9 +169,13 @@ class Sets:
         for kind in kinds:
             yield tuple(k for k, effect in enumerate(self.effects) if effect.kind is kind)
         yield tuple(dict.fromkeys((*own, *zeros)))
-        whole = dict.fromkeys(effect.key for effect in self.effects if effect.kind.in_parts and links)
-        for key in whole:
+        for key in dict.fromkeys(effect.key for effect in self.effects if effect.kind.in_parts and links):
             yield tuple(k for k, effect in enumerate(self.effects) if effect.key == key)
+
+    def again(self, effects: Iterable[Effect]) -> tuple[int, ...]:
+        """Return the set of the same effects and numbers, as far as they are candidates here."""
+        wanted = {(effect.key, k) for effect in effects for k in effect.amounts}
+        return tuple(k for k, one in enumerate(self.effects) if (one.key, one.amounts[0]) in wanted)
 
     def _climbed(self, start: tuple[int, ...], seen: dict[frozenset[int], Together]) -> Together:
         here = self.of(start)
@@ -185,7 +185,7 @@ class Sets:
             seen[frozenset(here.chosen)] = here
             better = self._without_one(here)
             if better is None and self._count(here) < _MOST_TOGETHER:
-                better = self._with_one_more(here) or self._exchanged(here)
+                better = self._with_one_more(here) or self._exchanged(here) or self._with_smaller_tolerances(here)
             if better is None:
                 return here
             here = better
@@ -194,14 +194,17 @@ class Sets:
     def _without_one(self, here: Together) -> Together | None:
         """Remove one cause or a part of one, where that is more probable."""
         present = frozenset(here.chosen)
-        there = [group for group in self._groups if present.issuperset(group)]
-        for group in sorted(there, key=lambda group: self._loss(here, group))[:_TRIED]:
+        losses = [(self._loss(here, group), group) for group in self._groups if present.issuperset(group)]
+        for loss, group in sorted(losses, key=lambda one: one[0])[:_TRIED]:
+            if loss > _COMES_NEAR:
+                break
             if better := _better([self.of(_without(here.chosen, group), here)], here):
                 return better
         return None
 
     def _with_one_more(self, here: Together) -> Together | None:
-        return _better([self.of((*here.chosen, *group), here) for group in self._promising(here)[:_TRIED]], here)
+        more = self._promising(here, here.worth)
+        return _better([self.of((*here.chosen, *group), here) for group in more[:_TRIED]], here)
 
     def _exchanged(self, here: Together) -> Together | None:
         """Exchange one cause for another, where that is more probable."""
@@ -209,9 +212,22 @@ class Sets:
         for identity in dict.fromkeys(self.effects[k].identity for k in here.chosen):
             own = tuple(k for k in here.chosen if self.effects[k].identity == identity)
             without = self.of(_without(here.chosen, own), here)
-            others = [group for group in self._promising(without) if self.effects[group[0]].identity != identity]
+            others = [
+                group for group in self._promising(without, here.worth) if self.effects[group[0]].identity != identity
+            ]
             tried += [self.of((*without.chosen, *group), without) for group in others[:_TRIED]]
         return _better(tried, here)
+
+    def _with_smaller_tolerances(self, here: Together) -> Together | None:
+        """Add the shifts or the turns of a link, where tolerances are then so much smaller that it is more probable.
+
+        Beside tolerances as large as the link's own error it seems to be worth nothing, however large they are.
+        """
+        if max(here.scales.lengths, here.scales.angles) <= 1.0:
+            return None
+        near = replace(here, scales=here.scales.no_larger)
+        added = [_without(group, here.chosen) for group in self._groups if len(group) > 1]
+        return _better([self.of((*here.chosen, *group), near) for group in added if group], here)
 
     def _count(self, here: Together) -> int:
         """Return the number of causes of a set."""
@@ -246,8 +262,11 @@ class Sets:
         """Number of all amounts, free or not, of each cause."""
         return {effect.key: len(effect.freeing(None).amounts) for effect in self.effects}
 
-    def _promising(self, here: Together) -> list[tuple[int, ...]]:
-        """Return the groups of candidates worth most with scales and noise held fixed, the best first."""
+    def _promising(self, here: Together, least: float) -> list[tuple[int, ...]]:
+        """Return the groups of candidates that may reach the worth `least`, the best first.
+
+        Their own worth is that with scales and noise held fixed; with scales of their own they may be worth more.
+        """
         present = frozenset(here.chosen)
         closed = present | (self._begins if present & self._begins else set())
         groups = dict.fromkeys(_without(group, here.chosen) for group in self._groups)
@@ -262,7 +281,8 @@ class Sets:
         gradient = self._toward[places] / here.sigma**2 - solved.T @ (self._toward[here.columns] / here.sigma**2)
         own = [np.searchsorted(places, np.concatenate([self._places[k] for k in group])) for group in open_groups]
         worths = _gained(inner, gradient, own) - self._costs_beside(here.chosen, open_groups)
-        return [open_groups[k] for k in np.argsort(worths)[::-1].tolist()]
+        best = np.argsort(worths)[::-1]
+        return [open_groups[k] for k in best[here.worth + worths[best] > least - _COMES_NEAR].tolist()]
 
     def _costs_beside(self, chosen: Sequence[int], groups: Sequence[tuple[int, ...]]) -> FloatArray:
         """Return the cost of naming each of some groups in addition to a set [nats]."""
@@ -294,7 +314,7 @@ class Sets:
         group = self._group(columns)
         inner, toward = self._inner[np.ix_(columns, columns)], self._toward[columns]
         logs = np.log(near.scales if near else Scales())
-        sigma = near.sigma if near else self._fit.noise.sigma
+        sigma = near.sigma if near else self._noise
         members, spent = [group == g for g in range(3)], np.zeros(3)
         for done in range(_ROUNDS if near is None else _ROUNDS_NEAR):
             factor, variances, amounts = self._solved(inner, toward, group, logs, sigma)
@@ -311,7 +331,7 @@ class Sets:
             if done and max(np.abs(steps).max(), abs(quieter)) < _STILL:
                 break
             logs = np.clip(logs + steps, np.log(_SMALLEST), np.log(MOST))
-            sigma = max(sigma * float(np.exp(quieter)), _QUIETEST * self._fit.noise.sigma)
+            sigma = max(sigma * float(np.exp(quieter)), _QUIETEST * self._noise)
         worth, factor, amounts = self._worth(inner, toward, group, logs, sigma)
         scales = Scales(*np.exp(logs).tolist())
         worth -= scales.doubt + _volume(spent)
@@ -352,7 +372,7 @@ class Sets:
     def _group(self, columns: NDArray[np.intp]) -> NDArray[np.int64]:
         """Return the scale of each column (p,); -1 where it is not a tolerance."""
         group = np.full(len(columns), -1)
-        group[self._nuisances : self._nuisances + self._tolerances] = self._fit.background.group
+        group[self._nuisances : self._nuisances + self._tolerances] = self._of_scale
         return group
 
     def _worth(
@@ -512,8 +532,7 @@ class _Place:
         candidates = [Candidate(cause, 0.0, 1) for cause in fit.causes] + [_at_rest(one) for one in scanned]
         candidates = [part for candidate in candidates for part in _in_parts(candidate)]
         self._sets = Sets(fit, candidates, float(np.log(max(len(hypotheses), 1))))
-        free = {cause.key: cause.amounts for cause in fit.causes}
-        own = tuple(k for k, one in enumerate(candidates) if one.effect.amounts[0] in free.get(one.effect.key, ()))
+        own = self._sets.again(fit.causes)
         self.here = self._sets.of(own)
         self.reached = self._sets.climbed(self._sets.starts(own, links=not present))
         self.name = self.name_of(self.here)
