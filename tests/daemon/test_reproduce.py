@@ -5,14 +5,13 @@ import json
 import re
 from collections.abc import Callable
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 from rich.console import Console
-
-pytest.importorskip("matplotlib")
 
 from bodyschema.cli.main import app
 from bodyschema.interfaces.errors import ConfigError
@@ -32,6 +31,9 @@ from bodyschema.reproduce.stream import RULE, Stream, bernstein_map, in_stages, 
 from bodyschema.reproduce.walk import walk
 from kbmaps import ChainTolerances, NonFiniteError, RigidChain
 
+pytestmark = pytest.mark.skipif(
+    find_spec("matplotlib") is None, reason="no matplotlib; to run it: pip install -e '.[plots]'"
+)
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "paper.md"
 # Small variants, so that every curve and table is made in seconds.
 SMALL = {
