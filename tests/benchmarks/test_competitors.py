@@ -64,6 +64,7 @@ WITHOUT_DRAWING = [c for c in LEARNERS if c.refuses(replace(simple_problem(), dr
 
 
 @pytest.mark.parametrize("competitor", WITHOUT_DRAWING, ids=lambda c: c.key)
+@pytest.mark.soak
 def test_a_competitor_that_needs_no_drawing_learns_without(competitor):
     problem = replace(simple_problem(), drawing=None, tolerances=None)
     start = float(np.linalg.norm(problem.x - problem.x.mean(axis=0), axis=1).mean())

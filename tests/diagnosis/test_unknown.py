@@ -112,6 +112,7 @@ def test_what_wanders_with_time_is_not_in_the_model_and_that_is_told(robot) -> N
     assert "What changes with time is in no such model" in modelled(left)
 
 
+@pytest.mark.soak
 def test_a_link_that_grows_as_it_warms_up_is_unexplained_and_no_cause_is_named(robot) -> None:
     motion = walk(robot, 1)
     columns = Simulation(robot).run(motion).columns(Effect.at(robot, "link_geometry", ELBOW))

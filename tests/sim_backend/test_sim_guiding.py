@@ -83,6 +83,7 @@ def test_the_ball_stays_visible_with_a_tool_that_is_250_mm_longer(seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.soak
 def test_a_single_tag_is_turned_to_the_eyes_in_nine_frames_of_ten(seed):
     robot = shipped()
     tag = SimTag(id=0, xyz=(0.0, 0.0, 0.0), rpy=(0.0, 0.0, 0.0), side_m=0.06)
@@ -115,6 +116,7 @@ def test_a_single_tag_is_turned_to_the_eyes_in_nine_frames_of_ten(seed):
     ],
     ids=len,
 )  # fmt: skip
+@pytest.mark.soak
 def test_other_choices_of_learnt_joints_are_guided_in_view_too(joints):
     run = guide(learning(joints), SimConfig(seed=1), 5.0)
     steps = step_degrees(run)
