@@ -153,6 +153,7 @@ def test_the_model_file_has_the_maps_of_the_axes(scene, taught) -> None:
     assert np.abs(angles).max() < 1e-6
 
 
+@pytest.mark.soak
 def test_the_solver_in_its_own_process_finds_the_same_orientations() -> None:
     chain, q = built_chain(np.random.default_rng(6)), path(np.random.default_rng(7), 30)
     pairs = turned(measured(chain, q, np.random.default_rng(8)), chain)
