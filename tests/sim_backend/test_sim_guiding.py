@@ -76,6 +76,7 @@ def test_twelve_seconds_of_guiding_cover_a_third_of_every_arm_joints_range(seed)
     assert share[2:].min() > 1 / 3
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_ball_stays_visible_with_a_tool_that_is_250_mm_longer(seed):
     run = guide(shipped(), SimConfig(seed=seed), 5.0, tool=(0.23, 0.0, -0.37), settle=1.0)
