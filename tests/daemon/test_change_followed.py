@@ -22,7 +22,7 @@ from bodyschema.learning.state import LearningHeader, LearningState
 from bodyschema.learning.uncertainty import PredictiveUncertainty
 from kbmaps import ChainBelief, ChainParameters, RigidChain, change_kinds, learning_bases
 
-SIGMA, TAUGHT, SINCE = 0.002, 120, 40
+SIGMA, TAUGHT, SINCE = 0.002, 180, 40
 # The second joint's zero.
 JOINT = 1
 

@@ -37,8 +37,8 @@ pytestmark = pytest.mark.skipif(
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "paper.md"
 # Small variants, so that every curve and table is made in seconds.
 SMALL = {
-    "fig4": lambda run: fig4(run, samples=400, tests=50),
-    "fig5": lambda run: fig5(run, train=150, test=30),
+    "fig4": lambda run: fig4(run, samples=800, tests=50),
+    "fig5": lambda run: fig5(run, train=300, test=30),
     "fig6": lambda run: fig6(run, online=32, cycles=64),
     "fig7": lambda run: fig7(run, online=32, cycles=32),
     "exactness": lambda run: exactness(run, joints=(5,)),
