@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from padasip.filters import FilterNLMS
 
 from benchmarks.humanoid_arm import JOINTS, guided_path, nominal_chain
 from benchmarks.timing import interleaved_medians_us
@@ -80,6 +79,8 @@ def kbmaps_calls(path: kernels.KernelPath, q: FloatArray, x: FloatArray) -> dict
 
 
 def padasip_step(kbmap: KBMap, q: FloatArray, x: FloatArray) -> Callable[[], object]:
+    from padasip.filters import FilterNLMS  # it imports scipy.stats, which takes a second
+
     filters = [FilterNLMS(n=kbmap.size, mu=0.5) for _ in range(3)]
     features, targets = kbmap.weights(q[0]), [float(value) for value in x[0]]
 

@@ -14,6 +14,7 @@ import free_ports
 import pytest
 from _pytest.doctest import DoctestModule
 from hypothesis import HealthCheck, settings
+from hypothesis.internal.conjecture import providers
 from skip_remedies import Report, with_remedy
 
 # No time limits: a busy machine is no failure. The same examples in every run, so that a red test is red again;
@@ -22,6 +23,8 @@ TIMELESS = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("suite", TIMELESS, derandomize=True, max_examples=6)
 settings.register_profile("soak", TIMELESS, print_blob=True, max_examples=300)
 settings.load_profile("suite")
+# Hypothesis takes constants out of every module imported so far: other ones in each worker, and a second to find them.
+providers._get_local_constants = providers.Constants
 
 QUICK = ("kbmaps/", "tests/interfaces/", "tests/kbmaps/")
 

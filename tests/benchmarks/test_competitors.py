@@ -17,6 +17,7 @@ from benchmarks.peers.registry import BY_KEY, COMPETITORS
 from benchmarks.peers.tasks import Setting
 from kbmaps import ChainTolerances, RigidChain
 
+pytestmark = pytest.mark.soak  # no part of the product
 REACH = np.full(2, 1.0)
 TOLERANCES = ChainTolerances(axes=0.05, points=0.015, tool=0.03)
 
@@ -178,14 +179,12 @@ def lwpr_on_cross(updates: int, settings: Settings) -> tuple[float, LWPR]:
     return float(np.mean((model.predict(grid)[:, 0] - cross(grid)) ** 2) / np.var(cross(grid))), model
 
 
-@pytest.mark.soak
 def test_lwpr_learns_the_cross_function_to_its_published_level():
     error, model = lwpr_on_cross(4000, Settings(first_metric=120.0))
     assert error < 0.03
     assert 40 < model.fields < 100
 
 
-@pytest.mark.soak
 def test_lwprs_width_adaptation_helps_where_the_first_width_is_too_wide():
     still, _ = lwpr_on_cross(3000, Settings(first_metric=20.0, learning_rate=0.0))
     adapted, _ = lwpr_on_cross(3000, Settings(first_metric=20.0))

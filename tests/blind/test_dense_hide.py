@@ -16,6 +16,7 @@ from .dense_hide import DenseCase, _eye_R, _Robot, _way, hide_dense, written
 from .dense_observer import Observer
 from .motion import Motion, move
 
+pytestmark = pytest.mark.soak  # they check the cases that only `make soak` judges in number
 SMALL = 1e-4  # usual amounts: the nonlinear remainder is much smaller
 EFFECTS = (
     "joint_offset",

@@ -178,11 +178,11 @@ def test_a_model_that_predicts_new_pairs_no_better_does_not_take_the_old_one_s_p
 
 def test_of_the_arm_since_a_change_nothing_is_known_before_the_solver_has_its_pairs() -> None:
     rng = np.random.default_rng(7)
-    chain, q = built_chain(rng), path(rng, TAUGHT + SINCE)
+    chain, q = built_chain(rng), path(rng, 60 + SINCE)
     learning = new_learning()
-    teach(learning, measured(chain, q[:TAUGHT], rng, sigma_m=SIGMA), every=NOW_AND_THEN)
+    teach(learning, measured(chain, q[:60], rng, sigma_m=SIGMA), every=NOW_AND_THEN)
     assert learning.known() is not None
-    after = measured(with_camera_moved(chain), q[TAUGHT:], rng, first=TAUGHT + 1, sigma_m=SIGMA)
+    after = measured(with_camera_moved(chain), q[60:], rng, first=60 + 1, sigma_m=SIGMA)
     while not learning.counters.changes:
         teach(learning, [after.pop(0)], background=False)
     assert learning.known() is None

@@ -63,6 +63,7 @@ def test_together_the_same_pairs_are_doubted_as_one_by_one() -> None:
     assert taught(pairs, TOGETHER_S).state().header.counters.doubted == taught(pairs, 0.0).counters.doubted == 4
 
 
+@pytest.mark.soak
 def test_together_they_teach_as_much_as_one_by_one() -> None:
     scene = Scene.draw(2, 60)
     together, each = (scene.error_m(taught(scene.pairs, seconds)) for seconds in (TOGETHER_S, 0.0))

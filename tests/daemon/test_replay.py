@@ -217,6 +217,7 @@ def processes_naming(text: str) -> list[str]:
     return found
 
 
+@pytest.mark.soak
 def test_ending_the_replay_ends_its_two_processes(tmp_path: Path, robot: Path) -> None:
     guided(robot).write_csv(tmp_path / "a.csv")
     kept, log = str(tmp_path / "kept"), tmp_path / "log"

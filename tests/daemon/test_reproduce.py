@@ -5,14 +5,13 @@ import json
 import re
 from collections.abc import Callable
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 from rich.console import Console
-
-pytest.importorskip("matplotlib")
 
 from bodyschema.cli.main import app
 from bodyschema.interfaces.errors import ConfigError
@@ -32,13 +31,16 @@ from bodyschema.reproduce.stream import RULE, Stream, bernstein_map, in_stages, 
 from bodyschema.reproduce.walk import walk
 from kbmaps import ChainTolerances, NonFiniteError, RigidChain
 
+pytestmark = pytest.mark.skipif(
+    find_spec("matplotlib") is None, reason="no matplotlib; to run it: pip install -e '.[plots]'"
+)
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "paper.md"
 # Small variants, so that every curve and table is made in seconds.
 SMALL = {
-    "fig4": lambda run: fig4(run, samples=800, tests=100),
+    "fig4": lambda run: fig4(run, samples=800, tests=50),
     "fig5": lambda run: fig5(run, train=300, test=30),
     "fig6": lambda run: fig6(run, online=32, cycles=64),
-    "fig7": lambda run: fig7(run, online=32, cycles=64),
+    "fig7": lambda run: fig7(run, online=32, cycles=32),
     "exactness": lambda run: exactness(run, joints=(5,)),
 }
 
@@ -242,6 +244,7 @@ def test_measured_curves_without_pybullet_name_what_to_install(tmp_path, monkeyp
         app(["reproduce", "fig7", "--out", str(tmp_path)], result_action="return_value")
 
 
+@pytest.mark.soak
 def test_figure_5_simulates_in_the_very_postures_that_were_measured(monkeypatch) -> None:
     monkeypatch.setattr("bodyschema.reproduce.fig5.postures", planted)
     monkeypatch.setattr("bodyschema.reproduce.fig5._models", lambda *_: {})  # only least squares is asked here
@@ -261,6 +264,7 @@ def by_the_rule_and_a_rigid_chain(
     return rule | learn_all(WITH_DRAWING[:1], known, (stream.q, stream.x), [stream.online], stream.tests)
 
 
+@pytest.mark.soak
 def test_figure_7_tests_on_measured_points_and_on_the_truth(monkeypatch) -> None:
     monkeypatch.setattr("bodyschema.reproduce.fig7.learn_stream", by_the_rule_and_a_rigid_chain)
     monkeypatch.setattr("bodyschema.reproduce.fig7.guided_walk", planted)
@@ -269,6 +273,7 @@ def test_figure_7_tests_on_measured_points_and_on_the_truth(monkeypatch) -> None
     assert of_truth < error(found, "rigid chain", "measured", "held out, as measured", "at 32")
 
 
+@pytest.mark.soak
 def test_a_guided_walk_is_measured_in_the_samplers_steps_as_well_as_the_tracker_can() -> None:
     pytest.importorskip("pybullet")
     found = guided_walk(6, 5, 0, lambda _said: None)

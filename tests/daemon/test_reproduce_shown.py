@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import io
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
 from rich.console import Console
 
-pytest.importorskip("matplotlib")
-
-from matplotlib.figure import Figure
-
 from bodyschema.cli.terminal import progress
 from bodyschema.reproduce import Column, Comparison, Curve, Experiment, Panel, Reading, plot
 from bodyschema.reproduce.show import show
 
+pytestmark = pytest.mark.skipif(
+    find_spec("matplotlib") is None, reason="no matplotlib; to run it: pip install -e '.[plots]'"
+)
 LONG = "without noise; steps of 1° to 3° a joint; near the walk"
 
 
@@ -76,6 +76,8 @@ def test_on_a_terminal_a_step_takes_the_place_of_the_last_one() -> None:
 
 
 def axes_of(panel: Panel):
+    from matplotlib.figure import Figure  # it takes a second to import
+
     axes = Figure().add_subplot()
     plot.draw(axes, panel, 1e-5)
     return axes

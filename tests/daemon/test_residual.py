@@ -18,7 +18,7 @@ from kbmaps import ChainTolerances, KBMap, ResidualModel, RigidChain
 SIGMA_M = 0.002
 DOWN = np.array([0.1, 0.2, -0.97])
 TOOL = np.array([0.1, 0.2, -0.1])
-PAIRS = 300
+PAIRS = 200
 
 
 class SaggingArm:

@@ -15,7 +15,7 @@ from bodyschema.learning.snapshot import Prediction
 from bodyschema.learning.solvers.solver import DirectSolver, Solved
 from bodyschema.learning.state import StateError
 
-TAUGHT, LATER = 100, 40
+TAUGHT, LATER, OTHER_TOOL_AT = 60, 20, 40
 
 
 class OnlyUntilSaved(DirectSolver):
@@ -64,12 +64,14 @@ def scene_with(case: str) -> tuple[Saved, list[Pair], FloatArray]:
     pairs = scene.pairs
     if case == "other tool":
         moved = scene.chain.with_tool([0.0, 0.15, 0.2])
-        pairs = pairs[:60] + measured(moved, scene.q[60:], rng, first=61)
+        pairs = pairs[:OTHER_TOOL_AT] + measured(moved, scene.q[OTHER_TOOL_AT:], rng, first=OTHER_TOOL_AT + 1)
     if case == "amid doubts":
         wild = pairs[TAUGHT - 1]
         pairs[TAUGHT - 1] = make_pair(wild.seq, wild.q, wild.x + 1.0)
     saved = Saved(
-        pairs[:TAUGHT], tool_changed_at=60 if case == "other tool" else None, unknown=case == "frame to be found"
+        pairs[:TAUGHT],
+        tool_changed_at=OTHER_TOOL_AT if case == "other tool" else None,
+        unknown=case == "frame to be found",
     )
     return saved, pairs[TAUGHT:], q
 

@@ -194,16 +194,19 @@ def test_p_values_of_what_is_not_there_are_uniform_under_noise(robot, over_poses
 
 
 @pytest.mark.parametrize(("name", "where"), ABSENT)
+@pytest.mark.soak
 def test_p_values_are_uniform_where_the_arm_walks(robot, over_walks, name, where) -> None:
     assert is_uniform(chances(robot, over_walks, name, where))
 
 
 @pytest.mark.parametrize(("name", "where"), ABSENT)
+@pytest.mark.soak
 def test_p_values_are_uniform_where_rows_are_rounded_alike_in_runs(robot, in_runs, name, where) -> None:
     assert is_uniform(chances(robot, in_runs, name, where))
 
 
 @pytest.mark.parametrize(("name", "where"), ABSENT)
+@pytest.mark.soak
 def test_p_values_that_take_such_rows_as_independent_are_not_uniform(robot, in_runs, name, where) -> None:
     assert not is_uniform(chances_of_independent_rows(robot, in_runs, name, where))
 

@@ -105,6 +105,7 @@ def test_following_the_advice_tells_them_apart(planted, open_case) -> None:
     assert file.advice == ()
 
 
+@pytest.mark.soak
 def test_the_motion_that_is_advised_tells_the_simulations_of_both_apart(open_case) -> None:
     robot = surveyed_arm()
     (standing,) = open_case.standings

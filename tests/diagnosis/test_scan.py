@@ -98,6 +98,7 @@ def test_a_moment_is_found_between_the_rows_where_it_was(robot, name, where, amo
     assert clock[JUMP_ROW - 1] < found.effect.value("t0") <= clock[JUMP_ROW]
 
 
+@pytest.mark.soak
 def test_the_moment_of_a_barely_visible_jump_lies_in_its_interval_as_often_as_stated(robot) -> None:
     clock = walk(robot, 0).clock
     half = 0.5 * (clock[1] - clock[0])

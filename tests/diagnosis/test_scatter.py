@@ -92,6 +92,7 @@ def test_a_play_of_several_times_the_scatter_is_clearly_seen_beside_it(robot, se
 
 
 @pytest.mark.parametrize("name", [pytest.param("backlash", marks=pytest.mark.soak), "settling"])
+@pytest.mark.soak
 def test_of_memories_that_no_joint_has_one_in_a_hundred_is_as_improbable_as_one_in_a_hundred(robot, name) -> None:
     """More than 4 of 80 p-values below 0.01 occur by chance in 1 of 700 such tests."""
     chances = []

@@ -18,6 +18,8 @@ from bodyschema.recordings.recording import Recording
 from bodyschema.robot.description import RobotDescription
 
 PER_RAD = 0.03
+# Of the effects, those that are most like it: the search among all sets of all effects takes seconds.
+NEAREST = ("joint_offset", "joint_scale", "joint_eccentricity", "joint_compliance", "link_geometry")
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +41,7 @@ def squared_recording(robot: RobotDescription) -> Recording:
 
 
 def squared(robot: RobotDescription) -> Diagnosis:
-    return diagnose(squared_recording(robot), Simulation(robot))
+    return diagnose(squared_recording(robot), Simulation(robot), only=NEAREST)
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +87,7 @@ def test_the_stored_model_makes_the_simulation_right_on_another_way(robot, diagn
 
 def test_a_further_diagnosis_with_the_stored_model_finds_nothing(robot, diagnosis, tmp_path) -> None:
     simulation = stored(diagnosis, tmp_path)
-    again = conclusion(diagnose(squared_recording(robot), simulation))
+    again = conclusion(diagnose(squared_recording(robot), simulation, only=NEAREST))
     assert (again.verdict, again.causes, again.unexplained.depends_on) == ("nothing_found", (), ())
 
 
@@ -102,7 +104,6 @@ def test_what_wanders_with_time_is_not_in_the_model_and_that_is_told(robot) -> N
     q[:, robot.joints.index(SHOULDER)] += 0.02 * np.sin(np.linspace(0.0, 9.0, len(q)))
     x = Simulation(robot).positions(motion_of(q))
     noise = SIGMA_M * np.random.default_rng([1, 1]).normal(size=x.shape)
-    # Of the effects, those that are most like it: the search among all sets of all effects takes seconds.
     nearest = ("joint_offset", "joint_scale", "encoder_jump", "thermal_drift", "tool_slip", "camera_moved")
     diagnosis = diagnose(measured(robot, motion, x + noise), Simulation(robot), only=nearest)
     left = conclusion(diagnosis).unexplained
@@ -112,6 +113,7 @@ def test_what_wanders_with_time_is_not_in_the_model_and_that_is_told(robot) -> N
     assert "What changes with time is in no such model" in modelled(left)
 
 
+@pytest.mark.soak
 def test_a_link_that_grows_as_it_warms_up_is_unexplained_and_no_cause_is_named(robot) -> None:
     motion = walk(robot, 1)
     columns = Simulation(robot).run(motion).columns(Effect.at(robot, "link_geometry", ELBOW))

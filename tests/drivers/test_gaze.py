@@ -230,6 +230,7 @@ def often_switched() -> Iterator[None]:
     sys.setswitchinterval(usual)
 
 
+@pytest.mark.soak
 def test_cameras_see_where_a_head_was_while_its_servo_turns_it(often_switched) -> None:
     shaft = DrivenShaft(0.5)
     turning = threading.Thread(target=lambda: [shaft(t) for t in range(5_000)])

@@ -98,6 +98,7 @@ def moved(tmp_path: Path, *, on: bool, seconds: float) -> np.ndarray:
         return arm.path[-1] - begin
 
 
+@pytest.mark.soak
 def test_the_arm_floats_where_it_is_left(tmp_path) -> None:
     assert np.abs(moved(tmp_path, on=True, seconds=2.0)).max() < DRIFT_RAD
 

@@ -118,6 +118,7 @@ def test_an_outlier_moves_the_chain_no_further_than_a_pair_at_the_gate():
 
 
 @pytest.mark.parametrize(("told", "pairs"), [(True, 30), (False, 100)])
+@pytest.mark.soak
 def test_outliers_from_the_first_pair_on_cost_no_more_than_their_share_of_the_pairs(told, pairs):
     spoilt, clean = [], []
     for seed in range(3):

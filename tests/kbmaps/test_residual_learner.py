@@ -164,6 +164,7 @@ def test_the_gain_of_a_prismatic_joint_is_learnt_beyond_the_rigid_chain(rng):
     assert mean_distance(learner.predict(test), truth) < 0.3 * mean_distance(learner.rigid.predict(test), truth)
 
 
+@pytest.mark.soak
 def test_twenty_joints_with_eccentric_encoders_are_learnt_beyond_the_rigid_chain(rng):
     arm = rough_arm(rng, "R" * 20)
     q, test = random_q(rng, arm.kinds, 600, 60.0), random_q(rng, arm.kinds, 200, 60.0)

@@ -92,6 +92,7 @@ def test_twenty_joints_are_exact_from_a_rough_prior_and_200_pairs():
     assert largest_error(learner, chain, "R" * 20) < 1e-9
 
 
+@pytest.mark.soak
 def test_a_cluster_of_five_degrees_is_exact_over_eighty():
     chain, _, q, x = case("R" * 7, 150, 4, revolute_deg=5.0)
     learner = TensorLearner(bases_for("R" * 7, 5.0))
@@ -146,6 +147,7 @@ def stretched(q):
 @pytest.mark.parametrize(
     "bend", ["lens", *(pytest.param(bend, marks=pytest.mark.soak) for bend in ("eccentric", "elastic"))]
 )
+@pytest.mark.soak
 def test_the_claimed_sigma_holds_where_the_truth_is_no_train(bend):
     inside, inside_twice = [], []
     for seed in range(4):
@@ -174,6 +176,7 @@ def test_the_claimed_sigma_holds_where_the_truth_is_no_train(bend):
     assert np.mean(inside_twice) > 0.85
 
 
+@pytest.mark.soak
 def test_a_rigid_arm_is_seldom_taken_for_another():
     found = 0
     for seed in range(20):

@@ -187,6 +187,7 @@ def test_a_baked_chain_is_the_chain_with_its_tool():
     np.testing.assert_allclose(baked.positions(q), layer.predict(q), rtol=0, atol=1e-12)
 
 
+@pytest.mark.soak
 def test_the_claim_covers_the_error():
     inside = []
     for seed in range(200):

@@ -58,12 +58,14 @@ def test_without_a_compiler_the_wheel_is_pure_and_the_build_says_why(tmp_path):
     assert f"{failing} failed" in result.log
 
 
+@pytest.mark.soak
 def test_a_compiler_that_is_not_there_does_not_stop_the_build(tmp_path):
     result = built(tmp_path, CC="no-such-compiler")
     assert result.wheel.endswith("-py3-none-any.whl")
     assert "no-such-compiler" in result.log
 
 
+@pytest.mark.soak
 def test_a_pure_wheel_can_be_asked_for(tmp_path):
     result = built(tmp_path, BODYSCHEMA_PURE="1")
     assert result.wheel.endswith("-py3-none-any.whl")

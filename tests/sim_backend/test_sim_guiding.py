@@ -76,6 +76,7 @@ def test_twelve_seconds_of_guiding_cover_a_third_of_every_arm_joints_range(seed)
     assert share[2:].min() > 1 / 3
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_ball_stays_visible_with_a_tool_that_is_250_mm_longer(seed):
     run = guide(shipped(), SimConfig(seed=seed), 5.0, tool=(0.23, 0.0, -0.37), settle=1.0)
@@ -83,6 +84,7 @@ def test_the_ball_stays_visible_with_a_tool_that_is_250_mm_longer(seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.soak
 def test_a_single_tag_is_turned_to_the_eyes_in_nine_frames_of_ten(seed):
     robot = shipped()
     tag = SimTag(id=0, xyz=(0.0, 0.0, 0.0), rpy=(0.0, 0.0, 0.0), side_m=0.06)
@@ -115,6 +117,7 @@ def test_a_single_tag_is_turned_to_the_eyes_in_nine_frames_of_ten(seed):
     ],
     ids=len,
 )  # fmt: skip
+@pytest.mark.soak
 def test_other_choices_of_learnt_joints_are_guided_in_view_too(joints):
     run = guide(learning(joints), SimConfig(seed=1), 5.0)
     steps = step_degrees(run)

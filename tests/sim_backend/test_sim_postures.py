@@ -68,6 +68,7 @@ def test_the_sources_end_after_the_last_posture(postures: FloatArray, unrendered
             camera.read(LIMIT_S)
 
 
+@pytest.mark.soak
 def test_the_same_postures_give_the_same_frames_bit_by_bit(postures: FloatArray) -> None:
     taken = []
     for _ in range(2):

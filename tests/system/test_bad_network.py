@@ -85,6 +85,7 @@ def test_after_a_partition_of_minutes_thousands_of_pairs_are_caught_up_with(tmp_
         expect_each_pair_learnt_once(config)
 
 
+@pytest.mark.soak
 def test_connections_that_are_cut_again_and_again_cost_no_pair(tmp_path, free_endpoint) -> None:
     with apart(tmp_path, free_endpoint) as (config, link):
         for _ in range(4):
@@ -93,6 +94,7 @@ def test_connections_that_are_cut_again_and_again_cost_no_pair(tmp_path, free_en
         expect_each_pair_learnt_once(config)
 
 
+@pytest.mark.soak
 def test_over_a_slow_network_every_pair_comes_though_late(tmp_path, free_endpoint) -> None:
     with apart(tmp_path, free_endpoint) as (config, link):
         link.delay_s, link.bytes_per_s = 0.4, 40_000

@@ -22,7 +22,7 @@ pytest.importorskip("pybullet")
 
 # The limit only ends a demo that would never end; on a busy machine it takes longer, and passes.
 LIMIT_S = 400
-FIRST, SECOND = 40, 10
+FIRST, SECOND = 30, 6
 
 
 @dataclass(frozen=True)

@@ -183,6 +183,7 @@ def errors_on_bullet_images(calibration: StereoCalibration, frames: int, seed: i
     return compare(answers, calibration)
 
 
+@pytest.mark.soak
 def test_the_simulator_s_pixels_are_where_the_tracker_expects_them(bullet_errors):
     # Half a pixel would be the renderer's own convention.
     assert np.abs(np.median(bullet_errors.centres_px, axis=0)).max() < 0.05

@@ -69,6 +69,7 @@ def test_intervals_cover_over_many_rigs() -> None:
     assert np.mean(z < 2.0) > 0.88
 
 
+@pytest.mark.soak
 def test_intervals_cover_where_corners_of_a_view_move_together() -> None:
     misses = []
     for seed in range(2):

@@ -154,6 +154,7 @@ def test_a_tag_that_moved_in_one_view_is_left_out_and_named() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 2))])
+@pytest.mark.soak
 def test_a_number_that_is_there_twice_is_no_rigid_body_and_named(seed: int) -> None:
     """Check duplicate numbers on opposite faces, so that no image shows both."""
     rng = np.random.default_rng(seed)

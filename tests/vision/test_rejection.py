@@ -125,6 +125,7 @@ def test_an_arm_that_touches_the_ball_s_outline_does_not_pull_the_centre():
     assert sigmas_off(answer(beside, BALL), BALL) < FAR_SIGMAS
 
 
+@pytest.mark.soak
 def test_fingertips_a_tenth_of_the_radius_over_a_small_ball_do_not_pass():
     rng = np.random.default_rng(3)
     tracker = StereoTracker(SMALL)

@@ -100,6 +100,7 @@ def sigmas_off(frames: int, seed: int) -> FloatArray:
     return np.array(off_by)
 
 
+@pytest.mark.soak
 def test_few_errors_are_larger_than_two_claimed_sigmas() -> None:
     off_by = sigmas_off(15, seed=1)
     assert len(off_by) >= 13

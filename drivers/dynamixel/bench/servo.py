@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 from bodyschema.drivers.dynamixel.models import TICK_S, TICKS, Model, baud_of, baud_value
 
@@ -94,10 +94,14 @@ class Servo:
         self.glitch_ticks, self.excess_a = 0, 0.0
         self._angle = angle
         self._memory = bytearray(model.layout.size)
+        self._values: dict[str, int] = {}  # of registers, as far as they have been read since the memory changed
+        self._is_protocol2 = model.protocol == 2
         self._places = {name: (r.address, r.end, r.signed) for name, r in model.layout.registers.items()}
         self._indirect = {
             data + k: pointer + 2 * k for pointer, data, count in indirect_blocks(model) for k in range(count)
         }
+        self._read_only = [self._places[name][:2] for name in READ_ONLY if name in self._places]
+        self._judged = [name for name in JUDGED if name in self._places]
         self._pointers = frozenset(self._indirect.values())
         self._first_indirect = min(self._indirect, default=len(self._memory))
         self._reset_memory()
@@ -112,15 +116,17 @@ class Servo:
 
     def __getitem__(self, name: str) -> int:
         """Return the value of a register."""
-        address, end, signed = self._places[name]
-        if end == address + 1 and not signed:
-            return self._memory[address]
-        return int.from_bytes(self._memory[address:end], "little", signed=signed)
+        value = self._values.get(name)
+        if value is None:
+            address, end, signed = self._places[name]
+            value = self._values[name] = int.from_bytes(self._memory[address:end], "little", signed=signed)
+        return value
 
     def __setitem__(self, name: str, value: int) -> None:
         """Write a register as the servo itself does, bypassing all locks."""
         address, end, signed = self._places[name]
         self._memory[address:end] = value.to_bytes(end - address, "little", signed=signed)
+        self._values[name] = value
 
     @property
     def id(self) -> int:
@@ -185,9 +191,9 @@ class Servo:
 
         It accepts no further goals. In current control the shaft is free then, in position control it is held in place.
         """
-        if self.model.protocol == 1 or not self["torque"] or self["watchdog"] <= 0:
+        if not self._is_protocol2 or (watchdog := self["watchdog"]) <= 0 or not self["torque"]:
             return
-        if t - self._heard_s > self["watchdog"] * WATCHDOG_UNIT_S:
+        if t - self._heard_s > watchdog * WATCHDOG_UNIT_S:
             self._held_at = self._angle(t)
             self["watchdog"] = FIRED
 
@@ -214,13 +220,15 @@ class Servo:
         block, places = self.model.layout.block, self.places(address, size)
         if any(block.address <= place < block.end for place in places):
             self._sense(t)
+        if isinstance(places, range):
+            return Error.NONE, bytes(self._memory[address : address + size])
         return Error.NONE, bytes(self._memory[place] for place in places)
 
-    def places(self, address: int, size: int) -> list[int]:
+    def places(self, address: int, size: int) -> Sequence[int]:
         """Return the effective addresses: those of Indirect Data are where their Indirect Address points."""
-        places = list(range(address, address + size))
         if address + size <= self._first_indirect:
-            return places
+            return range(address, address + size)
+        places = list(range(address, address + size))
         for data, pointer in self._indirect.items():
             if address <= data < address + size:
                 places[data - address] = int.from_bytes(self._memory[pointer : pointer + 2], "little")
@@ -237,6 +245,8 @@ class Servo:
     def _runs(self, address: int, data: bytes) -> list[tuple[int, bytes]]:
         """Split the bytes into runs of consecutive effective addresses."""
         places = self.places(address, len(data))
+        if isinstance(places, range):
+            return [(address, data)] if data else []
         begins = [k for k in range(len(places)) if k == 0 or places[k] != places[k - 1] + 1]
         return [(places[k], data[k:end]) for k, end in zip(begins, [*begins[1:], len(data)], strict=True)]
 
@@ -247,6 +257,7 @@ class Servo:
         had_torque, mode = self["torque"], self._mode
         self._angle(t)  # up to now the shaft has moved by the old values
         self._memory[address : address + len(data)] = data
+        self._values.clear()
         if self._mode != mode and "current_limit" in self.model.layout:
             self["goal_current"] = self["current_limit"]  # e-Manual, Operating Mode
         if self["torque"] and not had_torque and self._is_in_position_mode:
@@ -273,6 +284,7 @@ class Servo:
         fresh = bytearray(len(self._memory))
         fresh[: self.model.layout.ram] = self._memory[: self.model.layout.ram]
         self._memory = fresh
+        self._values.clear()
         self._put_factory_values(self.model.layout.ram)
         self._point_indirect()
         for name in RAM_OF_FACTORY:
@@ -309,18 +321,19 @@ class Servo:
 
     @property
     def _is_reversed(self) -> bool:
-        return self.model.protocol == 2 and bool(self["drive_mode"] & REVERSE)
+        return self._is_protocol2 and bool(self["drive_mode"] & REVERSE)
 
     @property
     def _mode(self) -> int:
-        return self["operating_mode"] if self.model.protocol == 2 else POSITION_MODE
+        return self["operating_mode"] if self._is_protocol2 else POSITION_MODE
 
     @property
     def _is_in_position_mode(self) -> bool:
-        return self.model.protocol == 2 and self["operating_mode"] == POSITION_MODE
+        return self._is_protocol2 and self["operating_mode"] == POSITION_MODE
 
     def _reset_memory(self) -> None:
         self._memory[:] = bytes(len(self._memory))
+        self._values.clear()
         self._error1 = 0
         self._put_factory_values(0)
         self._point_indirect()
@@ -333,11 +346,13 @@ class Servo:
         for address, size, value in factory_values(self.model):
             if address >= begin:
                 self._memory[address : address + size] = value.to_bytes(size, "little", signed=value < 0)
+        self._values.clear()
 
     def _point_indirect(self) -> None:
         """Point each Indirect Address at its own Indirect Data."""
         for data, pointer in self._indirect.items():
             self._memory[pointer : pointer + 2] = data.to_bytes(2, "little")
+        self._values.clear()
 
     def _fold(self, t: float) -> None:
         turn = self.model.ticks_per_turn
@@ -372,24 +387,22 @@ class Servo:
         layout, end = self.model.layout, address + len(data)
         if end > len(self._memory) or not data:
             return Error.ACCESS
-        if address < layout.ram and self["torque"] and self.model.protocol == 2:
+        if address < layout.ram and self["torque"] and self._is_protocol2:
             return Error.ACCESS
-        for pointer in range(address, end - 1):
-            if pointer in self._pointers:
-                target = int.from_bytes(data[pointer - address : pointer - address + 2], "little")
-                if not layout.ram <= target < len(self._memory):
-                    return Error.RANGE
-        for name in READ_ONLY:
-            if name in layout and layout[name].address < end and layout[name].end > address:
-                return Error.ACCESS
+        for pointer in self._pointers.intersection(range(address, end - 1)):
+            target = int.from_bytes(data[pointer - address : pointer - address + 2], "little")
+            if not layout.ram <= target < len(self._memory):
+                return Error.RANGE
+        if any(begin < end and behind > address for begin, behind in self._read_only):
+            return Error.ACCESS
         written = {
             name: layout.value(name, data, address)
-            for name in JUDGED
-            if name in layout and address <= layout[name].address and layout[name].end <= end
+            for name in self._judged
+            if address <= self._places[name][0] and self._places[name][1] <= end
         }
-        if any(written.get(name, 0) > largest for name, largest in LARGEST.items()):
+        if any(value > LARGEST.get(name, value) for name, value in written.items()):
             return Error.LIMIT
-        return self._refusal2(written) if self.model.protocol == 2 else Error.NONE
+        return self._refusal2(written) if self._is_protocol2 else Error.NONE
 
     def _refusal2(self, written: Mapping[str, int]) -> Error:
         """Return the error with which servos of Protocol 2.0 reject a write."""
