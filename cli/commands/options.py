@@ -36,7 +36,7 @@ DatasetCalibration = Annotated[
 @Parameter(name="*")
 @dataclass(frozen=True)
 class SourceOptions:
-    """What to take from a ROS bag or a LeRobotDataset."""
+    """Parts of a ROS bag or a LeRobotDataset to read."""
 
     joint_topic: Annotated[str | None, Parameter(help="Of a bag: the topic with the joint states.")] = None
     marker_topic: Annotated[str | None, Parameter(help="Of a bag: the topic with the marker's positions.")] = None
@@ -87,7 +87,7 @@ AS_THEY_ARE = SourceOptions()
 @Parameter(name="*")
 @dataclass(frozen=True)
 class SearchOptions:
-    """What a diagnosis looks for."""
+    """Effects that a diagnosis looks for, and its seed."""
 
     effects: Annotated[str | None, Parameter(help="Look for these alone, as in backlash,joint_offset.")] = None
     exclude: Annotated[str | None, Parameter(help="Do not look for these.")] = None
@@ -106,7 +106,7 @@ ANYTHING = SearchOptions()
 @Parameter(name="*")
 @dataclass(frozen=True)
 class LeRobotOptions:
-    """What becomes of the joint offsets found in LeRobot's calibration file."""
+    """LeRobot's calibration file, as a target of the joint offsets found."""
 
     lerobot: Annotated[
         Path | None,

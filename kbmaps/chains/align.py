@@ -11,9 +11,10 @@ from numpy.typing import ArrayLike
 
 from kbmaps.arrays import BoolArray, FloatArray, frozen, numbers, rows
 from kbmaps.chains.chain import RigidChain
+from kbmaps.chains.parameters import ChainParameters, ChainTolerances
 from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
 from kbmaps.robust import MEDIAN_NORM, ROUNDING_M, UNCALIBRATED_SIGMAS
-from kbmaps.rotations import cross_matrix, exponentials, nearest_rotation
+from kbmaps.rotations import cross_matrix, exponentials, nearest_rotation, rotation_vector
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,8 @@ class _Settings:
     step_tolerance: float = 1e-12
     # Starting points are only compared: the best one is fitted again, to the tolerance above.
     trial_tolerance: float = 1e-5
+    # This many evenly spread pairs suffice to place the arm.
+    placed: int = 64
     # Singular values below this share of the largest are directions that the data do not determine.
     rank_tolerance: float = 1e-7
 
@@ -288,3 +291,41 @@ def _check_spread(points: FloatArray, what: str) -> None:
         raise DegenerateDataError(
             f"{what} lie on one line or in one place, so no pose can be fitted to them; record pairs that spread out"
         )
+
+
+class PlacedStart:
+    """Nominal chain at its best-fitting pose; refitted only when the number of pairs has doubled.
+
+    The pose follows from the first 2^k pairs, so that it does not depend on when it was requested.
+    """
+
+    def __init__(self, parameters: ChainParameters, tolerances: ChainTolerances) -> None:
+        self._parameters, self._marker_known = parameters, math.isfinite(tolerances.tool)
+        known = math.isfinite(tolerances.base_rotation) and math.isfinite(tolerances.base_translation)
+        self.needed = not known
+        self._change: FloatArray = np.zeros(parameters.size)
+        self._placed_at = 0
+
+    def change(self, q: FloatArray, x: FloatArray) -> FloatArray:
+        """Return the change (size,) to start a fit from; 0 while the pairs do not determine a pose.
+
+        Args:
+            q: joint values of at least one pair (n, d) [rad, m].
+            x: marker positions (n, 3) [m].
+        """
+        first = 1 << (len(q).bit_length() - 1)
+        if self.needed and first != self._placed_at:
+            chosen = np.linspace(0, first - 1, min(first, _SETTINGS.placed)).round().astype(np.intp)
+            self._change, self._placed_at = self._placed(q[chosen], x[chosen]), first
+        return self._change
+
+    def _placed(self, q: FloatArray, x: FloatArray) -> FloatArray:
+        parameters, change = self._parameters, np.zeros(self._parameters.size)
+        try:
+            placed = align(parameters.reference, q, x, pose_known=False, marker_known=self._marker_known)
+        except DegenerateDataError:
+            return change
+        change[parameters.base_turn] = rotation_vector(placed.T_measured_nominal[:3, :3])
+        change[parameters.base_shift] = placed.T_measured_nominal[:3, 3]
+        change[parameters.tool] = placed.marker_shift
+        return change

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kbmaps.arrays import BoolArray, FloatArray, frozen, rows_or_vector
+from kbmaps.chains.align import PlacedStart
 from kbmaps.chains.belief import ChainBelief, squared
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import (
@@ -21,7 +22,6 @@ from kbmaps.chains.parameters import (
     describe_tolerances,
     parse_tolerances,
 )
-from kbmaps.chains.placed_start import PlacedStart
 from kbmaps.chains.report import ChainReport, Scatter, chain_report
 from kbmaps.chains.rigid_fit import RigidFit, fit_chain
 from kbmaps.errors import DegenerateDataError, ModelFormatError, SettingError

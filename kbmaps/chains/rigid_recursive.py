@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kbmaps.arrays import FloatArray, frozen, rows_or_vector, vector
+from kbmaps.chains.align import PlacedStart
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import (
@@ -22,7 +23,6 @@ from kbmaps.chains.parameters import (
     describe_tolerances,
     parse_tolerances,
 )
-from kbmaps.chains.placed_start import PlacedStart
 from kbmaps.chains.rigid_filter import LEAST_NOISE_M, NOISE_COORDINATES, NOISE_MEMORY, RigidFilter
 from kbmaps.chains.rigid_fit import NOTHING_KNOWN, NoiseKnowledge, RigidFit, fit_chain, folded
 from kbmaps.errors import ModelFormatError, SettingError

@@ -27,7 +27,8 @@ from kbmaps import (
     ShapeError,
     align,
 )
-from kbmaps.chains import placed_start, rigid_learner
+from kbmaps.chains import align as align_module
+from kbmaps.chains import rigid_learner
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -174,7 +175,7 @@ def test_where_an_arm_stands_is_looked_for_only_when_the_pairs_have_doubled(monk
     rng = np.random.default_rng(32)
     arm = rough_arm(rng, "RRR", ChainTolerances(tool=0.1, base_rotation=0.9, base_translation=1.0))
     asked = []
-    monkeypatch.setattr(placed_start, "align", lambda *args, **known: asked.append(1) or align(*args, **known))
+    monkeypatch.setattr(align_module, "align", lambda *args, **known: asked.append(1) or align(*args, **known))
     learner = RigidLearner(arm.nominal, ChainTolerances(tool=0.1, base_rotation=math.inf, base_translation=math.inf))
     q, x = arm.pairs(rng, 40, 0.001)
     for k in range(40):

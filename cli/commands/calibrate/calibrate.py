@@ -37,7 +37,7 @@ CAMERA_FRAME = "calibrated_camera"
 @Parameter(name="*")
 @dataclass(frozen=True)
 class FitOptions:
-    """What is fitted, and what is known beforehand."""
+    """Settings of the fit, and what is known beforehand."""
 
     sigma_mm: Annotated[
         float | None,
