@@ -10,6 +10,7 @@ from scenes import RADIUS_M, Errors, compare, measure_errors, place
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import MarkerFix
+from bodyschema.vision.ball.contour import Limb
 from bodyschema.vision.tracker import StereoTracker
 
 LOOKS = {
@@ -92,6 +93,13 @@ def test_a_bar_behind_the_ball_along_its_limb_hardly_pulls_its_centre():
         off_px.append(fix.centres_px[0] - u)
     # 0.07 px if all rays that show an edge have the same weight.
     assert abs(np.mean(off_px)) < 0.05, off_px
+
+
+def test_the_evenness_of_a_limb_is_the_share_of_its_rays_that_carry_it():
+    rays = np.zeros((8, 3))
+    for carrying in (2, 4, 8):
+        weight = np.where(np.arange(8) < carrying, 50.0, 0.0)
+        assert Limb(rays, np.zeros(8), weight, 0.8, 1.0).evenness == pytest.approx(carrying / 8)
 
 
 def test_more_image_noise_makes_the_claimed_sigma_larger():

@@ -57,6 +57,11 @@ class Limb:
     excess: float
 
     @property
+    def evenness(self) -> float:
+        """Evenness of the weights: 1 if all rays count alike, k/n if k of n rays do and the others have no weight."""
+        return float(self.weight.sum()) ** 2 / (len(self.weight) * float(self.weight @ self.weight))
+
+    @property
     def noise_share(self) -> float:
         """Share of pixel noise in the variances of `offset_px`, averaged over the rays with weight."""
         return 1.0 - _BEST_SIGMA_PX**2 * float(self.weight[self.weight > 0].mean())

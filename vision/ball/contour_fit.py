@@ -30,6 +30,8 @@ _LEAST_DETERMINANT = 1e-6
 # waves are small is no sign that it is. Beside that it is this part of what the few waves tell, and where they tell of
 # far more it is the square, over the last: a bend that shows is a sign of one that the fit has removed.
 _LEAST_DENSITY, _NOISE, _TOLD, _USUAL_DENSITY = 0.5, 1.75, 0.4, 12.0
+# If a smaller share of the rays carries the circle, their errors are not averaged out: sigma grows in proportion.
+_LEAST_EVENNESS = 0.5
 # Of an estimate's slope by its residuals (1 where none is far off, 0 where all are) at least this part counts.
 _LEAST_SLOPE = 0.4
 # What covers a ball breaks its limb at sharp corners, which shows in the quick waves; what is behind it bends whole
@@ -94,14 +96,15 @@ def fit_limb(
     """
     blur_px = USUAL_BLUR_PX
     fit: _Fit | None = None
-    unsettled, noise, excess = np.zeros(3), 1.0, 1.0
+    unsettled, noise, excess, fewer = np.zeros(3), 1.0, 1.0, 1.0
     for _ in range(_LOOKS):
         limb = find_limb(image, gate, centre_px, radius_px, shape, blur_px)
         fit = None if limb is None else _fit(limb, radius_px)
         if limb is None or fit is None:
             return None
         centre_px, radius_px = centre_px + shape @ fit.shift_px, radius_px + fit.growth_px
-        excess, noise = limb.excess, limb.noise_share * limb.excess
+        excess, fewer = limb.excess, max(1.0, _LEAST_EVENNESS / limb.evenness)
+        noise = limb.noise_share * excess
         last_blur_px, blur_px = blur_px, min(max(limb.blur_px, _SHARPEST_PX), _WIDEST_PX)
         moved_px = max(float(np.linalg.norm(fit.shift_px)), abs(fit.growth_px))
         if moved_px < _SETTLED_PX and abs(blur_px - last_blur_px) < _SETTLED_BLUR_PX:
@@ -117,7 +120,7 @@ def fit_limb(
     told = waves(fit.pulls, radius_px).mean
     usual = _LEAST_DENSITY + _NOISE * noise
     density = math.hypot(usual, (_TOLD + told / _USUAL_DENSITY) * told)
-    cov = density * fit.inverse + np.outer(unsettled, unsettled)
+    cov = fewer**2 * density * fit.inverse + np.outer(unsettled, unsettled)
     # A blurred disc's edge, where it is steepest, is nearer to the centre than the disc's.
     radius_px += blur_px**2 / (2.0 * radius_px)
     is_round = fit.off_px < _ROUND * radius_px

@@ -59,6 +59,8 @@ _ENOUGH = 60
 _TRIPLES = np.array(list(combinations(range(_ARCS), 3)))
 # Systematic error that averaging does not reduce [px].
 _FLOOR_PX = 0.001
+# A larger disagreement between coverage and limb, in sigmas, is added to the covariance.
+_LARGEST_CONTRADICTION = 4.0
 # Below this, relative to the cubed trace, the outline points do not determine centre and radius.
 _LEAST_DETERMINANT = 1e-5
 
@@ -142,11 +144,16 @@ def refine_outline(image: Float32Array, gate: Gate, rough: Outline, shape: Float
         return None
     if fitted.aliased:
         return rough
+    moved_px = fitted.centre_px - rough.centre_px
+    cov_px = fitted.cov_px + _FLOOR_PX**2 * np.eye(2)
+    contradiction = float(moved_px @ np.linalg.solve(cov_px + rough.cov_px, moved_px))
+    if contradiction > _LARGEST_CONTRADICTION**2:
+        cov_px += np.outer(moved_px, moved_px)
     return replace(
         rough,
         centre_px=fitted.centre_px,
         radius_px=fitted.radius_px,
-        cov_px=fitted.cov_px + _FLOOR_PX**2 * np.eye(2),
+        cov_px=cov_px,
         radius_sigma_px=fitted.radius_sigma_px,
         unrest=fitted.unrest,
     )

@@ -17,9 +17,6 @@ from .view import View
 # not have. On nineteen public sets without autofocus it explains at most once as much.
 _CLEARLY = 2.0
 _FALSE_ALARMS = 1e-3  # of independent corners
-_NOTHING = 1e-12
-# Of the median of a squared standard normal variable.
-_MEDIAN = float(chi2.median(1))
 
 
 def focal_spread(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> float | None:
@@ -50,14 +47,14 @@ def focal_spread(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -
         by_focal.extend(pull**2 / normal)
         off, rest = _without(focal, off), _without(focal, rest)
         # One that is no freedom of this view explains nothing.
-        by_others.append((rest.T @ off)[:, 0] ** 2 / np.maximum(np.sum(rest**2, axis=0), _NOTHING))
+        by_others.append((rest.T @ off)[:, 0] ** 2 / np.maximum(np.sum(rest**2, axis=0), np.finfo(np.float64).tiny))
         squares += float(np.sum(off**2))
         freedom += len(off) - 6 - len(normal)
     variance = squares / max(freedom, 1)
     explained = np.mean(by_focal) / max(variance, np.mean(by_others, axis=0).max())
     if explained < max(_CLEARLY, float(chi2.isf(_FALSE_ALARMS, len(by_focal))) / len(by_focal)):
         return None
-    spread = float(np.median(np.square(factors))) / _MEDIAN - variance * float(np.median(variances))
+    spread = float(np.median(np.square(factors))) / float(chi2.median(1)) - variance * float(np.median(variances))
     return float(np.sqrt(max(spread, 0.0)))
 
 

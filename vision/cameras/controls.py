@@ -12,11 +12,11 @@ import numpy as np
 from bodyschema.interfaces.errors import SourceError
 
 from .config import SideBySideConfig, UvcSettings
+from .look import EVERY_S
 
 EXPOSURE_UNIT_S = 1e-4  # V4L2_CID_EXPOSURE_ABSOLUTE
 MANUAL_EXPOSURE = 1  # V4L2_EXPOSURE_MANUAL
 ROUNDING = 0.05  # cameras round to their own steps
-FOCUS_EVERY_S = 0.5  # between two readings of the focus: a request to the camera
 
 
 class VideoCapture(Protocol):
@@ -134,7 +134,7 @@ class FocusWatch:
 
     def look(self, capture: VideoCapture, now_s: float) -> None:
         """Read the focus of the open camera, if it was not just read."""
-        if now_s - self._read_s < FOCUS_EVERY_S:
+        if now_s - self._read_s < EVERY_S:
             return
         self._read_s = now_s
         # A camera without such a control answers with 0 or -1.
