@@ -120,7 +120,7 @@ def cost(pairs: int, causes: int, seed: int) -> Cost:
     diagnosis = diagnose(measured, Simulation(robot), seed=seed)
     found = time.process_time()
     file = conclusion(diagnosis)
-    page(diagnosis, file, remedies(file, robot, np.zeros(len(JOINTS)), None), About("walk", robot.robot.name, "0"))
+    page(diagnosis, file, remedies(file, robot, *np.zeros((2, len(JOINTS)))), About("walk", robot.robot.name, "0"))
     told = time.process_time()
     named = tuple(f"{c.effect} at {c.where}" if c.where else c.effect for c in file.causes)
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
