@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bodyschema.diagnosis.assess.explanation import (
+    Explanation,
     changed_by_the_way,
     explain,
     needs_no_more_names,
@@ -24,7 +26,7 @@ from bodyschema.diagnosis.fit.background import Scales
 from bodyschema.diagnosis.fit.contact import doubtful
 from bodyschema.diagnosis.fit.fit import Fit, fitted
 from bodyschema.diagnosis.fit.instrument import instrument_factor, reshaped
-from bodyschema.diagnosis.fit.observations import Observations
+from bodyschema.diagnosis.fit.observations import IntArray, Observations
 from bodyschema.diagnosis.search.alike import Alike, alike
 from bodyschema.diagnosis.search.drives import with_small_ripples
 from bodyschema.diagnosis.search.held_out import Added, Blocks, added, gain_percent, held_out_errors, is_marker
@@ -32,7 +34,7 @@ from bodyschema.diagnosis.search.hypotheses import Hypotheses
 from bodyschema.diagnosis.search.scan import Candidate, Scan
 from bodyschema.diagnosis.search.search import Search, are_a_description
 from bodyschema.diagnosis.search.together import Tolerated, together, tolerated
-from bodyschema.diagnosis.unnamed.rattle import rattle
+from bodyschema.diagnosis.unnamed.rattle import Rattle, rattle
 from bodyschema.diagnosis.unnamed.unknown import Unknowns
 from bodyschema.effects import Effect, Identity, Simulation
 from bodyschema.interfaces.records import FloatArray
@@ -63,6 +65,8 @@ _LITTLE = 0.9
 _MOST_SPENT = 0.9
 # Smallest change of the instrument's noise (in logarithms) that triggers a refit.
 _SAME_NOISE = 0.1
+# In more than twice as many rows, causes are sought in runs of neighbouring rows, and fitted to all of them.
+_MOST_ROWS, _RUN = 1000, 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +85,7 @@ class Diagnosis:
         left: residual structure that no effect fits.
         blocks: blocks of time for held-out errors.
         seed: seed of the resampling.
+        part: the observations in which causes were sought; None for all.
         ended_early: True if the causes describe the error and do not explain it, as there are too many.
     """
 
@@ -95,6 +100,7 @@ class Diagnosis:
     left: Leftover
     blocks: Blocks
     seed: int
+    part: Observations | None = None
     ended_early: bool = False
 
     @property
@@ -232,15 +238,19 @@ class Diagnosis:
         """Confounded effects beside the best geometry."""
         named = {cause.key for cause in self.causes}
         joints = {cause.where for cause in self.causes}
-        pairs = alike(self.geometry, (effect for effect in self.hypotheses.effects if effect.where in joints))
+        geometry = self.geometry if self.part is None else self.geometry.over(self.part)
+        pairs = alike(geometry, (effect for effect in self.hypotheses.effects if effect.where in joints))
         return tuple(pair for pair in pairs if named & {pair.one.key, pair.other.key})
 
     @cached_property
     def rejected(self) -> list[tuple[Candidate, Added]]:
         """Rejected hypotheses, each with its best fit beside the causes."""
         present = {cause.key for cause in self.causes}
-        candidates = Scan(self.extended).candidates(h for h in self.hypotheses.effects if h.key not in present)
-        return list(zip(candidates, added(self.extended, candidates, self.blocks), strict=True))
+        fit, blocks = self.extended, self.blocks
+        if self.part is not None:
+            fit, blocks = fit.over(self.part), Blocks.cut(len(self.part))
+        candidates = Scan(fit).candidates(h for h in self.hypotheses.effects if h.key not in present)
+        return list(zip(candidates, added(fit, candidates, blocks), strict=True))
 
 
 def diagnose(
@@ -262,19 +272,129 @@ def diagnose(
         tell: called with the stage and about how much of the work is done.
     """
     observations = Observations.of(recording, simulation)
-    start = aligned(observations, simulation)
     hypotheses = Hypotheses.of(simulation, observations, only=only, without=without)
     told = Stages(tell)
     told.begin(SETS)
     told(f"{len(hypotheses.effects)} hypotheses")
-    search = Search(hypotheses.effects, told)
+    blocks = blocks or Blocks.cut(len(recording))
+    rows = _part_of(len(observations))
+    if len(rows) == len(observations):
+        found = _found(observations, simulation, hypotheses.effects, blocks, seed, told)
+    else:
+        part = _found(observations.some(rows), simulation, hypotheses.effects, Blocks.cut(len(rows)), seed, told)
+        told(f"the same in all {len(observations)} rows")
+        found = part.over(observations, simulation)
+    start, explanation, search = found.start, found.explanation, found.search
+    left = found.left(blocks)
+    fit = (explanation.fit if left.model is None else left.model.fit).settled()
+    made = tolerated(fit)
+    if left.model is None and not made.seen.any():
+        fit = fit.untolerated()
+    return Diagnosis(
+        hypotheses=hypotheses,
+        nominal=fitted(start.observations, simulation, len(simulation.effects)),
+        aligned=start,
+        geometry=_geometry(start),
+        extended=fit,
+        stored=fit if fit.is_exact else _stored(start, explanation.fit, fit, left, blocks),
+        tolerated=made,
+        standings=tuple(found.standings),
+        left=left,
+        blocks=blocks,
+        seed=seed,
+        part=None if found.part is None else found.part.start.observations,
+        ended_early=search.ended_early or are_a_description(fit.causes),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """What a search found in some observations.
+
+    Attributes:
+        start: fit of the parameters that robot.toml does not know.
+        standings: assessment of each cause against its rivals.
+        loose: play of the marker; None for one that is fixed.
+        is_reshaped: True if the noise has another shape than stated.
+        part: what was found in a part of the observations; None where all were searched.
+    """
+
+    start: Fit
+    search: Search
+    unknowns: Unknowns
+    explanation: Explanation
+    standings: Sequence[Standing]
+    loose: Rattle | None
+    is_reshaped: bool
+    part: _Found | None = None
+
+    def left(self, blocks: Blocks) -> Leftover:
+        """Return the residual structure that no effect fits."""
+        # In many rows, all families take much memory to find nothing again.
+        asked = self if self.part is None or self.explanation.unknown else self.part
+        return leftover(asked.explanation, asked.unknowns, blocks, self.loose)
+
+    def over(self, observations: Observations, simulation: Simulation) -> _Found:
+        """Return the same causes, fitted to all observations of which these were a part.
+
+        No further ones are sought: no model is exact, and in many rows its smallest error looks like a cause (Miller
+        and Dunson 2019). Moments are sought again, since they may lie between the parts.
+        """
+        before = self.start.observations
+        fit = self.explanation.fit.over(observations.with_factor(before.stated_factor))
+        observations, loose = fit.observations, self.loose
+        if self.is_reshaped:
+            observations = reshaped(fit) or observations
+        if before.doubtful is not None:
+            observations = observations.without(_left_out(fit))
+        if loose is not None:
+            loose = rattle(fit) or loose
+            observations = observations.with_rattle(loose.ratio, loose.ways_of(fit))
+        start = aligned(observations, simulation)
+        unknowns, fit, stands = Unknowns(start), fit.to(observations), list(self.standings)
+        for k, cause in enumerate(fit.causes):
+            again = Scan(fit, [cause]).without(cause).candidate(cause) if cause.kind.begins else None
+            if again is not None:
+                causes = [*fit.causes]
+                causes[k] = again.effect
+                fit, stands[k] = fit.with_causes(causes), replace(stands[k], itself=again)
+        chosen = unknowns.again(self.explanation.unknown)
+        apart = unknowns.apart(fit, chosen) if chosen else None
+        explanation = replace(self.explanation, fit=fit, apart=apart)
+        return _Found(start, self.search, unknowns, explanation, stands, loose, self.is_reshaped, self)
+
+
+def _part_of(rows: int) -> IntArray:
+    """Return the rows in which causes are sought: all, or equal runs that are spread over a long recording."""
+    if rows <= 2 * _MOST_ROWS:
+        return np.arange(rows)
+    firsts = np.linspace(0, rows - _RUN, _MOST_ROWS // _RUN).astype(np.intp)
+    return (firsts[:, None] + np.arange(_RUN)).ravel()
+
+
+def _left_out(fit: Fit) -> NDArray[np.bool_]:
+    """Return the rows (n,) to leave out because their history is not known well enough, if they are not too many."""
+    rows = doubtful(fit)
+    return rows if rows.mean() <= MOST_DOUBTFUL else np.zeros_like(rows)
+
+
+def _found(
+    observations: Observations,
+    simulation: Simulation,
+    hypotheses: Sequence[Effect],
+    blocks: Blocks,
+    seed: int,
+    told: Stages,
+) -> _Found:
+    """Search the causes in some observations, and ask whether something without a name is at work."""
+    start = aligned(observations, simulation)
+    search = Search(hypotheses, told)
     unknowns = Unknowns(start)
     enough = partial(needs_no_more_names, unknowns=unknowns, search=search)
-    begun = start if start.is_exact else together(start, hypotheses.effects, told)
+    begun = start if start.is_exact else together(start, hypotheses, told)
     told.begin(SEARCH, SETS)
     extended = search.run(begun, enough) if start.is_exact else _searched(begun, search, enough)
-    factor, rows = instrument_factor(extended), doubtful(extended)
-    left_out = rows if rows.mean() <= MOST_DOUBTFUL else np.zeros_like(rows)
+    factor, left_out = instrument_factor(extended), _left_out(extended)
     other_shape = None if start.is_exact else reshaped(extended)
     if other_shape is not None and (rattle(extended) or explain(extended, search.path, unknowns, search, told).unknown):
         # What is left is not noise alone.
@@ -296,7 +416,7 @@ def diagnose(
         told(loose.what)
         # Begin again: causes may have been named for it, and the noise is smaller without it.
         # What rattles has no place of its own, and does not slip.
-        fixed = [effect for effect in hypotheses.effects if effect.kind.stage != "tool"]
+        fixed = [effect for effect in hypotheses if effect.kind.stage != "tool"]
         search = Search(fixed, told)
         observations = observations.with_rattle(loose.ratio, loose.ways)
         start = aligned(observations, simulation)
@@ -305,7 +425,6 @@ def diagnose(
         extended = _searched(together(start, fixed, told), search, enough)
         loose = rattle(extended) or loose
     told.begin(NAMELESS, SEARCH)
-    blocks = blocks or Blocks.cut(len(recording))
     explanation = useful(explain(extended, search.path, unknowns, search, told), search, blocks, told)
     told.begin(RIVALS, NAMELESS)
     stands = standings(explanation.beside, search, blocks, seed, None if explanation.unknown else unknowns)
@@ -316,25 +435,7 @@ def diagnose(
             break
         explanation = fewer
         stands = standings(explanation.beside, search, blocks, seed)
-    left = leftover(explanation, unknowns, blocks, loose)
-    fit = (explanation.fit if left.model is None else left.model.fit).settled()
-    made = tolerated(fit)
-    if left.model is None and not made.seen.any():
-        fit = fit.untolerated()
-    return Diagnosis(
-        hypotheses=hypotheses,
-        nominal=fitted(observations, simulation, len(simulation.effects)),
-        aligned=start,
-        geometry=_geometry(start),
-        extended=fit,
-        stored=fit if fit.is_exact else _stored(start, explanation.fit, fit, left, blocks),
-        tolerated=made,
-        standings=tuple(stands),
-        left=left,
-        blocks=blocks,
-        seed=seed,
-        ended_early=search.ended_early or are_a_description(fit.causes),
-    )
+    return _Found(start, search, unknowns, explanation, stands, loose, other_shape is not None)
 
 
 def _stored(start: Fit, alone: Fit, complete: Fit, left: Leftover, blocks: Blocks) -> Fit:

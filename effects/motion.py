@@ -24,12 +24,14 @@ class Motion:
         t: increasing times [s], shape (n,); None if unknown.
         segment: run numbers, shape (n,); the motion between two runs was not observed.
         begun_at: start of all drifts [s]; None for the first row.
+        rows: row numbers (n,) in a longer recording of which this is a part; None for a whole one.
     """
 
     q: FloatArray
     t: FloatArray | None
     segment: NDArray[np.int64]
     begun_at: float | None = None
+    rows: FloatArray | None = None
 
     @classmethod
     def of(cls, recording: Recording) -> Motion:
@@ -47,6 +49,18 @@ class Motion:
         """Return unrelated postures q (n, d) without times."""
         return cls(q, None, np.arange(len(q), dtype=np.int64))
 
+    def some(self, rows: NDArray[np.intp]) -> Motion:
+        """Return a part of the motion, of increasing rows (m,); a gap between them begins a new run."""
+        segment = np.cumsum(self.begins[rows] | np.append(False, np.diff(rows) > 1), dtype=np.int64)
+        return Motion(
+            self.q[rows], None if self.t is None else self.t[rows], segment, self.begun_at, self.row_numbers[rows]
+        )
+
+    @property
+    def row_numbers(self) -> FloatArray:
+        """Number of each row (n,) in its recording."""
+        return np.arange(len(self.q), dtype=np.float64) if self.rows is None else self.rows
+
     def __len__(self) -> int:
         return len(self.q)
 
@@ -58,7 +72,7 @@ class Motion:
     @property
     def clock(self) -> FloatArray:
         """Time of each row (n,): times [s], or row numbers where there are none."""
-        return np.arange(len(self.q), dtype=np.float64) if self.t is None else self.t
+        return self.row_numbers if self.t is None else self.t
 
     @cached_property
     def begins(self) -> NDArray[np.bool_]:

@@ -35,6 +35,10 @@ _SHAPE_STEP = 1e-3
 SPRING_ROUNDS = 3
 # Corrections (n,) of readings by the encoder effects that were evaluated there, as long as both live.
 _CORRECTIONS: WeakKeyDictionary[Motion, WeakKeyDictionary[Effect, FloatArray]] = WeakKeyDictionary()
+# Corrections (4, 4) of joint frames by effects, as long as these live; None where they move none.
+_FRAMES: WeakKeyDictionary[Effect, FloatArray | None] = WeakKeyDictionary()
+# Predictions (n, 3) of residuals, which no effect changes, as long as both live.
+_RESIDUALS: WeakKeyDictionary[Motion, WeakKeyDictionary[Residual, FloatArray]] = WeakKeyDictionary()
 Staged = TypeVar("Staged", bound=EffectType)
 
 
@@ -307,8 +311,13 @@ class Simulation:
     @cached_property
     def link_moves(self) -> list[tuple[int, FloatArray]]:
         """Corrections of joint frames: the index in q, and the pose (4, 4) in the nominal frame."""
-        frames = [(effect, kind.frame(effect.values)) for effect, kind in self._of(StructureEffect)]
-        return [(self.place(effect).joint, frame) for effect, frame in frames if frame is not None]
+        moves = []
+        for effect, kind in self._of(StructureEffect):
+            if effect not in _FRAMES:
+                _FRAMES[effect] = kind.frame(effect.values)
+            if (frame := _FRAMES[effect]) is not None:
+                moves.append((self.place(effect).joint, frame))
+        return moves
 
     @cached_property
     def upward(self) -> list[bool]:
@@ -343,7 +352,12 @@ class Simulation:
 
     def added(self, motion: Motion) -> FloatArray:
         """Return the shift added to the camera's report (n, 3) [m]: drift and residual."""
-        shift = np.zeros((len(motion), 3)) if self.residual is None else self.residual.predict(motion.q)
+        shift = np.zeros((len(motion), 3))
+        if self.residual is not None:
+            known = _RESIDUALS.setdefault(motion, WeakKeyDictionary())
+            if self.residual not in known:
+                known[self.residual] = self.residual.predict(motion.q)
+            shift = known[self.residual]
         for effect, kind in self._of(TimeEffect):
             drift = kind.drift(motion, effect.values)
             if drift is not None:

@@ -459,6 +459,13 @@ class Fit:
     def _with(self, simulation: Simulation, tolerated: FloatArray) -> Fit:
         return _at(self.observations, simulation, self.nuisances, self.noise, self.background, tolerated)
 
+    def over(self, observations: Observations) -> Fit:
+        """Refit to observations of another motion of the same arm."""
+        simulation = self._settled_simulation
+        run = simulation.run(observations.motion)
+        background = Background(run, observations.whitening, self.background.scales, self.background)
+        return improved(_at(observations, simulation, self.nuisances, self.noise, background))
+
     def to(self, observations: Observations, start: Simulation | None = None) -> Fit:
         """Refit to other observations of the same motion, optionally from another simulation."""
         simulation = start or self.simulation
@@ -469,9 +476,9 @@ class Fit:
         """Refit with tolerances of these scales, linearised about their present values.
 
         Args:
-            also: causes that become tolerances and are no longer findings.
+            also: further tolerances; those among the causes are no longer findings.
         """
-        simulation = self.settled().simulation
+        simulation = self._settled_simulation
         if also:
             stays = [effect for effect in simulation.effects if effect not in also]
             moved = [effect.one_more(-2 - k) for k, effect in enumerate(also)]
@@ -484,10 +491,16 @@ class Fit:
         """Return the same fit with its tolerances moved into the simulation."""
         if self.background.scales is None:
             return self
-        simulation = self.simulation.with_background(self.background.with_amounts(self.tolerated))
+        simulation = self._settled_simulation
         run = simulation.run(self.observations.motion)
         background = Background(run, self.observations.whitening, self.background.scales, self.background)
         return _at(self.observations, simulation, self.nuisances, self.noise, background)
+
+    @property
+    def _settled_simulation(self) -> Simulation:
+        if self.background.scales is None:
+            return self.simulation
+        return self.simulation.with_background(self.background.with_amounts(self.tolerated))
 
     @property
     def written(self) -> Simulation:

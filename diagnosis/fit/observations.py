@@ -84,6 +84,10 @@ class Observations:
         variances = ratio * np.trace(self.own, axis1=1, axis2=2) / 3.0
         return replace(self, rattling=variances[:, None, None] * ways[:, :, None] * ways[:, None, :])
 
+    def some(self, rows: IntArray) -> Observations:
+        """Return a part of the observations, of increasing rows (m,), before anything is known of the noise."""
+        return Observations(self.motion.some(rows), self.x[rows], self.stated[rows], self.rounding[rows])
+
     def without(self, doubtful: NDArray[np.bool_]) -> Observations:
         """Return the same observations with rows (n,) that are ignored."""
         return replace(self, doubtful=doubtful)

@@ -33,7 +33,7 @@ def with_small_ripples(fit: Fit) -> Fit:
                 found.append(candidate.effect)
         if not found:
             break
-        fit = fit.starting([*fit.causes, *found]).tolerating(scales, found)
+        fit = fit.tolerating(scales, found)
     return fit
 
 

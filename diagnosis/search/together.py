@@ -108,25 +108,26 @@ class Sets:
     """
 
     def __init__(self, fit: Fit, candidates: Sequence[Candidate], doubt: float) -> None:
-        self._fit = fit
         columns, amounts = fit.columns, fit.effect_columns.shape[2]
         causes = sum(len(effect.amounts) for effect in fit.causes)
         own = [effect.values[effect.amounts] for effect in fit.simulation.effects]
         now = np.concatenate([*own, fit.tolerated])
         rows = fit.left.size
-        self._target = fit.left.ravel() + columns.reshape(rows, -1) @ now
+        target = fit.left.ravel() + columns.reshape(rows, -1) @ now
         parts = [columns[:, :, : amounts - causes], columns[:, :, amounts:]]
         self.effects = [candidate.effect for candidate in candidates]
         parts += [*_columns(fit, self.effects)]
         self._nuisances, self._tolerances = amounts - causes, len(fit.tolerated)
+        self._of_scale, self._noise = fit.background.group, fit.noise.sigma
+        scales = np.asarray(fit.background.scales or Scales())[fit.background.group]
         flat = np.concatenate(parts, axis=2).reshape(rows, -1)
         usual = [effect.parameters[k].usual for effect in self.effects for k in effect.amounts]
-        self._units = np.concatenate([np.ones(self._nuisances), fit.background.tolerances / self._scales_now, usual])
+        self._units = np.concatenate([np.ones(self._nuisances), fit.background.tolerances / scales, usual])
         lengths = np.linalg.norm(flat[:, : self._nuisances], axis=0)
         self._units[: self._nuisances] = 1e4 / np.where(lengths > 0.0, lengths, 1.0) * fit.noise.sigma * np.sqrt(rows)
         flat *= self._units
-        self._inner, self._toward = flat.T @ flat, flat.T @ self._target
-        self._square, self._rows = float(self._target @ self._target), 3.0 * float(fit.noise.weights.sum())
+        self._inner, self._toward = flat.T @ flat, flat.T @ target
+        self._square, self._rows = float(target @ target), 3.0 * float(fit.noise.weights.sum())
         self._kinds, self._keys = [one.kind for one in self.effects], [one.key for one in self.effects]
         self._trials = [float(np.log(candidate.trials)) for candidate in candidates]
         self._first = doubt + NAMED
@@ -143,11 +144,6 @@ class Sets:
         known = {cause.identity for cause in fit.causes}
         # The moment of each was sought without the others, so it is right for one of them at most.
         self._begins = {k for k, one in enumerate(self.effects) if one.kind.begins and one.identity not in known}
-
-    @cached_property
-    def _scales_now(self) -> FloatArray:
-        scales = self._fit.background.scales
-        return np.asarray(scales if scales is not None else Scales())[self._fit.background.group]
 
     def climbed(self, starts: Iterable[tuple[int, ...]]) -> list[Together]:
         """Improve each start by single changes, and return the sets reached."""
@@ -169,9 +165,13 @@ class Sets:
         for kind in kinds:
             yield tuple(k for k, effect in enumerate(self.effects) if effect.kind is kind)
         yield tuple(dict.fromkeys((*own, *zeros)))
-        whole = dict.fromkeys(effect.key for effect in self.effects if effect.kind.in_parts and links)
-        for key in whole:
+        for key in dict.fromkeys(effect.key for effect in self.effects if effect.kind.in_parts and links):
             yield tuple(k for k, effect in enumerate(self.effects) if effect.key == key)
+
+    def again(self, effects: Iterable[Effect]) -> tuple[int, ...]:
+        """Return the set of the same effects and numbers, as far as they are candidates here."""
+        wanted = {(effect.key, k) for effect in effects for k in effect.amounts}
+        return tuple(k for k, one in enumerate(self.effects) if (one.key, one.amounts[0]) in wanted)
 
     def _climbed(self, start: tuple[int, ...], seen: dict[frozenset[int], Together]) -> Together:
         here = self.of(start)
@@ -290,7 +290,7 @@ class Sets:
         group = self._group(columns)
         inner, toward = self._inner[np.ix_(columns, columns)], self._toward[columns]
         logs = np.log(near.scales if near else Scales())
-        sigma = near.sigma if near else self._fit.noise.sigma
+        sigma = near.sigma if near else self._noise
         members, spent = [group == g for g in range(3)], np.zeros(3)
         for done in range(_ROUNDS if near is None else _ROUNDS_NEAR):
             factor, variances, amounts = self._solved(inner, toward, group, logs, sigma)
@@ -307,7 +307,7 @@ class Sets:
             if done and max(np.abs(steps).max(), abs(quieter)) < _STILL:
                 break
             logs = np.clip(logs + steps, np.log(_SMALLEST), np.log(MOST))
-            sigma = max(sigma * float(np.exp(quieter)), _QUIETEST * self._fit.noise.sigma)
+            sigma = max(sigma * float(np.exp(quieter)), _QUIETEST * self._noise)
         worth, factor, amounts = self._worth(inner, toward, group, logs, sigma)
         scales = Scales(*np.exp(logs).tolist())
         worth -= scales.doubt + _volume(spent)
@@ -333,7 +333,7 @@ class Sets:
     def _group(self, columns: NDArray[np.intp]) -> NDArray[np.int64]:
         """Return the scale of each column (p,); -1 where it is not a tolerance."""
         group = np.full(len(columns), -1)
-        group[self._nuisances : self._nuisances + self._tolerances] = self._fit.background.group
+        group[self._nuisances : self._nuisances + self._tolerances] = self._of_scale
         return group
 
     def _worth(
@@ -434,7 +434,8 @@ def together(start: Fit, hypotheses: Sequence[Effect], tell: Callable[[str], Non
         worth, place, one = max(proposals, key=lambda proposal: proposal[0], default=(-np.inf, known[0], known[0].here))
         if worth < max(place.here.worth for place in known) - _COMES_NEAR:
             break
-        known.append(_Place(place.refitted(one), hypotheses))
+        near = [causes for other in known for causes in other.near]
+        known.append(_Place(place.refitted(one), hypotheses, near))
         tell(f"{len(known)} fitted")
     return max(known, key=lambda place: place.here.worth).fit
 
@@ -482,9 +483,13 @@ def _beside_tolerances(fit: Fit, cause: Effect) -> float:
 
 
 class _Place:
-    """A fit with its causes, and the sets of causes reached from it."""
+    """A fit with its causes, and the sets of causes reached from it.
 
-    def __init__(self, fit: Fit, hypotheses: Sequence[Effect]) -> None:
+    Args:
+        near: sets of causes that are probable elsewhere, from which to start here; None to start from everything.
+    """
+
+    def __init__(self, fit: Fit, hypotheses: Sequence[Effect], near: Sequence[Sequence[Effect]] | None = None) -> None:
         self.fit = fit
         present = {cause.key for cause in fit.causes}
         others = [one for one in hypotheses if one.key not in present and not one.kind.refines]
@@ -492,13 +497,18 @@ class _Place:
         candidates = [Candidate(cause, 0.0, 1) for cause in fit.causes] + [_at_rest(one) for one in scanned]
         candidates = [part for candidate in candidates for part in _in_parts(candidate)]
         self._sets = Sets(fit, candidates, float(np.log(max(len(hypotheses), 1))))
-        free = {cause.key: cause.amounts for cause in fit.causes}
-        own = tuple(k for k, one in enumerate(candidates) if one.effect.amounts[0] in free.get(one.effect.key, ()))
+        own = self._sets.again(fit.causes)
         self.here = self._sets.of(own)
-        self.reached = self._sets.climbed(self._sets.starts(own, links=not present))
+        self.reached = self._sets.climbed(self._sets.starts(own, links=near is None))
         self.name = self.name_of(self.here)
         # Drop cached results, which are large for many rows.
         self.fit = replace(fit)
+
+    @property
+    def near(self) -> list[list[Effect]]:
+        """The sets reached that are about as probable as the best one."""
+        best = max(one.worth for one in self.reached)
+        return [self._sets.causes(one) for one in self.reached if one.worth > best - _COMES_NEAR]
 
     def name_of(self, one: Together) -> frozenset[Key]:
         """Return the keys of the causes of a set, without their parameters."""

@@ -24,11 +24,13 @@ class Rattle:
     Attributes:
         half_m: half of its play [m].
         ratio: variance along the play over the variance across it, less one.
-        ways: direction of the play at each row (n, 3), in the measurement frame.
+        axis: direction of the play in the marker's link (3,).
+        ways: the same at each row (n, 3), in the measurement frame.
     """
 
     half_m: float
     ratio: float
+    axis: FloatArray
     ways: FloatArray
 
     @property
@@ -36,11 +38,14 @@ class Rattle:
         """Short description."""
         return f"the marker is loose on the hand, by ±{1e3 * self.half_m:.2g} mm"
 
+    def ways_of(self, fit: Fit) -> FloatArray:
+        """Return the direction of the play at each row of a fit (n, 3), in the measurement frame."""
+        return np.einsum("nji,j->ni", _turns(fit), self.axis)
+
 
 def rattle(fit: Fit) -> Rattle | None:
     """Return the play of the marker that the residuals of a fit show; None where they do not lie on two sides."""
-    run, rows = fit.run, fit.noise.weights > 0.0
-    turns = run.frames[:, -1, :3, :3].transpose(0, 2, 1) @ run.simulation.camera_pose[:3, :3]
+    rows, turns = fit.noise.weights > 0.0, _turns(fit)
     left = np.einsum("nij,nj->ni", turns, fit.observations.x - fit.predicted)
     variances, axes = np.linalg.eigh(np.cov(left[rows].T))
     across, along = float(variances[:2].mean()), float(variances[2])
@@ -49,7 +54,13 @@ def rattle(fit: Fit) -> Rattle | None:
     half, apart, worth = _two_sides(left[rows] @ axes[:, 2])
     if apart < _APART or worth < _NAMED:
         return None
-    return Rattle(half, along / across - 1.0, np.einsum("nji,j->ni", turns, axes[:, 2]))
+    return Rattle(half, along / across - 1.0, axes[:, 2], np.einsum("nji,j->ni", turns, axes[:, 2]))
+
+
+def _turns(fit: Fit) -> FloatArray:
+    """Return the rotations (n, 3, 3) from the measurement frame to the marker's link."""
+    run = fit.run
+    return run.frames[:, -1, :3, :3].transpose(0, 2, 1) @ run.simulation.camera_pose[:3, :3]
 
 
 def _two_sides(values: FloatArray) -> tuple[float, float, float]:

@@ -238,13 +238,18 @@ class _Amounts:
         self._left_m = fit.observations.x - fit.predicted - (0.0 if bent is None else bent)
         self._causes, self._lasting = len(fit.precision), functions.shape[2]
         self._columns = np.concatenate([fit.run_columns, functions, timed], axis=2)
-        weighted = fit.weighted(self._columns)
-        self._flat = weighted.reshape(fit.left.size, -1)
-        self._left = fit.weighted(self._left_m[:, :, None]).ravel()
-        self._folds = np.repeat(blocks.fold, 3)
+        flat = fit.weighted(self._columns).reshape(fit.left.size, -1)
+        left = fit.weighted(self._left_m[:, :, None]).ravel()
+        self._folds, self._products = np.unique(blocks.fold), []
+        for fold in self._folds:
+            rows = np.repeat(blocks.fold == fold, 3)
+            own = flat[rows]
+            self._products.append((own.T @ own, own.T @ left[rows], float(left[rows] @ left[rows])))
+        self._inner = np.sum([inner for inner, _, _ in self._products], axis=0)
+        self._toward = np.sum([toward for _, toward, _ in self._products], axis=0)
         tried = [(self._missed(size), size) for size in _SIZES]
         self._size = min(tried)[1]
-        self._all = self._solved(np.ones(len(self._left), dtype=np.bool_), self._size)
+        self._all = self._solved(self._size)
 
     @property
     def of_functions(self) -> FloatArray:
@@ -274,24 +279,27 @@ class _Amounts:
         """Change of each row's prediction (n, 3) [m] due to that row being in the fit."""
         more = np.zeros_like(self._fit.residuals)
         lasting = slice(0, self._causes + self._lasting)
-        for fold in np.unique(self._blocks.fold):
+        for k, fold in enumerate(self._folds):
             rows = self._blocks.fold == fold
-            change = self._all - self._solved(self._folds != fold, self._size)
+            change = self._all - self._solved(self._size, without=k)
             more[rows] = self._columns[rows][:, :, lasting] @ change[lasting]
         return more
 
     def _missed(self, size: float) -> float:
         """Return the sum of squares left on held-out rows."""
         total = 0.0
-        for fold in np.unique(self._folds):
-            rows = self._folds == fold
-            total += float(np.square(self._left[rows] - self._flat[rows] @ self._solved(~rows, size)).sum())
+        for k, (inner, toward, square) in enumerate(self._products):
+            amounts = self._solved(size, without=k)
+            total += square + float(amounts @ inner @ amounts - 2.0 * amounts @ toward)
         return total
 
-    def _solved(self, rows: np.ndarray, size: float) -> FloatArray:
-        free = self._flat.shape[1] - self._causes
+    def _solved(self, size: float, without: int | None = None) -> FloatArray:
+        """Return all amounts under a prior of this size, from all rows or without those of one fold."""
+        free = len(self._toward) - self._causes
         precision = [self._fit.precision]
         precision.append(np.full(free, (size * _noise_m(self._fit)) ** -2))
         ridge = np.diag(np.concatenate(precision)) * self._fit.noise.sigma**2
-        flat = self._flat[rows]
-        return solved(flat.T @ flat + ridge, flat.T @ self._left[rows])
+        if without is None:
+            return solved(self._inner + ridge, self._toward)
+        inner, toward, _ = self._products[without]
+        return solved(self._inner - inner + ridge, self._toward - toward)

@@ -141,16 +141,24 @@ class Unknowns:
 
     def __init__(self, start: Fit) -> None:
         self._start, self._run = start, start.run
+        self._families = families(start.run)
+        self._prepared: dict[int, Way] = {}
         self._near: WeakKeyDictionary[Fit, dict[tuple[Way, ...], list[tuple[Way, float]]]] = WeakKeyDictionary()
 
-    @cached_property
-    def _ways(self) -> list[Way]:
-        return [Way.of(family, self._start) for family in families(self._run)]
+    def _way(self, k: int) -> Way:
+        """Return a family, prepared on first use."""
+        if k not in self._prepared:
+            self._prepared[k] = Way.of(self._families[k], self._start)
+        return self._prepared[k]
 
     @property
     def count(self) -> int:
         """Number of families."""
-        return len(self._ways)
+        return len(self._families)
+
+    def again(self, ways: Sequence[Way]) -> tuple[Way, ...]:
+        """Return the same families, or parts of them, that were found in other observations."""
+        return tuple(replace(Way.of(way.family, self._start), choice=way.choice) for way in ways)
 
     def beside(self, fit: Fit, others: Sequence[Way] = ()) -> tuple[FloatArray, FloatArray]:
         """Return an orthonormal basis (3 n, r) of the changes by `fit` and some families, and the residuals (3 n,)."""
@@ -175,7 +183,7 @@ class Unknowns:
         twice = np.column_stack([directions * np.sqrt(shares), fit.unshared(np.column_stack([basis, left]))])
         seen = np.ascontiguousarray((twice * weights[:, None]).T)
         ranked: list[tuple[float, Way, FloatArray | None]] = []
-        for way in self._ways:
+        for way in map(self._way, range(self.count)):
             if way in others:
                 continue
             columns = way.columns
@@ -207,11 +215,11 @@ class Unknowns:
         """
         basis, left = basis_of(fit), fit.evident.ravel() / fit.noise.sigma
         ranked = [
-            (float(np.square(self._fresh(fit, basis, way).T @ left).sum()), k)
-            for k, way in enumerate(self._ways)
-            if way.family.is_specific
+            (float(np.square(self._fresh(fit, basis, self._way(k)).T @ left).sum()), k)
+            for k, family in enumerate(self._families)
+            if family.is_specific
         ]
-        return [self._ways[k] for gain, k in sorted(ranked, reverse=True)[:_NEAREST] if gain >= least]
+        return [self._way(k) for gain, k in sorted(ranked, reverse=True)[:_NEAREST] if gain >= least]
 
     def _doubt_of(self, way: Way) -> float:
         """Return the multiplicity and prior penalty of a family [nats]."""
