@@ -234,6 +234,11 @@ class Diagnosis:
         return np.linalg.norm(held_out_errors(self.extended.with_causes([]), self.blocks), axis=1)
 
     @cached_property
+    def sought(self) -> Fit:
+        """The complete fit over the rows in which causes were sought."""
+        return self.extended if self.part is None else self.extended.over(self.part)
+
+    @cached_property
     def alike(self) -> tuple[Alike, ...]:
         """Confounded effects beside the best geometry."""
         named = {cause.key for cause in self.causes}
@@ -246,9 +251,8 @@ class Diagnosis:
     def rejected(self) -> list[tuple[Candidate, Added]]:
         """Rejected hypotheses, each with its best fit beside the causes."""
         present = {cause.key for cause in self.causes}
-        fit, blocks = self.extended, self.blocks
-        if self.part is not None:
-            fit, blocks = fit.over(self.part), Blocks.cut(len(self.part))
+        fit = self.sought
+        blocks = self.blocks if self.part is None else Blocks.cut(len(self.part))
         candidates = Scan(fit).candidates(h for h in self.hypotheses.effects if h.key not in present)
         return list(zip(candidates, added(fit, candidates, blocks), strict=True))
 

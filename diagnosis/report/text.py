@@ -277,7 +277,7 @@ def _some(pairs: Sequence[str]) -> str:
 
 def _motion(diagnosis: Diagnosis, rival: Rival) -> str:
     """Return a clause on the joint that, moved through its whole range, best separates a cause from a rival."""
-    robot, fit = diagnosis.extended.simulation.robot, diagnosis.extended
+    robot, fit = diagnosis.extended.simulation.robot, diagnosis.sought
     apart = [apart_on(fit, rival.instead, widened(fit, [k])) for k in range(len(robot.joints))]
     best = int(np.argmax(apart))
     if apart[best] >= _TELLS:

@@ -71,10 +71,11 @@ def held_out_errors(fit: Fit, blocks: Blocks) -> FloatArray:
     if not len(fit.precision):
         return errors
     precision = np.diag(fit.precision) * fit.noise.sigma**2
-    run_columns, columns = fit.run_columns, fit.columns
-    for fold in range(_FOLDS):
+    run_columns, products = fit.run_columns, _Folds.of(fit, fit.columns, blocks).products
+    inners, towards = products.inner.sum(axis=0), products.toward.sum(axis=0)
+    for fold, (inner, toward) in enumerate(zip(products.inner, products.toward, strict=True)):
         own = blocks.fold == fold
-        errors[own] -= run_columns[own] @ _solve(columns[~own], fit.left[~own], precision)
+        errors[own] -= run_columns[own] @ solved(inners - inner + precision, towards - toward)
     return errors
 
 
@@ -238,8 +239,3 @@ def scores_p_value(columns: FloatArray, left: FloatArray, blocks: Blocks) -> flo
 def is_marker(fit: Fit) -> np.ndarray:
     """Return True for trusted fixes (n,) that are probably the marker."""
     return fit.noise.weights >= _MARKER
-
-
-def _solve(columns: FloatArray, left: FloatArray, precision: FloatArray) -> FloatArray:
-    flat = columns.reshape(-1, columns.shape[2])
-    return solved(flat.T @ flat + precision, flat.T @ left.ravel())

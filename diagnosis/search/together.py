@@ -44,7 +44,7 @@ _ROUNDED_OFF, _ONE_BEYOND_ROUNDING = 1e-13, 1e-8
 _SHOWN = 3.0
 # Maximum of changes to a set of causes, and of its causes for more to be added: beyond, the first order is not enough.
 _MOST_MOVES, _MOST_TOGETHER = 60, 8
-# Maximum of refitted sets, and the margin to the best within which a set is refitted [nats].
+# Maximum of refitted sets, and the margin to the best within which a set is refitted, and a change tried [nats].
 _MOST_REFITTED, _COMES_NEAR = 8, 15.0
 
 # Tolerances may stand for a cause of which they leave less than this share of the squares; a third is left of a jump.
@@ -190,14 +190,17 @@ class Sets:
     def _without_one(self, here: Together) -> Together | None:
         """Remove one cause or a part of one, where that is more probable."""
         present = frozenset(here.chosen)
-        there = [group for group in self._groups if present.issuperset(group)]
-        for group in sorted(there, key=lambda group: self._loss(here, group))[:_TRIED]:
+        losses = [(self._loss(here, group), group) for group in self._groups if present.issuperset(group)]
+        for loss, group in sorted(losses, key=lambda one: one[0])[:_TRIED]:
+            if loss > _COMES_NEAR:
+                break
             if better := _better([self.of(_without(here.chosen, group), here)], here):
                 return better
         return None
 
     def _with_one_more(self, here: Together) -> Together | None:
-        return _better([self.of((*here.chosen, *group), here) for group in self._promising(here)[:_TRIED]], here)
+        more = self._promising(here, here.worth)
+        return _better([self.of((*here.chosen, *group), here) for group in more[:_TRIED]], here)
 
     def _exchanged(self, here: Together) -> Together | None:
         """Exchange one cause for another, where that is more probable."""
@@ -205,7 +208,9 @@ class Sets:
         for identity in dict.fromkeys(self.effects[k].identity for k in here.chosen):
             own = tuple(k for k in here.chosen if self.effects[k].identity == identity)
             without = self.of(_without(here.chosen, own), here)
-            others = [group for group in self._promising(without) if self.effects[group[0]].identity != identity]
+            others = [
+                group for group in self._promising(without, here.worth) if self.effects[group[0]].identity != identity
+            ]
             tried += [self.of((*without.chosen, *group), without) for group in others[:_TRIED]]
         return _better(tried, here)
 
@@ -242,8 +247,11 @@ class Sets:
         """Number of all amounts, free or not, of each cause."""
         return {effect.key: len(effect.freeing(None).amounts) for effect in self.effects}
 
-    def _promising(self, here: Together) -> list[tuple[int, ...]]:
-        """Return the groups of candidates worth most with scales and noise held fixed, the best first."""
+    def _promising(self, here: Together, least: float) -> list[tuple[int, ...]]:
+        """Return the groups of candidates that may reach the worth `least`, the best first.
+
+        Their own worth is that with scales and noise held fixed; with scales of their own they may be worth more.
+        """
         present = frozenset(here.chosen)
         closed = present | (self._begins if present & self._begins else set())
         groups = dict.fromkeys(_without(group, here.chosen) for group in self._groups)
@@ -258,7 +266,8 @@ class Sets:
         gradient = self._toward[places] / here.sigma**2 - solved.T @ (self._toward[here.columns] / here.sigma**2)
         own = [np.searchsorted(places, np.concatenate([self._places[k] for k in group])) for group in open_groups]
         worths = _gained(inner, gradient, own) - self._costs_beside(here.chosen, open_groups)
-        return [open_groups[k] for k in np.argsort(worths)[::-1].tolist()]
+        best = np.argsort(worths)[::-1]
+        return [open_groups[k] for k in best[here.worth + worths[best] > least - _COMES_NEAR].tolist()]
 
     def _costs_beside(self, chosen: Sequence[int], groups: Sequence[tuple[int, ...]]) -> FloatArray:
         """Return the cost of naming each of some groups in addition to a set [nats]."""
@@ -434,8 +443,7 @@ def together(start: Fit, hypotheses: Sequence[Effect], tell: Callable[[str], Non
         worth, place, one = max(proposals, key=lambda proposal: proposal[0], default=(-np.inf, known[0], known[0].here))
         if worth < max(place.here.worth for place in known) - _COMES_NEAR:
             break
-        near = [causes for other in known for causes in other.near]
-        known.append(_Place(place.refitted(one), hypotheses, near))
+        known.append(_Place(place.refitted(one), hypotheses))
         tell(f"{len(known)} fitted")
     return max(known, key=lambda place: place.here.worth).fit
 
@@ -483,13 +491,9 @@ def _beside_tolerances(fit: Fit, cause: Effect) -> float:
 
 
 class _Place:
-    """A fit with its causes, and the sets of causes reached from it.
+    """A fit with its causes, and the sets of causes reached from it."""
 
-    Args:
-        near: sets of causes that are probable elsewhere, from which to start here; None to start from everything.
-    """
-
-    def __init__(self, fit: Fit, hypotheses: Sequence[Effect], near: Sequence[Sequence[Effect]] | None = None) -> None:
+    def __init__(self, fit: Fit, hypotheses: Sequence[Effect]) -> None:
         self.fit = fit
         present = {cause.key for cause in fit.causes}
         others = [one for one in hypotheses if one.key not in present and not one.kind.refines]
@@ -499,16 +503,10 @@ class _Place:
         self._sets = Sets(fit, candidates, float(np.log(max(len(hypotheses), 1))))
         own = self._sets.again(fit.causes)
         self.here = self._sets.of(own)
-        self.reached = self._sets.climbed(self._sets.starts(own, links=near is None))
+        self.reached = self._sets.climbed(self._sets.starts(own, links=not present))
         self.name = self.name_of(self.here)
         # Drop cached results, which are large for many rows.
         self.fit = replace(fit)
-
-    @property
-    def near(self) -> list[list[Effect]]:
-        """The sets reached that are about as probable as the best one."""
-        best = max(one.worth for one in self.reached)
-        return [self._sets.causes(one) for one in self.reached if one.worth > best - _COMES_NEAR]
 
     def name_of(self, one: Together) -> frozenset[Key]:
         """Return the keys of the causes of a set, without their parameters."""
