@@ -201,10 +201,20 @@ class Diagnosis:
         return gain_percent(before, after, self.blocks, self.seed)
 
     @cached_property
-    def without(self) -> dict[Identity, FloatArray]:
-        """Held-out distances (n,) [m] without each of the causes."""
-        errors = {c.identity: self._extended_errors(self.extended.without(c)) for c in self.causes}
-        return {key: np.linalg.norm(error, axis=1) for key, error in errors.items()}
+    def worse_without(self) -> dict[Identity, float]:
+        """Held-out sum of squares without each of the causes, over that with all."""
+        if self.part is not None and self.left.model is None:
+            fit, blocks = self.sought, Blocks.cut(len(self.part))
+            whole, fewer = (
+                held_out_errors(fit, blocks),
+                {c: held_out_errors(fit.without(c), blocks) for c in fit.causes},
+            )
+            markers = is_marker(fit)
+        else:
+            whole, markers = self.complete_errors, self.markers
+            fewer = {c: self._extended_errors(self.extended.without(c)) for c in self.causes}
+        square = max(float(np.square(whole[markers]).sum()), 1e-300)
+        return {cause.identity: float(np.square(errors[markers]).sum()) / square for cause, errors in fewer.items()}
 
     @cached_property
     def shares(self) -> Shares:

@@ -127,12 +127,10 @@ def _mean_mm(diagnosis: Diagnosis) -> Errors:
 
 
 def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:
-    fit, kept = diagnosis.extended, diagnosis.markers
-    full = float(np.square(diagnosis.complete_errors[kept]).sum())
-    losses = [max(float(np.square(diagnosis.without[c.identity][kept]).sum()) - full, 0.0) for c in fit.causes]
+    fit, worse = diagnosis.extended, [max(diagnosis.worse_without[c.identity], 1.0) for c in diagnosis.causes]
     sure, causes = _OF_A_DESCRIPTION if diagnosis.ended_early else 1.0, []
-    parts = zip(fit.causes, diagnosis.standings, diagnosis.shares.causes, losses, strict=True)
-    for cause, standing, share, loss in parts:
+    parts = zip(fit.causes, diagnosis.standings, diagnosis.shares.causes, worse, strict=True)
+    for cause, standing, share, squares in parts:
         causes.append(
             Cause(
                 effect=cause.name,
@@ -141,7 +139,7 @@ def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:
                 parameters=_parameters(diagnosis, cause, standing),
                 probability=sure * standing.probability,
                 share_of_gain_percent=100.0 * share,
-                held_out_gain_percent=100.0 * (1.0 - float(np.sqrt(full / max(full + loss, 1e-300)))),
+                held_out_gain_percent=100.0 * (1.0 - squares**-0.5),
                 stability_percent=100.0 * float(standing.again.mean()),
                 indistinguishable_from=tuple(_named(r) for r in standing.rivals if r.is_same_here),
                 rivals=tuple(_named(r) for r in standing.rivals),
