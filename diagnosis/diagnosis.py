@@ -366,12 +366,12 @@ class _Found:
             observations = observations.with_rattle(loose.ratio, loose.ways_of(fit))
         start = aligned(observations, simulation)
         unknowns, fit, stands = Unknowns(start), fit.to(observations), list(self.standings)
-        for k, cause in enumerate(fit.causes):
-            again = Scan(fit, [cause]).without(cause).candidate(cause) if cause.kind.begins else None
-            if again is not None:
+        for k in range(len(stands)):
+            moment = _moment_anew(fit, fit.causes[k], before.motion.clock) if fit.causes[k].kind.begins else None
+            if moment is not None:
                 causes = [*fit.causes]
-                causes[k] = again.effect
-                fit, stands[k] = fit.with_causes(causes), replace(stands[k], itself=again)
+                causes[k] = moment.effect
+                fit, stands[k] = fit.with_causes(causes), replace(stands[k], itself=moment)
         chosen = unknowns.again(self.explanation.unknown)
         apart = unknowns.apart(fit, chosen) if chosen else None
         explanation = replace(self.explanation, fit=fit, apart=apart)
@@ -384,6 +384,16 @@ def _part_of(rows: int) -> IntArray:
         return np.arange(rows)
     firsts = np.linspace(0, rows - _RUN, _MOST_ROWS // _RUN).astype(np.intp)
     return (firsts[:, None] + np.arange(_RUN)).ravel()
+
+
+def _moment_anew(fit: Fit, cause: Effect, searched: FloatArray) -> Candidate | None:
+    """Return a cause that begins at a moment with the best one, which was sought at some times (m,) alone."""
+    clock, after = fit.observations.motion.clock, int(np.searchsorted(searched, cause.values[-1]))
+    between = (clock > searched[max(after - 1, 0)]) & (clock < searched[min(after, len(searched) - 1)])
+    # Rows on the wrong side of the moment seem to be outliers.
+    weights = np.where(between & fit.observations.trusted, 1.0, fit.noise.weights)
+    counted = replace(fit, noise=replace(fit.noise, weights=weights))
+    return Scan(counted, [cause]).without(cause).candidate(cause)
 
 
 def _left_out(fit: Fit) -> NDArray[np.bool_]:
