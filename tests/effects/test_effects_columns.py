@@ -121,3 +121,17 @@ def test_an_effect_cannot_be_changed_by_the_residual_nor_the_other_way_round(rob
         both.positions(MOTION), alone.positions(MOTION) + 0.01 * np.sin(MOTION.q[:, :3]), atol=1e-15
     )
     np.testing.assert_array_equal(both.run(MOTION).columns(effect), alone.run(MOTION).columns(effect))
+
+
+def test_a_residual_is_asked_once_for_a_motion_whatever_the_effects_are(robot) -> None:
+    asked = []
+
+    class Bump:
+        def predict(self, q):
+            asked.append(len(q))
+            return 0.01 * np.sin(q[:, :3])
+
+    before = Simulation(robot, (), Bump())
+    before.positions(MOTION)
+    before.with_effects([sized(robot, ("joint_scale", "elbow", None), 1.0)]).positions(MOTION)
+    assert asked == [len(MOTION)]
