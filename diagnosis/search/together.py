@@ -181,7 +181,7 @@ class Sets:
             seen[frozenset(here.chosen)] = here
             better = self._without_one(here)
             if better is None and self._count(here) < _MOST_TOGETHER:
-                better = self._with_one_more(here) or self._exchanged(here)
+                better = self._with_one_more(here) or self._exchanged(here) or self._with_smaller_tolerances(here)
             if better is None:
                 return here
             here = better
@@ -213,6 +213,17 @@ class Sets:
             ]
             tried += [self.of((*without.chosen, *group), without) for group in others[:_TRIED]]
         return _better(tried, here)
+
+    def _with_smaller_tolerances(self, here: Together) -> Together | None:
+        """Add the shifts or the turns of a link, where tolerances are then so much smaller that it is more probable.
+
+        Beside tolerances as large as the link's own error it seems to be worth nothing, however large they are.
+        """
+        if max(here.scales.lengths, here.scales.angles) <= 1.0:
+            return None
+        near = replace(here, scales=here.scales.no_larger)
+        added = [_without(group, here.chosen) for group in self._groups if len(group) > 1]
+        return _better([self.of((*here.chosen, *group), near) for group in added if group], here)
 
     def _count(self, here: Together) -> int:
         """Return the number of causes of a set."""
