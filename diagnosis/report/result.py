@@ -90,6 +90,11 @@ class Cause(msgspec.Struct, frozen=True):
         """True where a rival is not much less probable, and the cause is not small."""
         return self.probability < SURE and bool(self.rivals) and not self.is_small
 
+    @property
+    def is_outvoted(self) -> bool:
+        """True where a rival is more probable."""
+        return any(rival.probability > self.probability for rival in self.rivals)
+
 
 class Rejected(msgspec.Struct, frozen=True):
     """A hypothesis that was tested and rejected.

@@ -134,8 +134,11 @@ def _head(causes: Sequence[Cause], tolerances: Tolerances | None, seen_by: str, 
     first = [cause for cause in ordered if not (everywhere and cause.is_small)][:_TOLD]
     said = [finding(c.effect, c.where, c.source, told_values(c), seen_by, timed=timed, weighed=weighed) for c in first]
     told = [clause + _or(cause) for clause, cause in zip(said, first, strict=True)]
-    if more := len(ordered) - len(first):
+    others = [cause.is_outvoted for cause in ordered if cause not in first]
+    if more := others.count(False):
         everywhere.append(f"{more} {'smaller' if first else 'small'} cause{'s' * (more > 1)}")
+    if more := others.count(True):
+        everywhere.append(f"{more} correction{'s' * (more > 1)} whose cause is not known")
     parts = [*told, *everywhere]
     head = f"{', '.join(parts[:-1])} and {parts[-1]}" if len(parts) > 1 else parts[0]
     return head[0].upper() + head[1:]
@@ -143,7 +146,9 @@ def _head(causes: Sequence[Cause], tolerances: Tolerances | None, seen_by: str, 
 
 def _or(cause: Cause) -> str:
     """Return the most probable alternative of a cause that is not sure, in parentheses."""
-    return f" (or {rival_named(cause.rivals[0])})" if cause.leaves_open else ""
+    if not cause.leaves_open:
+        return ""
+    return f" ({'more probably' if cause.is_outvoted else 'or'} {rival_named(cause.rivals[0])})"
 
 
 def _open(verdict: Verdict, causes: Sequence[Cause]) -> str:

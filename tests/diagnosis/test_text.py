@@ -92,3 +92,17 @@ def test_tolerances_that_do_not_show_are_told_by_what_they_are_at_most():
     assert made_to(Tolerances(size, none, none)) == (
         "The arm is made to about 0.3 mm and at most 0.02°; its drives run true to at most ±0.02°."
     )
+
+
+def test_an_alternative_that_is_more_probable_is_told_to_be_so() -> None:
+    errors, gain = Errors(5.0, 5.0, 1.0, 1.0, 0.9), Gain(80.0, (75.0, 85.0))
+    said = sentence("undecided", [_zero("elbow", probability=0.1)], errors, gain)
+    assert said.startswith("The zero of joint elbow is off by +1.15° (more probably link_geometry at elbow)")
+
+
+def test_small_causes_less_probable_than_others_are_no_causes_in_the_headline() -> None:
+    causes = [_zero("elbow"), *(_zero(f"joint_{k}", probability=0.1, share=1.0) for k in range(2))]
+    errors, gain = Errors(5.0, 5.0, 1.0, 1.0, 0.9), Gain(80.0, (75.0, 85.0))
+    of = Interval(0.1, (0.05, 0.2))
+    said = sentence("explained", causes, errors, gain, Tolerances(of, of, of, links_share_percent=50.0))
+    assert "small errors everywhere and 2 corrections whose cause is not known" in said
