@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.util import find_spec
@@ -53,7 +53,7 @@ from bodyschema.drivers.serial_lines.config import EncoderConfig, SerialLinesCon
 from bodyschema.drivers.serial_lines.joints import SerialLineJoints
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.clock import SystemClock
-from bodyschema.interfaces.errors import SourceEnded, SourceError
+from bodyschema.interfaces.errors import SourceEnded, SourceError, SourceLost
 from bodyschema.interfaces.protocols import JointSource, MarkerSource, StereoCamera, StereoEyes
 from bodyschema.interfaces.records import JointReading, MarkerFix, MarkerMiss, StereoFrame, frozen_array
 from bodyschema.recordings.recording import Recording
@@ -605,10 +605,18 @@ def test_eyes_tell_their_devices_apart(looks) -> None:
     assert left != right
 
 
+def read_through(make: Make, attempts: int = 5) -> list[Any]:
+    """Return the rows that come through a bench; begin again where a busy host held its lines up."""
+    for _ in range(attempts - 1):
+        with suppress(SourceLost), make() as rig, rig.opened():
+            return rig.read(ROWS)
+    with make() as rig, rig.opened():
+        return rig.read(ROWS)
+
+
 @pytest.mark.parametrize("make", THROUGH)
 def test_joints_through_a_bench_are_those_of_the_source_at_its_times(make: Make) -> None:
-    with make() as rig, rig.opened():
-        told = rig.read(ROWS)
+    told = read_through(make)
     assert [reading.t for reading in told] == TIMES.tolist()
     expected = [[0.01 * k, 0.1, -0.01 * k, 0.2] for k in range(ROWS)]
     assert np.abs(np.array([reading.q for reading in told]) - expected).max() <= np.pi / 4096 + 1e-9
