@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning.changes.outlier_gate import MEDIAN_TO_SIGMA
 from bodyschema.learning.nominal import NominalModel
-from bodyschema.learning.outlier_gate import MEDIAN_TO_SIGMA
 from bodyschema.learning.snapshot import MEAN_OVER_RMS
 from bodyschema.learning.status import Outlook
 from bodyschema.learning.uncertainty import PredictiveUncertainty

@@ -13,10 +13,10 @@ from bodyschema.interfaces.records import FloatArray, Pair
 from bodyschema.learning.changes.known_arm import KnownArm
 from bodyschema.learning.changes.monitor import LOOKED_BACK as KNOWN_PAIRS
 from bodyschema.learning.changes.monitor import ChangeMonitor, Reference
+from bodyschema.learning.changes.outlier_gate import DOUBT, OutlierGate, limits_m, sound
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.model_bank import EXACT, INSTANT, PRIOR, RESIDUAL, RIGID, LearntModel, ModelBank
 from bodyschema.learning.orientation import FEWEST_TO_BELIEVE, OrientationModel, Orientations
-from bodyschema.learning.outlier_gate import DOUBT, OutlierGate, limits_m, sound
 from bodyschema.learning.replay_memory import PairMemory, Permutations
 from bodyschema.learning.solvers.orientation import OrientationSolution
 from bodyschema.learning.solvers.solver import Solved, Task

@@ -14,11 +14,11 @@ from bodyschema.interfaces.records import FloatArray, Pair
 from bodyschema.learning.changes.adaptation import Adapted, Origin
 from bodyschema.learning.changes.known_arm import KnownArm
 from bodyschema.learning.changes.monitor import LOOK_AGAIN, DetectedChange
+from bodyschema.learning.changes.outlier_gate import DOUBT, explained, sound
 from bodyschema.learning.changes.record import NAMED_WITHIN, ChangeRecord, KindOfChange
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.model_bank import PRIOR
 from bodyschema.learning.nominal import PAIRS_TO_REFIT, NominalModel, chain_tolerances
-from bodyschema.learning.outlier_gate import DOUBT, explained, sound
 from bodyschema.learning.regime import Regime
 from bodyschema.learning.replay_memory import PairMemory
 from bodyschema.learning.solvers.solver import fitted_belief

@@ -19,13 +19,13 @@ from bodyschema.interfaces.extras import require_extra
 from bodyschema.interfaces.protocols import Clock, StereoCamera
 from bodyschema.robot.toml_file import line_of, read_toml
 from bodyschema.vision.cameras.config import CamerasConfig, ImagesConfig, RealsenseConfig, UvcSettings, VideosConfig
-from bodyschema.vision.cameras.controls import left_to_the_camera
 from bodyschema.vision.cameras.film import Film
 from bodyschema.vision.cameras.ideal import IdealCamera
 from bodyschema.vision.cameras.live import CameraFigures, LiveEyes
 from bodyschema.vision.cameras.opened import eyes_of
 from bodyschema.vision.cameras.realsense import RealsenseCamera
-from bodyschema.vision.cameras.serials import connected
+from bodyschema.vision.cameras.v4l2.controls import left_to_the_camera
+from bodyschema.vision.cameras.v4l2.serials import connected
 from bodyschema.vision.cameras.watched import PlainEyes, WatchedCamera
 from bodyschema.vision.rig.rectified import RectifiedCamera
 from bodyschema.vision.rig.rig_file import read_rig

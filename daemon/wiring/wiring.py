@@ -196,7 +196,7 @@ def _require_source(config: Config, *, sim: bool) -> None:
 
 def connected_cameras() -> list[str]:
     """Return the cameras of this machine, by the names that stay."""
-    from bodyschema.vision.cameras.serials import connected
+    from bodyschema.vision.cameras.v4l2.serials import connected
 
     return connected()
 

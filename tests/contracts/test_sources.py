@@ -61,9 +61,9 @@ from bodyschema.robot.description import RobotDescription
 from bodyschema.sim_backend import CameraConfig, SimConfig, SimWorld, model_file
 from bodyschema.sim_backend.config import SimTag
 from bodyschema.vision.cameras.config import CamerasConfig
-from bodyschema.vision.cameras.device import OpenCapture
 from bodyschema.vision.cameras.ideal import IdealCamera
 from bodyschema.vision.cameras.opened import eyes_of
+from bodyschema.vision.cameras.v4l2.device import OpenCapture
 from bodyschema.vision.config import VisionConfig
 from bodyschema.vision.rig.lens import Lens
 from bodyschema.vision.rig.rectified import RectifiedCamera

@@ -6,8 +6,8 @@ import numpy as np
 from guided_arm import Scene, nominal_model
 
 from bodyschema.learning.changes.known_arm import KnownArm
+from bodyschema.learning.changes.outlier_gate import CHANGE, OutlierGate
 from bodyschema.learning.config import LearnerConfig
-from bodyschema.learning.outlier_gate import CHANGE, OutlierGate
 from bodyschema.learning.regime import Regime
 from bodyschema.learning.uncertainty import UncertaintyTracker
 from kbmaps import ChainTolerances

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodyschema.learning.outlier_gate import explained
+from bodyschema.learning.changes.outlier_gate import explained
 
 
 @pytest.mark.parametrize(

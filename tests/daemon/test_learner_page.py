@@ -6,10 +6,10 @@ import re
 from pathlib import Path
 
 from bodyschema.daemon.config import LARGEST_MAP
+from bodyschema.learning.changes.outlier_gate import CHANGE, DOUBT, FEWEST_FOR_CHANGE
 from bodyschema.learning.model_bank import TRUSTED
 from bodyschema.learning.nominal import PAIRS_TO_REFIT
 from bodyschema.learning.online_learner import REGION_RAD
-from bodyschema.learning.outlier_gate import CHANGE, DOUBT, FEWEST_FOR_CHANGE
 from bodyschema.learning.snapshot import IN_SUPPORT
 from bodyschema.learning.solvers.solver import KEPT, LARGEST_NET, WINDOW
 from kbmaps.contest import CLEARLY, SHORTEST

@@ -18,9 +18,9 @@ from bodyschema.vision.cameras.images import ImageRoll
 from bodyschema.vision.cameras.look import of_image
 from bodyschema.vision.cameras.opened import eyes_of
 from bodyschema.vision.cameras.pairing import Pairing
-from bodyschema.vision.cameras.serials import connected, serial_of
 from bodyschema.vision.cameras.shot import Shot
 from bodyschema.vision.cameras.stamps import TRIALS, Stamps
+from bodyschema.vision.cameras.v4l2.serials import connected, serial_of
 
 FILE = Path("robot.toml")
 BY_ID = "/dev/v4l/by-id/usb-A-video-index0"

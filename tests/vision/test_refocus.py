@@ -16,7 +16,7 @@ from shown_board import BOARD, SIZE, corner_views, view_of
 from bodyschema.vision.calibration.calibrate import Asked, calibrate, fit
 from bodyschema.vision.calibration.refocus import focal_spread
 from bodyschema.vision.calibration.view import EYES, ONE_EYE, Eye, View
-from bodyschema.vision.cameras.controls import FocusWatch
+from bodyschema.vision.cameras.v4l2.controls import FocusWatch
 from bodyschema.vision.rig.stereo_rig import CalibrationError
 
 

@@ -17,12 +17,12 @@ from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import StereoFrame
 
-from .capture import Capture
 from .config import CamerasConfig, OneConfig, SideBySideConfig, TwoConfig
-from .device import CameraDevice, OpenCapture, open_v4l2
 from .pairing import Pairing
-from .serials import serial_of
 from .shot import Shot
+from .v4l2.capture import Capture
+from .v4l2.device import CameraDevice, OpenCapture, open_v4l2
+from .v4l2.serials import serial_of
 
 FIRST_IMAGE_S = 5.0
 MANY_APART = 10

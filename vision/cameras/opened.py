@@ -16,11 +16,11 @@ from .config import (
     TwoConfig,
     VideosConfig,
 )
-from .device import OpenCapture, open_v4l2
 from .film import Film, Roll
 from .images import ImageRoll
 from .live import LiveEyes
 from .realsense import RealsenseCamera
+from .v4l2.device import OpenCapture, open_v4l2
 from .videos import VideoRoll
 
 

@@ -10,9 +10,8 @@ import cv2
 import numpy as np
 
 from bodyschema.interfaces.errors import SourceError
-
-from .config import SideBySideConfig, UvcSettings
-from .look import EVERY_S
+from bodyschema.vision.cameras.config import SideBySideConfig, UvcSettings
+from bodyschema.vision.cameras.look import EVERY_S
 
 EXPOSURE_UNIT_S = 1e-4  # V4L2_CID_EXPOSURE_ABSOLUTE
 MANUAL_EXPOSURE = 1  # V4L2_EXPOSURE_MANUAL

@@ -13,11 +13,11 @@ import numpy as np
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import ImageArray
+from bodyschema.vision.cameras.config import UvcSettings
+from bodyschema.vision.cameras.shot import Shot
+from bodyschema.vision.cameras.stamps import Stamps
 
-from .config import UvcSettings
 from .controls import FocusWatch, VideoCapture, apply, raw_size_px, sends_jpeg
-from .shot import Shot
-from .stamps import Stamps
 
 JPEG_END = b"\xff\xd9"
 PADDING_BYTES = 64  # that some cameras append

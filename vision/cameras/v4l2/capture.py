@@ -10,10 +10,10 @@ from types import TracebackType
 from typing import Self
 
 from bodyschema.interfaces.errors import SourceError
+from bodyschema.vision.cameras.look import Look
+from bodyschema.vision.cameras.shot import Shot
 
 from .device import CameraDevice
-from .look import Look
-from .shot import Shot
 
 log = logging.getLogger(__name__)
 
