@@ -221,7 +221,7 @@ def _poses(robot: RobotDescription) -> FloatArray:
 
 
 def is_told(made: Sequence[tuple[float, float]]) -> bool:
-    """Return True if the probable workmanships (axes [rad], positions [m]) agree within the factor TOLD_WITHIN."""
+    """Return True if the probable workmanships (axes [rad], positions [m]) agree within the factor `told_within`."""
     axes = [axes for axes, _ in made]
     return max(axes) <= _SETTINGS.told_within * min(axes)
 

@@ -54,7 +54,7 @@ class EffectType(ABC):
         turns_only: True if only a revolute joint can have it.
         needs_times: True if it needs times, not only an order.
         needs_stereo: True if it needs the stereo calibration.
-        needs_weight: True if it needs joints that bear the arm's weight, and its masses.
+        needs_weight: True if it needs joints that bear the arm's weight.
         in_parts: True if only some of its amounts may differ from nominal, as where a link is too long but straight.
         rigid: True if a rigid chain can hold it.
         is_spring: True if its joint yields in proportion to its load.

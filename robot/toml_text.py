@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -36,22 +37,27 @@ def with_values(file: Path, table: str, values: Mapping[str, Any]) -> str:
     Raises:
         ConfigError: the file cannot be read, has no such table, or is written in a way that cannot be edited.
     """
-    read_toml(file)
+    expected, _ = read_toml(file)
     text = file.read_bytes().decode()
     listed = ", ".join(f"{key} = {toml_value(value)}" for key, value in values.items())
     by_hand = f"Nothing was changed. Write into [{table}] yourself: {listed}"
     try:
         document = tomlkit.parse(text.removeprefix(_BOM).replace("\r\n", "\n"))
-        found: Any = document
-        for part in table.split("."):
-            found = found.get(part)
-            found = found[0] if isinstance(found, list) and found else found
-            if not isinstance(found, Mapping):
-                raise ConfigError(f"there is no table [{table}]", file=file, remedy=by_hand)
-        found.update(values)  # pyright: ignore[reportAttributeAccessIssue]
-    except TOMLKitError as error:
-        raise ConfigError(f"cannot be edited: {error}", file=file, remedy=by_hand) from error
-    edited = tomlkit.dumps(document)
+        for tables in (document, expected):
+            found: Any = tables
+            for part in table.split("."):
+                found = found.get(part)
+                found = found[0] if isinstance(found, list) and found else found
+                if not isinstance(found, Mapping):
+                    raise ConfigError(f"there is no table [{table}]", file=file, remedy=by_hand)
+            found.update(values)  # pyright: ignore[reportAttributeAccessIssue]
+        edited = tomlkit.dumps(document)
+        if tomllib.loads(edited) != expected:
+            raise ConfigError(f"[{table}] is written so that it cannot be edited", file=file, remedy=by_hand)
+    except (TOMLKitError, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(
+            f"[{table}] is written so that it cannot be edited: {str(error).rstrip('.')}", file=file, remedy=by_hand
+        ) from error
     return _BOM * text.startswith(_BOM) + (edited.replace("\n", "\r\n") if "\r\n" in text else edited)
 
 

@@ -108,7 +108,7 @@ def compared(simulation: Simulation, recording: Recording, out: Path) -> tuple[l
             predicted[f"{out.name} in MuJoCo {version_}"] = replayed(out, simulation.robot.joints, motion)
     elif out.suffix.lower() == DRIVERS:
         # Beside the fit of camera and marker, which changes no background.
-        kept = tuple(effect for effect in simulation.all_effects if effect.name in IN_DRIVERS)
+        kept = tuple(effect for effect in simulation.after_moments.all_effects if effect.name in IN_DRIVERS)
         settings = Simulation(simulation.robot, (), None, kept)
         predicted[f"zeros and scales of {out.name}"] = aligned(Observations.of(recording, settings), settings).predicted
     elif out.suffix.lower() == CORRECTION:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 
 from bodyschema.diagnosis.assess.rivals import Rival, Standing
@@ -14,6 +15,7 @@ from bodyschema.diagnosis.search.aliases import alias_sentences
 from bodyschema.diagnosis.search.scan import Candidate
 from bodyschema.diagnosis.search.together import is_at_limit
 from bodyschema.effects import Effect
+from bodyschema.effects.effect_type import EffectType
 from bodyschema.interfaces.records import FloatArray
 
 from .result import (
@@ -36,6 +38,8 @@ from .text import advice, evidence, sentence
 _HALF_WIDTH_95 = 1.959964
 # Probability that causes which describe the error, and do not explain it, are there at all.
 _OF_A_DESCRIPTION = 0.5
+# ... and that an error beside a joint that gives is one of its own, where the weight is assumed.
+_OF_A_GUESS = 0.5
 # Below this p-value, the report explains why a hypothesis is not a cause.
 _HARDLY_CHANCE = 1e-3
 
@@ -150,9 +154,26 @@ def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:
                 evidence=evidence(standing),
             )
         )
+    if not diagnosis.aligned.simulation.gravity.known:
+        giving = {cause.where for cause in fit.causes if cause.kind.is_spring}
+        beside = [cause.where in giving and _like_sag(cause.kind) for cause in fit.causes]
+        causes = [_or_sag(cause) if likely else cause for cause, likely in zip(causes, beside, strict=True)]
     if diagnosis.outliers_are_found:
         causes.append(_outliers(diagnosis))
     return tuple(causes)
+
+
+def _like_sag(kind: EffectType) -> bool:
+    """Return True for an error of a joint that depends on its angle alone, as sag about nearly does."""
+    lasts = not (kind.depends_on_path or kind.changes_with_time)
+    return kind.encoder is not None and lasts and not kind.is_zero
+
+
+def _or_sag(cause: Cause) -> Cause:
+    """Return a cause beside a joint that gives, of an arm whose weight is assumed: it may be a part of that."""
+    what = "the spread of the arm's weight, which the URDF does not state"
+    sag = Indistinguishable("unexplained", None, None, "this_motion", _OF_A_GUESS, what)
+    return msgspec.structs.replace(cause, probability=min(cause.probability, _OF_A_GUESS), rivals=(sag, *cause.rivals))
 
 
 def _named(rival: Rival) -> Indistinguishable:

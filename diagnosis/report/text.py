@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -71,7 +72,8 @@ def remedies(diagnosis: DiagnosisFile, robot: RobotDescription, steps: FloatArra
     """
     workshop = Workshop(robot, steps, torques, {cause.effect: cause for cause in diagnosis.causes})
     causes = in_order(diagnosis.causes)
-    told = [presenter_of(cause.effect).remedy(workshop, Found.of(cause)) for cause in causes]
+    found = [replace(Found.of(cause), weighed=diagnosis.weighed) for cause in causes]
+    told = [presenter_of(each.effect).remedy(workshop, what) for each, what in zip(causes, found, strict=True)]
     return [_if_sure(cause, remedy) for cause, remedy in zip(causes, told, strict=True)]
 
 

@@ -81,15 +81,16 @@ class _Limits:
             )
         elif not simulation.gravity.known:
             self.sentences.append(
-                "The URDF states no masses: links of 1 kg per metre were assumed. How far joints give under the arm's "
-                "weight is not affected by that, but their stiffness is."
+                "The URDF states no masses: links of 1 kg per metre were assumed, so how far joints give under the "
+                "arm's weight is rough, and what resembles it at the same joint may be a part of it."
             )
 
     def excludes(self, kind: EffectType) -> bool:
         """Return True if no effect of this kind can be tested, or if all of it is free anyway."""
         robot = self._simulation.robot
         if kind.needs_weight:
-            return robot.robot.hold == "torque_free"
+            unknown = kind.is_load and not self._simulation.gravity.known
+            return unknown or robot.robot.hold == "torque_free"
         if kind.rigid and not kind.at_joint:
             return kind.is_free(robot)
         if kind.needs_times and self._motion.t is None:

@@ -52,11 +52,11 @@ def remember(r, to, reading, pace, c):
     """Set a strain (0 play, 1 hysteresis, 2 settling), its last reading, and how far it has begun."""
     (strain, last, begun), now, (kind, scale) = r[to : to + 3], r[reading], c[:2]
     move = now - last if begun else 0.0
-    way, x, left = copysign(1.0, move), abs(move) / scale, 1.0 - copysign(1.0, move) * strain if begun > 1 else 0.0
+    way, left = copysign(1.0, move), 1.0 - copysign(1.0, move) * strain if begun > 1 else 0.0
     if kind == 2:
         strain = 0.0 if r[pace] < 0 else move + copysign(abs(scale) ** r[pace], scale) * strain
     elif move:  # the first shows the side
-        strain = way * (1.0 - (left * exp(-x) if kind else max(left - x, 0.0)))
+        strain = way * (1.0 - (left * exp(-abs(move) / scale) if kind else max(left - abs(move) / scale, 0.0)))
     if isfinite(now):
         r[to : to + 3] = strain, now, 2 if move else max(begun, 1)
 

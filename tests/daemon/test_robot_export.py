@@ -64,6 +64,15 @@ def test_gain_of_settings_of_drivers_is_printed(extended, measured, tmp_path, ca
     assert "zeros and scales of drivers.txt" in told
 
 
+def test_a_jump_of_an_encoder_is_a_zero_of_the_drivers_afterwards(extended, measured, tmp_path, capsys) -> None:
+    export(extended, tmp_path / "drivers.txt", "--measured", measured)
+    as_offset = rms_mm(capsys.readouterr().out)
+    text = extended.read_text().replace('"joint_offset"', '"encoder_jump"')
+    extended.write_text(text.replace("offset_rad = 0.05", "jump_rad = 0.05\nt0 = -1.0"))
+    export(extended, tmp_path / "jumped.txt", "--measured", measured)
+    assert rms_mm(capsys.readouterr().out)[2] == as_offset[2]
+
+
 def test_settings_of_drivers_that_are_wrong_gain_nothing(extended, measured, tmp_path, capsys) -> None:
     extended.write_text(extended.read_text().replace("offset_rad = 0.05", "offset_rad = 0.5"))
     export(extended, tmp_path / "drivers.txt", "--measured", measured)

@@ -58,6 +58,13 @@ def test_a_missing_table_is_named_with_what_to_write(tmp_path: Path, text: str) 
     assert error.value.remedy.endswith("[vision.cameras] yourself: latency_s = 0.01, latency_sigma_s = 0.001")
 
 
+@pytest.mark.parametrize("text", ["[[vision.cameras]] # mine", "[[vision.cameras]]"])
+def test_what_would_not_read_back_as_meant_is_left_to_people(tmp_path: Path, text: str) -> None:
+    (tmp_path / "robot.toml").write_text(text)
+    with pytest.raises(ConfigError, match=r"\[vision\.cameras\] is written so that it cannot be edited"):
+        with_values(tmp_path / "robot.toml", "vision.cameras", VALUES)
+
+
 WAS = b'[vision.cameras]  # two\r\nleft = "a"\r\nlatency_s = 0.0  # mine\r\n\r\n[robot]\r\n'
 BECOMES = WAS.replace(b"0.0", b"0.01").replace(b"mine\r\n", b"mine\r\nlatency_sigma_s = 0.001\r\n")
 VALUES = {"latency_s": 0.01, "latency_sigma_s": 0.001}

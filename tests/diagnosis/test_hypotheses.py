@@ -33,6 +33,7 @@ def names(hypotheses: Hypotheses) -> set[str]:
 def test_a_robot_without_masses_is_tested_for_joints_that_give() -> None:
     found = asked_of(desk_arm(HELD))
     assert "joint_compliance" in names(found)
+    assert "payload" not in names(found)
     assert any("states no masses" in sentence for sentence in found.limitations)
 
 

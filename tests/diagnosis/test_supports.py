@@ -110,6 +110,8 @@ def test_a_joint_that_gives_is_named_where_the_urdf_states_no_masses(robot) -> N
     assert (first.effect, first.where) == ("joint_compliance", SHOULDER)
     assert "N·m" not in file.sentence
     assert not file.weighed
+    beside = [cause.probability for cause in file.causes if cause.effect in ("joint_eccentricity", "joint_scale")]
+    assert all(probability <= 0.5 for probability in beside)
 
 
 def test_what_may_be_a_mount_that_gives_is_told_with_how_to_see_it(robot) -> None:

@@ -166,6 +166,15 @@ def test_memory_goes_on_from_a_state_in_the_file(commands, robot, tmp_path) -> N
         np.testing.assert_allclose(corrected(command, file, q[20:])[0], whole[20:], rtol=0, atol=1e-14)
 
 
+def test_a_joint_whose_settling_remembers_one_move_alone_is_read_too(commands, robot, tmp_path) -> None:
+    simulation = Simulation(robot, (Effect.at(robot, "settling", "wrist", values=[0.1, 0.0]),))
+    write_correction(simulation, tmp_path / "c.json", "")
+    motion = steady()
+    for command in commands.values():
+        angles, _ = corrected(command, tmp_path / "c.json", motion.q)
+        np.testing.assert_allclose(angles[1:], simulation.run(motion).q[1:], rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("name", sorted(NOT_OF_THE_ARM))
 def test_what_is_no_error_of_the_arm_is_listed(name, robot, tmp_path) -> None:
     simulation = Simulation(robot, (sized(robot, (name, None, None), 1.0),))

@@ -54,7 +54,7 @@ def focal_spread(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -
     explained = np.mean(by_focal) / max(variance, np.mean(by_others, axis=0).max())
     if explained < max(_CLEARLY, float(chi2.isf(_FALSE_ALARMS, len(by_focal))) / len(by_focal)):
         return None
-    spread = float(np.median(np.square(factors))) / float(chi2.median(1)) - variance * float(np.median(variances))
+    spread = float(np.mean(np.square(factors))) - variance * float(np.mean(variances))
     return float(np.sqrt(max(spread, 0.0)))
 
 

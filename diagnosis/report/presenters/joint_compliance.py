@@ -27,8 +27,9 @@ class JointCompliance(Presenter):
         compliance = next(v for name, v in found.numbers.items() if name.startswith("compliance"))
         most = workshop.torques[workshop.joint(found)] * compliance
         sag = f"{1e3 * most:.2g} mm" if workshop.slides(found) else f"{most * DEG:.2g}°"
+        about = "up to" if found.weighed else "roughly up to, since the URDF states no masses,"
         return (
-            f"Check what bears the weight at {found.where}: screws, gear, belt, the gain of its position loop (up to "
+            f"Check what bears the weight at {found.where}: screws, gear, belt, the gain of its position loop ({about} "
             f"{sag} here). A spring that stays belongs into the simulation, as in extended.toml."
         )
 
