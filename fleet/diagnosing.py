@@ -147,7 +147,7 @@ def workers(scheduler: str | None, jobs: int, count: int | None = None) -> Itera
                 n_workers=count or min(os.cpu_count() or 1, jobs),
                 threads_per_worker=1,
                 processes=True,
-                dashboard_address=None,  # pyright: ignore[reportArgumentType]
+                dashboard_address="127.0.0.1:0",  # without one it takes port 8787, and warns where that is in use
                 silence_logs=logging.CRITICAL,
             ) as local,
             Client(local) as client,

@@ -57,6 +57,7 @@ class Child:
         stderr: IO | None = None,
     ) -> None:
         self.args, self.returncode, self._lock = [str(word) for word in arguments], None, threading.Lock()
+        self._heard = b""
         request = json.dumps([self.args, str(cwd or Path.cwd()), dict(os.environ if env is None else env)])
         self._fate, fate = os.pipe()
         with open(os.devnull, "wb") as nowhere:
@@ -64,18 +65,27 @@ class Child:
             with _ASKING:  # two threads must not start two servers
                 socket.send_fds(_server(), [request.encode()], files)
         os.close(fate)
-        self.pid = int(os.read(self._fate, 64))
+        self.pid = self._next()
 
     def __del__(self) -> None:
         os.close(self._fate)
 
     def wait(self, timeout: float | None = None) -> int:
-        if not select.select([self._fate], [], [], timeout)[0]:
+        if not (self._heard or select.select([self._fate], [], [], timeout)[0]):
             raise subprocess.TimeoutExpired(self.args, timeout or 0.0)
         with self._lock:  # two threads may wait
             if self.returncode is None:
-                self.returncode = int(os.read(self._fate, 64))
+                self.returncode = self._next()
             return self.returncode
+
+    def _next(self) -> int:
+        """Return the next number that the server says: the process's, then its exit code, which may come at once."""
+        while b"\n" not in self._heard:
+            if not (heard := os.read(self._fate, 64)):
+                raise ChildProcessError("the forking process ended")
+            self._heard += heard
+        number, _, self._heard = self._heard.partition(b"\n")
+        return int(number)
 
     def poll(self) -> int | None:
         with suppress(subprocess.TimeoutExpired):
@@ -141,7 +151,7 @@ def _serve(wire: socket.socket) -> list[str]:
         for ready in select.select([wire.fileno(), *alive], [], [])[0]:
             if ready != wire.fileno():
                 pid, fate = alive.pop(ready)
-                os.write(fate, b"%d" % os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
+                os.write(fate, b"%d\n" % os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
                 os.close(fate)
                 os.close(ready)
                 continue
@@ -150,7 +160,7 @@ def _serve(wire: socket.socket) -> list[str]:
                 os._exit(0)
             if (pid := os.fork()) == 0:
                 return _settle(json.loads(message), files)
-            os.write(files[0], b"%d" % pid)
+            os.write(files[0], b"%d\n" % pid)
             alive[os.pidfd_open(pid)] = pid, files[0]
             for file in files[1:]:
                 os.close(file)
