@@ -235,6 +235,11 @@ class Simulation:
         """True if the joints bear the arm's weight; torque-free joints leave it to the guiding hand."""
         return self.robot.robot.hold != "torque_free"
 
+    @property
+    def shows_weight(self) -> bool:
+        """True if the weight may show: the joints bear it, or the URDF states it and what carries them may give."""
+        return self.bears_weight or self.gravity.known
+
     def given_way(self, q: FloatArray, hung: dict[Identity, float] | None = None) -> FloatArray:
         """Return the deflection of the joints under the arm's weight (n, d) [rad, m], their springs unloaded at q (n,
         d).

@@ -79,8 +79,7 @@ def _by_joint(residuals: Residuals) -> Iterator[Panel]:
 
 
 def _by_torque(residuals: Residuals) -> Iterator[Panel]:
-    simulation = residuals.run.simulation
-    if not (simulation.gravity.known or simulation.bears_weight):
+    if not residuals.run.simulation.shows_weight:
         return
     for k, name in enumerate(residuals.robot.joints):
         torque = residuals.run.torques[:, k]

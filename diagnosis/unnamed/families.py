@@ -107,7 +107,8 @@ def families(run: Simulated) -> list[Family]:
                 found.append(Family(what, "joint", k, (), True, joint, _any_of_time(count)))
             what = f"the link before {names[k]} changes with time"
             found.append(Family(what, "body", k, (), True, link, _warming_or_any_of_time))
-        found += _giving(run, k)
+        if run.simulation.shows_weight:
+            found += _giving(run, k)
     if timed:
         for what, moves in (("the tool changes with time", _tool), ("the camera moves with time", _camera)):
             found.append(Family(what, "body", None, (), True, moves, _warming_or_any_of_time))

@@ -69,3 +69,10 @@ def test_a_focal_length_that_wanders_is_told_from_all_other_families() -> None:
     start = aligned(Observations.of(measured(robot, motion, x), Simulation(robot)), Simulation(robot))
     way, _ = Unknowns(start).nearest(start)[0]
     assert way.family.what == "the lens refocuses: its focal length wanders"
+
+
+def test_a_hand_that_bears_an_arm_of_unknown_weight_leaves_nothing_that_gives() -> None:
+    held = {"torque_free": "held"}
+    for robot, gives in ((desk_arm(), False), (desk_arm(held), True)):
+        found = families(Simulation(robot).run(walk(robot, 1)))
+        assert any("under the arm's weight" in family.what for family in found) == gives
