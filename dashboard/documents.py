@@ -6,6 +6,8 @@ from typing import Any, Literal
 
 import msgspec
 
+from bodyschema.robot.hand_eye import MarkerPose
+
 Process = Literal["sampler", "learner"]
 
 
@@ -166,6 +168,8 @@ class ArmDocument(msgspec.Struct, frozen=True):
         camera: pose of the measurement frame.
         hand: number of the link that holds the marker.
         measured: the marker as it was measured.
+        measured_pose, predicted_pose: measurement and prediction in the measurement frame, as all messages have poses;
+            null without a prediction.
         trail: where it was measured in the pairs before, the newest last.
         predicted: the marker by the answering model; null without one.
         radii: half axes of the ellipsoid around it, along the measurement frame's axes, in which 95 % of measurements
@@ -181,6 +185,8 @@ class ArmDocument(msgspec.Struct, frozen=True):
     measured: list[float]
     trail: list[list[float]]
     predicted: list[float] | None
+    measured_pose: MarkerPose
+    predicted_pose: MarkerPose | None
     radii: list[float] | None
     apart_m: float | None
     placed: bool

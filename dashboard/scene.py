@@ -9,6 +9,7 @@ from bodyschema.daemon.transport.wire import PredictReply
 from bodyschema.interfaces.records import FloatArray, Pair
 from bodyschema.learning.status import LearntFigure
 from bodyschema.robot.description import RobotDescription, link_poses
+from bodyschema.robot.hand_eye import MarkerPose
 from bodyschema.robot.rpy import pose_of
 from kbmaps.rotations import quaternions
 
@@ -55,6 +56,8 @@ def arm(
         measured=_numbers(measured[-1]),
         trail=measured[:-1].round(_DECIMALS).tolist(),
         predicted=None if predicted is None else _numbers(predicted),
+        measured_pose=MarkerPose.of(pairs[-1].x, pairs[-1].cov, pairs[-1].R, pairs[-1].cov_R),
+        predicted_pose=None if reply is None or reply.poses is None else reply.poses[0],
         radii=None if reply is None or noise_m is None else _radii(np.array(reply.sigma[0]), noise_m),
         apart_m=None if predicted is None else float(np.linalg.norm(predicted - measured[-1])),
         placed=calibration is not None or robot.camera.pose_known,

@@ -40,9 +40,11 @@ def main(robot: str, endpoint: str, *angles: str) -> None:
     q = [float(angle) for angle in angles]
     with session_to(endpoint) as session:  # a session that is not closed keeps Python from exiting
         reply = ask(session, f"bodyschema/{robot}/predict", {"q": [q]})
-    for x, sigma, inside in zip(reply["x"], reply["sigma"], reply["in_support"], strict=True):
+    for x, sigma, inside, pose in zip(reply["x"], reply["sigma"], reply["in_support"], reply["poses"], strict=True):
         where = "where data was" if inside else "away from all data"
         print(f"x = {x} m, 1-sigma {sigma} m, {where}")
+        if pose["matrix"] is not None:  # an orientation is learnt
+            print(f"T = {pose['matrix']}, covariance of x, y, z and turns {pose['covariance']} m², rad²")
     print(f"model {reply['model']} of {reply['pairs']} pairs")
 
 

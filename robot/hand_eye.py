@@ -57,13 +57,13 @@ class HandEye(msgspec.Struct, frozen=True):
 
 
 class MarkerPose(msgspec.Struct, frozen=True):
-    """A predicted pose of the marker in the measurement frame, in SI.
+    """A pose of the marker in the measurement frame, in SI: the form of all messages, with the names of `HandEye`.
 
     Attributes:
         translation_m: x, y, z.
-        quaternion_xyzw, matrix: orientation, and homogeneous matrix of four rows of four; null where no orientation is
-            learnt.
-        covariance: 6 x 6, row by row, as that of `HandEye`; null likewise. A prediction has no correlations.
+        quaternion_xyzw, matrix: orientation, and homogeneous matrix of four rows of four; null without an orientation.
+        covariance: 6 x 6, row by row, as that of `HandEye`, of a prediction without correlations; null where that of
+            the orientation is not known.
         translation_covariance: 3 x 3, row by row [m²].
     """
 
@@ -74,16 +74,39 @@ class MarkerPose(msgspec.Struct, frozen=True):
     translation_covariance: list[float]
 
     @classmethod
-    def of(
-        cls, x: list[float], sigma: list[float], quaternion: list[float] | None, sigma_R: list[float] | None
-    ) -> Self:
-        """Return a pose from a position with its 1-sigma [m], and an orientation with its own [rad], if any."""
-        narrow = np.diag(np.square(sigma)).ravel().tolist()
-        if quaternion is None or sigma_R is None:
-            return cls(x, None, None, None, narrow)
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = rotation_matrices("R", quaternion), x
-        return cls(x, quaternion, T.tolist(), np.diag(np.square([*sigma, *sigma_R])).ravel().tolist(), narrow)
+    def of(cls, x: FloatArray, cov: FloatArray, R: FloatArray | None = None, cov_R: FloatArray | None = None) -> Self:
+        """Return one pose, as `rows` does."""
+        return cls.rows(x[None], cov[None], None if R is None else R[None], None if cov_R is None else cov_R[None])[0]
+
+    @classmethod
+    def rows(
+        cls, x: FloatArray, cov: FloatArray, R: FloatArray | None = None, cov_R: FloatArray | None = None
+    ) -> list[Self]:
+        """Return n poses.
+
+        Args:
+            x: positions (n, 3) [m].
+            cov: their covariances (n, 3, 3), or their 1-sigma (n, 3).
+            R: orientations, unit quaternions (n, 4).
+            cov_R: covariances (n, 3, 3) of a small rotation about the axes [rad²], or its 1-sigma (n, 3).
+        """
+        n = len(x)
+        six = np.zeros((n, 6, 6))
+        six[:, :3, :3], nothing = _covariances(cov), [None] * n
+        places, narrow = x.tolist(), six[:, :3, :3].reshape(n, 9).tolist()
+        if R is None:
+            return [cls(place, None, None, None, each) for place, each in zip(places, narrow, strict=True)]
+        T = np.tile(np.eye(4), (n, 1, 1))
+        T[:, :3, :3], T[:, :3, 3] = rotation_matrices("R", R), x
+        if cov_R is not None:
+            six[:, 3:, 3:] = _covariances(cov_R)
+        wide = nothing if cov_R is None else six.reshape(n, 36).tolist()
+        return [cls(*row) for row in zip(places, R.tolist(), T.tolist(), wide, narrow, strict=True)]
+
+
+def _covariances(of: FloatArray) -> FloatArray:
+    """Return covariances (n, 3, 3) as they are, or from their 1-sigma (n, 3)."""
+    return of if of.ndim == 3 else np.square(of)[:, :, None] * np.eye(3)
 
 
 def in_shell_lines(pose: HandEye) -> str:

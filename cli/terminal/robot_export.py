@@ -7,25 +7,51 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Annotated
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
 from bodyschema.cli.hardware.driver_snippets import IN_DRIVERS, write_snippets
+from bodyschema.cli.terminal.diagnosis_run import DIAGNOSIS
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.effects import Motion, Simulation
 from bodyschema.effects.exports import replayed, write_correction, write_mjcf, write_urdf
 from bodyschema.effects.exports.correction import held_by_correction
 from bodyschema.effects.exports.replay import mujoco_version
+from bodyschema.effects.files import EXTENDED_FILE
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.recordings.recording import Recording
+from bodyschema.robot.limited import read_at_most
 
 MJCF, URDF, CORRECTION, DRIVERS = ".xml", ".urdf", ".json", ".txt"
+
+
+def _write_correction(simulation: Simulation, file: Path, heading: str) -> list[str]:
+    """Write correction.json with the covariance of poses from the diagnosis.json beside extended.toml, if it is one."""
+    found, known = simulation.robot.file.with_name(DIAGNOSIS), None
+    if simulation.robot.file.name == EXTENDED_FILE and found.is_file():
+        try:
+            known = msgspec.json.decode(read_at_most(found), type=_Known).marker_covariance
+        except (OSError, msgspec.DecodeError) as error:
+            raise ConfigError(f"is not what diagnose wrote: {error}", file=found, remedy="Diagnose again") from error
+    told = write_correction(simulation, file, heading, known)
+    return told if known else [*told, f"not in it: the pose's covariance, which {DIAGNOSIS} beside {EXTENDED_FILE} has"]
+
+
+class _Known(msgspec.Struct, frozen=True):
+    """What a correction takes of diagnosis.json."""
+
+    marker_covariance: Annotated[list[float], Meta(min_length=36, max_length=36)] | None = None
+
+
 _WRITERS: dict[str, Callable[[Simulation, Path, str], list[str]]] = {
     MJCF: write_mjcf,
     URDF: write_urdf,
-    CORRECTION: write_correction,
+    CORRECTION: _write_correction,
     DRIVERS: write_snippets,
 }
 _WITHOUT_MUJOCO = "Not replayed: MuJoCo is not installed (pip install mujoco)"

@@ -27,8 +27,9 @@ from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import JointReading
 from bodyschema.learning.model_bank import LearntModel
 from bodyschema.learning.online_learner import OnlineLearner
-from bodyschema.learning.snapshot import NoFrameError, Snapshot
+from bodyschema.learning.snapshot import NoFrameError, Prediction, Snapshot
 from bodyschema.robot.description import RobotDescription
+from bodyschema.robot.hand_eye import MarkerPose
 from kbmaps import InverseKinematics
 
 
@@ -61,6 +62,7 @@ class Answers:
             age_s=self._age_s(snapshot.newest_utc),
             R=None if prediction.R is None else prediction.R.tolist(),
             sigma_R=None if prediction.sigma_R is None else prediction.sigma_R.tolist(),
+            poses=_poses(prediction),
         )
         return encode(reply, request.encoding)
 
@@ -96,6 +98,7 @@ class Answers:
             in_support=bool(there.in_support[0]),
             model=snapshot.digest,
             pairs=snapshot.pairs,
+            pose=_poses(there)[0],
         )
         return encode(reply, request.encoding)
 
@@ -116,6 +119,10 @@ class Answers:
         kbmap = snapshot.require_map()
         texts = {"robot": self._robot.name, "joints": " ".join(self._joints), "pairs": str(snapshot.pairs)}
         return kbmap.with_metadata(texts | {"model": kbmap.digest, "answering": snapshot.digest}).to_bytes()
+
+
+def _poses(prediction: Prediction) -> list[MarkerPose]:
+    return MarkerPose.rows(prediction.x, prediction.sigma, prediction.R, prediction.sigma_R)
 
 
 log = logging.getLogger(__name__)

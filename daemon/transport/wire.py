@@ -18,6 +18,7 @@ from bodyschema.interfaces.covariance import from_upper, upper_triangle
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import FARTHEST_M, LARGEST_Q, FloatArray, Pair, frozen_array
 from bodyschema.recordings.columns import QUATERNION_TOLERANCE
+from bodyschema.robot.hand_eye import MarkerPose
 from bodyschema.robot.suggest import with_choices
 
 JSON = "application/json"
@@ -46,6 +47,8 @@ class PairMessage(msgspec.Struct, frozen=True):
         cov: its covariance [m²].
         R: marker orientation, a unit quaternion; null for a ball.
         cov_R: covariance of a small rotation about the axes [rad²]; null if unknown.
+        pose: `x` and `R` with their covariances once more, in the form of all messages; null from a sampler of an
+            earlier version.
     """
 
     store: str
@@ -58,6 +61,7 @@ class PairMessage(msgspec.Struct, frozen=True):
     cov: tuple[float, float, float, float, float, float]
     R: tuple[float, float, float, float] | None = None
     cov_R: tuple[float, float, float, float, float, float] | None = None
+    pose: MarkerPose | None = None
     schema: int = SCHEMA
 
 
@@ -103,6 +107,8 @@ class PredictReply(msgspec.Struct, frozen=True):
             learner heard of that one [s]; null before any pair.
         R: marker orientations, n × 4; null where no pair with the present tool had one.
         sigma_R: 1-sigma of a small rotation about each axis [rad], n × 3; null with `R`.
+        poses: the rows once more, in the form of all messages, with the covariances of `sigma` and `sigma_R`; null from
+            a learner of an earlier version.
     """
 
     x: list[list[float]]
@@ -113,6 +119,7 @@ class PredictReply(msgspec.Struct, frozen=True):
     age_s: float | None
     R: list[list[float]] | None = None
     sigma_R: list[list[float]] | None = None
+    poses: list[MarkerPose] | None = None
     schema: int = SCHEMA
 
 
@@ -161,6 +168,7 @@ class IkReply(msgspec.Struct, frozen=True):
         in_support: `q` lies where data was.
         model: hash of the answering model.
         pairs: pairs that it has learnt.
+        pose: the predicted pose at `q`, as `predict` has it; null from a learner of an earlier version.
     """
 
     q: list[float]
@@ -172,6 +180,7 @@ class IkReply(msgspec.Struct, frozen=True):
     in_support: bool
     model: str
     pairs: int
+    pose: MarkerPose | None = None
     schema: int = SCHEMA
 
 
@@ -241,6 +250,7 @@ def pair_to_wire(pair: Pair) -> PairMessage:
         cov=upper_triangle(pair.cov),
         R=None if pair.R is None else _four(pair.R),
         cov_R=None if pair.cov_R is None else upper_triangle(pair.cov_R),
+        pose=MarkerPose.of(pair.x, pair.cov, pair.R, pair.cov_R),
     )
 
 

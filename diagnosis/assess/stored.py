@@ -15,6 +15,8 @@ from bodyschema.diagnosis.search.held_out import Blocks, held_out_errors
 from bodyschema.diagnosis.unnamed.smooth import SmoothModel
 from bodyschema.effects import Motion
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.robot.urdf import inverse
+from kbmaps.rotations import rotation_vectors
 
 # Number of long blocks of time, each of which is left out once. In short ones a walk stays near where it was.
 _PARTS = 10
@@ -22,6 +24,8 @@ _PARTS = 10
 _SURELY = 0.95
 # Number of new poses.
 _POSES = 400
+# Part of 1-sigma by which a numerical derivative steps: errors beyond first order stay under 1e-3 of it.
+_SMALL = 1e-3
 
 
 def stored(candidates: Sequence[Fit], markers: NDArray[np.bool_]) -> Fit:
@@ -91,6 +95,35 @@ class _Elsewhere:
         gains = simpler.squares - self.squares
         unsure = float(np.std(gains, ddof=1)) * np.sqrt(len(gains)) * stdtrit(len(gains) - 1, _SURELY)
         return float(gains.sum()) - unsure > max(self.variance - simpler.variance, 0.0)
+
+
+def marker_covariance(fit: Fit) -> FloatArray:
+    """Return the covariance (6, 6) of the marker's pose as the fit predicts it in the measurement frame.
+
+    It is that of all fitted numbers together, in the mean of recorded poses, without the instrument's noise: x, y, z
+    [m²], then turns about the frame's axes [rad²].
+    """
+    motion = fit.observations.motion
+    motion = motion.some(np.arange(0, len(motion), -(-len(motion) // _POSES)))
+    here, covariance = _marker_poses(fit, np.zeros(len(fit.covariance)), motion), np.zeros((6, 6))
+    shares, directions = np.linalg.eigh(fit.covariance)
+    for step in (directions * np.sqrt(np.maximum(shares, 0.0))).T:
+        poses = _marker_poses(fit, _SMALL * step, motion)
+        turned = rotation_vectors(poses[:, :3, :3] @ here[:, :3, :3].swapaxes(1, 2))
+        moved = np.concatenate([poses[:, :3, 3] - here[:, :3, 3], turned], axis=1) / _SMALL
+        covariance += moved.T @ moved / len(moved)
+    return covariance
+
+
+def _marker_poses(fit: Fit, step: FloatArray, motion: Motion) -> FloatArray:
+    """Return the marker's poses (n, 4, 4) in the measurement frame after a step of the fit."""
+    simulation, tolerated = fit.moved(step)
+    if fit.background.scales is not None:
+        simulation = simulation.with_background(fit.background.with_amounts(tolerated))
+    run = simulation.run(motion)
+    poses = inverse(simulation.camera_pose) @ run.frames[:, -1]
+    poses[:, :3, 3] = run.x_placed
+    return poses
 
 
 def _long_blocks(rows: int) -> Blocks:

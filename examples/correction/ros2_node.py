@@ -3,10 +3,10 @@
 python ros2_node.py correction.json [--router tcp/127.0.0.1:7447] [--domain 0] [--topic /joint_states]
 
 It publishes sensor_msgs/JointState on /joint_states_corrected, which `ros2 topic echo` shows, and for programs without
-ROS {"t_ns": …, "q": […], "marker": {…}} as JSON on bodyschema/<robot>/corrected, the marker's pose in SI as matrix and
-quaternion. A message that does not have all joints, or a position that is not finite, is passed over. Velocities and
-efforts stay as they are. What depends on moves between rows of a recording (settling) is left out: messages come at
-another pace.
+ROS {"t_ns": …, "q": […], "marker": {…}} as JSON on bodyschema/<robot>/corrected, the marker's pose in SI as matrix,
+quaternion and 6 x 6 covariance. Where the covariance is null, `covariance_unknown` says why. A message that does not
+have all joints, or a position that is not finite, is passed over. Velocities and efforts stay as they are. What depends
+on moves between rows of a recording (settling) is left out: messages come at another pace.
 """
 
 import argparse
@@ -27,6 +27,7 @@ from bodyschema.robot.calibrated_files import CAMERA_LINK, MARKER_LINK
 from bodyschema.robot.hand_eye import HandEye
 
 NODE = "bodyschema_correction"
+UNKNOWN = "correction.json has none: export it from an extended.toml that has its diagnosis.json beside it"
 
 
 class CorrectedJoints:
@@ -35,6 +36,8 @@ class CorrectedJoints:
     def __init__(self, session, file, domain, topic):
         contents = json.loads(file)
         self.arm, self.names = Correction(file), contents["joints"]
+        known = contents.get("marker_covariance")
+        self.covariance = None if known is None else np.reshape(known, (6, 6))
         self.session, self.sequence = session, 0
         corrected, name = f"{topic}_corrected", str(session.info.zid())
         tokens = rmw.node_token(domain, name, NODE), rmw.publisher_token(domain, name, NODE, corrected, JOINT_STATE)
@@ -65,7 +68,9 @@ class CorrectedJoints:
         attached = rmw.attachment(self.sequence, time.time_ns(), self.gid)
         self.to_ros.put(encode_joint_state(corrected), attachment=attached)
         T = np.array([*pose, 0.0, 0.0, 0.0, 1.0]).reshape(4, 4)
-        marker = msgspec.to_builtins(HandEye.of(CAMERA_LINK, MARKER_LINK, T))
+        marker = msgspec.to_builtins(HandEye.of(CAMERA_LINK, MARKER_LINK, T, self.covariance))
+        if self.covariance is None:
+            marker["covariance_unknown"] = UNKNOWN
         self.to_zenoh.put(json.dumps({"t_ns": message.header.stamp_ns, "q": angles, "marker": marker}))
 
 

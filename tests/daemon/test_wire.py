@@ -20,6 +20,8 @@ from bodyschema.daemon.transport.wire import (
 )
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import Pair, frozen_array
+from bodyschema.robot.hand_eye import MarkerPose
+from kbmaps import quaternions
 
 JOINTS = ("waist", "shoulder", "elbow")
 finite = st.floats(allow_nan=False, allow_infinity=False)
@@ -43,6 +45,33 @@ def test_an_orientation_comes_out_of_the_wire_as_it_went_in(encoding) -> None:
     back = pair_from_wire(decode(encode(pair_to_wire(pair), encoding), PairMessage, encoding), 3)
     assert np.array_equal(back.R, turn)
     assert np.array_equal(back.cov_R, cov_R)
+
+
+@given(
+    st.lists(st.floats(1e-6, 1.0), min_size=6, max_size=6),
+    st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4).filter(lambda turn: np.linalg.norm(turn) > 0.1),
+)
+def test_a_pose_has_the_covariance_of_its_sigmas(sigmas, turn) -> None:
+    sigma, R = np.array(sigmas), np.array(turn) / np.linalg.norm(turn)
+    pose = MarkerPose.rows(
+        np.zeros((2, 3)), np.tile(sigma[:3], (2, 1)), np.tile(R, (2, 1)), np.tile(sigma[3:], (2, 1))
+    )[1]
+    cov, matrix = np.reshape(pose.covariance, (6, 6)), np.array(pose.matrix)
+    assert np.array_equal(cov, cov.T)
+    assert np.linalg.eigvalsh(cov).min() > 0.0
+    assert np.allclose(np.sqrt(cov.diagonal()), sigma, rtol=1e-12)
+    assert np.array_equal(np.reshape(pose.translation_covariance, (3, 3)), cov[:3, :3])
+    assert np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-12)
+    assert abs(abs(quaternions(matrix[None, :3, :3])[0] @ pose.quaternion_xyzw) - 1.0) < 1e-9
+
+
+def test_a_pair_states_its_pose() -> None:
+    cov = np.diag([1.0, 2.0, 3.0]) + 0.1
+    pair = Pair("id", 3, 2, 1.5, "utc", np.zeros(3), np.arange(3.0), cov, None, np.array([0.0, 0.6, 0.0, 0.8]))
+    pose = pair_to_wire(pair).pose
+    assert np.array_equal(np.reshape(pose.translation_covariance, (3, 3)), cov)
+    assert np.array(pose.matrix)[:3, 3].tolist() == [0.0, 1.0, 2.0]
+    assert pose.covariance is None  # that of the orientation is not known
 
 
 def message(**changed: object) -> bytes:

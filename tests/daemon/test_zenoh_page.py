@@ -162,11 +162,21 @@ def test_predictions_and_solutions_have_poses_in_json(learner: Config, capsys) -
 
 
 def test_an_orientation_makes_a_matrix_and_covariance() -> None:
-    pose = MarkerPose.of([0.1, 0.2, 0.3], [1e-3, 2e-3, 3e-3], [0.0, 0.0, 1.0, 0.0], [0.01, 0.02, 0.03])
+    x, turn = np.array([0.1, 0.2, 0.3]), np.array([0.0, 0.0, 1.0, 0.0])
+    pose = MarkerPose.rows(x[None], np.array([[1e-3, 2e-3, 3e-3]]), turn[None], np.array([[0.01, 0.02, 0.03]]))[0]
     wanted = [[-1, 0, 0, 0.1], [0, -1, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]]
     assert np.array(pose.matrix) == pytest.approx(np.array(wanted))
     sigmas = np.sqrt(np.array(pose.covariance).reshape(6, 6).diagonal())
     assert sigmas == pytest.approx([1e-3, 2e-3, 3e-3, 0.01, 0.02, 0.03])
+
+
+def test_raw_replies_have_the_poses_of_the_command_line(learner: Config, capsys) -> None:
+    with client(learner.tables.zenoh.learner) as bus:
+        [raw] = json.loads(bus.ask_one(KEYS.predict, encode(JointsRequest([0.1, 0.2]))))["poses"]
+        found = json.loads(bus.ask_one(KEYS.ik, encode(IkRequest((0.3, 0.0, 0.0)))))
+        [there] = json.loads(bus.ask_one(KEYS.predict, encode(JointsRequest(found["q"]))))["poses"]
+    assert [raw] == json.loads(predicted(learner, capsys, "--json", "--", "0.1", "0.2"))["poses"]
+    assert found["pose"] == there
 
 
 def ask_ik(learner: Config, request: IkRequest) -> IkReply:

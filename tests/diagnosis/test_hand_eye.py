@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bodyschema.cli.terminal.diagnosis_run import Found, Source
+from bodyschema.diagnosis.assess.stored import marker_covariance
 from bodyschema.diagnosis.diagnosis import Diagnosis
 from bodyschema.diagnosis.fit.fit import fitted
 from bodyschema.diagnosis.fit.observations import Observations
@@ -52,3 +53,20 @@ def test_a_pose_that_was_not_fitted_has_no_covariance() -> None:
     pose = found(robot, None, 0, ()).hand_eye
     assert pose.covariance is None
     np.testing.assert_allclose(pose.matrix, robot.camera.pose, atol=1e-12)
+
+
+def test_covariance_of_predicted_poses_covers_the_truth() -> None:
+    robot, squares = RobotDescription.load(DESK_ARM), []
+    kinds = (("camera_pose", None), ("joint_offset", robot.joints[1]), ("tool_offset", None))
+    unknown = tuple(Effect.at(robot, kind, where) for kind, where in kinds)
+    truth = Simulation(robot, tuple(e.with_values(0.01 * (1.0 + np.arange(len(e.values)))) for e in unknown))
+    motion = Motion.still(np.linspace(robot.lower, robot.upper, 9)[4][None])
+    for seed in range(12):
+        fit = found(robot, truth, seed, unknown).diagnosis.stored
+        off = fit.simulation.positions(motion)[0] - truth.positions(motion)[0]
+        cov = marker_covariance(fit)
+        assert np.allclose(cov, cov.T)
+        assert np.linalg.eigvalsh(cov).min() > 0.0
+        squares.append(off @ np.linalg.solve(cov[:3, :3], off))
+    # Chi-squared with 3 degrees of freedom; a pose in the middle is predicted a little better than the mean of all.
+    assert 0.7 < np.mean(squares) < 6.0

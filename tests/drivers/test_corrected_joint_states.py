@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from unittest.mock import MagicMock
 
+import numpy as np
 import pytest
 import zenoh
 from ros2_robot import PATHS
@@ -46,7 +47,8 @@ def correction(tmp_path: Path) -> str:
     (tmp_path / "robot.toml").write_text(f'{head}[camera]\nparent_link = "l0"\n')
     robot = RobotDescription.load(tmp_path / "robot.toml")
     offsets = [Effect.at(robot, "joint_offset", name, values=[0.1 * k]) for k, name in enumerate(NAMES, 1)]
-    write_correction(Simulation(robot, tuple(offsets)), tmp_path / "correction.json", "made by a test")
+    covariance = (1e-6 * np.eye(6)).ravel().tolist()
+    write_correction(Simulation(robot, tuple(offsets)), tmp_path / "correction.json", "made by a test", covariance)
     return (tmp_path / "correction.json").read_text()
 
 
@@ -85,6 +87,21 @@ def test_corrected_joint_states_have_the_raw_ones_stamps(endpoint, correction, m
             marker = json.loads(next(as_json).payload.to_string())["marker"]
             assert [len(row) for row in marker["matrix"]] == [4] * 4
             assert len(marker["quaternion_xyzw"]) == 4
+            assert np.array_equal(np.reshape(marker["covariance"], (6, 6)), 1e-6 * np.eye(6))
+
+
+def test_an_unknown_covariance_has_its_reason(correction, monkeypatch) -> None:
+    monkeypatch.syspath_prepend(str(READERS))
+    from ros2_node import CorrectedJoints
+
+    session, sample = MagicMock(), MagicMock()
+    without = json.dumps(json.loads(correction) | {"marker_covariance": None})
+    message = JointState(Header(1, ""), NAMES, (0.1,) * len(NAMES))
+    sample.payload.to_bytes.return_value = encode_joint_state(message)
+    CorrectedJoints(session, without, 0, "/joint_states").take(sample)
+    marker = json.loads(session.declare_publisher.return_value.put.call_args[0][0])["marker"]
+    assert marker["covariance"] is None
+    assert "diagnosis.json" in marker["covariance_unknown"]
 
 
 @pytest.mark.parametrize("wrong", [float("nan"), float("inf")])

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
-from bodyschema.cli.commands.run.predict import poses
 
 if TYPE_CHECKING:
     from bodyschema.daemon.config import Config
@@ -32,7 +31,7 @@ def ik(
     ] = None,
     robot: RobotFile = HERE,
     deg: Annotated[bool, flag("Angles are in degrees.")] = False,
-    as_json: Annotated[bool, flag("Print the learner's reply, and the pose in SI, as JSON.", name="--json")] = False,
+    as_json: Annotated[bool, flag("Print the learner's reply, with the pose in SI, as JSON.", name="--json")] = False,
 ) -> None:
     """Ask the learner for joint angles that bring the marker to a position in the measurement frame.
 
@@ -45,23 +44,19 @@ def ik(
     """
     import math
 
-    import msgspec
-
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.transport.bus import client
     from bodyschema.daemon.transport.keys import Keys
-    from bodyschema.daemon.transport.wire import IkReply, IkRequest, JointsRequest, PredictReply, decode, encode
+    from bodyschema.daemon.transport.wire import IkReply, IkRequest, decode, encode
     from bodyschema.interfaces.errors import RequestError
 
     config = Config.load(robot)
     if not all(map(math.isfinite, (x, y, z))):
         raise RequestError(f"{x:g}, {y:g}, {z:g} is no position: give three finite numbers in metres")
     with client(config.route("learner")) as bus:
-        keys = Keys(config.robot.name)
-        reply = decode(bus.ask_one(keys.ik, encode(IkRequest((x, y, z), posture=posture))), IkReply)
-        there = decode(bus.ask_one(keys.predict, encode(JointsRequest([reply.q]))), PredictReply) if as_json else None
-    if there is not None:
-        print_json(msgspec.to_builtins(reply) | {"pose": poses(there)[0]})
+        reply = decode(bus.ask_one(Keys(config.robot.name).ik, encode(IkRequest((x, y, z), posture=posture))), IkReply)
+    if as_json:
+        print_json(reply)
     else:
         _show(reply, config, deg)
     if not reply.converged:

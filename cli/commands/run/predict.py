@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
@@ -14,14 +14,13 @@ if TYPE_CHECKING:
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.transport.wire import JointsRequest, PredictReply
     from bodyschema.interfaces.records import FloatArray
-    from bodyschema.robot.hand_eye import MarkerPose
 
 
 def predict(
     *q: Annotated[float, Parameter(help="One value for each joint, in robot.toml's order [rad; m if it slides].")],
     robot: RobotFile = HERE,
     deg: Annotated[bool, flag("Angles are in degrees.")] = False,
-    as_json: Annotated[bool, flag("Print the learner's reply, and the poses in SI, as JSON.", name="--json")] = False,
+    as_json: Annotated[bool, flag("Print the learner's reply, with the poses in SI, as JSON.", name="--json")] = False,
 ) -> None:
     """Ask the learner for the marker position in the measurement frame.
 
@@ -32,7 +31,6 @@ def predict(
 
     Next: the same from your own program, over zenoh: docs/zenoh.md.
     """
-    import msgspec
     import numpy as np
     from rich.console import Console
 
@@ -46,23 +44,11 @@ def predict(
     with client(config.route("learner")) as bus:
         reply = decode(bus.ask_one(Keys(config.robot.name).predict, encode(request)), PredictReply)
     if as_json:
-        print_json(msgspec.to_builtins(reply) | {"poses": poses(reply)})
+        print_json(reply)
         return
     _show(reply)
     for note in _notes(config, np.array(request.q), deg):
         Console(highlight=False).print(note, style="yellow", markup=False)
-
-
-def poses(reply: PredictReply) -> list[MarkerPose]:
-    """Return the marker's predicted poses as `--json` has them."""
-    from bodyschema.robot.hand_eye import MarkerPose
-
-    return [MarkerPose.of(*row) for row in zip(reply.x, reply.sigma, *_turns(reply), strict=True)]
-
-
-def _turns(reply: PredictReply) -> tuple[Sequence[list[float] | None], Sequence[list[float] | None]]:
-    nothing = [None] * len(reply.x)
-    return reply.R or nothing, reply.sigma_R or nothing
 
 
 def _notes(config: Config, q: FloatArray, deg: bool) -> Iterator[str]:
