@@ -18,6 +18,7 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 SOURCES = "kbmaps/csrc"
 LIBRARY = "kbmaps/_kernels.abi3.so"
 PACKAGE = "bodyschema"
+READER = {"examples/correction/correction.py": "bodyschema/effects/exports/correction_reader.py"}
 # The oldest Python whose limited API the sources use.
 ABI_TAG = "cp311-abi3"
 FLAGS = ["-O3", "-std=gnu11", "-fPIC", "-shared", "-fvisibility=hidden", "-fno-math-errno"]
@@ -33,6 +34,8 @@ class KernelBuildHook(BuildHookInterface):
         root, place = Path(self.root), LIBRARY
         if (root / PACKAGE).is_dir():
             mend_links(root / PACKAGE)
+            if version != "editable":  # `export --measured` runs the reader that users copy
+                build_data["force_include"].update(READER)
         else:
             root, place = root.parent, Path(LIBRARY).name
         if os.environ.get("BODYSCHEMA_PURE", "") not in ("", "0"):

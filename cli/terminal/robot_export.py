@@ -18,8 +18,7 @@ from bodyschema.cli.terminal.diagnosis_run import DIAGNOSIS
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.effects import Motion, Simulation
-from bodyschema.effects.exports import replayed, write_correction, write_mjcf, write_urdf
-from bodyschema.effects.exports.correction import held_by_correction
+from bodyschema.effects.exports import corrected, replayed, write_correction, write_mjcf, write_urdf
 from bodyschema.effects.exports.replay import mujoco_version
 from bodyschema.effects.files import EXTENDED_FILE
 from bodyschema.interfaces.errors import ConfigError
@@ -138,7 +137,7 @@ def compared(simulation: Simulation, recording: Recording, out: Path) -> tuple[l
         settings = Simulation(simulation.robot, (), None, kept)
         predicted[f"zeros and scales of {out.name}"] = aligned(Observations.of(recording, settings), settings).predicted
     elif out.suffix.lower() == CORRECTION:
-        predicted[f"what {out.name} holds"] = held_by_correction(simulation).positions(motion)
+        predicted[out.name] = corrected(out, motion)
     else:
         predicted[out.name] = _seen_by_urdf(out, simulation, motion.q)
     return _rows(predicted, recording.x), why_not

@@ -2,7 +2,7 @@
 
 from .correction import write_correction
 from .mjcf import write_mjcf
-from .replay import replayed
+from .replay import corrected, replayed
 from .urdf import write_urdf
 
-__all__ = ["replayed", "write_correction", "write_mjcf", "write_urdf"]
+__all__ = ["corrected", "replayed", "write_correction", "write_mjcf", "write_urdf"]

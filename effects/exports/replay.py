@@ -1,8 +1,9 @@
-"""Replay an exported file in MuJoCo: the marker's rest position at each reading of a recording."""
+"""Replay an exported file: the marker's position at each reading, by MuJoCo or by the reader of correction.json."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,23 @@ def replayed(file: Path, joints: Sequence[str], motion: Motion) -> FloatArray:
     except ValueError as error:
         raise ConfigError(f"MuJoCo does not load it: {error}", file=file) from error
     return statics.positions(motion.q)
+
+
+def corrected(file: Path, motion: Motion) -> FloatArray:
+    """Return positions (n, 3) [m] of the marker in the measurement frame, from a correction.json alone.
+
+    They are those of examples/correction/correction.py, the reader that controllers copy.
+    """
+    here = Path(__file__).resolve()
+    wheel, checkout = here.with_name("correction_reader.py"), here.parents[2] / "examples/correction/correction.py"
+    spec = spec_from_file_location("bodyschema_correction_reader", wheel if wheel.exists() else checkout)
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    reader = module.Correction(file.read_text(encoding="utf-8"))
+    paces = [None if begins else pace for begins, pace in zip(motion.begins, motion.pace.tolist(), strict=True)]
+    return np.array([reader.read(q, pace)[1][3::4] for q, pace in zip(motion.q.tolist(), paces, strict=True)])
 
 
 class _Statics:

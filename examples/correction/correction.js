@@ -59,7 +59,7 @@ module.exports = { Correction };
 if (require.main === module) {
   const fs = require("fs"), correction = new Correction(fs.readFileSync(process.argv[2], "utf8"));
   const number = (word) => {
-    if (Number.isNaN(Number(word)) && !/^[+-]?(nan|inf|infinity)$/i.test(word)) throw new Error("no number: " + word);
+    if (!/^[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)$/i.test(word)) throw Error("not a number: " + word);
     return Number(word);
   };
   for (const line of fs.readFileSync(0, "utf8").split("\n").filter((each) => each.trim()))

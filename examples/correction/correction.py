@@ -4,9 +4,9 @@ python correction.py correction.json < readings.txt    # readings in each line; 
 """
 
 import json
+import math
 import sys
-from functools import partial
-from math import copysign, cos, exp, isfinite, nan, sin
+from math import copysign, exp, isfinite, nan
 
 
 class Correction:
@@ -16,10 +16,13 @@ class Correction:
         file = json.loads(text)
         if file.get("format") != "bodyschema correction 3":
             raise ValueError("not a correction of version 3: write it again with `bodyschema export`")
-        self.joints, end = file["numbers"][:2]
-        self.registers, numbers = file["numbers"][:end], file["numbers"][end:]
-        steps = zip(*[iter(numbers)] * 5, strict=True)
-        self.steps = [(STEPS[step], to, a, b, self.registers[c : c + 13]) for step, to, a, b, c in steps]
+        self.joints, end = map(int, file["numbers"][:2])
+        self.registers, numbers = list(map(float, file["numbers"][:end])), map(int, file["numbers"][end:])
+        # The steps as one function of Python, made of these numbers alone: four times as fast as a call for each.
+        steps, scope = zip(*[numbers] * 5, strict=True), {**vars(math), "remember": remember}
+        lines = [STEPS[step].format(to=to, a=a, b=b, c=self.registers[c : c + 13]) for step, to, a, b, c in steps]
+        exec("\n ".join(["def run(r):", *lines]), scope)
+        self.run = scope["run"]
 
     def read(self, q, pace=1.0):
         """Return true joint angles, and the marker's pose (3 rows of 4) in the measurement frame, at the next readings.
@@ -31,26 +34,13 @@ class Correction:
         if len(q) != d:
             raise ValueError("another number of readings than of joints")
         r[2], r[15 + d : 15 + 2 * d] = -1.0 if pace is None else pace, q
-        for step, to, a, b, c in self.steps:
-            step(r, to, a, b, c)
+        self.run(r)
         return r[15 : 15 + d], r[3:15]
 
 
-def add(r, to, a, b, c):
-    r[to] = r[a] + c[0] * r[b]
-
-
-def add_three(r, to, a, b, c):
-    r[to : to + 3] = r[a] + c[0] * r[b], r[a + 1] + c[0] * r[b + 1], r[a + 2] + c[0] * r[b + 2]
-
-
-def wave(r, to, a, b, c):
-    r[to] = r[a] + c[0] * sin(c[1] * r[b] + c[2])
-
-
-def remember(r, to, reading, pace, c):
+def remember(r, to, reading, pace, kind, scale):
     """Set a strain (0 play, 1 hysteresis, 2 settling), its last reading, and how far it has begun."""
-    (strain, last, begun), now, (kind, scale) = r[to : to + 3], r[reading], c[:2]
+    (strain, last, begun), now = r[to : to + 3], r[reading]
     move = now - last if begun else 0.0
     way, left = copysign(1.0, move), 1.0 - copysign(1.0, move) * strain if begun > 1 else 0.0
     if kind == 2:
@@ -61,37 +51,34 @@ def remember(r, to, reading, pace, c):
         r[to : to + 3] = strain, now, 2 if move else max(begun, 1)
 
 
-def torque(r, to, load, down, c):
-    r[to] = r[load + 3] * r[down + 2] if c[0] else r[load] * r[down + 1] - r[load + 1] * r[down]
-
-
-def side(r, to, torque, before, c):
-    turns = abs(r[torque]) > (c[0] if r[before] else -1.0)
-    r[to] = (-1.0 if r[torque] < 0.0 else 1.0) if turns else r[before]
-
-
-def inwards(r, to, load, by, numbers):
-    """Set what a body weighs, (mass times place, mass), as its parent has it."""
-    (x, y, z, m), (slides, a, b, c, p, d, e, f, q, g, h, i, s) = r[load : load + 4], numbers
-    u, v, z = (1.0, 0.0, z + r[by] * m) if slides else (cos(r[by]), sin(r[by]), z)
-    x, y = u * x - v * y, v * x + u * y
-    r[to : to + 3] = a * x + b * y + c * z + p * m, d * x + e * y + f * z + q * m, g * x + h * y + i * z + s * m
-
-
-def outwards(r, to, row, by, numbers, places=(0,)):
-    """Set rows of a pose to the next joint's."""
-    slides, a, b, c, p, d, e, f, q, g, h, i, s = numbers
-    u, v, shift = (1.0, 0.0, r[by]) if slides else (cos(r[by]), sin(r[by]), 0.0)
-    for k in places:
-        x, y, z, w = r[row + k : row + k + 4]
-        w, x, y, z = w + p * x + q * y + s * z, a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z
-        r[to + k : to + k + 4] = u * x + v * y, u * y - v * x, z, w + shift * z
-
-
-STEPS = add, add_three, wave, remember, torque, side, inwards, outwards, None, partial(outwards, places=(0, 4, 8))
+ADD = "r[{to}] = r[{a}] + {c[0]} * r[{b}]"
+ADD_THREE = "; ".join(f"r[{{to}} + {k}] = r[{{a}} + {k}] + {{c[0]}} * r[{{b}} + {k}]" for k in range(3))
+WAVE = "r[{to}] = r[{a}] + {c[0]} * sin({c[1]} * r[{b}] + {c[2]})"
+MEMORY = "remember(r, {to}, {a}, {b}, {c[0]}, {c[1]})"
+TORQUE = "r[{to}] = r[{a} + 3] * r[{b} + 2] if {c[0]} else r[{a}] * r[{b} + 1] - r[{a} + 1] * r[{b}]"
+SIDE = "r[{to}] = (-1.0 if r[{a}] < 0.0 else 1.0) if abs(r[{a}]) > ({c[0]} if r[{b}] else -1.0) else r[{b}]"
+MOTION = "u, v, s = (1.0, 0.0, r[{b}]) if {c[0]} else (cos(r[{b}]), sin(r[{b}]), 0.0); "
+# What a body weighs, (mass times place, mass), as its parent has it.
+INWARDS = MOTION + (
+    "x, y, z, w = r[{a}], r[{a} + 1], r[{a} + 2], r[{a} + 3]; x, y, z = u * x - v * y, v * x + u * y, z + s * w; "
+    "r[{to}] = {c[1]} * x + {c[2]} * y + {c[3]} * z + {c[4]} * w; "
+    "r[{to} + 1] = {c[5]} * x + {c[6]} * y + {c[7]} * z + {c[8]} * w; "
+    "r[{to} + 2] = {c[9]} * x + {c[10]} * y + {c[11]} * z + {c[12]} * w; "
+)
+# A row of a pose, as the next joint's.
+ROW = (
+    "x, y, z, w = r[{a}], r[{a} + 1], r[{a} + 2], r[{a} + 3]; w = w + {c[4]} * x + {c[8]} * y + {c[12]} * z; "
+    "x, y, z = {c[1]} * x + {c[5]} * y + {c[9]} * z, {c[2]} * x + {c[6]} * y + {c[10]} * z, "
+    "{c[3]} * x + {c[7]} * y + {c[11]} * z; "
+    "r[{to}], r[{to} + 1], r[{to} + 2], r[{to} + 3] = u * x + v * y, u * y - v * x, z, w + s * z; "
+)
+ROWS = [ROW.replace("{a}", f"{{a}} + {k}").replace("{to}", f"{{to}} + {k}") for k in (0, 4, 8)]
+STEPS = ADD, ADD_THREE, WAVE, MEMORY, TORQUE, SIDE, INWARDS, MOTION + ROW, None, MOTION + "".join(ROWS)
 
 if __name__ == "__main__":
     with open(sys.argv[1], encoding="utf-8") as stream:
         correction = Correction(stream.read())
     for line in filter(str.strip, sys.stdin):
+        if "_" in line or not line.isascii():  # Python alone reads 1_000, and digits of other scripts
+            raise ValueError(f"not numbers: {line}")
         print(*(x for part in correction.read(map(float, line.replace(",", " ").split())) for x in part))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +14,7 @@ from small_arm import write_small_arm
 from bodyschema.cli.main import app
 from bodyschema.cli.recordings.synthesis import simulated
 from bodyschema.effects import Effect, Simulation, load_simulation, write_extended
+from bodyschema.effects.exports import write_correction
 from bodyschema.interfaces.errors import ConfigError, RequestError
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.description import RobotDescription
@@ -54,6 +58,43 @@ def test_gain_of_the_file_itself_is_printed(extended, measured, tmp_path, capsys
 
 def rms_mm(told: str) -> list[float]:
     return [float(line.split("│")[2]) for line in told.splitlines() if line.count("│") > 3]
+
+
+def test_gain_of_a_correction_is_that_of_its_reader(extended, measured, tmp_path, capsys) -> None:
+    export(extended, tmp_path / "correction.json", "--measured", measured)
+    told = capsys.readouterr().out
+    recording = Recording.read(measured, load_simulation(extended).robot.joints)
+    lines = "\n".join(" ".join(map(repr, q)) for q in recording.q.tolist())
+    reader = Path(__file__).parents[2] / "examples" / "correction" / "correction.py"
+    command = [sys.executable, str(reader), str(tmp_path / "correction.json")]
+    done = subprocess.run(command, input=lines, capture_output=True, text=True, check=True)
+    rows = np.array([line.split() for line in done.stdout.splitlines()], dtype=np.float64)
+    missed = rows[:, recording.q.shape[1] :].reshape(-1, 3, 4)[:, :, 3] - recording.x
+    assert rms_mm(told)[2] == pytest.approx(1e3 * np.sqrt(np.square(missed).sum(axis=1).mean()), abs=6e-4)
+    assert rms_mm(told)[2] > 0.0  # the play of the first row is known to the simulation alone
+
+
+def test_gain_of_a_correction_is_read_from_the_file(extended, measured, tmp_path, capsys, monkeypatch) -> None:
+    def spoilt(simulation: Simulation, file: Path, heading: str, covariance: object) -> list[str]:
+        return write_correction(Simulation(simulation.robot), file, heading)
+
+    monkeypatch.setattr("bodyschema.cli.terminal.robot_export.write_correction", spoilt)
+    export(extended, tmp_path / "correction.json", "--measured", measured)
+    nominal, _, own = rms_mm(capsys.readouterr().out)
+    assert own == nominal
+
+
+def test_the_covariance_of_a_diagnosis_is_in_its_correction(extended, tmp_path, capsys) -> None:
+    export(extended, tmp_path / "without.json")
+    assert "not in it: the pose's covariance" in " ".join(capsys.readouterr().out.split())
+    covariance = np.eye(6).ravel().tolist()
+    extended.with_name("diagnosis.json").write_text(json.dumps({"marker_covariance": covariance}))
+    export(extended, tmp_path / "with.json")
+    found = [json.loads((tmp_path / name).read_text())["marker_covariance"] for name in ("without.json", "with.json")]
+    assert found == [None, covariance]
+    extended.with_name("diagnosis.json").write_text('{"marker_covariance": [1, 2]}')
+    with pytest.raises(ConfigError, match="Diagnose again"):
+        export(extended, tmp_path / "wrong.json")
 
 
 def test_gain_of_settings_of_drivers_is_printed(extended, measured, tmp_path, capsys) -> None:

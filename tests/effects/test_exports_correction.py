@@ -275,8 +275,12 @@ def test_lines_are_read_alike(commands, robot, tmp_path) -> None:
         first, second = run.stdout.splitlines()
         assert first == second, language
         assert read_lines(command, tmp_path / "c.json", "\n").stdout == "", language
-        for word in ("0.1x", "word", "1,,x"):
-            assert read_lines(command, tmp_path / "c.json", " ".join([word] * d)).returncode != 0, (language, word)
+        for word in ("0.1x", "word", "1,,x", "0x10", "-0X1p3", "0b1", "0o7", "1_0", "1e", "nan(1)", "\u0661", "."):
+            run = read_lines(command, tmp_path / "c.json", " ".join([word] * d))
+            assert (run.returncode != 0, run.stdout) == (True, ""), (language, word)
+        for word in ("-.5", "1.", "1E-2", "+2"):
+            run = read_lines(command, tmp_path / "c.json", " ".join([word] * d))
+            assert (run.returncode, "nan" in run.stdout.lower()) == (0, False), (language, word)
 
 
 def test_settling_is_left_out_where_each_reading_is_an_interruption(robot, tmp_path) -> None:

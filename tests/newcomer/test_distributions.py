@@ -60,6 +60,7 @@ def test_the_wheel_has_every_file_of_every_part_and_two_packages(wheel: Path) ->
     files = files_of(wheel)
     assert {name.partition("/")[0] for name in files} == {"bodyschema", "kbmaps"}
     assert tracked() <= files
+    assert "bodyschema/effects/exports/correction_reader.py" in files
 
 
 def test_the_sdist_has_no_link_and_makes_the_same_wheel(sdist: Path, wheel: Path, tmp_path: Path) -> None:
@@ -110,7 +111,7 @@ def test_auditwheel_finds_the_compiled_wheel_fit_for_manylinux(tmp_path: Path) -
 def test_links_that_came_as_text_are_mended(tmp_path: Path) -> None:
     """Check the case of a zip archive of the repository that pip unpacked."""
     source = tmp_path / "source"
-    for name in ("interfaces", "bodyschema", "kbmaps"):
+    for name in ("interfaces", "bodyschema", "kbmaps", "examples"):
         shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "hatch_build.py", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
