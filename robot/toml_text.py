@@ -32,7 +32,7 @@ def toml_value(value: object) -> str:
 def with_values(file: Path, table: str, values: Mapping[str, Any]) -> str:
     """Return the text of a TOML file with values in a table, which has to be there; in the first of several.
 
-    Line ends and a byte order mark are those of the file.
+    Each line keeps its end, a new one takes that of the line before; a byte order mark stays.
 
     Raises:
         ConfigError: the file cannot be read, has no such table, or is written in a way that cannot be edited.
@@ -58,7 +58,18 @@ def with_values(file: Path, table: str, values: Mapping[str, Any]) -> str:
         raise ConfigError(
             f"[{table}] is written so that it cannot be edited: {str(error).rstrip('.')}", file=file, remedy=by_hand
         ) from error
-    return _BOM * text.startswith(_BOM) + (edited.replace("\n", "\r\n") if "\r\n" in text else edited)
+    return _BOM * text.startswith(_BOM) + _with_line_ends(edited, text.removeprefix(_BOM))
+
+
+def _with_line_ends(edited: str, text: str) -> str:
+    """Return an edited text, whose lines end in LF, with the line ends of the text that it was made from."""
+    ends = ["\r" * line.endswith("\r") for line in text.split("\n")]
+    ends[-1] = ends[max(len(ends) - 2, 0)]  # the last line has none: what follows it takes that of the line before
+    old, new = text.replace("\r\n", "\n").split("\n"), edited.split("\n")
+    for _, first, last, begin, end in difflib.SequenceMatcher(None, old, new).get_opcodes():
+        for k in range(begin, min(end, len(new) - 1)):
+            new[k] += ends[max(min(first + k - begin, last - 1), 0)]
+    return "\n".join(new)
 
 
 def difference(file: Path, edited: str) -> list[str]:

@@ -8,6 +8,8 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.toml_text import difference, with_values, write_edited
@@ -120,3 +122,30 @@ def test_links_permissions_and_earlier_backups_stay(tmp_path: Path) -> None:
     assert (target.read_text(), backup.read_text(), earlier.read_text()) == ("[robot]\n", TEXT, "mine")
     assert {stat.S_IMODE(file.stat().st_mode) for file in (target, backup)} == {0o640}
     assert backup.name == "left.toml.before2"
+
+
+def test_each_line_of_mixed_ends_keeps_its_own(tmp_path: Path) -> None:
+    file = tmp_path / "robot.toml"
+    file.write_bytes(b'[robot]\nname = "arm"\r\n\n[vision.cameras]\r\nleft = "a"\nlatency_s = 0.0\r\n# last\r\n[drivers]\n')
+    write_edited(file, with_values(file, "vision.cameras", VALUES))
+    assert file.read_bytes() == (
+        b'[robot]\nname = "arm"\r\n\n[vision.cameras]\r\nleft = "a"\nlatency_s = 0.01\r\n'
+        b"# last\r\nlatency_sigma_s = 0.001\r\n[drivers]\n"
+    )
+
+
+@given(st.lists(st.tuples(st.sampled_from(["", "# a", "a = 1", "bb = 2"]), st.booleans()), max_size=9), st.booleans())
+def test_line_ends_of_other_lines_never_change(tmp_path_factory, lines, ends_in_line_end) -> None:
+    file = tmp_path_factory.mktemp("ends") / "robot.toml"
+    seen: list[str] = []
+    for line, windows in lines:
+        if not (line and line[0] != "#" and line in "".join(seen)):
+            seen.append(line + ("\r\n" if windows else "\n"))
+    text = "[table]\n" + "".join(seen) + ("" if ends_in_line_end else "# end")
+    file.write_bytes(text.encode())
+    assert with_values(file, "table", {}) == text
+    edited = with_values(file, "table", {"new": 1})
+    added = [line for line in edited.splitlines() if line == "new = 1"]
+    assert len(added) == 1
+    rest = edited.replace("new = 1\r\n", "").replace("new = 1\n", "").replace("new = 1", "")
+    assert rest.rstrip("\r\n") == text.rstrip("\r\n")
