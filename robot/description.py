@@ -21,7 +21,7 @@ from bodyschema.interfaces.records import FloatArray, frozen_array
 from kbmaps import RigidChain
 
 from .rpy import pose_of, rpy_of
-from .toml_file import Positive, convert, line_of, read_toml
+from .toml_file import NAME, Positive, convert, line_of, read_toml
 from .urdf import MOVING, UrdfJoint, UrdfTree, chain_between, motions
 
 Vector3 = tuple[float, float, float]
@@ -29,8 +29,6 @@ Side = Annotated[int, Meta(ge=1, le=LARGEST_SIDE_PX)]
 ImageSize = tuple[Side, Side]
 # Beyond these a number is of another unit: degrees, millimetres.
 LARGEST_TURN_RAD, LONGEST_TOOL_M, FARTHEST_CAMERA_M = 2.0 * math.pi, 2.0, 50.0
-# One chunk of a zenoh key: no separators, no wild cards, and not the @ that hides a chunk from wild cards.
-NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]*\Z"  # `$` would let a line break follow
 Name = Annotated[str, Meta(pattern=NAME)]
 
 

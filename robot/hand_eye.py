@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import msgspec
-import numpy as np
 
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.whole_files import write_whole
-from kbmaps.rotations import quaternions, rotation_matrices, rotation_vector
+
+# numpy is imported where it is used: clients that only read these messages do without.
+if TYPE_CHECKING:
+    from bodyschema.interfaces.records import FloatArray
 
 LAUNCH = "hand_eye.launch.py"
 _STEP = 1e-6  # of the numerical derivative of a pose [m, rad]
@@ -43,13 +43,14 @@ class HandEye(msgspec.Struct, frozen=True):
     @classmethod
     def of(cls, parent: str, child: str, T_parent_child: FloatArray, covariance: FloatArray | None = None) -> Self:
         """Return a pose (4, 4) with its covariance (6, 6) as ROS has them."""
-        quaternion = quaternions(T_parent_child[None, :3, :3])[0]
-        place = T_parent_child[:3, 3]
+        from kbmaps.rotations import quaternions
+
+        quaternion, place = quaternions(T_parent_child[None, :3, :3])[0].tolist(), T_parent_child[:3, 3].tolist()
         return cls(
             parent,
             child,
-            place.tolist(),
-            quaternion.tolist(),
+            place,
+            quaternion,
             T_parent_child.tolist(),
             None if covariance is None else covariance.ravel().tolist(),
             " ".join(["ros2 run tf2_ros", _PUBLISHER, *_arguments(place, quaternion, parent, child)]),
@@ -90,22 +91,29 @@ class MarkerPose(msgspec.Struct, frozen=True):
             R: orientations, unit quaternions (n, 4).
             cov_R: covariances (n, 3, 3) of a small rotation about the axes [rad²], or its 1-sigma (n, 3).
         """
+        import numpy as np
+
+        from kbmaps.rotations import rotation_matrices
+
         n = len(x)
         six = np.zeros((n, 6, 6))
         six[:, :3, :3], nothing = _covariances(cov), [None] * n
         places, narrow = x.tolist(), six[:, :3, :3].reshape(n, 9).tolist()
         if R is None:
             return [cls(place, None, None, None, each) for place, each in zip(places, narrow, strict=True)]
+        unit: FloatArray = R / np.linalg.norm(R, axis=1)[:, None]  # some are written with few digits
         T = np.tile(np.eye(4), (n, 1, 1))
-        T[:, :3, :3], T[:, :3, 3] = rotation_matrices("R", R), x
+        T[:, :3, :3], T[:, :3, 3] = rotation_matrices("R", unit), x
         if cov_R is not None:
             six[:, 3:, 3:] = _covariances(cov_R)
         wide = nothing if cov_R is None else six.reshape(n, 36).tolist()
-        return [cls(*row) for row in zip(places, R.tolist(), T.tolist(), wide, narrow, strict=True)]
+        return [cls(*row) for row in zip(places, unit.tolist(), T.tolist(), wide, narrow, strict=True)]
 
 
 def _covariances(of: FloatArray) -> FloatArray:
     """Return covariances (n, 3, 3) as they are, or from their 1-sigma (n, 3)."""
+    import numpy as np
+
     return of if of.ndim == 3 else np.square(of)[:, :, None] * np.eye(3)
 
 
@@ -123,6 +131,10 @@ def pose_covariance(pose: Callable[[FloatArray], FloatArray], values: FloatArray
         pose: the pose (4, 4) for values such as `values` (p,).
         covariance: of the values, shape (p, p).
     """
+    import numpy as np
+
+    from kbmaps.rotations import rotation_vector
+
     here, jacobian = pose(values), np.empty((6, len(values)))
     for k in range(len(values)):
         moved = pose(values + _STEP * np.eye(len(values))[k])
@@ -137,8 +149,10 @@ def write_launch_file(pose: HandEye, folder: Path) -> Path:
     Raises:
         ConfigError: it cannot be written.
     """
+    from bodyschema.interfaces.whole_files import write_whole
+
     file = folder / LAUNCH
-    arguments = _arguments(np.array(pose.translation_m), np.array(pose.quaternion_xyzw), pose.parent, pose.child)
+    arguments = _arguments(pose.translation_m, pose.quaternion_xyzw, pose.parent, pose.child)
     text = _LAUNCH_FILE.format(package="tf2_ros", executable=_PUBLISHER, arguments=arguments)
     try:
         write_whole({file: text.encode()})
@@ -160,7 +174,7 @@ def generate_launch_description():
 '''
 
 
-def _arguments(place: FloatArray, quaternion: FloatArray, parent: str, child: str) -> list[str]:
+def _arguments(place: list[float], quaternion: list[float], parent: str, child: str) -> list[str]:
     names = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
     numbers = [f"{value + 0.0:.9f}" for value in (*place, *quaternion)]
     words = [word for pair in zip(names, numbers, strict=True) for word in pair]

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from bodyschema.cli.terminal.findings_view import calibration_table, outlook_lines
 from bodyschema.cli.terminal.screen import coverage_table, degrees, mm, rejected
-from bodyschema.daemon.config import Config
+from bodyschema.daemon.client_config import ClientConfig
 from bodyschema.daemon.service.remedies import as_typed
 from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.identity import Route
@@ -45,8 +45,8 @@ class Seen:
 class Watcher:
     """Queries both processes for their states. Use as a context manager; the processes may come and go."""
 
-    def __init__(self, config: Config) -> None:
-        self._keys = Keys(config.robot.name)
+    def __init__(self, config: ClientConfig) -> None:
+        self._keys = Keys(config.name)
         self._routes = {process: config.route(process) for process in PROCESSES}
         self._sessions: dict[str, ZenohSession] = {}
 
@@ -91,13 +91,12 @@ def as_json(seen: Seen) -> str:
     return msgspec.json.encode({"schema": 1, "sampler": seen.sampler, "learner": seen.learner}).decode()
 
 
-def screen(seen: Seen, config: Config) -> RenderableType:
+def screen(seen: Seen, config: ClientConfig) -> RenderableType:
     """Return a screen of both states; a small terminal cuts off the end of the joints' coverage."""
-    chain = config.robot.chain
     parts: list[RenderableType] = []
     parts += _absent("sampler", config.route("sampler")) if seen.sampler is None else _sampler(seen.sampler)
     parts.append(Text())
-    slides = {name for name, slides in zip(config.robot.joints, chain.prismatic, strict=True) if slides}
+    slides = {name for name, slides in zip(config.joints, config.slides, strict=True) if slides}
     parts += _absent("learner", config.route("learner")) if seen.learner is None else _learner(seen.learner)
     if seen.learner is not None and seen.learner.calibration is not None:
         parts += [Text(), calibration_table(seen.learner.calibration, slides)]

@@ -7,19 +7,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 
 import msgspec
-import numpy as np
 from msgspec import Meta
 
 from bodyschema.daemon.transport.keys import CommandName
-from bodyschema.interfaces.covariance import from_upper, upper_triangle
 from bodyschema.interfaces.errors import RequestError
-from bodyschema.interfaces.records import FARTHEST_M, LARGEST_Q, FloatArray, Pair, frozen_array
-from bodyschema.recordings.columns import QUATERNION_TOLERANCE
 from bodyschema.robot.hand_eye import MarkerPose
 from bodyschema.robot.suggest import with_choices
+
+# numpy is imported where it is used: clients that send and read messages do without.
+if TYPE_CHECKING:
+    from bodyschema.interfaces.records import FloatArray, Pair
 
 JSON = "application/json"
 MSGPACK = "application/msgpack"
@@ -238,6 +238,8 @@ def decode(payload: bytes, kind: type[M], encoding: str = JSON) -> M:
 
 def pair_to_wire(pair: Pair) -> PairMessage:
     """Return a pair as its message."""
+    from bodyschema.interfaces.covariance import upper_triangle
+
     x, y, z = pair.x.tolist()
     return PairMessage(
         store=pair.store,
@@ -260,6 +262,12 @@ def pair_from_wire(message: PairMessage, joints: int) -> Pair:
     Raises:
         RequestError: it has another number of joints, a non-finite number, or an invalid quaternion.
     """
+    import numpy as np
+
+    from bodyschema.interfaces.covariance import from_upper
+    from bodyschema.interfaces.records import Pair, frozen_array
+    from bodyschema.recordings.columns import QUATERNION_TOLERANCE
+
     q = np.array(message.q)
     numbers = np.concatenate([q, message.x, message.cov, [message.t], message.R or (), message.cov_R or ()])
     if len(q) != joints:
@@ -293,6 +301,10 @@ def position(name: str, values: Sequence[float]) -> FloatArray:
     Raises:
         RequestError: a number is not finite, or too large to be in metres.
     """
+    import numpy as np
+
+    from bodyschema.interfaces.records import FARTHEST_M
+
     x = np.array(values, dtype=np.float64)
     if not np.isfinite(x).all():
         raise RequestError(f"{name} is not finite")
@@ -310,6 +322,8 @@ def joint_vector(name: str, values: Sequence[float], joints: tuple[str, ...]) ->
     Raises:
         RequestError: the count is wrong, or a value is impossible for its joint.
     """
+    import numpy as np
+
     if len(values) != len(joints):
         raise RequestError(
             f"{name} has {len(values)} numbers; this robot has {len(joints)} joints: {', '.join(joints)}"
@@ -323,7 +337,20 @@ def joint_angles(request: JointsRequest, joints: tuple[str, ...]) -> FloatArray:
     """Return the request's joint angles, shape (n, d) [rad].
 
     Raises:
-        RequestError: a row has the wrong length, a value is impossible for a joint, or the batch is empty or too large.
+        RequestError: as `joint_rows`, or a value is impossible for a joint.
+    """
+    import numpy as np
+
+    q = np.array(joint_rows(request, joints), dtype=np.float64)
+    _require_angles(q, joints, lambda row: f"row {row} of q")
+    return q
+
+
+def joint_rows(request: JointsRequest, joints: tuple[str, ...]) -> list[list[float]]:
+    """Return the rows of the request.
+
+    Raises:
+        RequestError: a row has the wrong length, or the batch is empty or too large.
     """
     if not request.q:
         raise RequestError("q is empty; send one vector of joint angles or a list of them")
@@ -331,18 +358,22 @@ def joint_angles(request: JointsRequest, joints: tuple[str, ...]) -> FloatArray:
     rows = [request.q] if one_vector else request.q
     if len(rows) > LARGEST_BATCH:
         raise RequestError(f"q has {len(rows)} rows; send at most {LARGEST_BATCH} at once")
+    checked: list[list[float]] = []
     for number, row in enumerate(rows):
         if not isinstance(row, list) or len(row) != len(joints):
             length = len(row) if isinstance(row, list) else 1
             raise RequestError(
                 f"row {number} of q has {length} numbers; this robot has {len(joints)} joints: {', '.join(joints)}"
             )
-    q = np.array(rows, dtype=np.float64)
-    _require_angles(q, joints, lambda row: f"row {row} of q")
-    return q
+        checked.append(cast("list[float]", row))
+    return checked
 
 
 def _require_angles(q: FloatArray, joints: tuple[str, ...], named: Callable[[int], str]) -> None:
+    import numpy as np
+
+    from bodyschema.interfaces.records import LARGEST_Q
+
     wrong = np.argwhere(~(np.abs(q) <= LARGEST_Q))
     if len(wrong) == 0:
         return

@@ -17,6 +17,7 @@ from bodyschema.cli.commands.options import print_json
 from bodyschema.cli.front_page import ASCII, UNICODE, front_page
 from bodyschema.cli.main import COMMANDS, MODULES, RENAMED, app, command_line, present_names
 from bodyschema.cli.terminal.screen import two_digits
+from bodyschema.daemon.client_config import ClientConfig
 from bodyschema.daemon.config import Config
 from bodyschema.interfaces.errors import BusError, ConfigError, RequestError
 
@@ -64,6 +65,24 @@ def test_help_loads_nothing_that_takes_long(tmp_path) -> None:
     assert "bodyschema.cli.front_page" in loaded
     assert loaded & {"cyclopts", "rich", "attr", "numpy", "zenoh", "msgspec", "ctypes", "inspect"} == set()
     assert len(loaded) < 100
+
+
+def test_clients_are_told_what_is_wrong_in_robot_toml(robot, capsys) -> None:
+    robot.write_text(robot.read_text() + "[daemon.more]\n")
+    for command in (["predict", "0", "0"], ["ik", "0.3", "0", "0"], ["status"]):
+        with pytest.raises(ConfigError, match="more"):
+            app([*command, "--robot", str(robot)], exit_on_error=False, result_action="return_value")
+
+
+def test_a_client_config_agrees_with_the_whole(robot, monkeypatch) -> None:
+    whole, own = Config.load(robot, {}), ClientConfig.load(robot, {})
+    assert (own.name, own.joints, own.zenoh) == (whole.robot.name, whole.robot.joints, whole.tables.zenoh)
+    assert own.route("learner") == whole.route("learner")
+    assert own.slides == tuple(whole.robot.chain.prismatic.tolist())
+    limits = [(own.joint_limits[name][1:]) for name in own.joints]
+    assert limits == list(zip(whole.robot.lower.tolist(), whole.robot.upper.tolist(), strict=True))
+    renamed = ClientConfig.load(robot, {"BODYSCHEMA_ROBOT_NAME": "other", "BODYSCHEMA_ROBOT": str(robot)})
+    assert renamed.name == "other"
 
 
 def test_status_and_predict_load_neither_effects_nor_solvers(robot) -> None:

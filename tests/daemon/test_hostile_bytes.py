@@ -162,7 +162,9 @@ def test_wild_numbers_get_finite_answers_or_errors(answers: Answers, x: list, q:
         request = Request({}, wire.encode(question, wire.MSGPACK), wire.MSGPACK)
         reply = taken(lambda ask=ask, request=request: ask(request))
         assert isinstance(reply, bytes | None)
-        numbers = [] if reply is None else msgspec.msgpack.decode(reply).values()
+        fields = {} if reply is None else msgspec.msgpack.decode(reply)
+        poses = [*fields.pop("poses", []), *filter(None, [fields.pop("pose", None)])]
+        numbers = [*fields.values(), *(value for pose in poses for value in pose.values())]
         flat = [np.ravel(value) for value in numbers if isinstance(value, float | list)]
         assert all(np.isfinite(value).all() for value in flat)
 

@@ -16,6 +16,7 @@ from told_statuses import LEARNER, SAMPLER
 
 from bodyschema.cli.main import app
 from bodyschema.cli.terminal.status_view import Seen, Watcher, as_json, screen
+from bodyschema.daemon.client_config import ClientConfig
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler.devices import session_of
 from bodyschema.daemon.sampler.sampler import Sampler
@@ -35,7 +36,7 @@ def config(tmp_path: Path, free_endpoint) -> Config:
 
 def shown(seen: Seen, config: Config) -> str:
     console = Console(file=io.StringIO(), width=80)
-    console.print(screen(seen, config))
+    console.print(screen(seen, ClientConfig.load(config.file, {})))
     return console.file.getvalue()
 
 
@@ -119,7 +120,7 @@ def test_json_has_both_processes_and_null_for_who_is_not_there() -> None:
 
 
 def test_the_watcher_finds_a_process_that_comes_later(config) -> None:
-    with Watcher(config) as watcher:
+    with Watcher(ClientConfig.load(config.file, {})) as watcher:
         assert watcher.look().nobody
         with sampler_running(config):
             seen = watcher.look()
@@ -128,7 +129,7 @@ def test_the_watcher_finds_a_process_that_comes_later(config) -> None:
 
 
 def test_the_watcher_sees_a_process_go(config) -> None:
-    with Watcher(config) as watcher:
+    with Watcher(ClientConfig.load(config.file, {})) as watcher:
         with sampler_running(config):
             assert not watcher.look().nobody
         assert watcher.look().nobody

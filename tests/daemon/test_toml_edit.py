@@ -126,12 +126,10 @@ def test_links_permissions_and_earlier_backups_stay(tmp_path: Path) -> None:
 
 def test_each_line_of_mixed_ends_keeps_its_own(tmp_path: Path) -> None:
     file = tmp_path / "robot.toml"
-    file.write_bytes(b'[robot]\nname = "arm"\r\n\n[vision.cameras]\r\nleft = "a"\nlatency_s = 0.0\r\n# last\r\n[drivers]\n')
+    head = b'[robot]\nname = "arm"\r\n\n[vision.cameras]\r\nleft = "a"\n'
+    file.write_bytes(head + b"latency_s = 0.0\r\n# last\r\n[drivers]\n")
     write_edited(file, with_values(file, "vision.cameras", VALUES))
-    assert file.read_bytes() == (
-        b'[robot]\nname = "arm"\r\n\n[vision.cameras]\r\nleft = "a"\nlatency_s = 0.01\r\n'
-        b"# last\r\nlatency_sigma_s = 0.001\r\n[drivers]\n"
-    )
+    assert file.read_bytes() == head + b"latency_s = 0.01\r\n# last\r\nlatency_sigma_s = 0.001\r\n[drivers]\n"
 
 
 @given(st.lists(st.tuples(st.sampled_from(["", "# a", "a = 1", "bb = 2"]), st.booleans()), max_size=9), st.booleans())

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -72,6 +74,8 @@ def test_a_pair_states_its_pose() -> None:
     assert np.array_equal(np.reshape(pose.translation_covariance, (3, 3)), cov)
     assert np.array(pose.matrix)[:3, 3].tolist() == [0.0, 1.0, 2.0]
     assert pose.covariance is None  # that of the orientation is not known
+    rounded = replace(pair, R=1.0009 * pair.R)  # as far off as pairs may be
+    assert np.allclose(pair_to_wire(rounded).pose.matrix, pose.matrix)
 
 
 def message(**changed: object) -> bytes:

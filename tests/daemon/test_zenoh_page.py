@@ -129,6 +129,16 @@ def test_the_command_predict_prints_the_same(learner: Config) -> None:
     assert done.stdout.splitlines()[1].split()[:3] == ["300.0", "0.0", "0.0"]
 
 
+@pytest.mark.parametrize(("command", "says"), [(["predict", "0", "0"], "300.0"), (["status"], "learner of arm is")])
+def test_clients_load_no_numpy(learner: Config, command: list[str], says: str) -> None:
+    last = "atexit.register(lambda: print('numpy' in sys.modules))"
+    code = f"import atexit, sys; {last}; from bodyschema.cli.main import main; main()"
+    whole = [sys.executable, "-c", code, *command, "--robot", str(learner.file)]
+    done = subprocess.run(whole, capture_output=True, text=True, timeout=LIMIT_S, check=False)
+    assert says in done.stdout
+    assert done.stdout.splitlines()[-1] == "False"
+
+
 def predicted(learner: Config, capsys, *arguments: str) -> str:
     command = ["predict", "--robot", str(learner.file), *arguments]
     app(command, exit_on_error=False, result_action="return_value")

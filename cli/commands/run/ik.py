@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
 
 if TYPE_CHECKING:
-    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.client_config import ClientConfig
     from bodyschema.daemon.transport.wire import IkReply
 
 REASONS = {
@@ -44,17 +44,17 @@ def ik(
     """
     import math
 
-    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.client_config import ClientConfig
     from bodyschema.daemon.transport.bus import client
     from bodyschema.daemon.transport.keys import Keys
     from bodyschema.daemon.transport.wire import IkReply, IkRequest, decode, encode
     from bodyschema.interfaces.errors import RequestError
 
-    config = Config.load(robot)
+    config = ClientConfig.load(robot)
     if not all(map(math.isfinite, (x, y, z))):
         raise RequestError(f"{x:g}, {y:g}, {z:g} is no position: give three finite numbers in metres")
-    with client(config.route("learner")) as bus:
-        reply = decode(bus.ask_one(Keys(config.robot.name).ik, encode(IkRequest((x, y, z), posture=posture))), IkReply)
+    with config.checked_on_error(), client(config.route("learner")) as bus:
+        reply = decode(bus.ask_one(Keys(config.name).ik, encode(IkRequest((x, y, z), posture=posture))), IkReply)
     if as_json:
         print_json(reply)
     else:
@@ -63,7 +63,7 @@ def ik(
         sys.exit(1)
 
 
-def _show(reply: IkReply, config: Config, deg: bool) -> None:
+def _show(reply: IkReply, config: ClientConfig, deg: bool) -> None:
     import math
 
     from rich.console import Console
@@ -73,7 +73,7 @@ def _show(reply: IkReply, config: Config, deg: bool) -> None:
     from bodyschema.cli.terminal.screen import two_digits
 
     table = Table(box=None, pad_edge=False, header_style="bold", show_header=False)
-    for name, value, slides in zip(config.robot.joints, reply.q, config.robot.chain.prismatic, strict=True):
+    for name, value, slides in zip(config.joints, reply.q, config.slides, strict=True):
         unit = "m" if slides else "deg" if deg else "rad"
         digits = 2 if unit == "deg" else 4
         shown = round(math.degrees(value) if unit == "deg" else value, digits) + 0.0  # no -0.00

@@ -11,6 +11,7 @@ from cyclopts import Parameter
 from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
 
 if TYPE_CHECKING:
+    from bodyschema.daemon.client_config import ClientConfig
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.transport.wire import JointsRequest, PredictReply
     from bodyschema.interfaces.records import FloatArray
@@ -31,23 +32,38 @@ def predict(
 
     Next: the same from your own program, over zenoh: docs/zenoh.md.
     """
-    import numpy as np
-    from rich.console import Console
-
-    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.client_config import ClientConfig
     from bodyschema.daemon.transport.bus import client
     from bodyschema.daemon.transport.keys import Keys
-    from bodyschema.daemon.transport.wire import PredictReply, decode, encode
+    from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode
 
-    config = Config.load(robot)
-    request = _request(q, config, deg)
-    with client(config.route("learner")) as bus:
-        reply = decode(bus.ask_one(Keys(config.robot.name).predict, encode(request)), PredictReply)
+    config = ClientConfig.load(robot)
+    with config.checked_on_error():
+        rows = _rows(q, config, deg)
+        with client(config.route("learner")) as bus:
+            reply = decode(bus.ask_one(Keys(config.name).predict, encode(JointsRequest([*rows]))), PredictReply)
     if as_json:
         print_json(reply)
         return
     _show(reply)
-    for note in _notes(config, np.array(request.q), deg):
+    limits = [config.joint_limits.get(name, ("", 0.0, 0.0)) for name in config.joints]
+    beyond = (
+        kind != "continuous" and not lower <= value <= upper
+        for row in rows
+        for value, (kind, lower, upper) in zip(row, limits, strict=True)
+    )
+    if any(beyond):
+        _show_notes(config, rows, deg)
+
+
+def _show_notes(config: ClientConfig, rows: list[list[float]], deg: bool) -> None:
+    """Print remarks on joint values [rad, m] that the arm cannot have."""
+    import numpy as np
+    from rich.console import Console
+
+    from bodyschema.daemon.config import Config
+
+    for note in _notes(Config.load(config.file), np.array(rows), deg):
         Console(highlight=False).print(note, style="yellow", markup=False)
 
 
@@ -69,40 +85,40 @@ def _notes(config: Config, q: FloatArray, deg: bool) -> Iterator[str]:
         )
 
 
-def _request(values: tuple[float, ...], config: Config, deg: bool) -> JointsRequest:
-    """Return the request. RequestError if the input is not a vector of joint angles."""
-    import numpy as np
+def _rows(values: tuple[float, ...], config: ClientConfig, deg: bool) -> list[list[float]]:
+    """Return the vectors of joint values [rad, m]. RequestError if the input is none."""
+    import math
 
-    from bodyschema.daemon.transport.wire import JointsRequest, joint_angles
+    from bodyschema.daemon.transport.wire import JointsRequest, joint_angles, joint_rows
     from bodyschema.interfaces.errors import RequestError
 
     if values:
         request = JointsRequest(list(values))
     elif sys.stdin.isatty():
-        raise RequestError(
-            f"no joint angles; give {len(config.robot.joints)} ({', '.join(config.robot.joints)}), or JSON on stdin"
-        )
+        raise RequestError(f"no joint angles; give {len(config.joints)} ({', '.join(config.joints)}), or JSON on stdin")
     else:
         request = _from_standard_input(config)
-    angles = joint_angles(request, config.robot.joints)
-    if deg:
-        turns = ~config.robot.chain.prismatic
-        angles[:, turns] = np.radians(angles[:, turns])
-    return JointsRequest(angles.tolist())
+    rows = joint_rows(request, config.joints)
+    if not all(math.isfinite(value) for row in rows for value in row):
+        joint_angles(request, config.joints)  # which says where
+    if not deg:
+        return rows
+    slides = config.slides
+    return [[value if is_m else math.radians(value) for value, is_m in zip(row, slides, strict=True)] for row in rows]
 
 
-def _from_standard_input(config: Config) -> JointsRequest:
+def _from_standard_input(config: ClientConfig) -> JointsRequest:
     from bodyschema.daemon.transport.wire import JointsRequest, decode
     from bodyschema.interfaces.errors import RequestError
 
     text = sys.stdin.buffer.read()
-    names = ", ".join(config.robot.joints)
+    names = ", ".join(config.joints)
     if not text.strip():
-        raise RequestError(f"no joint angles, and standard input is empty; give {len(config.robot.joints)} ({names})")
+        raise RequestError(f"no joint angles, and standard input is empty; give {len(config.joints)} ({names})")
     try:
         return decode(b'{"q":' + text + b"}", JointsRequest)
     except RequestError as error:
-        wanted = f"a JSON list of {len(config.robot.joints)} numbers ({names}), or a list of such lists"
+        wanted = f"a JSON list of {len(config.joints)} numbers ({names}), or a list of such lists"
         raise RequestError(f"standard input is not {wanted}") from error
 
 

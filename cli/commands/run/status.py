@@ -25,9 +25,9 @@ def status(
     from rich.console import Console
 
     from bodyschema.cli.terminal.status_view import Watcher, as_json, screen
-    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.client_config import ClientConfig
 
-    config = Config.load(robot)
+    config = ClientConfig.load(robot)
     console = Console(highlight=False)
     with Watcher(config) as watcher:
         if watch and not json:
@@ -37,6 +37,10 @@ def status(
                 for seen in watcher.follow():
                     live.update(screen(seen, config), refresh=True)
         for seen in watcher.follow() if watch else [watcher.look()]:
+            if seen.nobody and not watch:
+                from bodyschema.daemon.config import Config
+
+                Config.load(robot)  # with a wrong one neither starts
             if json:
                 console.file.write(as_json(seen) + "\n")
                 console.file.flush()

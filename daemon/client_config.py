@@ -1,0 +1,115 @@
+"""What a client of sampler and learner needs of robot.toml, without the packages of the processes (no numpy)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated
+from xml.etree import ElementTree
+
+import msgspec
+from msgspec import Meta
+
+from bodyschema.daemon.transport.identity import Route
+from bodyschema.daemon.transport.zenoh_config import ZenohConfig
+from bodyschema.interfaces.errors import BusError, ConfigError, RequestError
+from bodyschema.robot.limited import read_at_most
+from bodyschema.robot.toml_file import NAME, convert, read_toml
+
+# Variables that override what is read here.
+OVERRIDES = ("BODYSCHEMA_ROBOT_", "BODYSCHEMA_ZENOH_")
+
+
+class _Robot(msgspec.Struct, frozen=True):
+    name: Annotated[str, Meta(pattern=NAME)]
+    urdf: str
+    joints: Annotated[tuple[str, ...], Meta(min_length=1)]
+
+
+class _Tables(msgspec.Struct, frozen=True):
+    robot: _Robot
+    zenoh: ZenohConfig = ZenohConfig()
+
+
+@dataclass(frozen=True)
+class ClientConfig:
+    """The robot's name, its joints, and where its processes are.
+
+    `Config` reads and checks everything else; clients leave that to the processes, and load in a third of the time.
+
+    Attributes:
+        file: robot.toml.
+        urdf: file of the URDF.
+    """
+
+    file: Path
+    name: str
+    joints: tuple[str, ...]
+    urdf: Path
+    zenoh: ZenohConfig
+
+    @classmethod
+    def load(cls, file: Path, environment: Mapping[str, str] = os.environ) -> ClientConfig:
+        """Read robot.toml; where something is wrong or the environment overrides it, as `Config` does.
+
+        Raises:
+            ConfigError: as `Config.load`.
+        """
+        if not any(variable.startswith(OVERRIDES) for variable in environment):
+            try:
+                raw, text = read_toml(file)
+                tables = convert(raw, _Tables, file=file, text=text)
+                tables.zenoh.check(file, text)
+                robot = tables.robot
+                return cls(file, robot.name, robot.joints, file.parent / robot.urdf, tables.zenoh)
+            except ConfigError:
+                pass
+        from bodyschema.daemon.config import Config
+
+        full = Config.load(file, environment)
+        robot = full.robot.robot
+        return cls(file, robot.name, robot.joints, file.parent / robot.urdf, full.tables.zenoh)
+
+    def route(self, process: str) -> Route:
+        """Return the endpoint and identity with which a client connects to `sampler` or `learner`."""
+        return self.zenoh.route(process, self.file.parent)
+
+    @contextmanager
+    def checked_on_error(self) -> Iterator[None]:
+        """Raise the ConfigError of a wrong robot.toml in the place of errors of requests and of the connection."""
+        try:
+            yield
+        except (BusError, RequestError):
+            from bodyschema.daemon.config import Config
+
+            Config.load(self.file)
+            raise
+
+    @cached_property
+    def joint_limits(self) -> Mapping[str, tuple[str, float, float]]:
+        """By joint of the URDF, its type and its limits [rad; m if it slides].
+
+        Raises:
+            ConfigError: the URDF is not one.
+        """
+        try:
+            found = ElementTree.fromstring(read_at_most(self.urdf)).findall("joint")
+            return {joint.attrib["name"]: (joint.attrib["type"], *_limits(joint.find("limit"))) for joint in found}
+        except (OSError, ElementTree.ParseError, KeyError, ValueError):
+            from bodyschema.daemon.config import Config
+
+            tree = Config.load(self.file).robot.tree
+            return {name: (joint.kind, joint.lower, joint.upper) for name, joint in tree.joints.items()}
+
+    @property
+    def slides(self) -> tuple[bool, ...]:
+        """True for each prismatic joint among `joints`."""
+        return tuple(name in self.joint_limits and self.joint_limits[name][0] == "prismatic" for name in self.joints)
+
+
+def _limits(limit: ElementTree.Element | None) -> tuple[float, float]:
+    return (0.0, 0.0) if limit is None else (float(limit.get("lower", "0")), float(limit.get("upper", "0")))
