@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,7 +72,10 @@ def lerobot_robot_toml(arm: LeRobotArm, urdf: Path, robot: Path, calibration: Pa
         name=key_name(calibration.stem)
     )
     servos = _servos(arm, tree, read_calibration(calibration, arm.joints), calibration)
-    return robot_toml(guess, seen) + _servo_tables(arm, servos, calibration, port)
+    # LeRobot's arms have these joints and links, and the camera's pose is fitted.
+    known = "# CHECK: " if seen.webcam else "# CHECK: (?!the cameras;)"
+    text = re.sub(f"{known}(.)", lambda found: f"# {found[1].upper()}", robot_toml(guess, seen))
+    return text + _servo_tables(arm, servos, calibration, port)
 
 
 def lerobot_port(arm: LeRobotArm, scan: Scan) -> str:

@@ -130,6 +130,7 @@ def test_one_webcam_and_its_marker_need_no_editing(tmp_path, marker, expected) -
     vision = found.tables.vision
     assert found.robot.camera.eyes == 1
     assert vision.cameras.one.device == "/dev/v4l/by-id/cam"
+    assert "CHECK: " not in (tmp_path / "robot.toml").read_text()
     assert (vision.tag.side_m if vision.marker == "tag" else vision.radius_m) == expected
 
 
