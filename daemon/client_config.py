@@ -16,7 +16,7 @@ from msgspec import Meta
 
 from bodyschema.daemon.transport.identity import Route
 from bodyschema.daemon.transport.zenoh_config import ZenohConfig
-from bodyschema.interfaces.errors import BusError, ConfigError, RequestError
+from bodyschema.interfaces.errors import ConfigError, RequestError
 from bodyschema.robot.limited import read_at_most
 from bodyschema.robot.toml_file import NAME, convert, read_toml
 
@@ -39,7 +39,7 @@ class _Tables(msgspec.Struct, frozen=True):
 class ClientConfig:
     """The robot's name, its joints, and where its processes are.
 
-    `Config` reads and checks everything else; clients leave that to the processes, and load in a third of the time.
+    `Config` reads and checks everything else; clients leave that to the processes, which takes half of the time.
 
     Attributes:
         file: robot.toml.
@@ -80,10 +80,10 @@ class ClientConfig:
 
     @contextmanager
     def checked_on_error(self) -> Iterator[None]:
-        """Raise the ConfigError of a wrong robot.toml in the place of errors of requests and of the connection."""
+        """Raise the ConfigError of a wrong robot.toml in the place of the error of a wrong request."""
         try:
             yield
-        except (BusError, RequestError):
+        except RequestError:
             from bodyschema.daemon.config import Config
 
             Config.load(self.file)

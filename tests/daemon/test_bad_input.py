@@ -118,7 +118,7 @@ def fix(file: Path, right: str, wrong: str) -> None:
         ("run learner", "state_dir", "statedir", 12, "unknown key 'statedir' in [daemon]. Did you mean 'state_dir'?"),
         ("replay", '"arm.urdf"', '"leg.urdf"', None, "cannot read the URDF: No such file or directory. Fix [robot]"),
         ("predict", '"waist", ', '"wrist", ', 4, "there is no joint 'wrist' in arm.urdf. Did you mean 'waist'?"),
-        ("status", "state_dir", "statedir", 12, "unknown key 'statedir' in [daemon]. Did you mean 'state_dir'?"),
+        ("config", "state_dir", "statedir", 12, "unknown key 'statedir' in [daemon]. Did you mean 'state_dir'?"),
     ],
 )
 def test_nothing_starts_with_a_wrong_description(robot, command, right, wrong, line, said) -> None:

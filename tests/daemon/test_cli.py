@@ -67,11 +67,16 @@ def test_help_loads_nothing_that_takes_long(tmp_path) -> None:
     assert len(loaded) < 100
 
 
-def test_clients_are_told_what_is_wrong_in_robot_toml(robot, capsys) -> None:
+def test_status_and_predict_load_no_numpy(robot) -> None:
+    loaded = loaded_by(["status"], ["predict", "0", "0"], cwd=robot.parent)
+    assert {"bodyschema.daemon.client_config", "zenoh"} <= loaded
+    assert loaded & {"numpy", "scipy", "kbmaps", "lxml", "tomlkit", "bodyschema.daemon.config"} == set()
+
+
+def test_a_wrong_request_is_told_what_is_wrong_in_robot_toml(robot) -> None:
     robot.write_text(robot.read_text() + "[daemon.more]\n")
-    for command in (["predict", "0", "0"], ["ik", "0.3", "0", "0"], ["status"]):
-        with pytest.raises(ConfigError, match="more"):
-            app([*command, "--robot", str(robot)], exit_on_error=False, result_action="return_value")
+    with pytest.raises(ConfigError, match="more"):
+        app(["predict", "0", "--robot", str(robot)], exit_on_error=False, result_action="return_value")
 
 
 def test_a_client_config_agrees_with_the_whole(robot, monkeypatch) -> None:

@@ -37,10 +37,6 @@ def status(
                 for seen in watcher.follow():
                     live.update(screen(seen, config), refresh=True)
         for seen in watcher.follow() if watch else [watcher.look()]:
-            if seen.nobody and not watch:
-                from bodyschema.daemon.config import Config
-
-                Config.load(robot)  # with a wrong one neither starts
             if json:
                 console.file.write(as_json(seen) + "\n")
                 console.file.flush()
