@@ -93,7 +93,7 @@ class MarkerPose(msgspec.Struct, frozen=True):
         """
         import numpy as np
 
-        from kbmaps.rotations import rotation_matrices
+        from kbmaps.rotations import cross_matrix
 
         n = len(x)
         six = np.zeros((n, 6, 6))
@@ -103,7 +103,9 @@ class MarkerPose(msgspec.Struct, frozen=True):
             return [cls(place, None, None, None, each) for place, each in zip(places, narrow, strict=True)]
         unit: FloatArray = R / np.linalg.norm(R, axis=1)[:, None]  # some are written with few digits
         T = np.tile(np.eye(4), (n, 1, 1))
-        T[:, :3, :3], T[:, :3, 3] = rotation_matrices("R", unit), x
+        K = cross_matrix(unit[:, :3])
+        T[:, :3, :3] += 2.0 * (unit[:, 3:, None] * K + K @ K)
+        T[:, :3, 3] = x
         if cov_R is not None:
             six[:, 3:, 3:] = _covariances(cov_R)
         wide = nothing if cov_R is None else six.reshape(n, 36).tolist()
