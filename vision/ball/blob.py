@@ -10,6 +10,7 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
 from bodyschema.vision.config import VisionConfig
+from bodyschema.vision.images import WHITE
 
 from .colour import Gate
 from .outline import Outline, fit_outline, refine_outline
@@ -27,8 +28,8 @@ _SAME_FILL = 0.02
 _MOST_UNEVEN = 0.3
 # The ball is occluded if a larger share of its outline leaves the ellipse.
 _MOST_OFF = 0.15
-# Grey level of an over-exposed pixel, and the largest share of such pixels on a ball that can be measured.
-_WHITE, _MOST_WHITE = 250, 0.35
+# Largest share of over-exposed pixels on a ball that can be measured.
+_MOST_WHITE = 0.35
 # Radius of the ball to which `max_centre_sigma_px` applies [px].
 _SMALL_PX = 5.0
 # 1-sigma of the centre of a patch that could not be measured, as a share of its radius.
@@ -236,7 +237,7 @@ def _level(image: ImageArray, box: Region, centre_px: FloatArray, radius_px: flo
 def _washed_out(image: ImageArray, patch: Patch) -> bool:
     """Return True if much of the ball is white in all channels, so that neither colour nor shading is usable."""
     pixels = patch.box.crop(image)
-    return float(np.mean(pixels.min(axis=2) >= _WHITE)) > _MOST_WHITE * np.pi / 4
+    return float(np.mean(pixels.min(axis=2) >= WHITE)) > _MOST_WHITE * np.pi / 4
 
 
 def _clear_of_border(box: Region, margin_px: float, size: tuple[int, int]) -> bool:

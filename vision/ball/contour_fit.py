@@ -24,8 +24,6 @@ _SHARPEST_PX, _WIDEST_PX = 0.4, 3.0
 _ALIASED_PX = 0.55
 # Student's degrees of freedom of an edge's error, which set the weight of outliers; residual limit [px]; iterations.
 _FREEDOM, _FARTHEST_PX, _ROUNDS = 4.0, 1.0, 3
-# Below this, relative to the cubed trace, the limb does not determine centre and radius.
-_LEAST_DETERMINANT = 1e-6
 # The wave once round is at least so large: this, and so many times the noise that the channels show; that the other
 # waves are small is no sign that it is. Beside that it is this part of what the few waves tell, and where they tell of
 # far more it is the square, over the last: a bend that shows is a sign of one that the fit has removed.
@@ -139,7 +137,7 @@ def _fit(limb: Limb, radius_px: float) -> _Fit | None:
     residual = limb.offset_px
     for _ in range(_ROUNDS):
         used = weight
-        inverse = inverse_of_normal((design * used[:, None]).T @ design, _LEAST_DETERMINANT)
+        inverse = inverse_of_normal((design * used[:, None]).T @ design)
         if inverse is None or np.count_nonzero(used) < len(told) // 2:
             return None
         solution = inverse @ (design.T @ (used * limb.offset_px))
