@@ -27,8 +27,8 @@ from .shapes import rpy_of
 _MOST_OFF = 6.0
 # ... in units of what is usual, which calibrated cameras bring to so much at most.
 _MOST_USUAL = 5.0
-# Largest shares of all views, and of the views of one tag, with outliers; a single one is always allowed.
-_MOST_LEFT_OUT, _MOST_OF_A_TAG = 0.25, 0.34
+# Largest share of all views, and of the views of one tag, with outliers; a single one is always allowed.
+_MOST_LEFT_OUT = 0.34
 _LEAST_VIEWS = 3
 
 Motion = tuple[FloatArray, FloatArray]  # rotation (3, 3) and place (3,) [m]
@@ -151,7 +151,7 @@ def _is_odd(left_out: Sequence[tuple[str, int]], views: Sequence[ClusterView]) -
     shown, times = Counter(id for view in views for id in view.ids), Counter(id for _, id in left_out)
     if len({name for name, _ in left_out}) > max(1.0, _MOST_LEFT_OUT * len(views)):
         return True
-    return any(count > max(1.0, _MOST_OF_A_TAG * shown[id]) for id, count in times.items())
+    return any(count > max(1.0, _MOST_LEFT_OUT * shown[id]) for id, count in times.items())
 
 
 def _not_rigid(left_out: Sequence[tuple[str, int]], odd: int | None) -> str:
