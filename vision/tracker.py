@@ -32,8 +32,6 @@ _log = logging.getLogger(__name__)
 
 # Half the side of the region searched around the predicted centre: radii, plus pixels, plus steps between frames.
 _REGION_RADII, _REGION_PX, _REGION_STEPS = 1.6, 14.0, 0.7
-# A patch smaller than this share of the tracked marker is another object, such as part of a brick.
-_LEAST_SIZE = 0.5
 # A disc fits the prediction if its position and its size differ by less than this, in radii of the marker.
 _AS_EXPECTED = 0.25
 # So long after the last fix the marker is expected within reach of it [s], if it moved on for no longer than this [s];
@@ -206,8 +204,7 @@ class StereoTracker:
         Once a disc fits the prediction, patches that are not whole are skipped.
         """
         region = self._whole if expected is None else expected.region
-        least_radius_px = 0.0 if expected is None else _LEAST_SIZE * expected.radius_px
-        patches = find_patches(image, region, self._gate, self.config, least_radius_px)
+        patches = find_patches(image, region, self._gate, self.config)
         discs: list[Disc] = []
         rough: list[Disc] = []
         reason: Reason | None = None

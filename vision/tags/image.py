@@ -57,8 +57,8 @@ class TagImage:
 def measure_tag(grey: ImageArray, id: int, corners_px: FloatArray, config: TagConfig) -> TagImage | Reason:
     """Measure the tag whose corners are near `corners_px` (4, 2) in a grey image, or return why it is doubtful."""
     found = _measured(grey, id, corners_px, 1.0, config)
-    if found in (Reason.OCCLUDED, Reason.LOW_CONTRAST):
-        # The margin may be narrower than a module.
+    if isinstance(found, Reason):
+        # The margin may be narrower than a module, the tag very oblique, or near the image's border.
         again = _measured(grey, id, corners_px, _SHORTER, config)
         return again if isinstance(again, TagImage) else found
     return found
