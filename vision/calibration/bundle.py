@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import cv2
 import numpy as np
@@ -178,7 +177,7 @@ class _Linear:
     mixed: FloatArray
     penalty: float
 
-    @cached_property
+    @property
     def squares(self) -> float:
         return self.penalty + _weighted(self.residuals, self.weights)
 

@@ -23,7 +23,7 @@ def photograph(image: ImageArray, corners: Corners | None, alt: str) -> str:
     scale = min(1.0, _WIDTH_PX / image.shape[1])
     small = shrunk(image, _WIDTH_PX)
     if small.ndim == 2:
-        small = cv2.cvtColor(small, cv2.COLOR_GRAY2BGR)
+        small = np.asarray(cv2.cvtColor(small, cv2.COLOR_GRAY2BGR), np.uint8)
     if corners is not None:
         for k, at in enumerate((corners.px + 0.5) * scale - 0.5):
             centre = (round(float(at[0]) * 8), round(float(at[1]) * 8))
