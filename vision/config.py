@@ -14,6 +14,9 @@ from bodyschema.vision.tags.config import ClusterConfig, TagConfig
 
 Ratio = Annotated[float, Meta(gt=1)]
 
+# After a longer pause the last fixes of a marker predict nothing [s].
+LONGEST_PAUSE_S = 0.5
+
 MarkerKind = Literal["ball", "bright_ball", "tag", "cluster", "plugin"]
 ColourName = Literal["red", "orange", "yellow", "green", "cyan", "blue", "magenta"]
 

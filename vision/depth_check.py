@@ -12,8 +12,7 @@ import numpy as np
 from bodyschema.interfaces.protocols import MarkerSource
 from bodyschema.interfaces.records import MarkerFix, MarkerMiss
 
-JUDGED, FEWEST_JUDGED = 100, 20
-MANY = 0.2
+JUDGED = 20  # frames
 SIGMAS = 4.0
 DEPTH_ERROR = 0.02  # of the distance, as the maker promises up to 2 m
 
@@ -41,14 +40,15 @@ class DepthChecked:
     @property
     def health(self) -> tuple[str, ...]:
         """A persistent contradiction, with what to do."""
-        wrong = [(eyes, depth) for eyes, depth, sigmas in self._apart if sigmas > SIGMAS]
-        if len(self._apart) < FEWEST_JUDGED or len(wrong) < MANY * len(self._apart):
+        if len(self._apart) < JUDGED:
             return ()
-        eyes, depth = np.median(wrong, axis=0)
+        eyes, depth, sigmas = np.median(self._apart, axis=0)
+        if sigmas <= SIGMAS:
+            return ()
         return (
-            f"the depth image has the marker at {depth:.3f} m where the two eyes measure {eyes:.3f} m, in {len(wrong)} "
-            f"of {len(self._apart)} frames: is something else taken for the marker? If not, run the device's own "
-            "calibration (RealSense Viewer, On-Chip Calibration)",
+            f"the depth image has the marker at {depth:.3f} m where the two eyes measure {eyes:.3f} m: "
+            "is something else taken for the marker? If not, run the device's own calibration (RealSense Viewer, "
+            "On-Chip Calibration)",
         )
 
     def __enter__(self) -> Self:

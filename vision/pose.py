@@ -13,10 +13,7 @@ from scipy.spatial.transform import Rotation
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
 
-_STEPS = 25
-_CONVERGED = 1e-6
-# Levenberg's damping, relative to the diagonal of the normal equations.
-_FIRST_DAMPING, _MOST_DAMPING = 1e-4, 1e6
+from .least_squares import damped_step, minimised
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,14 +42,26 @@ class Pose:
         x: the body's origin (3,) [m].
         cov: covariance (6, 6) of a small turn about the axes of the optical frame [rad], then of x [m].
         squares: sum of the squared residuals in units of their sigmas.
-        by_sighting: the same of each sighting.
     """
 
     rotation: FloatArray
     x: FloatArray
     cov: FloatArray
     squares: float
-    by_sighting: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Linearised:
+    """Residuals at a pose, and their derivative by turn and place, in units of sigma."""
+
+    rotation: FloatArray
+    x: FloatArray
+    residuals: FloatArray
+    jacobian: FloatArray
+
+    @property
+    def squares(self) -> float:
+        return float(self.residuals @ self.residuals)
 
 
 class PoseEstimator:
@@ -63,50 +72,40 @@ class PoseEstimator:
     """
 
     def __init__(self, calibration: StereoCalibration, sightings: Sequence[Sighting]) -> None:
-        self._calibration, self._sightings = calibration, tuple(sightings)
-        self._eyes = [self._all_of(right) for right in (False, True) if any(s.right == right for s in sightings)]
-        self._roots = [self._root(eye) for eye in self._eyes]
-        self._own_roots = [self._root(sighting) for sighting in self._sightings]
+        self._calibration = calibration
+        self._eyes = [_all_of(sightings, right) for right in (False, True) if any(s.right == right for s in sightings)]
+        self._roots = [whitening(eye.cov_px, calibration.pixel_sigma) for eye in self._eyes]
 
     def refine(self, rotation: FloatArray, x: FloatArray) -> Pose | None:
         """Return the least-squares pose near a first one; None if the body is not in front of the eyes.
 
         Levenberg-Marquardt on the turn about the origin of the body and the origin's place.
         """
-        damping = _FIRST_DAMPING
-        now = self._linearised(rotation, x)
-        if now is None:
+        first = self._linearised(rotation, x)
+        if first is None:
             return None
-        for _ in range(_STEPS):
-            residuals, jacobian = now
-            normal = jacobian.T @ jacobian
-            scale = np.diag(normal)
-            change = np.linalg.solve(normal + damping * np.diag(scale), jacobian.T @ residuals)
-            turn = Rotation.from_rotvec(change[:3]).as_matrix() @ rotation
-            tried = self._linearised(turn, x + change[3:])
-            if tried is not None and tried[0] @ tried[0] <= residuals @ residuals:
-                rotation, x, now, damping = turn, x + change[3:], tried, damping / 10.0
-                if float(change @ (scale * change)) < _CONVERGED:
-                    break
-            elif (damping := damping * 10.0) > _MOST_DAMPING:
-                break
-        return self._result(rotation, x, *now)
+        found = minimised(first, self._stepped)
+        cov = np.asarray(np.linalg.inv(found.jacobian.T @ found.jacobian), dtype=np.float64)
+        return Pose(found.rotation, found.x, cov, found.squares)
+
+    def _stepped(self, now: _Linearised, damping: float) -> _Linearised | None:
+        change = damped_step(now.jacobian, now.residuals, damping)
+        return self._linearised(Rotation.from_rotvec(change[:3]).as_matrix() @ now.rotation, now.x + change[3:])
 
     def scale(self, pose: Pose) -> tuple[float, float]:
         """Return the relative size error of the body against its nominal size, and its 1-sigma.
 
         One more Gauss-Newton step with the size free: the eyes' distance against the printed size.
         """
-        linearised = self._linearised(pose.rotation, pose.x)
-        if linearised is None:
+        there = self._linearised(pose.rotation, pose.x)
+        if there is None:
             return math.inf, 0.0
-        residuals, jacobian = linearised
         grown = np.concatenate(
             [root @ self._moved(eye, pose).ravel() for eye, root in zip(self._eyes, self._roots, strict=True)]
         )
-        full = np.column_stack([jacobian, grown])
+        full = np.column_stack([there.jacobian, grown])
         cov = np.linalg.inv(full.T @ full)
-        return float((cov @ full.T @ residuals)[6]), math.sqrt(cov[6, 6])
+        return float((cov @ full.T @ there.residuals)[6]), math.sqrt(cov[6, 6])
 
     def _moved(self, eye: Sighting, pose: Pose) -> FloatArray:
         """Return the derivative of an eye's pixels by the body's size (k, 2)."""
@@ -115,21 +114,10 @@ class PoseEstimator:
             ..., 0
         ]
 
-    def _all_of(self, right: bool) -> Sighting:
-        """Return one eye's sighting of all points."""
-        seen = [sighting for sighting in self._sightings if sighting.right == right]
-        points, pixels = np.concatenate([s.points for s in seen]), np.concatenate([s.pixels for s in seen])
-        return Sighting(points, pixels, np.asarray(block_diag(*(s.cov_px for s in seen))), right)
-
-    def _root(self, sighting: Sighting) -> FloatArray:
-        """Return the matrix that makes residuals independent and of sigma 1."""
-        return whitening(sighting.cov_px, self._calibration.pixel_sigma)
-
     def _in_eye(self, x: FloatArray, sighting: Sighting) -> FloatArray:
         return x - np.array([self._calibration.baseline_m, 0.0, 0.0]) if sighting.right else x
 
-    def _linearised(self, rotation: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-        """Return the residuals and their derivative by turn and place, in units of sigma."""
+    def _linearised(self, rotation: FloatArray, x: FloatArray) -> _Linearised | None:
         residuals, jacobians = [], []
         for eye, root in zip(self._eyes, self._roots, strict=True):
             arms = eye.points @ rotation.T
@@ -138,22 +126,17 @@ class PoseEstimator:
                 return None
             projection = projection_slopes(self._calibration.focal_px, points)
             by_turn = projection @ turned(arms)
-            residuals.append(root @ (eye.pixels - self._seen(points)).ravel())
+            seen = self._calibration.focal_px * points[:, :2] / points[:, 2:] + self._calibration.principal_point_px
+            residuals.append(root @ (eye.pixels - seen).ravel())
             jacobians.append(root @ np.concatenate([by_turn, projection], axis=2).reshape(-1, 6))
-        return np.concatenate(residuals), np.concatenate(jacobians)
+        return _Linearised(rotation, x, np.concatenate(residuals), np.concatenate(jacobians))
 
-    def _seen(self, points: FloatArray) -> FloatArray:
-        return self._calibration.focal_px * points[:, :2] / points[:, 2:] + self._calibration.principal_point_px
 
-    def _squares(self, sighting: Sighting, root: FloatArray, rotation: FloatArray, x: FloatArray) -> float:
-        points = sighting.points @ rotation.T + self._in_eye(x, sighting)
-        return float(np.square(root @ (sighting.pixels - self._seen(points)).ravel()).sum())
-
-    def _result(self, rotation: FloatArray, x: FloatArray, residuals: FloatArray, jacobian: FloatArray) -> Pose:
-        pairs = zip(self._sightings, self._own_roots, strict=True)
-        parts = tuple(self._squares(sighting, root, rotation, x) for sighting, root in pairs)
-        cov = np.asarray(np.linalg.inv(jacobian.T @ jacobian), dtype=np.float64)
-        return Pose(rotation, x, cov, float(residuals @ residuals), parts)
+def _all_of(sightings: Sequence[Sighting], right: bool) -> Sighting:
+    """Return one eye's sighting of all points."""
+    seen = [sighting for sighting in sightings if sighting.right == right]
+    points, pixels = np.concatenate([s.points for s in seen]), np.concatenate([s.pixels for s in seen])
+    return Sighting(points, pixels, np.asarray(block_diag(*(s.cov_px for s in seen))), right)
 
 
 def projection_slopes(focal_px: float, points: FloatArray) -> FloatArray:

@@ -6,13 +6,12 @@ from dataclasses import replace
 from types import TracebackType
 from typing import Protocol, Self
 
-import cv2
-
 from bodyschema.interfaces.protocols import StereoCamera
 from bodyschema.interfaces.records import ImageArray, MarkerFix, MarkerMiss, StereoFrame
 
-# Pictures for a page beside other panels: about 100 kB.
-_WIDEST_PX, _QUALITY = 1280, 80
+from .images import jpeg, shrunk
+
+_WIDEST_PX = 1280  # of a picture beside other panels of a page
 
 
 class MarkerTracker(Protocol):
@@ -59,10 +58,7 @@ class TrackedCamera:
         newest = self._newest
         if newest is None or self._annotator is None:
             return None
-        drawn = self._annotator.drawn(*newest)
-        scale = min(1.0, _WIDEST_PX / drawn.shape[1])
-        small = cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        return cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
+        return jpeg(shrunk(self._annotator.drawn(*newest), _WIDEST_PX))
 
     def read(self, timeout_s: float) -> MarkerFix | MarkerMiss | None:
         """Return the marker in the next frame, or the reason for a miss; None if no frame came within `timeout_s`

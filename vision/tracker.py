@@ -24,7 +24,7 @@ from bodyschema.vision.ball.match import StereoMatcher, is_reflection_of
 from bodyschema.vision.ball.size import BallSize
 from bodyschema.vision.ball.sphere import Pinhole
 
-from .config import VisionConfig
+from .config import LONGEST_PAUSE_S, VisionConfig
 from .images import check_calibration, check_images
 from .triangulate import Location
 
@@ -32,12 +32,8 @@ _log = logging.getLogger(__name__)
 
 # Half the side of the region searched around the predicted centre: radii, plus pixels, plus steps between frames.
 _REGION_RADII, _REGION_PX, _REGION_STEPS = 1.6, 14.0, 0.7
-# A patch smaller than this share of the tracked marker is another object, such as part of a brick.
-_LEAST_SIZE = 0.5
 # A disc fits the prediction if its position and its size differ by less than this, in radii of the marker.
 _AS_EXPECTED = 0.25
-# After a longer pause the last fixes give no prediction [s].
-_LONGEST_PAUSE_S = 0.5
 # So long after the last fix the marker is expected within reach of it [s], if it moved on for no longer than this [s];
 # the reach is so many radii larger. Without a fix, what is left of two is the marker after that time.
 _LONGEST_MEMORY_S, _FAIR_PAUSE_S, _JUMP_RADII = 0.9, 0.1, 2.0
@@ -208,8 +204,7 @@ class StereoTracker:
         Once a disc fits the prediction, patches that are not whole are skipped.
         """
         region = self._whole if expected is None else expected.region
-        least_radius_px = 0.0 if expected is None else _LEAST_SIZE * expected.radius_px
-        patches = find_patches(image, region, self._gate, self.config, least_radius_px)
+        patches = find_patches(image, region, self._gate, self.config)
         discs: list[Disc] = []
         rough: list[Disc] = []
         reason: Reason | None = None
@@ -239,7 +234,7 @@ class StereoTracker:
 
     def _predicted(self, t: float) -> tuple[_Expected, _Expected] | None:
         track = self._track
-        if track is None or not 0 < t - track.t <= _LONGEST_PAUSE_S:
+        if track is None or not 0 < t - track.t <= LONGEST_PAUSE_S:
             return None
         step = track.velocity_px_s * (t - track.t)
         half = _REGION_RADII * track.radius_px + _REGION_PX + _REGION_STEPS * float(np.abs(step).max())
@@ -276,7 +271,7 @@ class StereoTracker:
     def _refused_again(self, t: float, found: Location) -> Reason | None:
         """Return the reason of a recent refusal if this is the same object, else None."""
         refused = self._refused
-        if refused is None or not 0 <= t - refused.t <= _LONGEST_PAUSE_S:
+        if refused is None or not 0 <= t - refused.t <= LONGEST_PAUSE_S:
             return None
         alike = max(found.level, refused.level) < _ALIKE_LEVELS * min(found.level, refused.level)
         return refused.reason if alike and self._within_reach(found.x, refused.x, t - refused.t) else None
@@ -304,7 +299,7 @@ class StereoTracker:
 
     def _remember(self, t: float, found: Location) -> None:
         velocity = np.zeros(4)
-        if self._track is not None and 0 < t - self._track.t <= _LONGEST_PAUSE_S:
+        if self._track is not None and 0 < t - self._track.t <= LONGEST_PAUSE_S:
             velocity = (found.centres_px - self._track.centres_px) / (t - self._track.t)
         radius_px = self.calibration.focal_px * self.config.radius_m / float(found.x[2])
         self._last, self._refused = _Last(t, found.x, found.level), None

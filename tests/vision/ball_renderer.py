@@ -225,7 +225,7 @@ def processed(grey_levels: FloatArray, look: Look) -> ImageArray:
     image = np.rint(curved).astype(np.uint8)
     if look.bayer:
         mosaic = image[..., 1].copy()
-        mosaic[::2, ::2], mosaic[1::2, 1::2] = image[::2, ::2, 0], image[1::2, 1::2, 2]
+        mosaic[::2, ::2], mosaic[1::2, 1::2] = image[::2, ::2, 2], image[1::2, 1::2, 0]
         image = np.asarray(cv2.cvtColor(mosaic, cv2.COLOR_BayerRGGB2BGR), np.uint8)
     if look.denoise:
         image = np.asarray(cv2.bilateralFilter(image, 5, 3.0 * look.denoise, 1.5), np.uint8)

@@ -22,6 +22,9 @@ LOOKS = {
     "half hard edges": Look(samples=2, blur_px=0.0, noise_sd=2.5),
 }
 
+# A colour mosaic, noise filter, tone curve, halos and JPEG.
+PHONE = Look(sharpen=1.0, bayer=True, denoise=4.0, jpeg=75, tone=1 / 2.2)
+
 
 def pooled(frames: int, seed: int) -> Errors:
     return joined(measure_errors(SMALL, look, frames, seed + number) for number, look in enumerate(LOOKS.values()))
@@ -76,6 +79,12 @@ def test_a_ball_in_full_view_is_found_nearly_always(errors):
     # 45 of 1200 others are missed; at a rate of 4 % there are more than this once in a thousand times.
     most = binom.isf(1e-3, len(errors.x) + len(errors.misses), 0.04)
     assert len(errors.misses) <= most, errors.misses
+
+
+def test_a_phone_s_images_show_the_ball_as_surely_as_claimed():
+    found = measure_errors(SMALL, PHONE, 5, seed=3)
+    assert len(found.misses) <= 2, found.misses
+    assert (np.abs(found.x) < 4.0 * found.sigma).all()
 
 
 def test_a_bar_behind_the_ball_along_its_limb_hardly_pulls_its_centre():

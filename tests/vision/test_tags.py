@@ -231,9 +231,11 @@ def test_a_curled_sheet_is_measured_with_less_certainty() -> None:
 
 
 def test_a_followed_tag_is_found_after_a_step_and_after_a_jump() -> None:
-    found = tracker()
+    # No edge along the pixels: there the renderer, which blurs after pixels, unlike a lens, is off by 0.015 px.
+    found, rotation = tracker(), tilted([0.2, 1.0, 0.3], 20.0)
     for number, x in enumerate(MIDDLE + np.array([[0.0, 0.0, 0.0], [0.004, 0.0, 0.0], [-0.04, 0.03, 0.05]])):
-        assert max(off(found.track(seen(sheet(x=x), t=number / 30.0, seed=number)), FACING, x)) < 4.0
+        frame = seen(sheet(rotation=rotation, x=x), t=number / 30.0, seed=number)
+        assert max(off(found.track(frame), rotation, x)) < 4.0
 
 
 def test_an_empty_picture_has_no_marker() -> None:

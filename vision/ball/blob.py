@@ -10,6 +10,7 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
 from bodyschema.vision.config import VisionConfig
+from bodyschema.vision.images import WHITE
 
 from .colour import Gate
 from .outline import Outline, fit_outline, refine_outline
@@ -27,15 +28,14 @@ _SAME_FILL = 0.02
 _MOST_UNEVEN = 0.3
 # The ball is occluded if a larger share of its outline leaves the ellipse.
 _MOST_OFF = 0.15
-# Grey level of an over-exposed pixel, and the largest share of such pixels on a ball that can be measured.
-_WHITE, _MOST_WHITE = 250, 0.35
+# Largest share of over-exposed pixels on a ball that can be measured.
+_MOST_WHITE = 0.35
 # Radius of the ball to which `max_centre_sigma_px` applies [px].
 _SMALL_PX = 5.0
 # 1-sigma of the centre of a patch that could not be measured, as a share of its radius.
 _ROUGH_SIGMA = 0.1
-# A patch at the border is a partly visible ball if this many outline points lie on a circle, within this share of the
-# radius.
-_LEAST_ARC_POINTS, _ROUND = 8, 0.1
+# A patch at the border is a partly visible ball if its outline lies on a circle, within this share of the radius.
+_ROUND = 0.1
 # Margin around a patch for its outline [px].
 _APRON_PX = 12
 
@@ -109,22 +109,15 @@ class Disc:
         return float(np.linalg.norm(self.centre_px - other.centre_px)) < max(self.radius_px, other.radius_px)
 
 
-def find_patches(
-    image: ImageArray, region: Region, gate: Gate, config: VisionConfig, least_radius_px: float = 0.0
-) -> list[Patch]:
-    """Return patches of the marker's colour in `region` of a BGR image, at least this large, the most disc-like
-    first.
-    """
-    pixels = region.crop(image)
-    least_pixels = max(config.min_pixels, round(_LEAST_FILL * math.pi * least_radius_px**2))
-    patches = _patches(gate.mask(pixels), region, least_pixels, config)
+def find_patches(image: ImageArray, region: Region, gate: Gate, config: VisionConfig) -> list[Patch]:
+    """Return patches of the marker's colour in `region` of a BGR image, the most disc-like first."""
+    patches = _patches(gate.mask(region.crop(image)), region, config)
     for patch in list(patches):
         if not patch.is_whole:
-            for part in _brighter_parts(image, patch, gate, least_pixels, config):
+            for part in _brighter_parts(image, patch, gate, config):
                 if not any(part.box == other.box and abs(part.fill - other.fill) < _SAME_FILL for other in patches):
                     patches.append(part)
-    large = [patch for patch in patches if patch.radius_px >= least_radius_px]
-    return sorted(large, key=lambda patch: -patch.fill)[: config.max_candidates]
+    return sorted(patches, key=lambda patch: -patch.fill)[: config.max_candidates]
 
 
 def patch_at(image: ImageArray, centre_px: FloatArray, radius_px: float, gate: Gate) -> Patch | None:
@@ -199,7 +192,7 @@ def _cut_circle(image: ImageArray, patch: Patch, gate: Gate) -> tuple[FloatArray
         return None
     points = longest.reshape(-1, 2) + np.array([patch.box.left, patch.box.top], dtype=np.float64)
     points = points[((points > 1) & (points < (width - 2, height - 2))).all(axis=1)]
-    if len(points) < _LEAST_ARC_POINTS:
+    if len(points) < 3:
         return None
     # Kåsa's fit: |p|² = 2 c·p + r² − |c|² is linear in c and the rest.
     middle = points.mean(axis=0)
@@ -236,7 +229,7 @@ def _level(image: ImageArray, box: Region, centre_px: FloatArray, radius_px: flo
 def _washed_out(image: ImageArray, patch: Patch) -> bool:
     """Return True if much of the ball is white in all channels, so that neither colour nor shading is usable."""
     pixels = patch.box.crop(image)
-    return float(np.mean(pixels.min(axis=2) >= _WHITE)) > _MOST_WHITE * np.pi / 4
+    return float(np.mean(pixels.min(axis=2) >= WHITE)) > _MOST_WHITE * np.pi / 4
 
 
 def _clear_of_border(box: Region, margin_px: float, size: tuple[int, int]) -> bool:
@@ -245,9 +238,9 @@ def _clear_of_border(box: Region, margin_px: float, size: tuple[int, int]) -> bo
     )
 
 
-def _patches(mask: ImageArray, region: Region, least_pixels: int, config: VisionConfig) -> list[Patch]:
+def _patches(mask: ImageArray, region: Region, config: VisionConfig) -> list[Patch]:
     _, _, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
-    large = np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] >= least_pixels) + 1
+    large = np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] >= config.min_pixels) + 1
     by_size = large[np.argsort(-stats[large, cv2.CC_STAT_AREA], kind="stable")]
     patches = (_patch(mask, stats[label], region) for label in by_size[: 4 * config.max_candidates])
     return [patch for patch in patches if patch is not None]
@@ -275,9 +268,7 @@ def _patch(mask: ImageArray, stats: np.ndarray, region: Region) -> Patch | None:
     return Patch(whole, np.array([left + x, top + y]), radius, fill)
 
 
-def _brighter_parts(
-    image: ImageArray, patch: Patch, gate: Gate, least_pixels: int, config: VisionConfig
-) -> list[Patch]:
+def _brighter_parts(image: ImageArray, patch: Patch, gate: Gate, config: VisionConfig) -> list[Patch]:
     """Return the parts of a patch that keep much of its strongest colour: the ball in front of a brick wall, for
     example.
     """
@@ -289,5 +280,5 @@ def _brighter_parts(
     return [
         part
         for share in _STRONG_SHARES
-        for part in _patches((own & (amount > share * strongest)).astype(np.uint8), patch.box, least_pixels, config)
+        for part in _patches((own & (amount > share * strongest)).astype(np.uint8), patch.box, config)
     ]

@@ -19,8 +19,7 @@ _SEED_PX = 3
 # Pixels nearer to grey or black than this have no usable hue (parts of 255).
 _LEAST_SATURATION, _LEAST_VALUE = 64, 40
 # Quantile of the ball's hues cut off on either side, and margin for other light [°].
-_SHARE, _MARGIN_DEG = 0.02, 6.0
-_NARROWEST_DEG, _WIDEST_DEG = 10.0, 40.0
+_SHARE, _MARGIN_DEG = 0.02, 8.0
 # Lowest saturation and brightness of the ball in other light, relative to those seen here.
 _DIMMER_SATURATION, _DIMMER_VALUE = 0.6, 0.35
 # Change that marks a moving pixel [grey levels], and the fewest moving pixels of a ball.
@@ -140,7 +139,7 @@ def _band(pixels: ImageArray) -> HueBand:
     saturation, value = (float(np.quantile(pixels[:, channel], 2 * _SHARE)) / 255.0 for channel in (1, 2))
     return HueBand(
         hue_deg=round(middle, 1) % 360.0,
-        half_width_deg=round(float(np.clip(reach, _NARROWEST_DEG, _WIDEST_DEG)), 1),
+        half_width_deg=round(reach, 1),
         min_saturation=round(_DIMMER_SATURATION * saturation, 2),
         min_value=round(_DIMMER_VALUE * value, 2),
     )

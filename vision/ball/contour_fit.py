@@ -18,22 +18,16 @@ from .polar import median
 
 # Most iterations; converged when the limb and its blur changed by less than these [px].
 _LOOKS, _SETTLED_PX, _SETTLED_BLUR_PX = 4, 0.02, 0.05
-# Range of the blur [px].
-_SHARPEST_PX, _WIDEST_PX = 0.4, 3.0
 # An edge sharper than this after interpolation [px] was not anti-aliased: coverage is then the better measure.
 _ALIASED_PX = 0.55
 # Student's degrees of freedom of an edge's error, which set the weight of outliers; residual limit [px]; iterations.
 _FREEDOM, _FARTHEST_PX, _ROUNDS = 4.0, 1.0, 3
-# Below this, relative to the cubed trace, the limb does not determine centre and radius.
-_LEAST_DETERMINANT = 1e-6
 # The wave once round is at least so large: this, and so many times the noise that the channels show; that the other
 # waves are small is no sign that it is. Beside that it is this part of what the few waves tell, and where they tell of
 # far more it is the square, over the last: a bend that shows is a sign of one that the fit has removed.
 _LEAST_DENSITY, _NOISE, _TOLD, _USUAL_DENSITY = 0.5, 1.75, 0.4, 12.0
 # If a smaller share of the rays carries the circle, their errors are not averaged out: sigma grows in proportion.
 _LEAST_EVENNESS = 0.5
-# Of an estimate's slope by its residuals (1 where none is far off, 0 where all are) at least this part counts.
-_LEAST_SLOPE = 0.4
 # What covers a ball breaks its limb at sharp corners, which shows in the quick waves; what is behind it bends whole
 # arcs, in the slow ones, which the claim follows. Beyond so many times the variance of the samples, as far as the
 # channels agree on that, it is no ball's limb alone.
@@ -105,7 +99,7 @@ def fit_limb(
         centre_px, radius_px = centre_px + shape @ fit.shift_px, radius_px + fit.growth_px
         excess, fewer = limb.excess, max(1.0, _LEAST_EVENNESS / limb.evenness)
         noise = limb.noise_share * excess
-        last_blur_px, blur_px = blur_px, min(max(limb.blur_px, _SHARPEST_PX), _WIDEST_PX)
+        last_blur_px, blur_px = blur_px, limb.blur_px
         moved_px = max(float(np.linalg.norm(fit.shift_px)), abs(fit.growth_px))
         if moved_px < _SETTLED_PX and abs(blur_px - last_blur_px) < _SETTLED_BLUR_PX:
             unsettled = np.zeros(3)
@@ -139,7 +133,7 @@ def _fit(limb: Limb, radius_px: float) -> _Fit | None:
     residual = limb.offset_px
     for _ in range(_ROUNDS):
         used = weight
-        inverse = inverse_of_normal((design * used[:, None]).T @ design, _LEAST_DETERMINANT)
+        inverse = inverse_of_normal((design * used[:, None]).T @ design)
         if inverse is None or np.count_nonzero(used) < len(told) // 2:
             return None
         solution = inverse @ (design.T @ (used * limb.offset_px))
@@ -166,5 +160,5 @@ def _pulls(full: FloatArray, used: FloatArray, residual: FloatArray) -> FloatArr
     share = np.divide(used, full, out=np.zeros_like(full), where=full > 0)
     told = np.count_nonzero(full)
     mean = float(share.sum()) / told
-    slope = max(float(np.sum(2.0 * share**2 - share)) / told, _LEAST_SLOPE * mean)
+    slope = float(np.sum(2.0 * share**2 - share)) / told  # above 0, since half of the residuals are not far off
     return np.sqrt(full) * residual * share * (math.sqrt(mean) / slope)

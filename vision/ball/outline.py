@@ -61,8 +61,6 @@ _TRIPLES = np.array(list(combinations(range(_ARCS), 3)))
 _FLOOR_PX = 0.001
 # A larger disagreement between coverage and limb, in sigmas, is added to the covariance.
 _LARGEST_CONTRADICTION = 4.0
-# Below this, relative to the cubed trace, the outline points do not determine centre and radius.
-_LEAST_DETERMINANT = 1e-5
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,7 +229,7 @@ def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> Outl
     for _ in range(3):
         if np.count_nonzero(weight) < len(weight) // 2:
             return None
-        inverse = inverse_of_normal((design * weight[:, None]).T @ design, _LEAST_DETERMINANT)
+        inverse = inverse_of_normal((design * weight[:, None]).T @ design)
         if inverse is None:
             return None
         solution = inverse @ (design.T @ (weight * edges.distance_px))
@@ -301,7 +299,7 @@ def _agreeing(design: FloatArray, edges: _Edges) -> FloatArray:
 def _all_agree(design: FloatArray, edges: _Edges) -> bool:
     """Return True if one circle fits all points."""
     weighted = design * edges.weight[:, None]
-    inverse = inverse_of_normal(weighted.T @ design, _LEAST_DETERMINANT)
+    inverse = inverse_of_normal(weighted.T @ design)
     if inverse is None:
         return False
     off = np.abs(edges.distance_px - design @ (inverse @ (weighted.T @ edges.distance_px)))

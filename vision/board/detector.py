@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.records import FloatArray, ImageArray
 
 from .board import SIZES, Board, dictionary, smallest_size
-from .exposure import image_fault
+from .exposure import MOST_BLUR_PX, image_fault
 from .refine import refined
 from .sharpness import blur_px
 from .squares import squares_seen
@@ -28,8 +28,6 @@ OTHER_BOARD: tuple[Why, ...] = ("mirrored", "other_dictionary", "other_pattern",
 _LEAST_CORNERS = 6
 _LEAST_MARKERS = 3
 _SMALLEST_GRID = (4, 3)  # corners of an unknown chessboard: smaller ones are found in any texture
-# Corner accuracy is a small share of the edge width; with more blur that share is too large.
-_MOST_BLUR_PX = 2.5
 _FAMILIES = ("4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "APRILTAG_36h11", "ARUCO_ORIGINAL")
 
 
@@ -81,7 +79,7 @@ class BoardDetector:
             fault = image_fault(grey)
             return found if fault is None else NotFound(*fault)
         blur = blur_px(grey, self.board, found.numbers, found.px)
-        if blur > _MOST_BLUR_PX:
+        if blur > MOST_BLUR_PX:
             text = f"blurred: edges have a 1-sigma of {blur:.1f} px. Hold the board still, focus, shorten the exposure"
             return NotFound("blurred", text)
         return Corners(found.numbers, found.px, blur)

@@ -23,7 +23,6 @@ from .board import Board
 IntArray = NDArray[np.int64]
 
 _REACH = 0.35  # of a square: length along the edges
-_NEIGHBOURS = 1.6  # squares: neighbourhood for the board's directions at a corner
 _BENDING_STEPS = 2  # squares to each side: neighbourhood for the bend of the edges
 _ITERATIONS = 8
 _CONVERGED_PX = 1e-3
@@ -67,7 +66,7 @@ def _frames(board: Board, numbers: IntArray, px: FloatArray) -> FloatArray:
     found = np.full((len(px), 2, 2), np.nan)
     for k, place in enumerate(places):
         offsets = places - place
-        near = np.max(np.abs(offsets), axis=1) < _NEIGHBOURS
+        near = np.max(np.abs(offsets), axis=1) < 1.5  # the eight around it
         model = offsets[near] - offsets[near].mean(axis=0)
         if np.linalg.matrix_rank(model) < 2:
             if H is None:

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import cv2
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.vision.least_squares import minimised
 from bodyschema.vision.rig.lens import Lens, Model
 from bodyschema.vision.rig.stereo_rig import CalibrationError, lenses_of
 
 from .view import EYES, View
 
-_ITERATIONS = 60
-_CONVERGED = 1e-7  # smallest relative decrease of the sum of squares for another step: thousandths of a sigma
-_FIRST_DAMPING = 1e-4
-_MOST_DAMPING = 1e12
-_POSE = 6
+POSE = 6
 
 
 @dataclass(frozen=True)
@@ -85,28 +81,19 @@ def solve(
     Raises:
         CalibrationError: the views do not determine the parameters.
     """
-    damping = _FIRST_DAMPING
     weighed = tuple(np.ones(view.corner_count) for view in views) if weights is None else tuple(weights)
     prior = np.zeros(len(vector)) if prior is None else prior
-    linear = _linearised(views, corners_m, model, vector, poses, weighed, prior)
-    for _ in range(_ITERATIONS):
-        while damping < _MOST_DAMPING:
-            step = linear.step(damping)
-            if step is not None:
-                stepped = _linearised(views, corners_m, model, vector + step[0], poses + step[1], weighed, prior)
-                if stepped.squares <= linear.squares:
-                    break
-            damping *= 10.0
-        else:
-            break
-        gained = linear.squares - stepped.squares
-        vector, poses, linear = vector + step[0], poses + step[1], stepped
-        damping = max(0.1 * damping, 1e-12)
-        if gained <= _CONVERGED * linear.squares:
-            break
+
+    def stepped(now: _Linear, damping: float) -> _Linear | None:
+        step = now.step(damping)
+        if step is None:
+            return None
+        return _linearised(views, corners_m, model, now.vector + step[0], now.poses + step[1], weighed, prior)
+
+    linear = minimised(_linearised(views, corners_m, model, vector, poses, weighed, prior), stepped)
     if not np.isfinite(linear.squares):
         raise CalibrationError("the views do not determine the lenses. Take more views, tilted and all over the image")
-    return Bundle(model, vector, poses, tuple(linear.residuals), weighed, linear.reduced(0.0)[0], prior)
+    return Bundle(model, linear.vector, linear.poses, tuple(linear.residuals), weighed, linear.reduced(0.0)[0], prior)
 
 
 def view_residuals(
@@ -118,23 +105,13 @@ def view_residuals(
         start: the pose to start from, shape (6,).
         weights: corner weights, shape (corners,).
     """
-    pose = start[None]
-    linear = _linearised([view], corners_m, model, vector, pose, [weights])
-    damping = _FIRST_DAMPING
-    for _ in range(_ITERATIONS):
-        H = linear.pose_normals[0]
-        step = np.linalg.solve(H + damping * np.diag(np.diag(H)), linear.pose_gradients[0])
-        stepped = _linearised([view], corners_m, model, vector, pose + step, [weights])
-        if stepped.squares > linear.squares:
-            damping *= 10.0
-            if damping > _MOST_DAMPING:
-                break
-            continue
-        gained = linear.squares - stepped.squares
-        pose, linear, damping = pose + step, stepped, 0.1 * damping
-        if gained <= _CONVERGED * linear.squares:
-            break
-    return linear.residuals[0]
+
+    def stepped(now: _Linear, damping: float) -> _Linear:
+        H = now.pose_normals[0]
+        step = np.linalg.solve(H + damping * np.diag(np.diag(H)), now.pose_gradients[0])
+        return _linearised([view], corners_m, model, vector, now.poses + step, [weights])
+
+    return minimised(_linearised([view], corners_m, model, vector, start[None], [weights]), stepped).residuals[0]
 
 
 def seen_with_slopes(
@@ -159,11 +136,11 @@ def seen_with_slopes(
             rotation, translation, by_rig, by_pose = _in_right_eye(pose, right_eye)
         px, J_pose, J_lens = lenses[number].project_posed(corners_m[corners.numbers], rotation, translation)
         n = J_lens.shape[1]
-        J = np.zeros((len(J_lens), n * len(lenses) + len(right_eye) + _POSE))
+        J = np.zeros((len(J_lens), n * len(lenses) + len(right_eye) + POSE))
         J[:, number * n : (number + 1) * n] = J_lens
         if by_rig is not None:
-            J[:, -2 * _POSE : -_POSE] = J_pose @ by_rig
-        J[:, -_POSE:] = J_pose if by_pose is None else J_pose @ by_pose
+            J[:, -2 * POSE : -POSE] = J_pose @ by_rig
+        J[:, -POSE:] = J_pose if by_pose is None else J_pose @ by_pose
         residuals.append(corners.px - px)
         slopes.append(J)
     return np.concatenate(residuals), np.concatenate(slopes)
@@ -179,7 +156,7 @@ def _in_right_eye(pose: FloatArray, right_eye: FloatArray) -> tuple[FloatArray, 
     """Return a pose in the right eye's frame, and its Jacobians by the right eye's pose and by that in the left eye."""
     composed = cv2.composeRT(pose[:3], pose[3:], right_eye[:3], right_eye[3:])
     r, t, r_r1, r_t1, r_r2, r_t2, t_r1, t_t1, t_r2, t_t2 = (np.asarray(each, dtype=np.float64) for each in composed)
-    by_rig, by_pose = np.empty((2, _POSE, _POSE))
+    by_rig, by_pose = np.empty((2, POSE, POSE))
     by_rig[:3, :3], by_rig[:3, 3:], by_rig[3:, :3], by_rig[3:, 3:] = r_r2, r_t2, t_r2, t_t2
     by_pose[:3, :3], by_pose[:3, 3:], by_pose[3:, :3], by_pose[3:, 3:] = r_r1, r_t1, t_r1, t_t1
     return r.ravel(), t.ravel(), by_rig, by_pose
@@ -189,6 +166,8 @@ def _in_right_eye(pose: FloatArray, right_eye: FloatArray) -> tuple[FloatArray, 
 class _Linear:
     """Residuals and normal equations at a point: of the rig, of each pose, and mixed."""
 
+    vector: FloatArray
+    poses: FloatArray
     residuals: list[FloatArray]
     weights: Sequence[FloatArray]
     normal: FloatArray
@@ -198,13 +177,13 @@ class _Linear:
     mixed: FloatArray
     penalty: float
 
-    @cached_property
+    @property
     def squares(self) -> float:
         return self.penalty + _weighted(self.residuals, self.weights)
 
     def reduced(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return normal matrix and gradient of the rig with the poses eliminated, and the poses' normal matrices."""
-        poses = self.pose_normals + damping * self.pose_normals * np.eye(_POSE)
+        poses = self.pose_normals + damping * self.pose_normals * np.eye(POSE)
         weighed = np.linalg.solve(poses, np.transpose(self.mixed, (0, 2, 1)))
         normal = self.normal + damping * np.diag(np.diag(self.normal))
         normal = normal - np.tensordot(self.mixed, weighed, axes=([0, 2], [0, 1]))
@@ -240,6 +219,8 @@ def _linearised(
     p, m = len(vector), len(views)
     known = np.zeros(p) if prior is None else prior
     linear = _Linear(
+        vector,
+        poses,
         [],
         weights,
         np.diag(known),

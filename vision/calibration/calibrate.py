@@ -28,7 +28,6 @@ from .weights import corner_weights
 ModelChoice = Literal["auto", "pinhole", "fisheye", "rational"]
 
 _OUTLIER_SPREADS = 8.0
-_OUTLIER_RATIO = 3.0
 _MOST_LEFT_OUT = 0.35
 _REWEIGHTED = 3
 # Power of the distance from the axis in the last term of the distortion, and the 1-sigma of that term at the image's
@@ -268,8 +267,7 @@ def _outlier(rms_px: FloatArray) -> int | None:
     usual = float(np.median(rms_px))
     spread = 1.4826 * float(np.median(np.abs(rms_px - usual)))
     worst = int(np.argmax(rms_px))
-    limit = max(usual + _OUTLIER_SPREADS * spread, _OUTLIER_RATIO * usual)
-    return worst if rms_px[worst] > limit else None
+    return worst if rms_px[worst] > usual + _OUTLIER_SPREADS * spread else None
 
 
 def _require_places(model: Model, vector: FloatArray) -> None:

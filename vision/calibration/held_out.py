@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray
 
-from .bundle import Bundle, solve, view_residuals
+from .bundle import POSE, Bundle, solve, view_residuals
 from .view import View
 
 _FOLDS = 10
-_POSE_FREEDOM = 6
 
 
 @dataclass(frozen=True)
@@ -63,5 +62,5 @@ def held_out(views: Sequence[View], corners_m: FloatArray, whole: Bundle) -> Hel
             own = whole.weights[k]
             left = view_residuals(views[k], corners_m, whole.model, part.vector, whole.poses[k], own)
             squares[k] = np.sum(left[own > 0.0] ** 2)
-    freedom = np.array([each.size - _POSE_FREEDOM for each in whole.kept])
+    freedom = np.array([each.size - POSE for each in whole.kept])
     return HeldOut(squares, freedom)

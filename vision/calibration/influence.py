@@ -12,8 +12,6 @@ from bodyschema.interfaces.records import FloatArray
 from .bundle import Bundle, lenses_and_rest, seen_with_slopes
 from .view import View
 
-_LEAST_FREE = 0.2
-
 
 @dataclass(frozen=True)
 class Influence:
@@ -46,7 +44,7 @@ def influences(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> 
         J = J - K @ of_pose @ (K.T @ (w * J))
         # The diagonal of the hat matrix (Huber & Ronchetti 2009, section 7.1).
         taken = w[:, 0] * (np.sum(J @ rig * J, axis=1) + np.sum(K @ of_pose * K, axis=1))
-        free = np.maximum(1.0 - taken.reshape(-1, 2).mean(axis=1), _LEAST_FREE)
+        free = 1.0 - taken.reshape(-1, 2).mean(axis=1)
         yield Influence(residual, w * J, J.T @ (w * J), K, free)
 
 

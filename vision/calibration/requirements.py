@@ -19,8 +19,7 @@ _TILTED_DEG = 10.0
 _LEAST_TILTED = 3
 # Sigmas are those of whole views, two to five times those of independent corners: fifteen good pairs at 640×480 leave
 # 0.8 %, 0.5 % and 1.4 %.
-_MOST_FOCAL_SIGMA = 0.01  # of the focal length
-_MOST_BASELINE_SIGMA = 0.01  # of the baseline
+_MOST_SIGMA = 0.01  # of the focal length, and of the baseline
 _MOST_CENTRE_SIGMA = 0.02  # of the image's width
 _MOST_HELD_OUT = 0.0015  # of the image's width
 _MOST_TURNED_RAD = np.radians(45.0)
@@ -89,7 +88,7 @@ def unsure(rig: Rig) -> list[str]:
     for eye in ("left", "right")[: len(rig.serials)]:
         whose = f"{eye} " if len(rig.serials) > 1 else ""
         focal = max(sigma[f"{eye}.f{axis}_px"] / value[f"{eye}.f{axis}_px"] for axis in "xy")
-        if focal > _MOST_FOCAL_SIGMA:
+        if focal > _MOST_SIGMA:
             reasons.append(
                 f"the {whose}focal length is known to {focal:.1%} only. Take views with the board tilted more"
             )
@@ -105,7 +104,7 @@ def unsure(rig: Rig) -> list[str]:
     if not isinstance(rig, StereoRig):
         return reasons
     share = rig.baseline_sigma_m / rig.baseline_m
-    if share > _MOST_BASELINE_SIGMA:
+    if share > _MOST_SIGMA:
         reasons.append(
             f"the baseline is known to {share:.1%} only. Take more views that both eyes see, near and tilted"
         )

@@ -17,7 +17,6 @@ from .view import EYES, Eye, View, seen_by
 
 # of the image's width: candidate focal lengths of a fisheye lens
 _FISHEYE_FOCALS = (0.25, 0.35, 0.5, 0.7, 1.0)
-_LEAST_CORNERS = 6
 
 
 def start(
@@ -63,18 +62,17 @@ def pose_of(seen: Corners, corners_m: FloatArray, lens: Lens) -> FloatArray:
 
 
 def _lens(seen: Sequence[Corners], corners_m: FloatArray, size_px: tuple[int, int], model: Model, eye: Eye) -> Lens:
-    usable = [corners for corners in seen if len(corners) >= _LEAST_CORNERS]
-    if len(usable) < 3:
-        raise CalibrationError(f"the board is in {len(usable)} {eye} images. Take at least 3, better 20")
+    if len(seen) < 3:
+        raise CalibrationError(f"the board is in {len(seen)} {eye} images. Take at least 3, better 20")
     if model == "fisheye":
-        return min(
-            (_fisheye(usable, corners_m, size_px, share) for share in _FISHEYE_FOCALS), key=lambda each: each[1]
-        )[0]
+        return min((_fisheye(seen, corners_m, size_px, share) for share in _FISHEYE_FOCALS), key=lambda each: each[1])[
+            0
+        ]
     count = len(DISTORTION_NAMES[model])
     try:
         _, matrix, distortion, _, _ = cv2.calibrateCamera(
-            [corners_m[each.numbers].astype(np.float32) for each in usable],
-            [each.px.astype(np.float32) for each in usable],
+            [corners_m[each.numbers].astype(np.float32) for each in seen],
+            [each.px.astype(np.float32) for each in seen],
             size_px,
             np.eye(3),
             np.zeros(count),

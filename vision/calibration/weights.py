@@ -24,10 +24,8 @@ from .influence import influences
 from .view import View
 
 _FARTHEST = 5.0  # 1-sigmas: a corner farther off is an outlier
-_MOST_MISTAKEN = 0.2  # of an image's corners: largest share of outliers
 _GROUP = 60  # corners with squares of similar width
 _SHARED = 6.0  # prior weight of the usual variance, in corners, against an image's own
-_ROUNDS = 3
 # A squared distance in the plane over twice the coordinate variance is exponential; this is the median.
 _MEDIAN = np.log(2.0)
 
@@ -62,8 +60,7 @@ class _Spread:
         for number in range(int(self.image.max()) + 1):
             mine = np.flatnonzero(self.image == number)
             off = self.own[mine] / usual[mine]
-            most = 0.5 * _FARTHEST**2 * max(float(np.median(off)) / _MEDIAN, 1.0)
-            fits[mine] = off <= max(most, float(np.quantile(off, 1.0 - _MOST_MISTAKEN)))
+            fits[mine] = off <= 0.5 * _FARTHEST**2 * max(float(np.median(off)) / _MEDIAN, 1.0)
         return fits
 
 
@@ -76,9 +73,7 @@ def corner_weights(views: Sequence[View], corners_m: FloatArray, bundle: Bundle)
     everything = np.ones(len(spread.own), dtype=bool)
     usual = spread.usual(np.ones(len(spread.own)), everything, robust=True)
     kept = spread.fitting(usual)
-    for _ in range(_ROUNDS):
-        share = spread.shares(usual, kept)
-        usual = spread.usual(share, kept, robust=False)
+    usual = spread.usual(spread.shares(usual, kept), kept, robust=False)
     weights = np.where(kept, 1.0 / (usual * spread.shares(usual, kept)), 0.0)
     weights /= weights.mean()
     return tuple(np.split(weights, np.cumsum([view.corner_count for view in views])[:-1]))

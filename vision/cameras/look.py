@@ -9,23 +9,21 @@ from itertools import pairwise
 import numpy as np
 
 from bodyschema.interfaces.records import ImageArray
+from bodyschema.vision.images import is_black, too_white
 
 EVERY_S = 0.5  # an image is looked at
 OVER_S = 3.0  # the frame rate is measured
 FEWEST = 5  # frames that make a rate
 SLOW = 0.8  # of the configured rate
 STEP_PX = 8  # between the pixels that are looked at
-BLACK, BLACK_QUANTILE = 20, 0.99
-WHITE, MOST_WHITE = 250, 0.25
 
 
 def of_image(image: ImageArray, name: str) -> str | None:
     """Return what is wrong with the light in an image, or None."""
     levels = image[::STEP_PX, ::STEP_PX]
-    if np.quantile(levels, BLACK_QUANTILE) < BLACK:
+    if is_black(levels):
         return f"the {name}'s image is black: is the lens cap on? Else more light, or a longer exposure_s"
-    white = float((levels >= WHITE).all(axis=2).mean())
-    if white > MOST_WHITE:
+    if (white := too_white(levels.min(axis=2))) is not None:
         return f"the {name} is over-exposed: {100 * white:.0f} % of its image is white. Shorten exposure_s"
     return None
 

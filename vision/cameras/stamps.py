@@ -7,7 +7,6 @@ from itertools import pairwise
 
 TRIALS = 3  # frames checked before the first is returned
 FARTHEST_S = 1.0  # largest delay from the kernel's stamp to the arrival
-AHEAD_S = 1e-3  # no image is taken after it arrived
 KERNEL_SIGMA_S = 1e-3
 ARRIVAL_SIGMA_S = 0.02  # of arrival times: decoding, scheduling, a busy bus
 
@@ -60,4 +59,4 @@ class Stamps:
 
 
 def _near(kernel_s: float, arrival_s: float) -> bool:
-    return kernel_s > 0 and -AHEAD_S <= arrival_s - kernel_s < FARTHEST_S
+    return kernel_s > 0 and -KERNEL_SIGMA_S <= arrival_s - kernel_s < FARTHEST_S

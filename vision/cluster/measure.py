@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.vision.least_squares import damped_step, minimised
 from bodyschema.vision.pose import fitted_motion, projection_slopes, turned, whitening
 from bodyschema.vision.rig.stereo_rig import CalibrationError
 from bodyschema.vision.tags.body import TAG_CORNERS
@@ -22,14 +23,12 @@ from bodyschema.vision.triangulate import triangulate
 
 from .shapes import rpy_of
 
-_STEPS, _CONVERGED = 60, 1e-9
-_FIRST_DAMPING, _MOST_DAMPING = 1e-4, 1e8
 # A tag in a view whose corners are this many sigmas off (RMS) is none: covered, bent, or another of its number.
 _MOST_OFF = 6.0
 # ... in units of what is usual, which calibrated cameras bring to so much at most.
 _MOST_USUAL = 5.0
-# Largest shares of all views, and of the views of one tag, with outliers; a single one is always allowed.
-_MOST_LEFT_OUT, _MOST_OF_A_TAG = 0.25, 0.34
+# Largest share of all views, and of the views of one tag, with outliers; a single one is always allowed.
+_MOST_LEFT_OUT = 0.34
 _LEAST_VIEWS = 3
 
 Motion = tuple[FloatArray, FloatArray]  # rotation (3, 3) and place (3,) [m]
@@ -111,7 +110,7 @@ def measure_cluster(
         )
     every, left_out = usable, list[tuple[str, int]]()
     while True:
-        problem = _solved(usable, calibration, side_m, other_sides_m)
+        problem = _Problem(usable, calibration, side_m, other_sides_m or {})
         worst = problem.worst()
         if worst is None:
             used = {view.name for view in usable}
@@ -127,17 +126,6 @@ def _usable(views: Sequence[ClusterView]) -> list[ClusterView]:
     return [view for view in views if len(view.ids) >= 2 and view.left.keys() & view.right.keys()]
 
 
-def _solved(
-    views: Sequence[ClusterView],
-    calibration: StereoCalibration,
-    side_m: float,
-    other_sides_m: Mapping[int, float] | None,
-) -> _Problem:
-    problem = _Problem(views, calibration, side_m, other_sides_m or {})
-    problem.solve()
-    return problem
-
-
 def _odd_one(
     views: Sequence[ClusterView],
     calibration: StereoCalibration,
@@ -151,7 +139,7 @@ def _odd_one(
         if len(rest) < _LEAST_VIEWS:
             continue
         with suppress(CalibrationError):
-            problem = _solved(rest, calibration, side_m, other_sides_m)
+            problem = _Problem(rest, calibration, side_m, other_sides_m or {})
             if problem.worst() is None:
                 fits[id] = problem.misfit
     best = min(fits, key=lambda id: fits[id], default=None)
@@ -163,7 +151,7 @@ def _is_odd(left_out: Sequence[tuple[str, int]], views: Sequence[ClusterView]) -
     shown, times = Counter(id for view in views for id in view.ids), Counter(id for _, id in left_out)
     if len({name for name, _ in left_out}) > max(1.0, _MOST_LEFT_OUT * len(views)):
         return True
-    return any(count > max(1.0, _MOST_OF_A_TAG * shown[id]) for id, count in times.items())
+    return any(count > max(1.0, _MOST_LEFT_OUT * shown[id]) for id, count in times.items())
 
 
 def _not_rigid(left_out: Sequence[tuple[str, int]], odd: int | None) -> str:
@@ -206,6 +194,26 @@ class _Block:
     root: FloatArray
 
 
+@dataclass(frozen=True)
+class _Linearised:
+    """Residuals in sigmas at poses of tags and bodies, their derivatives by all turns and places, and by the size."""
+
+    tags: Mapping[int, Motion]
+    bodies: Sequence[Motion]
+    residuals: FloatArray
+    J: FloatArray
+    grown: FloatArray
+
+    @property
+    def squares(self) -> float:
+        return float(self.residuals @ self.residuals)
+
+    @property
+    def misfit(self) -> float:
+        """RMS of what is left, in units of the corners' own sigmas."""
+        return float(np.sqrt(self.squares / max(len(self.residuals) - self.J.shape[1], 1)))
+
+
 class _Problem:
     """Least-squares problem of all poses: the cluster's in the views and the tags' on it, in the first tag's frame."""
 
@@ -226,10 +234,12 @@ class _Problem:
             if tags
         ]
         located = [self._located(view) for view in views]
-        self._tags = self._first_tags(
+        tags = self._first_tags(
             [{id: fitted_motion(self._corners[id], seen) for id, seen in each.items()} for each in located]
         )
-        self._bodies = [self._first_body(each) for each in located]
+        self._found = minimised(
+            self._linearised(tags, [self._first_body(tags, each) for each in located]), self._stepped
+        )
 
     def _block(self, view: int, tags: Mapping[int, TagImage], x: float) -> _Block:
         ids = tuple(sorted(tags))
@@ -272,10 +282,10 @@ class _Problem:
             known[b] = _after(known[a], _middle(between))
         return known
 
-    def _first_body(self, located: Mapping[int, FloatArray]) -> Motion:
+    def _first_body(self, tags: Mapping[int, Motion], located: Mapping[int, FloatArray]) -> Motion:
         if not located:
             raise CalibrationError("a view in which no tag's corners can be located by both eyes")
-        body = [self._corners[id] @ self._tags[id][0].T + self._tags[id][1] for id in located]
+        body = [self._corners[id] @ tags[id][0].T + tags[id][1] for id in located]
         return fitted_motion(np.concatenate(body), np.concatenate(list(located.values())))
 
     # --- the joint problem
@@ -285,53 +295,33 @@ class _Problem:
         """First column of each tag that is not the first."""
         return {id: 6 * k for k, id in enumerate(self.ids[1:])}
 
-    def solve(self) -> None:
-        """Levenberg-Marquardt on all turns and places."""
-        damping = _FIRST_DAMPING
-        residuals, J, _ = self._linearised()
-        for _ in range(_STEPS):
-            normal = J.T @ J
-            scale = np.diag(normal)
-            change = np.linalg.solve(normal + damping * np.diag(scale), J.T @ residuals)
-            before = self._tags, self._bodies
-            self._move(np.asarray(change, dtype=np.float64))
-            tried = self._linearised()
-            if tried[0] @ tried[0] <= residuals @ residuals:
-                gained = residuals @ residuals - tried[0] @ tried[0]
-                (residuals, J, _), damping = tried, max(damping / 10.0, 1e-12)
-                if gained <= _CONVERGED * (residuals @ residuals):
-                    break
-            else:
-                self._tags, self._bodies = before
-                damping *= 10.0
-                if damping > _MOST_DAMPING:
-                    break
-
-    def _move(self, step: FloatArray) -> None:
+    def _stepped(self, now: _Linearised, damping: float) -> _Linearised:
         def moved(motion: Motion, by: FloatArray) -> Motion:
             return Rotation.from_rotvec(by[:3]).as_matrix() @ motion[0], motion[1] + by[3:]
 
+        step = damped_step(now.J, now.residuals, damping)
         at = self._columns
-        self._tags = {id: moved(m, step[at[id] : at[id] + 6]) if id in at else m for id, m in self._tags.items()}
+        tags = {id: moved(m, step[at[id] : at[id] + 6]) if id in at else m for id, m in now.tags.items()}
         first = 6 * len(at)
-        self._bodies = [moved(m, step[first + 6 * k : first + 6 * k + 6]) for k, m in enumerate(self._bodies)]
+        return self._linearised(
+            tags, [moved(m, step[first + 6 * k : first + 6 * k + 6]) for k, m in enumerate(now.bodies)]
+        )
 
-    def _linearised(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Residuals in sigmas, their derivative by all turns and places, and by the size of the squares."""
+    def _linearised(self, tags: Mapping[int, Motion], bodies: Sequence[Motion]) -> _Linearised:
         at, first = self._columns, 6 * (len(self.ids) - 1)
         width = first + 6 * len(self._views)
         residuals: list[FloatArray] = []
         slopes: list[FloatArray] = []
         growths: list[FloatArray] = []
         for block in self._blocks:
-            turn, x = self._bodies[block.view]
+            turn, x = bodies[block.view]
             J = np.zeros((len(block.pixels), 2, width))
             seen = np.zeros_like(block.pixels)
             grown = np.zeros((len(block.pixels), 2))
             for k, id in enumerate(block.ids):
                 rows = slice(4 * k, 4 * k + 4)
-                on_tag = self._corners[id] @ self._tags[id][0].T
-                arms = (on_tag + self._tags[id][1]) @ turn.T
+                on_tag = self._corners[id] @ tags[id][0].T
+                arms = (on_tag + tags[id][1]) @ turn.T
                 points = arms + x - block.eye
                 slope = projection_slopes(self._calibration.focal_px, points)
                 seen[rows] = self._calibration.focal_px * points[:, :2] / points[:, 2:]
@@ -345,22 +335,22 @@ class _Problem:
             residuals.append(block.root @ off.ravel())
             slopes.append(block.root @ J.reshape(-1, width))
             growths.append(block.root @ grown.ravel())
-        return np.concatenate(residuals), np.concatenate(slopes), np.concatenate(growths)
+        together = (np.concatenate(each) for each in (residuals, slopes, growths))
+        return _Linearised(tags, bodies, *together)
 
     # --- what comes out
 
     @property
     def misfit(self) -> float:
         """RMS of what is left, in units of the corners' own sigmas."""
-        residuals, J, _ = self._linearised()
-        return float(np.sqrt(residuals @ residuals / max(len(residuals) - J.shape[1], 1)))
+        return self._found.misfit
 
     def worst(self) -> tuple[str, int] | None:
         """Return the view's name and the tag's number of the worst outlier, or None.
 
         Squares that are all larger or smaller than stated are no outliers: that is free here.
         """
-        residuals, J, grown = self._linearised()
+        residuals, J, grown = self._found.residuals, self._found.J, self._found.grown
         full = np.column_stack([J, grown])
         residuals = residuals - full @ np.linalg.solve(full.T @ full, full.T @ residuals)
         squares: dict[tuple[str, int], list[FloatArray]] = {}
@@ -376,14 +366,14 @@ class _Problem:
 
     def result(self, left_out: Sequence[tuple[str, int]], unused: Sequence[str]) -> MeasuredCluster:
         """Return the solution with its uncertainty, scaled up if the residuals exceed the assumed noise."""
-        residuals, J, grown = self._linearised()
+        residuals, J, grown = self._found.residuals, self._found.J, self._found.grown
         misfit = self.misfit**2
         cov = np.linalg.inv(J.T @ J) * max(misfit, 1.0)
         full = np.column_stack([J, grown])
         inverse = np.linalg.inv(full.T @ full)
         at, tags = self._columns, []
         for id in self.ids:
-            rotation, xyz = self._tags[id]
+            rotation, xyz = self._found.tags[id]
             sigma = np.sqrt(np.diag(cov)[at[id] : at[id] + 6]) if id in at else np.zeros(6)
             place = float(xyz[0]), float(xyz[1]), float(xyz[2])
             placed = PlacedTag(id=id, xyz=place, rpy=rpy_of(rotation), side_m=self._other_sides_m.get(id))

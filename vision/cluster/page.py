@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.vision.printing.sheet import AROUND_MM, LINE_MM, Page, Rectangle, Text, page, pattern, sheets
+from bodyschema.vision.printing.sheet import AROUND_MM, LINE_MM, TEXT_MM, Page, Rectangle, Text, page, pattern, sheets
 from bodyschema.vision.tags.config import Dictionary
 from bodyschema.vision.tags.dictionary import tag_modules
 from bodyschema.vision.tags.edge import MODULES
@@ -18,7 +18,6 @@ FACE_SIDES = 1.0 + 2.5 / MODULES
 _DASH_MM = 2.0
 # Gap between single tags, with room for their numbers.
 _GAP_MM = 6.0
-_NUMBER_MM = 3.0
 
 
 def shape_page(shape: Shape, ids: Sequence[int], dictionary: Dictionary, side_mm: float, paper: str) -> Page:
@@ -64,7 +63,7 @@ def tags_page(ids: Sequence[int], dictionary: Dictionary, side_mm: float, paper:
         row, column = divmod(place, columns)
         x, y = column * pitch, row * pitch
         black += [*_tag(dictionary, id, x, y, side_mm), *_outline(x, y, width)]
-        numbers.append(Text(x, y + width + _NUMBER_MM + 0.5, f"{dictionary} {id}, {side_mm:g} mm", size_mm=_NUMBER_MM))
+        numbers.append(Text(x, y + width + TEXT_MM + 0.5, f"{dictionary} {id}, {side_mm:g} mm"))
     rows = math.ceil(len(ids) / columns)
     name = f"{dictionary} {_listed(ids)}, black squares of {side_mm:g} mm"
     made = page((columns * pitch - _GAP_MM, rows * pitch), paper, name, black, numbers)

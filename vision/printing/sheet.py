@@ -27,7 +27,7 @@ _RULER_MM = 14.0
 # Of the sheet's sides, what the drawing does not get.
 AROUND_MM = 2 * MARGIN_MM + _RULER_MM
 LINE_MM = 0.2
-_TEXT_MM = 3.0
+TEXT_MM = 3.0
 # Helvetica's letters are half as wide as high, on the mean.
 _LETTER = 0.52
 
@@ -50,7 +50,7 @@ class Text:
     y_mm: float
     text: str
     turned: bool = False
-    size_mm: float = _TEXT_MM
+    size_mm: float = TEXT_MM
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def page(
 
 def _line(text: str, x: float, y: float, sheet_mm: float) -> Text:
     """Return a line of text that begins at x, or further left if it would leave the sheet."""
-    longest = _LETTER * _TEXT_MM * len(text)
+    longest = _LETTER * TEXT_MM * len(text)
     return Text(max(min(x, sheet_mm - MARGIN_MM - longest), MARGIN_MM), y, text)
 
 

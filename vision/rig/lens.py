@@ -22,7 +22,8 @@ DISTORTION_NAMES: dict[Model, tuple[str, ...]] = {
 }
 # The largest x/z and y/z that a rectified image shows: beyond, a fisheye's image is stretched out.
 WIDEST = 1.2
-_RAYS, _STEPS = 64, 64
+# Lines across an image on which it is examined, and places on each.
+RAYS = 64
 _ITERATIONS = 30
 _CONVERGED = 1e-12
 _WIDEST_RAD = 1.5
@@ -103,10 +104,10 @@ class Lens:
         A polynomial of the distortion turns back somewhere; a fit to corners does not keep that out of the image.
         Directions beyond `WIDEST` do not count.
         """
-        turn = 2.0 * np.pi * np.arange(_RAYS) / _RAYS
+        turn = 2.0 * np.pi * np.arange(RAYS) / RAYS
         across = WIDEST / np.maximum(np.abs(np.cos(turn)), np.abs(np.sin(turn)))
         rays = np.stack([np.cos(turn), np.sin(turn)], axis=1) * across[:, None]
-        ahead = np.linspace(0.0, 1.0, _STEPS)[:, None, None] * rays
+        ahead = np.linspace(0.0, 1.0, RAYS)[:, None, None] * rays
         px = self.project(np.concatenate([ahead, np.ones((*ahead.shape[:2], 1))], axis=2).reshape(-1, 3))
         px = px.reshape(*ahead.shape[:2], 2)
         outward = np.sum(np.diff(px, axis=0) * rays, axis=2) > 0.0

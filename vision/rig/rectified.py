@@ -16,10 +16,8 @@ from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import StereoEyes
 from bodyschema.interfaces.records import FloatArray, ImageArray, StereoFrame
 
-from .lens import WIDEST, Lens
+from .lens import RAYS, WIDEST, Lens
 from .stereo_rig import CalibrationError, OneEyeRig, Rig
-
-_BORDER_POINTS = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +119,7 @@ class Rectification:
 def _filled(lens: Lens, R: FloatArray, size_px: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
     """Return the limits (x/z, y/z) of an upright rectangle that one eye's image fills."""
     width, height = size_px
-    along = np.linspace(0.0, 1.0, _BORDER_POINTS)
+    along = np.linspace(0.0, 1.0, RAYS)
     ends = np.zeros_like(along)
     sides = [
         np.column_stack([x * (width - 1), y * (height - 1)])

@@ -25,13 +25,12 @@ from .config import TagConfig
 
 # Black border, data and border of all dictionaries that are offered: 6 + 2 modules.
 MODULES = 8.0
-# Distance that lines across an edge keep from the ends of black border and white margin (one module each): so many
-# blurs, so that little of the modules beyond shows; on small tags they reach over this share of the module.
-_CLEAR_BLURS, _CLEAR_SHARE = 1.7, 0.5
-LONGEST_REACH_PX, _SHORTEST_REACH_PX = 6.0, 0.6
+# Distance in blurs that lines across an edge keep from the ends of black border and white margin (one module each), so
+# that little of the modules beyond shows; on small tags they reach over this share of the module. Their distance in
+# blurs from the tag's corners, which are rounded off: at 1.8 without noise tags come out larger by 0.0004 px an edge.
+_CLEAR_BLURS, _CLEAR_SHARE, _CORNER_BLURS = 1.7, 0.5, 2.6
+LONGEST_REACH_PX = 6.0
 _SAMPLE_PX = 0.5
-# Distance from the corners, whose blur rounds the edges off: blurs, and share of the side; at most this share.
-_CORNER_BLURS, _CORNER_SHARE, _MOST_CORNER = 2.6, 0.08, 0.25
 _FEWEST_POINTS, _MOST_POINTS = 6, 80
 # The sharpest edge (1-sigma) [px].
 SHARPEST_PX = 0.45
@@ -240,13 +239,10 @@ def _rays(
     share = _CLEAR_SHARE * modules
     clear = np.minimum(np.maximum(modules - _CLEAR_BLURS * blur_px, share), LONGEST_REACH_PX)
     reaches = shorter * (np.maximum(clear, share) if rough else clear)
-    if not (reaches >= _SHORTEST_REACH_PX).all():
-        return Reason.NO_MARKER
     # At an acute corner, nearby lines leave the tag through its other side.
     sides = quads[:, [3, 2]] - quads[:, :2]
     leaning = (sides * along[:, None]).sum(axis=2) / (sides * normals[:, None]).sum(axis=2)
-    rounded = np.minimum(np.maximum(_CORNER_BLURS * blur_px, _CORNER_SHARE * lengths), _MOST_CORNER * lengths)
-    free = rounded[:, None] + np.maximum(leaning * np.outer(reaches, (-1.0, 1.0)), 0.0)
+    free = _CORNER_BLURS * blur_px + np.maximum(leaning * np.outer(reaches, (-1.0, 1.0)), 0.0)
     counts = np.minimum((lengths - free.sum(axis=1)).astype(np.intp), _MOST_POINTS)
     if counts.min() < _FEWEST_POINTS:
         return Reason.NO_MARKER

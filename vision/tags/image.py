@@ -19,17 +19,14 @@ from .config import TagConfig
 from .dictionary import tag_modules
 from .edge import LONGEST_REACH_PX, MODULES, SHARPEST_PX, Edges, Light, find_edges
 
-# Most iterations; converged when no corner moved by more than this [px] and the blur by no more than this share.
-_ROUNDS, _SETTLED_PX, _SETTLED_BLUR = 8, 0.01, 0.02
-# Corners are rough until they move by less than this share of a module, for at most these rounds more than one.
-_ROUGH_SHARE, _ROUGH_ROUNDS = 0.3, 2
-# Usual blur of lens and interpolation (1-sigma); its prior spread, in an image with a noise of one grey level; the
-# largest blur [px].
-_USUAL_BLUR_PX, _USUAL_SIGMA_PX, _WIDEST_PX = 0.85, 0.1, 3.0
+# Most rounds with rough corners, and half of all; converged when no corner moved by more than this [px].
+_ROUNDS, _SETTLED_PX = 4, 0.01
+# Corners are rough until they move by less than this share of a module.
+_ROUGH_SHARE = 0.3
+# Usual blur of lens and interpolation (1-sigma) [px]; its prior spread, in an image with a noise of one grey level.
+_USUAL_BLUR_PX, _USUAL_SIGMA_PX = 0.85, 0.1
 # A blur that is a larger share of a module is the cause where corners are not sure.
 _MOST_BLUR = 0.5
-# Largest factor of the blur's change from one round to the next.
-_LARGEST_WIDENING = 1.5
 # Prior factor by which interpolation correlates neighbouring points' errors, and its weight in waves along the edges.
 _SMOOTHED, _SMOOTHED_WAVES = 1.5, 10
 # Slow waves have half-periods of at least this many points; least upper bound of their indices.
@@ -60,8 +57,8 @@ class TagImage:
 def measure_tag(grey: ImageArray, id: int, corners_px: FloatArray, config: TagConfig) -> TagImage | Reason:
     """Measure the tag whose corners are near `corners_px` (4, 2) in a grey image, or return why it is doubtful."""
     found = _measured(grey, id, corners_px, 1.0, config)
-    if found in (Reason.OCCLUDED, Reason.LOW_CONTRAST):
-        # The margin may be narrower than a module.
+    if isinstance(found, Reason):
+        # The margin may be narrower than a module, the tag very oblique, or near the image's border.
         again = _measured(grey, id, corners_px, _SHORTER, config)
         return again if isinstance(again, TagImage) else found
     return found
@@ -80,17 +77,16 @@ def _measured(
             return edges
         number += 1
         moved = _meetings(edges)
-        moved_px, before_px = float(np.abs(moved - corners_px).max()), blur_px
+        moved_px = float(np.abs(moved - corners_px).max())
         module_px = 2.0 * float(edges.half_lengths.min()) / MODULES
         if moved_px > max(LONGEST_REACH_PX, module_px):
             return Reason.OCCLUDED
         corners_px, blur_px = moved, _blur(edges, blur_px)
         if light is None:
-            light = _EVEN if moved_px < _ROUGH_SHARE * module_px or number > _ROUGH_ROUNDS else None
+            light = _EVEN if moved_px < _ROUGH_SHARE * module_px or number >= _ROUNDS else None
             continue
         light = _light(edges)
-        settled = moved_px < _SETTLED_PX and abs(blur_px - before_px) < _SETTLED_BLUR * blur_px
-        if settled or number >= _ROUNDS:
+        if moved_px < _SETTLED_PX or number >= 2 * _ROUNDS:
             break
     shortest_px = 2.0 * float(edges.half_lengths.min())
     if shortest_px < config.min_side_px:
@@ -107,9 +103,7 @@ def _blur(edges: Edges, before_px: float) -> float:
     """Estimate the blur (1-sigma) [px] of all edges, from the previous estimate `before_px`."""
     usual = _USUAL_SIGMA_PX**-2
     wider = edges.widening + usual * (_USUAL_BLUR_PX - before_px)
-    factor = 1.0 + wider / (usual + edges.information) / before_px
-    factor = min(max(factor, 1.0 / _LARGEST_WIDENING), _LARGEST_WIDENING)
-    return min(max(factor * before_px, SHARPEST_PX), _WIDEST_PX)
+    return max(before_px + wider / (usual + edges.information), SHARPEST_PX)
 
 
 def _light(edges: Edges) -> Light:

@@ -20,6 +20,7 @@ from bodyschema.interfaces.records import (
     StereoFrame,
     frozen_array,
 )
+from bodyschema.vision.config import LONGEST_PAUSE_S
 from bodyschema.vision.images import check_calibration, check_images
 from bodyschema.vision.one_eye import first_pose
 from bodyschema.vision.pose import Pose, PoseEstimator, Sighting, fitted_motion, mirrored
@@ -35,8 +36,6 @@ _log = logging.getLogger(__name__)
 
 # Margin of the search region around the last frame's corners: share of their extent, plus pixels.
 _REGION_SHARE, _REGION_PX = 0.6, 30
-# After a longer pause the last fix predicts nothing [s].
-_LONGEST_PAUSE_S = 0.5
 # Poses farther apart than this [rad] are distinct; the worse must be less likely by this difference of squares.
 _TWO_POSES_RAD, _CLEARLY_WORSE = 0.05, 12.0
 # Of two poses that the image does not distinguish, take one that is no farther from the last frame's pose than this
@@ -189,7 +188,7 @@ class TagTracker:
             best = stayed
         # What the claimed noise does not explain, nor chance (1-sigma), is taken for more noise.
         unexplained = max(misfit - math.sqrt(2.0 / freedom), 1.0)
-        return Pose(best.rotation, best.x, best.cov * unexplained, best.squares, best.by_sighting)
+        return Pose(best.rotation, best.x, best.cov * unexplained, best.squares)
 
     def _minima(self, estimator: PoseEstimator, seen: list[dict[int, TagImage]]) -> list[Pose]:
         """Return the distinct local minima of the squares, the most likely first."""
@@ -203,7 +202,7 @@ class TagTracker:
 
     def _stayed(self, t: float, poses: Sequence[Pose]) -> Pose | None:
         """Return the pose, of two, that is consistent with the last frame; None if that is unclear."""
-        if self._last is None or not 0 < t - self._last[0] <= _LONGEST_PAUSE_S:
+        if self._last is None or not 0 < t - self._last[0] <= LONGEST_PAUSE_S:
             return None
         turned = [float(Rotation.from_matrix(self._last[2].T @ pose.rotation).magnitude()) for pose in poses]
         nearest = int(np.argmin(turned))
@@ -233,7 +232,7 @@ class TagTracker:
         return mirrored(rotation @ axes, x + rotation @ corners.mean(axis=0)) @ axes.T
 
     def _predicted(self, t: float) -> list[tuple[int, int, int, int]] | None:
-        if self._last is None or not 0 < t - self._last[0] <= _LONGEST_PAUSE_S:
+        if self._last is None or not 0 < t - self._last[0] <= LONGEST_PAUSE_S:
             return None
         width, height = self.calibration.image_size_px
         regions = []

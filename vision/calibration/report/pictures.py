@@ -11,9 +11,9 @@ from bodyschema.interfaces.records import FloatArray, ImageArray
 from bodyschema.vision.board import Corners
 from bodyschema.vision.calibration.guidance import GRID
 from bodyschema.vision.calibration.view import Eye
+from bodyschema.vision.images import jpeg, shrunk
 
 _WIDTH_PX = 400
-_QUALITY = 80
 _GREEN = (60, 210, 60)
 _FIRST = (30, 60, 240)
 
@@ -21,15 +21,14 @@ _FIRST = (30, 60, 240)
 def photograph(image: ImageArray, corners: Corners | None, alt: str) -> str:
     """Return a small image with the detected corners; the first one is red, to reveal a rotated board."""
     scale = min(1.0, _WIDTH_PX / image.shape[1])
-    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    small = shrunk(image, _WIDTH_PX)
     if small.ndim == 2:
-        small = cv2.cvtColor(small, cv2.COLOR_GRAY2BGR)
+        small = np.asarray(cv2.cvtColor(small, cv2.COLOR_GRAY2BGR), np.uint8)
     if corners is not None:
         for k, at in enumerate((corners.px + 0.5) * scale - 0.5):
             centre = (round(float(at[0]) * 8), round(float(at[1]) * 8))
             cv2.circle(small, centre, 24, _GREEN if k else _FIRST, 1 if k else 2, cv2.LINE_AA, shift=3)
-    data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
-    return f'<img alt="{alt}" src="data:image/jpeg;base64,{base64.b64encode(data).decode()}">'
+    return f'<img alt="{alt}" src="data:image/jpeg;base64,{base64.b64encode(jpeg(small)).decode()}">'
 
 
 def coverage(px: FloatArray, covered: np.ndarray, size_px: tuple[int, int], eye: Eye) -> str:

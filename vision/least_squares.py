@@ -1,0 +1,53 @@
+"""Levenberg-Marquardt for all least-squares problems of this package."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol, TypeVar
+
+import numpy as np
+
+from bodyschema.interfaces.records import FloatArray
+
+# Most steps, and the relative decrease of the sum of squares that ends them: thousandths of a sigma.
+_STEPS, _CONVERGED = 60, 1e-7
+# Damping relative to the diagonal of the normal equations, at first and at most.
+_FIRST_DAMPING, _MOST_DAMPING = 1e-4, 1e12
+
+
+class Linearised(Protocol):
+    """A problem at one point."""
+
+    @property
+    def squares(self) -> float:
+        """The sum of squares there."""
+        ...
+
+
+P = TypeVar("P", bound=Linearised)
+
+
+def minimised(problem: P, stepped: Callable[[P, float], P | None]) -> P:
+    """Return the problem where its sum of squares is smallest.
+
+    Args:
+        problem: at the start.
+        stepped: returns the problem after a step with the given damping; None if there is no such step.
+    """
+    damping = _FIRST_DAMPING
+    for _ in range(_STEPS):
+        then = stepped(problem, damping)
+        if then is not None and then.squares <= problem.squares:
+            gained = problem.squares - then.squares
+            problem, damping = then, 0.1 * damping
+            if gained <= _CONVERGED * problem.squares:
+                break
+        elif (damping := 10.0 * damping) > _MOST_DAMPING:
+            break
+    return problem
+
+
+def damped_step(jacobian: FloatArray, residuals: FloatArray, damping: float) -> FloatArray:
+    """Return the step (p,) for residuals (n,) and their negative derivative (n, p) by what is sought."""
+    normal = jacobian.T @ jacobian
+    return np.asarray(np.linalg.solve(normal + damping * np.diag(np.diag(normal)), jacobian.T @ residuals), np.float64)
