@@ -236,7 +236,9 @@ def test_positions_of_another_robot_are_refused_without_a_name() -> None:
     assert not found.misread
 
 
-@pytest.mark.parametrize(("rows", "said"), [(1, "1 row earlier"), pytest.param(-2, "2 rows later", marks=pytest.mark.soak)])
+@pytest.mark.parametrize(
+    ("rows", "said"), [(1, "1 row earlier"), pytest.param(-2, "2 rows later", marks=pytest.mark.soak)]
+)
 def test_positions_of_another_row_are_named(rows, said) -> None:
     right = pairs()
     found = replace(right, q=np.roll(right.q, -rows, axis=0)).seen()
