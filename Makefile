@@ -45,10 +45,10 @@ demo: $(DEMO_STAMP) ## Watch the whole thing learn in simulation, about a minute
 	@$(BIN)/bodyschema demo
 
 test: setup     ## Run the tests
-	@$(BIN)/python -m pytest --forks auto
+	@$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 smoke: setup    ## A few tests of everything, in less than a minute
-	@$(BIN)/python -m pytest --forks auto $(SMOKE)
+	@$(BIN)/python -m pytest -n auto --dist loadfile $(SMOKE)
 
 check: setup    ## Lint: ruff, pyright, import-linter
 	@$(BIN)/ruff check .

@@ -10,10 +10,8 @@ from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when numpy is imported; more threads only spin
 
-import forked
 import free_ports
 import pytest
-import warm
 from _pytest.doctest import DoctestModule
 from hypothesis import HealthCheck, settings
 from hypothesis.internal.conjecture import providers
@@ -27,8 +25,6 @@ settings.register_profile("soak", TIMELESS, print_blob=True, max_examples=300)
 settings.load_profile("suite")
 # Hypothesis takes constants out of every module imported so far: other ones in each worker, and a second to find them.
 providers._get_local_constants = providers.Constants
-
-pytest_addoption, pytest_runtestloop = forked.pytest_addoption, forked.pytest_runtestloop
 
 QUICK = ("kbmaps/", "tests/interfaces/", "tests/kbmaps/")
 
@@ -49,18 +45,22 @@ def pytest_collect_file() -> Generator[None, list[pytest.Collector], list[pytest
     return [collector for collector in (yield) if not isinstance(collector, DoctestModule)]
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """Return three workers for two processors: half of the tests wait for processes, clocks or disks."""
+    return (3 * len(os.sched_getaffinity(0)) + 1) // 2
+
+
 def pytest_collection(session: pytest.Session) -> None:
     """Collect no garbage among thousands of tests, which are none."""
     gc.disable()
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Leave what was collected out of every later search for garbage; prepare what forks of this process share."""
+    """Leave what was collected out of every later search for garbage."""
     gc.collect()
     gc.freeze()
     gc.enable()
-    if forked.wanted(session.config) > 1:
-        warm.start()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -119,11 +119,6 @@ def run(
         return subprocess.CompletedProcess(child.args, code, out.read(), err.read())
 
 
-def start() -> None:
-    """Start the forking process now: forks of this process then share it."""
-    _server()
-
-
 @functools.cache
 def _server() -> socket.socket:
     """Return the socket to the forking process, which ends with this one."""
@@ -175,7 +170,6 @@ def _settle(request: tuple[list[str], str, dict[str, str]], files: list[int]) ->
     """Reset the process to the state of a new one; return its arguments."""
     arguments, folder, environment = request
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    signal.signal(signal.SIGINT, signal.default_int_handler)
     os.dup2(files[1], 1)
     os.dup2(files[2], 2)
     os.closerange(3, max(map(int, os.listdir("/proc/self/fd"))) + 1)
@@ -210,7 +204,6 @@ def _run(arguments: list[str]) -> int:
 
 if __name__ == "__main__":
     sys.path.pop(0)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the tests, too; the server ends with them
     _import_all()
     gc.freeze()  # a collection would copy every page
     code = _run(_serve(socket.socket(fileno=int(sys.argv[1]))))
