@@ -229,6 +229,7 @@ def test_a_zero_far_off_is_mentioned() -> None:
     assert "the zero of q3 comes out +" in found.warnings[0]
 
 
+@pytest.mark.soak
 def test_positions_of_another_robot_are_refused_without_a_name() -> None:
     right = pairs()
     found = replace(right, x=np.random.default_rng(1).permutation(right.x)).seen()

@@ -72,6 +72,7 @@ def with_a_link_that_bends(robot: RobotDescription, times_the_noise: float, seed
     return measured(robot, motion, run.measured + moved + noise)
 
 
+@pytest.mark.soak
 def test_a_link_that_bends_is_unexplained_and_no_cause_is_named(robot) -> None:
     file = found(with_a_link_that_bends(robot, 0.5, 1), robot)
     assert (file.verdict, file.causes) == ("unexplained", ())

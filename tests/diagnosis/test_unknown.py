@@ -98,6 +98,7 @@ def test_the_held_out_error_is_that_of_the_stored_model(robot, diagnosis, file, 
     assert abs(file.rms_mm.extended / truth_mm - 1.0) < 0.05
 
 
+@pytest.mark.soak
 def test_what_wanders_with_time_is_not_in_the_model_and_that_is_told(robot) -> None:
     motion = walk(robot, 1, rows=60)
     q = motion.q.copy()

@@ -250,6 +250,7 @@ def test_without_webgl_the_figures_stay(page) -> None:
     says(page, "#cloud-text", "median")
 
 
+@pytest.mark.soak
 def test_everything_is_reached_with_the_keyboard_alone(drawn) -> None:
     page = drawn
     says(page, "#cloud-text", "median")
