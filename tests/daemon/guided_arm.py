@@ -20,7 +20,7 @@ REACH = np.radians(60.0)
 STEP = np.radians(2.0)
 STORE = "one"
 # A solver that is asked so rarely is as good after a hundred pairs, and much cheaper.
-NOW_AND_THEN = 25
+NOW_AND_THEN = 60
 
 
 def nominal_chain() -> RigidChain:

@@ -184,6 +184,7 @@ def test_another_robot_toml_is_not_overwritten(backed_up, elsewhere) -> None:
     assert f"{elsewhere}: there already" in refused(backed_up, elsewhere)
 
 
+@pytest.mark.soak
 def test_a_sampler_that_writes_the_store_is_not_disturbed(config, backed_up) -> None:
     with (
         PairStore(config.store_file, session_of(config, SystemClock())),

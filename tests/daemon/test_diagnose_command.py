@@ -226,6 +226,7 @@ def test_the_same_seed_gives_the_same_figures(told, out, again) -> None:
     assert json.loads(again.out) == json.loads((out / "diagnosis.json").read_text())
 
 
+@pytest.mark.soak
 def test_effects_that_are_excluded_are_not_looked_for(file) -> None:
     looked = json.loads(diagnose(file, "--robot", DESK_ARM, *FEW, "--exclude", "joint_scale", "--json").out)
     named = {row["effect"] for row in [*looked["causes"], *looked["rejected"]]}

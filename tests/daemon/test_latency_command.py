@@ -56,6 +56,7 @@ def test_a_recording_and_the_simulation_are_not_both_taken(tmp_path) -> None:
         app(words, exit_on_error=False, result_action="return_value")
 
 
+@pytest.mark.soak
 def test_the_simulated_robot_has_no_latency(tmp_path, monkeypatch, capsys) -> None:
     pytest.importorskip("pybullet")
     monkeypatch.chdir(tmp_path)

@@ -170,6 +170,7 @@ def test_the_solver_in_its_own_process_finds_the_same_orientations() -> None:
     assert pytest.approx(apart.snapshot.predict(q).R, abs=1e-9) == direct.snapshot.predict(q).R
 
 
+@pytest.mark.soak
 def test_where_the_hand_bends_the_maps_of_the_axes_answer() -> None:
     """Check an arm with compliance, whose orientations no rigid chain has."""
     rng = np.random.default_rng(9)

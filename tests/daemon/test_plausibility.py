@@ -229,6 +229,7 @@ def test_a_zero_far_off_is_mentioned() -> None:
     assert "the zero of q3 comes out +" in found.warnings[0]
 
 
+@pytest.mark.soak
 def test_positions_of_another_robot_are_refused_without_a_name() -> None:
     right = pairs()
     found = replace(right, x=np.random.default_rng(1).permutation(right.x)).seen()
@@ -236,7 +237,9 @@ def test_positions_of_another_robot_are_refused_without_a_name() -> None:
     assert not found.misread
 
 
-@pytest.mark.parametrize(("rows", "said"), [(1, "1 row earlier"), (-2, "2 rows later")])
+@pytest.mark.parametrize(
+    ("rows", "said"), [(1, "1 row earlier"), pytest.param(-2, "2 rows later", marks=pytest.mark.soak)]
+)
 def test_positions_of_another_row_are_named(rows, said) -> None:
     right = pairs()
     found = replace(right, q=np.roll(right.q, -rows, axis=0)).seen()

@@ -192,6 +192,7 @@ def test_a_doubt_about_the_recording_is_a_warning() -> None:
     assert as_text(report(doubt="So far apart.")).endswith("Warning: So far apart.")
 
 
+@pytest.mark.soak
 def test_a_guided_recording_is_learnt_by_the_two_processes(tmp_path: Path, robot: Path) -> None:
     guided(robot).write_csv(tmp_path / "a.csv")
     ended = command_line(tmp_path / "a.csv", "--json", "--speed", 0, "--keep", tmp_path / "kept")

@@ -281,6 +281,7 @@ def test_a_guided_walk_is_measured_in_the_samplers_steps_as_well_as_the_tracker_
     assert (steps.min() >= 1.0, steps.max() <= 3.0, found.noise_m < 0.003) == (True, True, True)
 
 
+@pytest.mark.soak
 def test_postures_far_apart_are_measured_as_well_as_the_tracker_can() -> None:
     pytest.importorskip("pybullet")
     found = postures(5, 5, 0, lambda _said: None)

@@ -94,6 +94,7 @@ def test_a_restored_learner_publishes_the_same_map(taught: OnlineLearner) -> Non
     assert restored.snapshot.require_map().digest == taught.snapshot.require_map().digest
 
 
+@pytest.mark.soak
 def test_what_the_arm_yields_stays_known_with_another_tool(arm: SaggingArm, taught: OnlineLearner) -> None:
     learning = new_learning()
     learning.restore(taught.state())
@@ -112,6 +113,7 @@ def test_another_tool_is_found_while_it_answers(arm: SaggingArm, taught: OnlineL
     assert learning.counters.changes == taught.counters.changes + 1
 
 
+@pytest.mark.soak
 def test_the_solver_s_process_gives_the_solution_that_a_direct_one_gives(arm: SaggingArm) -> None:
     nominal = nominal_model()
     tolerances = ChainTolerances(axes=0.05, points=0.015, tool=0.03)

@@ -76,7 +76,8 @@ def scene_with(case: str) -> tuple[Saved, list[Pair], FloatArray]:
     return saved, pairs[TAUGHT:], q
 
 
-CASES = ["as drawn", "frame to be found", "other tool", "amid doubts"]
+# The others go through all that the first does, and further.
+CASES = [pytest.param("as drawn", marks=pytest.mark.soak), "frame to be found", "other tool", "amid doubts"]
 
 
 @pytest.fixture(scope="module", params=CASES)

@@ -51,8 +51,8 @@ def on_a_soft_mount(robot: RobotDescription, times_the_noise: float, seed: int) 
     return measured(robot, motion, x + moved + SIGMA_M * np.random.default_rng([seed, 1]).normal(size=x.shape))
 
 
-def found(recording: Recording, robot: RobotDescription) -> DiagnosisFile:
-    return conclusion(diagnose(recording, Simulation(robot)))
+def found(recording: Recording, robot: RobotDescription, only: tuple[str, ...] = ()) -> DiagnosisFile:
+    return conclusion(diagnose(recording, Simulation(robot), only=only))
 
 
 def with_a_link_that_bends(robot: RobotDescription, times_the_noise: float, seed: int) -> Recording:
@@ -72,6 +72,7 @@ def with_a_link_that_bends(robot: RobotDescription, times_the_noise: float, seed
     return measured(robot, motion, run.measured + moved + noise)
 
 
+@pytest.mark.soak
 def test_a_link_that_bends_is_unexplained_and_no_cause_is_named(robot) -> None:
     file = found(with_a_link_that_bends(robot, 0.5, 1), robot)
     assert (file.verdict, file.causes) == ("unexplained", ())
@@ -101,11 +102,16 @@ def test_a_joint_that_gives_is_named(robot, where) -> None:
     assert (cause.effect, cause.where) == ("joint_compliance", where)
 
 
-def test_a_joint_that_gives_is_named_where_the_urdf_states_no_masses(robot) -> None:
+# Among all effects it takes four times as long.
+NEAREST = ("joint_compliance", "joint_eccentricity", "joint_scale", "backlash")
+
+
+@pytest.mark.parametrize("only", [NEAREST, pytest.param((), marks=pytest.mark.soak)], ids=["nearest", "all"])
+def test_a_joint_that_gives_is_named_where_the_urdf_states_no_masses(robot, only) -> None:
     truth = Effect.at(robot, "joint_compliance", SHOULDER, values=[0.03])
     recording = seen(robot, walk(robot, 1), (truth,), 1)
     held = {"torque_free": "held", "_known = false": "_known = true"}
-    file = found(recording, desk_arm(held))
+    file = found(recording, desk_arm(held), only)
     first = max(file.causes, key=lambda cause: cause.weight_percent)
     assert (first.effect, first.where) == ("joint_compliance", SHOULDER)
     assert "N·m" not in file.sentence

@@ -98,8 +98,9 @@ def test_the_held_out_error_is_that_of_the_stored_model(robot, diagnosis, file, 
     assert abs(file.rms_mm.extended / truth_mm - 1.0) < 0.05
 
 
+@pytest.mark.soak
 def test_what_wanders_with_time_is_not_in_the_model_and_that_is_told(robot) -> None:
-    motion = walk(robot, 1, rows=100)
+    motion = walk(robot, 1, rows=60)
     q = motion.q.copy()
     q[:, robot.joints.index(SHOULDER)] += 0.02 * np.sin(np.linspace(0.0, 9.0, len(q)))
     x = Simulation(robot).positions(motion_of(q))

@@ -129,6 +129,7 @@ def truth():
     return robot.chain.with_tool(np.array([0.05, 0.0, -0.15]))
 
 
+@pytest.mark.soak
 def test_the_learnt_model_is_taken_where_it_is_good(truth) -> None:
     nominal = GazingRobot(truth=truth)
     learnt = GazingRobot(learner(nominal.robot, truth, 0.002), truth)
@@ -186,6 +187,7 @@ def test_asked_off_and_on_at_once_the_head_stays_where_it_is() -> None:
         assert robot.heads[0](robot.clock.now()) == pytest.approx(before, abs=0.01)
 
 
+@pytest.mark.soak
 def test_a_head_that_is_held_fast_ends_it() -> None:
     with (robot := GazingRobot(blocked_deg=8.0)).joints:
         robot.switch_on()

@@ -268,7 +268,7 @@ def test_a_model_that_fails_ends_it() -> None:
         assert "ZeroDivisionError" in dropped(arm)
 
 
-@pytest.mark.parametrize("bits", [0x01, 0x04, 0x08, 0x10, 0x20])
+@pytest.mark.parametrize("bits", [0x01, *(pytest.param(bit, marks=pytest.mark.soak) for bit in (4, 8, 0x10)), 0x20])
 def test_a_fault_of_one_servo_ends_all(bits) -> None:
     with (arm := FloatingArm()).joints:
         arm.float()

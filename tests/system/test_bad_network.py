@@ -190,6 +190,7 @@ class Flood:
                         self.answered += 1
 
 
+@pytest.mark.soak
 def test_under_a_flood_of_queries_pairs_go_on_being_learnt(tmp_path, free_endpoint) -> None:
     config = write_robot(tmp_path, free_endpoint)
     with running(config, "sampler"), running(config, "learner"):

@@ -82,6 +82,7 @@ def test_servos_and_a_stereo_camera_give_pairs_that_agree_in_time(library, movin
     assert np.sqrt(np.mean(error**2)) < 1.5e-3  # 70 ms are 13 mm at this speed
 
 
+@pytest.mark.soak
 def test_a_camera_that_is_unplugged_is_told_of_and_taken_again_while_the_servos_are_read_on(library, moving) -> None:
     config, camera = moving
     with sampling(config, preloaded(library)) as sampler:

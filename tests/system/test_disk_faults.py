@@ -106,6 +106,7 @@ def test_a_full_disk_with_room_again_goes_on_without_a_gap(tmp_path, free_endpoi
         assert [pair.seq for pair in store.read()] == list(range(1, status.pairs + 1))
 
 
+@pytest.mark.soak
 def test_a_slow_disk_is_told_and_costs_no_pair_that_was_accepted(tmp_path, free_endpoint, disk_shim) -> None:
     config = write_robot(tmp_path, free_endpoint)
     disk = FailingDisk(config.state_dir, disk_shim)

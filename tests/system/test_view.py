@@ -131,8 +131,8 @@ def no_complaints(complaints: list[str]) -> Iterator[None]:
 
 
 @contextmanager
-def opened(browser, address: str, complaints: list[str]) -> Iterator[Any]:
-    context = browser.new_context(viewport=SIZES["desktop"], color_scheme="light")
+def opened(browser, address: str, complaints: list[str], size: str) -> Iterator[Any]:
+    context = browser.new_context(viewport=SIZES[size], color_scheme="light")
     page = context.new_page()
     page.set_default_timeout(LIMIT_MS)
     page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
@@ -146,15 +146,15 @@ def opened(browser, address: str, complaints: list[str]) -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def page(browser, address: str, complaints: list[str]) -> Iterator[Any]:
     """Yield the page, one for all tests: to load and draw it takes two seconds of CPU."""
-    with opened(browser, address, complaints) as page:
+    with opened(browser, address, complaints, "desktop") as page:
         yield page
 
 
 @pytest.fixture
 def drawn(chromium, address: str, complaints: list[str]) -> Iterator[Any]:
-    """Yield the page in a browser with WebGL."""
+    """Yield the page in a browser with WebGL, small: each pixel is drawn in software."""
     browser = chromium.launch(executable_path=CHROMIUM, args=DRAWING)
-    with opened(browser, address, complaints) as page:
+    with opened(browser, address, complaints, "phone") as page:
         yield page
     browser.close()
 
@@ -250,6 +250,7 @@ def test_without_webgl_the_figures_stay(page) -> None:
     says(page, "#cloud-text", "median")
 
 
+@pytest.mark.soak
 def test_everything_is_reached_with_the_keyboard_alone(drawn) -> None:
     page = drawn
     says(page, "#cloud-text", "median")

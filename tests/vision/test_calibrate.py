@@ -56,6 +56,7 @@ def planted() -> tuple:
 # --- results
 
 
+@pytest.mark.soak
 def test_intervals_cover_over_many_rigs() -> None:
     misses = []
     for seed in range(4):
