@@ -158,9 +158,11 @@ class Sets:
         reached = {one.chosen: one for one in (self._climbed(start, seen) for start in starts)}
         return list(reached.values())
 
-    def starts(self, own: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
-        """Yield the starting sets: the fit's causes, none, all joint offsets, all effects of each kind, and each cause
-        that may have only some of its numbers, with all of them.
+    def starts(self, own: tuple[int, ...], *, links: bool) -> Iterator[tuple[int, ...]]:
+        """Yield the starting sets: the fit's causes, none, all joint offsets, and all effects of each kind.
+
+        Args:
+            links: also yield each cause that may have only some of its numbers, with all of them.
         """
         yield own
         yield ()
@@ -170,7 +172,7 @@ class Sets:
         for kind in kinds:
             yield tuple(k for k, effect in enumerate(self.effects) if effect.kind is kind)
         yield tuple(dict.fromkeys((*own, *zeros)))
-        for key in dict.fromkeys(effect.key for effect in self.effects if effect.kind.in_parts):
+        for key in dict.fromkeys(effect.key for effect in self.effects if effect.kind.in_parts and links):
             yield tuple(k for k, effect in enumerate(self.effects) if effect.key == key)
 
     def again(self, effects: Iterable[Effect]) -> tuple[int, ...]:
@@ -538,9 +540,13 @@ class _Place:
         self._sets = Sets(fit, candidates, float(np.log(max(len(hypotheses), 1))))
         own = self._sets.again(fit.causes)
         self.here = self._sets.of(own)
-        # What any start led to elsewhere leads on from there.
-        reached = (self._sets.again(place.numbers_of(one)) for place in others for one in place.reached)
-        self.reached = self._sets.climbed([own, (), *reached] if others else self._sets.starts(own))
+        if self.here.worth > max((place.here.worth for place in others), default=-np.inf):
+            starts = self._sets.starts(own, links=not others)
+        else:
+            # A fit no better than others leads on from what these have reached.
+            reached = (self._sets.again(place.numbers_of(one)) for place in others for one in place.reached)
+            starts = dict.fromkeys([own, *reached])
+        self.reached = self._sets.climbed(starts)
         self.name = self.name_of(self.here)
         # Drop cached results, which are large for many rows.
         self.fit = replace(fit)
