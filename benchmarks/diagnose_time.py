@@ -106,7 +106,7 @@ def recording(robot: RobotDescription, pairs: int, causes: int, seed: int) -> Re
     rng = np.random.default_rng(seed)
     motion = walk(robot, pairs, rng)
     effects = tuple(Effect.at(robot, name, joint, None, values) for name, joint, values in HIDDEN[:causes])
-    exact = Recording(joints=robot.joints, q=motion.q, x=np.empty((pairs, 3)), t=motion.t, segment=motion.segment)
+    exact = Recording(joints=robot.joints, q=motion.q, x=np.zeros((pairs, 3)), t=motion.t, segment=motion.segment)
     simulation = Simulation(robot, effects)
     exact = simulated(simulation, exact)
     return with_noise(simulation, exact, exact, rng)

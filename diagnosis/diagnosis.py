@@ -413,24 +413,22 @@ def _found(
     """Search the causes in some observations, and ask whether something without a name is at work."""
     start = aligned(observations, simulation)
     search = Search(hypotheses, told)
-    unknowns = Unknowns(start)
-    enough = partial(needs_no_more_names, unknowns=unknowns, search=search)
     begun = start if start.is_exact else together(start, hypotheses, told)
     told.begin(SEARCH, SETS)
+    # The set of causes compared best tells the noise, and the rows that they leave out, before the long search.
+    begun, start = _counted(begun, start, simulation)
+    unknowns = Unknowns(start)
+    enough = partial(needs_no_more_names, unknowns=unknowns, search=search)
     extended = search.run(begun, enough) if start.is_exact else _searched(begun, search, enough)
-    factor, left_out = instrument_factor(extended), _left_out(extended)
     other_shape = None if start.is_exact else reshaped(extended)
     if other_shape is not None and (rattle(extended) or explain(extended, search.path, unknowns, search, told).unknown):
         # What is left is not noise alone.
         other_shape = None
-    is_other = abs(np.log(factor)) > _SAME_NOISE or left_out.any() or other_shape is not None
-    if not start.is_exact and is_other and not search.ended_early:
-        observations = (other_shape or observations).with_factor(factor).without(left_out)
-        start = aligned(observations, simulation)
+    again, start = (extended, start) if search.ended_early else _counted(extended, start, simulation, other_shape)
+    if again is not extended:
         unknowns = Unknowns(start)
         enough = partial(needs_no_more_names, unknowns=unknowns, search=search)
-        scales = extended.background.scales or Scales()
-        extended = _searched(extended.to(observations).tolerating(scales), search, enough)
+        extended = _searched(again, search, enough)
     loose = None if start.is_exact else rattle(extended)
     if loose is not None and explain(extended, search.path, unknowns, search, told).unknown:
         # An error of the last joint moves the marker along one line as well.
@@ -460,6 +458,26 @@ def _found(
         explanation = fewer
         stands = standings(explanation.beside, search, blocks, seed)
     return _Found(start, search, unknowns, explanation, stands, loose, other_shape is not None)
+
+
+def _counted(fit: Fit, start: Fit, simulation: Simulation, shape: Observations | None = None) -> tuple[Fit, Fit]:
+    """Refit, with the noise that a fit shows and without the rows that its causes leave out; the fit where it has them.
+
+    Args:
+        start: fit of the parameters that robot.toml does not know, returned with the same observations.
+        shape: the observations with another shape of the noise; None where it stays.
+    """
+    observations = fit.observations
+    factor, left_out = instrument_factor(fit), _left_out(fit)
+    before = np.zeros_like(left_out) if observations.doubtful is None else observations.doubtful
+    # Other sizes of the same causes change few rows.
+    other_rows = (left_out ^ before).sum() > (left_out & before).sum()
+    other_noise = abs(np.log(factor / observations.stated_factor)) > _SAME_NOISE
+    if fit.is_exact or not (other_rows or other_noise or shape is not None):
+        return fit, start
+    observations = (shape or observations).with_factor(factor).without(left_out)
+    again = fit.to(observations).tolerating(fit.background.scales or Scales())
+    return again, aligned(observations, simulation)
 
 
 def _stored(start: Fit, alone: Fit, complete: Fit, left: Leftover, blocks: Blocks) -> Fit:

@@ -14,7 +14,7 @@ from bodyschema.interfaces.records import FloatArray, frozen_array
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.suggest import did_you_mean
 
-from .effect_type import EffectType
+from .effect_type import CameraEffect, EffectType, StructureEffect
 from .parameter import Parameter
 from .registry import EFFECT_TYPES
 
@@ -94,6 +94,16 @@ class Effect:
     def identity(self) -> Identity:
         """Identity among the effects of one simulation: `key` and `ordinal`."""
         return *self.key, self.ordinal
+
+    @cached_property
+    def frame(self) -> FloatArray | None:
+        """Pose (4, 4) of its joint's frame in the nominal frame; None if it does not move it."""
+        return self.kind.frame(self.values) if isinstance(self.kind, StructureEffect) else None
+
+    @cached_property
+    def pose(self) -> FloatArray | None:
+        """Pose (4, 4) of the camera in its frame before; None if it does not move it."""
+        return self.kind.pose(self.values) if isinstance(self.kind, CameraEffect) else None
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

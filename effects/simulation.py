@@ -35,8 +35,6 @@ _SHAPE_STEP = 1e-3
 SPRING_ROUNDS = 3
 # Corrections (n,) of readings by the encoder effects that were evaluated there, as long as both live.
 _CORRECTIONS: WeakKeyDictionary[Motion, WeakKeyDictionary[Effect, FloatArray]] = WeakKeyDictionary()
-# Corrections (4, 4) of joint frames by effects, as long as these live; None where they move none.
-_FRAMES: WeakKeyDictionary[Effect, FloatArray | None] = WeakKeyDictionary()
 # Predictions (n, 3) of residuals, which no effect changes, as long as both live.
 _RESIDUALS: WeakKeyDictionary[Motion, WeakKeyDictionary[Residual, FloatArray]] = WeakKeyDictionary()
 Staged = TypeVar("Staged", bound=EffectType)
@@ -132,7 +130,7 @@ class Simulation:
         for effect in self.all_effects:
             if not effect.kind.is_free(robot):
                 continue
-            if isinstance(effect.kind, CameraEffect) and (moved := effect.kind.pose(effect.values)) is not None:
+            if isinstance(effect.kind, CameraEffect) and (moved := effect.pose) is not None:
                 pose = pose @ moved
             elif isinstance(effect.kind, ToolEffect):
                 marker = marker + effect.kind.shift(effect.values)
@@ -316,13 +314,8 @@ class Simulation:
     @cached_property
     def link_moves(self) -> list[tuple[int, FloatArray]]:
         """Corrections of joint frames: the index in q, and the pose (4, 4) in the nominal frame."""
-        moves = []
-        for effect, kind in self._of(StructureEffect):
-            if effect not in _FRAMES:
-                _FRAMES[effect] = kind.frame(effect.values)
-            if (frame := _FRAMES[effect]) is not None:
-                moves.append((self.place(effect).joint, frame))
-        return moves
+        structure = [effect for effect, _ in self._of(StructureEffect)]
+        return [(self.place(effect).joint, effect.frame) for effect in structure if effect.frame is not None]
 
     @cached_property
     def upward(self) -> list[bool]:
@@ -338,12 +331,12 @@ class Simulation:
             shift[after(motion, effect) if kind.begins else slice(None)] += kind.shift(effect.values)
         return shift
 
-    @property
+    @cached_property
     def camera_pose(self) -> FloatArray:
         """Initial camera pose (4, 4), in the frame that the description gives it."""
         T = np.eye(4)
         for effect, kind in self._of(CameraEffect):
-            if not kind.begins and (pose := kind.pose(effect.values)) is not None:
+            if not kind.begins and (pose := effect.pose) is not None:
                 T = T @ pose
         return T
 
@@ -351,7 +344,7 @@ class Simulation:
         """Return the camera's pose (n, 4, 4) in its initial frame."""
         T = np.tile(np.eye(4), (len(motion), 1, 1))
         for effect, kind in self._of(CameraEffect):
-            if kind.begins and (pose := kind.pose(effect.values)) is not None:
+            if kind.begins and (pose := effect.pose) is not None:
                 T[after(motion, effect)] @= pose
         return T
 
@@ -453,14 +446,14 @@ class Simulated:
     def seen(self, moved: FloatArray) -> FloatArray:
         """Return the change of the measurements by moves (n, 3, p) [m] of the point in the nominal camera's frame."""
         for effect in self.simulation.effects:
-            if (pose := _observer(effect)) is not None and not effect.kind.begins:
+            if (pose := effect.pose) is not None and not effect.kind.begins:
                 moved = pose[:3, :3].T @ moved
         return self.optical(self.since_moved(moved))
 
     def since_moved(self, moved: FloatArray) -> FloatArray:
         """Return moves (n, 3, p) in the present camera frame, from moves in the frame where it was set up."""
         for effect in self.simulation.effects:
-            if (pose := _observer(effect)) is not None and effect.kind.begins:
+            if (pose := effect.pose) is not None and effect.kind.begins:
                 moved = np.where(since(self.motion, effect) > 0.0, pose[:3, :3].T @ moved, moved)
         return moved
 
@@ -480,8 +473,3 @@ class Simulated:
             for step in _STEP * np.eye(3)
         ]
         return np.stack(changes, axis=2) / (2.0 * _STEP)
-
-
-def _observer(effect: Effect) -> FloatArray | None:
-    """Return the pose (4, 4) of the camera that an effect gives it; None for another effect."""
-    return effect.kind.pose(effect.values) if isinstance(effect.kind, CameraEffect) else None

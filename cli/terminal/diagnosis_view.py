@@ -19,10 +19,9 @@ from bodyschema.diagnosis.report.numbers import (
     rival_named,
     share,
     telling,
-    tolerance_shares,
 )
 from bodyschema.diagnosis.report.result import SMALL, Cause, DiagnosisFile, Errors, Indistinguishable, Verdict
-from bodyschema.diagnosis.report.text import beside_geometry, in_order, made_to, modelled, to_do
+from bodyschema.diagnosis.report.text import beside_geometry, in_order, made_to, modelled, other_shares, to_do
 
 # Number of rejected hypotheses shown.
 NEAREST = 6
@@ -69,7 +68,7 @@ def view(diagnosis: DiagnosisFile, remedies: Sequence[str], *, timed: bool) -> G
         parts.append(_causes(diagnosis, timed))
     if diagnosis.tolerances is not None:
         parts.append(Text(made_to(diagnosis.tolerances)))
-    if rivals := [line for cause in diagnosis.causes for line in rival_lines(cause)]:
+    if rivals := [line for cause in diagnosis.causes if not cause.is_correction for line in rival_lines(cause)]:
         parts.append(_list("Not distinguished", rivals))
     if diagnosis.rejected:
         parts.append(_rejected(diagnosis))
@@ -154,13 +153,14 @@ def _causes(diagnosis: DiagnosisFile, timed: bool) -> Table:
     for name in ("sure", "share", "gain"):
         table.add_column(name, justify="right", no_wrap=True)
     for cause in in_order(diagnosis.causes):
+        if cause.is_correction:
+            break
         numbers = telling(numbers_of(cause, timed=timed))
         figures = (percent(cause.probability), share(cause.share_of_gain_percent), share(cause.held_out_gain_percent))
         labels, values = ("\n".join(lines) for lines in ([n.label for n in numbers], [str(n) for n in numbers]))
         table.add_row(Text(place(cause).replace(" ", "\n", 1)), labels, values, *figures)
-    if diagnosis.tolerances is not None:
-        for told, of in tolerance_shares(diagnosis.tolerances):
-            table.add_row(told, "", "", "", share(of), "")
+    for told, of in other_shares(diagnosis):
+        table.add_row(told, "", "", "", share(of), "")
     return table
 
 

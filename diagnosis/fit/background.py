@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bodyschema.effects import Effect, Simulated, Simulation
 from bodyschema.interfaces.records import FloatArray
@@ -126,7 +127,10 @@ class Background:
 
     def inner(self, weights: FloatArray) -> FloatArray:
         """Return the products (p, p) of the whitened columns, rows weighted (n,)."""
-        return weighted_products(self.white, self._inner, weights)
+        partly = rows_in_part(weights)
+        rows = self.white.reshape(len(weights), -1)[partly] * np.sqrt(1.0 - weights[partly])[:, None]
+        flat = rows.reshape(3 * len(partly), self.white.shape[1])
+        return self._inner - flat.T @ flat
 
     @cached_property
     def spectrum(self) -> FloatArray:
@@ -142,15 +146,9 @@ class Background:
         return float(0.5 * np.log1p(self.spectrum / sigma**2).sum())
 
 
-def weighted_products(columns: FloatArray, inner: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return the weighted products (p, p) of columns (3 n, p) from the unweighted ones, rows weighted (n,).
-
-    Only rows that do not count in full are visited.
-    """
-    partly = np.flatnonzero(1.0 - weights > _COUNTS_IN_FULL)
-    rows = columns.reshape(len(weights), 3, columns.shape[1])[partly] * np.sqrt(1.0 - weights[partly])[:, None, None]
-    flat = rows.reshape(3 * len(partly), columns.shape[1])
-    return inner - flat.T @ flat
+def rows_in_part(weights: FloatArray) -> NDArray[np.intp]:
+    """Return the rows that do not count in full, of weights (n,): the only ones that weighted products visit again."""
+    return np.flatnonzero(1.0 - weights > _COUNTS_IN_FULL)
 
 
 def background_effects(simulation: Simulation, q: FloatArray) -> tuple[Effect, ...]:

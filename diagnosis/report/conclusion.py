@@ -71,7 +71,7 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
         rejected=_rejected(diagnosis),
         unexplained=_unexplained(diagnosis),
         stability=_stability(diagnosis, causes),
-        advice=advice(diagnosis),
+        advice=advice(diagnosis, causes),
         limitations=_limitations(diagnosis),
         alike=_alike(diagnosis),
         tolerances=tolerances,

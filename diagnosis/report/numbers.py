@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from .result import Cause, Indistinguishable, Interval, Rejected, Tolerances
+from .result import Cause, Indistinguishable, Interval, Rejected
 
 _DEG = math.degrees(1.0)
 # Factor and unit by the suffix of a number's name; the first match applies.
@@ -137,15 +137,6 @@ def named(effect: str, where: str | None, source: str | None) -> str:
     """Return effect and joint in the form of `place`."""
     at = "" if where is None else f" at {where}"
     return f"{effect}{at}{'' if source is None else f' from {source}'}"
-
-
-def tolerance_shares(tolerances: Tolerances) -> list[tuple[str, float]]:
-    """Return the shares of the gain [%] of drives and of links that are not zero, with their names."""
-    shares = {
-        "small errors of drives": tolerances.drives_share_percent,
-        "small errors of links": tolerances.links_share_percent,
-    }
-    return [(name, share) for name, share in shares.items() if share > 0.0]
 
 
 def rival_named(rival: Indistinguishable) -> str:

@@ -15,7 +15,7 @@ from bodyschema.diagnosis.report.numbers import chance, mm, share, told_values
 from bodyschema.diagnosis.report.presenters.outliers import outlier_panel
 from bodyschema.diagnosis.report.presenters.registry import presenter_of
 from bodyschema.diagnosis.report.result import Cause, DiagnosisFile, Gain, Verdict
-from bodyschema.diagnosis.report.text import beside_geometry, finding, in_order, made_to, modelled, to_do
+from bodyschema.diagnosis.report.text import beside_geometry, corrections, finding, in_order, made_to, modelled, to_do
 from bodyschema.effects import Effect
 
 from . import tables
@@ -143,6 +143,9 @@ def _causes(residuals: Residuals, file: DiagnosisFile, remedies: Sequence[str]) 
         _cause(residuals, cause, effects[id(cause)], remedy, file, opened=k < _OPEN and not cause.is_small)
         for k, (cause, remedy) in enumerate(zip(ordered, remedies, strict=True))
     ]
+    if more := sum(cause.is_correction for cause in ordered):
+        folded = "".join(articles[-more:])
+        articles[-more:] = [f"<details><summary>{corrections(more).capitalize()}</summary>{folded}</details>"]
     return (
         f'<section id="causes"><h2>Causes</h2>{tables.causes(file, timed=residuals.timed)}'
         '<p class="key">In the plots: pale dots are single pairs, strong dots their means with 95 % intervals, the '

@@ -10,6 +10,8 @@ import msgspec
 SMALL = 5.0
 # A less probable cause leaves the verdict open, and is to be confirmed first.
 SURE = 0.9
+# Probability of what is no more probable than not.
+_EVEN = 0.5
 Verdict = Literal["explained", "nothing_found", "undecided", "unexplained"]
 
 
@@ -94,6 +96,11 @@ class Cause(msgspec.Struct, frozen=True):
     def is_outvoted(self) -> bool:
         """True where a rival is more probable."""
         return any(rival.probability > self.probability for rival in self.rivals)
+
+    @property
+    def is_correction(self) -> bool:
+        """True for one that makes a small difference, and is no more probable than not: its cause is not known."""
+        return self.is_small and self.probability <= _EVEN
 
 
 class Rejected(msgspec.Struct, frozen=True):

@@ -15,10 +15,9 @@ from bodyschema.diagnosis.report.numbers import (
     rival_named,
     share,
     telling,
-    tolerance_shares,
 )
 from bodyschema.diagnosis.report.result import Cause, DiagnosisFile, Indistinguishable, Rejected
-from bodyschema.diagnosis.report.text import in_order
+from bodyschema.diagnosis.report.text import in_order, other_shares
 
 # Rows to omit where they equal another.
 _SAME_AS = {"aligned": "nominal", "extended": "aligned"}
@@ -49,18 +48,18 @@ def errors(diagnosis: DiagnosisFile) -> str:
 
 
 def causes(diagnosis: DiagnosisFile, *, timed: bool) -> str:
-    """Return a table of every cause with its non-zero numbers."""
-    rows = []
+    """Return a table of the causes with their non-zero numbers, and of the shares of what else explains."""
+    rows, others = [], other_shares(diagnosis)
     for cause in in_order(diagnosis.causes):
+        if cause.is_correction:
+            break
         figures = (
             f"<td>{percent(cause.probability)}<td>{share(cause.share_of_gain_percent)}"
             f"<td>{cause.held_out_gain_percent:.1f} %"
         )
         shown = _lines(telling(numbers_of(cause, timed=timed)))
         rows.append(f"<tr><td>{escape(place(cause))}<td class=text>{shown}{figures}</tr>")
-    if diagnosis.tolerances is not None:
-        shares = tolerance_shares(diagnosis.tolerances)
-        rows += [f"<tr><td>{told}<td><td><td>{share(part)}<td></tr>" for told, part in shares]
+    rows += [f"<tr><td>{told}<td><td><td>{share(part)}<td></tr>" for told, part in others]
     return _table(("Cause", "Numbers, ± for 95 %", "Sure", "Share of the gain", "Gain"), rows)
 
 

@@ -39,8 +39,23 @@ _WATCH = {
 
 
 def in_order(causes: Sequence[Cause]) -> list[Cause]:
-    """Return causes in the order in which to act: small ones last, the heaviest first."""
-    return sorted(causes, key=lambda cause: (cause.is_small, -cause.weight_percent))
+    """Return causes in the order in which to act: the heaviest first, small ones later, mere corrections last."""
+    return sorted(causes, key=lambda cause: (cause.is_small, cause.is_correction, -cause.weight_percent))
+
+
+def corrections(count: int) -> str:
+    """Return a name for some causes that are no more probable than not."""
+    return f"{count} correction{'s' * (count > 1)} whose cause is not known"
+
+
+def other_shares(diagnosis: DiagnosisFile) -> list[tuple[str, float]]:
+    """Return the shares of the gain [%] of corrections without a cause, of drives and of links, with their names."""
+    few = [cause.share_of_gain_percent for cause in diagnosis.causes if cause.is_correction]
+    told = [(corrections(len(few)), sum(few))] if few else []
+    if (of := diagnosis.tolerances) is not None:
+        shares = ("small errors of drives", of.drives_share_percent), ("small errors of links", of.links_share_percent)
+        told += [(name, share) for name, share in shares if share > 0.0]
+    return told
 
 
 def finding(
@@ -136,11 +151,11 @@ def _head(causes: Sequence[Cause], tolerances: Tolerances | None, seen_by: str, 
     first = [cause for cause in ordered if not (everywhere and cause.is_small)][:_TOLD]
     said = [finding(c.effect, c.where, c.source, told_values(c), seen_by, timed=timed, weighed=weighed) for c in first]
     told = [clause + _or(cause) for clause, cause in zip(said, first, strict=True)]
-    others = [cause.is_outvoted for cause in ordered if cause not in first]
+    others = [cause.is_outvoted or cause.is_correction for cause in ordered if cause not in first]
     if more := others.count(False):
         everywhere.append(f"{more} {'smaller' if first else 'small'} cause{'s' * (more > 1)}")
     if more := others.count(True):
-        everywhere.append(f"{more} correction{'s' * (more > 1)} whose cause is not known")
+        everywhere.append(corrections(more))
     parts = [*told, *everywhere]
     head = f"{', '.join(parts[:-1])} and {parts[-1]}" if len(parts) > 1 else parts[0]
     return head[0].upper() + head[1:]
@@ -189,15 +204,18 @@ def to_do(diagnosis: DiagnosisFile, remedies: Sequence[str]) -> tuple[list[str],
     Args:
         remedies: of each cause, as returned by `remedies`.
     """
-    first = sum(not cause.is_small for cause in diagnosis.causes)
-    told = list(remedies[:first])
+    ordered = list(zip(in_order(diagnosis.causes), remedies, strict=True)) if remedies else []
+    told = [remedy for cause, remedy in ordered if not cause.is_small]
+    small = [remedy for cause, remedy in ordered if cause.is_small and not cause.is_correction]
+    if more := sum(cause.is_correction for cause, _ in ordered):
+        small.append(f"Change nothing because of {corrections(more)}: extended.toml has what is sure of them.")
     of = diagnosis.tolerances
     if of is not None and of.in_extended and of.share_percent >= SMALL:
         told.append(
             f"Use extended.toml: small errors of links and drives have a share of {of.share_percent:.0f} % of the gain,"
             " and no single one is worth mending."
         )
-    return told, list(remedies[first:])
+    return told, small
 
 
 def beside_geometry(rms: Errors, alike: Sequence[Alike]) -> list[str]:
@@ -245,12 +263,16 @@ def evidence(standing: Standing) -> str:
     return f"{text}; the nearest rival: {rival.described} ({100 * rival.probability:.0f} %)."
 
 
-def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """Return sentences of advice: motions that would separate confounded causes, and steps against unnamed causes."""
+def advice(diagnosis: Diagnosis, causes: Sequence[Cause]) -> tuple[str, ...]:
+    """Return sentences of advice: motions that would separate confounded causes, and steps against unnamed causes.
+
+    Args:
+        causes: those of the diagnosis, and perhaps outliers after them.
+    """
     told: list[str] = []
     pairs: dict[str, list[str]] = {}
-    for cause, standing in zip(diagnosis.causes, diagnosis.standings, strict=True):
-        for rival in standing.rivals:
+    for cause, standing, found in zip(diagnosis.causes, diagnosis.standings, causes, strict=False):
+        for rival in () if found.is_correction else standing.rivals:
             if not rival.is_same_anywhere:
                 pair = f"{describe(cause)} from {rival.described}"
                 pairs.setdefault(_motion(diagnosis, rival), []).append(pair)

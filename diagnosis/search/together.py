@@ -9,6 +9,7 @@ rows (MacKay 1992, "Bayesian interpolation"; Tipping and Faul 2003, "Fast margin
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -51,6 +52,8 @@ _MOST_REFITTED, _COMES_NEAR = 8, 15.0
 
 # Tolerances may stand for a cause of which they leave less than this share of the squares; a third is left of a jump.
 _FOLLOWED = 0.1
+
+_LOG_SMALLEST, _LOG_MOST = math.log(_SMALLEST), math.log(MOST)
 
 dpotrf, dpotri, dpotrs = get_lapack_funcs(("potrf", "potri", "potrs"), dtype=np.float64)
 
@@ -194,11 +197,12 @@ class Sets:
     def _without_one(self, here: Together) -> Together | None:
         """Remove one cause or a part of one, where that is more probable."""
         present = frozenset(here.chosen)
-        losses = [(self._loss(here, group), group) for group in self._groups if present.issuperset(group)]
-        for loss, group in sorted(losses, key=lambda one: one[0])[:_TRIED]:
-            if loss > _COMES_NEAR:
+        groups = [group for group in self._groups if present.issuperset(group)]
+        losses = self._losses(here, groups)
+        for k in np.argsort(losses, kind="stable")[:_TRIED].tolist():
+            if losses[k] > _COMES_NEAR:
                 break
-            if better := _better([self.of(_without(here.chosen, group), here)], here):
+            if better := _better([self.of(_without(here.chosen, groups[k]), here)], here):
                 return better
         return None
 
@@ -233,14 +237,12 @@ class Sets:
         """Return the number of causes of a set."""
         return len({self.effects[k].identity for k in here.chosen})
 
-    def _loss(self, here: Together, group: tuple[int, ...]) -> float:
-        """Return the worth of some numbers with scales and noise held fixed [nats]."""
-        places = np.searchsorted(here.columns, np.concatenate([self._places[k] for k in group]))
-        covariance = here.covariance[np.ix_(places, places)]
-        amounts = here.amounts[places]
-        gained = 0.5 * float(amounts @ np.linalg.solve(covariance, amounts))
-        cost = self._cost(here.chosen) - self._cost(_without(here.chosen, group))
-        return gained + 0.5 * float(np.linalg.slogdet(covariance)[1]) - cost
+    def _losses(self, here: Together, groups: Sequence[tuple[int, ...]]) -> FloatArray:
+        """Return the worth of each of some groups of numbers with scales and noise held fixed [nats]."""
+        own = [np.searchsorted(here.columns, np.concatenate([self._places[k] for k in group])) for group in groups]
+        squares, volumes = _in_groups(here.covariance, here.amounts, own)
+        fewer = np.array([self._cost(_without(here.chosen, group)) for group in groups])
+        return squares + volumes - (self._cost(here.chosen) - fewer)
 
     def _cost(self, chosen: Sequence[int]) -> float:
         """Return the cost of naming the causes of a set [nats]."""
@@ -280,7 +282,8 @@ class Sets:
         inner[np.diag_indices_from(inner)] += 1.0
         gradient = self._toward[places] / here.sigma**2 - solved.T @ (self._toward[here.columns] / here.sigma**2)
         own = [np.searchsorted(places, np.concatenate([self._places[k] for k in group])) for group in open_groups]
-        worths = _gained(inner, gradient, own) - self._costs_beside(here.chosen, open_groups)
+        squares, volumes = _in_groups(inner, gradient, own)
+        worths = squares - volumes - self._costs_beside(here.chosen, open_groups)
         best = np.argsort(worths)[::-1]
         return [open_groups[k] for k in best[here.worth + worths[best] > least - _COMES_NEAR].tolist()]
 
@@ -315,28 +318,27 @@ class Sets:
         inner, toward = self._inner[np.ix_(columns, columns)], self._toward[columns]
         logs = np.log(near.scales if near else Scales())
         sigma = near.sigma if near else self._noise
-        members, spent = [group == g for g in range(3)], np.zeros(3)
+        members, spent = (group == np.arange(3)[:, None]).astype(np.float64), np.zeros(3)
         for done in range(_ROUNDS if near is None else _ROUNDS_NEAR):
             factor, variances, amounts = self._solved(inner, toward, group, logs, sigma)
-            inverse = dpotri(factor[0], lower=True)[0]
-            told = 1.0 - np.diag(inverse) / variances
+            told = 1.0 - dpotri(factor[0], lower=True)[0].diagonal() / variances
             # Update from a scale's tolerances and its prior (MacKay 1992, equation 4.10).
-            spent = np.array([told[one].sum() for one in members])
-            squares = np.array([(np.square(amounts) / variances)[one].sum() for one in members])
+            spent, squares = members @ told, members @ (np.square(amounts) / variances)
             steps = (squares - spent - logs / SPREAD**2) / (2.0 * np.maximum(spent, 0.5) + 1.0 / SPREAD**2)
-            steps = np.clip(steps, -_FARTHEST, _FARTHEST)
+            steps = np.minimum(np.maximum(steps, -_FARTHEST), _FARTHEST)
             rss = self._square - 2.0 * float(amounts @ toward) + float(amounts @ inner @ amounts)
             free = max(self._rows - float(told.sum()), 1.0)
-            quieter = float(np.clip(0.5 * np.log(max(rss, 1e-300) / free) - np.log(sigma), -_FARTHEST, _FARTHEST))
+            quieter = 0.5 * math.log(max(rss, 1e-300) / free) - math.log(sigma)
+            quieter = min(max(quieter, -_FARTHEST), _FARTHEST)
             if done and max(np.abs(steps).max(), abs(quieter)) < _STILL:
                 break
-            logs = np.clip(logs + steps, np.log(_SMALLEST), np.log(MOST))
-            sigma = max(sigma * float(np.exp(quieter)), _QUIETEST * self._noise)
+            logs = np.minimum(np.maximum(logs + steps, _LOG_SMALLEST), _LOG_MOST)
+            sigma = max(sigma * math.exp(quieter), _QUIETEST * self._noise)
         worth, factor, amounts = self._worth(inner, toward, group, logs, sigma)
         scales = Scales(*np.exp(logs).tolist())
         worth -= scales.doubt + _volume(spent)
         if max(scales) < _MAY_BE_EXACT:
-            exact = self._worth(inner, toward, group, np.full(3, np.log(_SMALLEST)), sigma)
+            exact = self._worth(inner, toward, group, np.full(3, _LOG_SMALLEST), sigma)
             if exact[0] > worth:
                 (worth, factor, amounts), scales = exact, Scales(*[_SMALLEST] * 3)
         worth -= self._cost(chosen)
@@ -350,7 +352,7 @@ class Sets:
         without = []
         for g in range(3):
             logs = np.log(here.scales)
-            logs[g] = np.log(_SMALLEST)
+            logs[g] = _LOG_SMALLEST
             without.append(self._worth(inner, toward, group, logs, here.sigma)[0])
         return whole - np.array(without) > _SHOWN
 
@@ -360,12 +362,12 @@ class Sets:
         group, found = self._group(here.columns), np.array(here.scales)
         for g in range(3):
             logs, best = np.log(here.scales), -np.inf
-            while logs[g] < np.log(MOST):
+            while logs[g] < _LOG_MOST:
                 worth = self._worth(inner, toward, group, logs, here.sigma)[0]
                 best = max(best, worth)
                 if worth < best - _RULED_OUT:
                     break
-                logs[g] = min(logs[g] + _FINER, np.log(MOST))
+                logs[g] = min(logs[g] + _FINER, _LOG_MOST)
             found[g] = np.exp(logs[g])
         return found
 
@@ -382,20 +384,22 @@ class Sets:
         factor, variances, amounts = self._solved(inner, toward, group, logs, sigma)
         left = self._square - float(amounts @ toward)
         evidence = -0.5 * left / sigma**2 - self._rows * float(np.log(sigma))
-        evidence -= float(np.log(np.diag(factor[0])).sum()) + 0.5 * float(np.log(variances).sum())
+        evidence -= float(np.log(factor[0].diagonal()).sum()) + 0.5 * float(np.log(variances).sum())
         return evidence, factor, amounts
 
     def _solved(
         self, inner: FloatArray, toward: FloatArray, group: np.ndarray, logs: FloatArray, sigma: float
     ) -> tuple[tuple[FloatArray, bool], FloatArray, FloatArray]:
         """Return the factor of the precision, prior variances (p,) and amounts (p,), in units of `_units`."""
-        variances = np.where(group >= 0, np.exp(2.0 * logs)[group], 1.0)
+        # The last of the scales stands for columns that are no tolerances.
+        variances = np.append(np.exp(2.0 * logs), 1.0)[group]
         precision = inner / sigma**2
-        squares, places = np.diag(precision).copy(), np.diag_indices_from(precision)
-        precision[places] += 1.0 / variances + _ROUNDED_OFF * squares
+        diagonal = precision.reshape(-1)[:: len(precision) + 1]
+        squares = diagonal.copy()
+        diagonal += 1.0 / variances + _ROUNDED_OFF * squares
         factor, failed = dpotrf(precision, lower=True, clean=False)
         if failed:
-            precision[places] += _ONE_BEYOND_ROUNDING * squares
+            diagonal += _ONE_BEYOND_ROUNDING * squares
             factor = dpotrf(precision, lower=True, clean=False)[0]
         return (factor, True), variances, dpotrs(factor, toward / sigma**2, lower=True)[0]
 
@@ -434,16 +438,18 @@ def _volume(spent: FloatArray) -> float:
     return float(0.5 * np.log1p(2.0 * spent * SPREAD**2).sum())
 
 
-def _gained(inner: FloatArray, gradient: FloatArray, groups: Sequence[NDArray[np.intp]]) -> FloatArray:
-    """Return the evidence that each group of columns adds, from products that include the prior [nats]."""
-    sizes, gained = np.array([len(group) for group in groups]), np.empty(len(groups))
+def _in_groups(
+    matrix: FloatArray, vector: FloatArray, groups: Sequence[NDArray[np.intp]]
+) -> tuple[FloatArray, FloatArray]:
+    """Return half of v' M⁻¹ v and of ln |M| for the part M, v of a matrix (p, p) and a vector (p,) in each group."""
+    sizes, squares, volumes = np.array([len(group) for group in groups]), *np.empty((2, len(groups)))
     for size in np.unique(sizes).tolist():
         some = np.flatnonzero(sizes == size)
         places = np.stack([groups[k] for k in some.tolist()])
-        precision, toward = inner[places[:, :, None], places[:, None, :]], gradient[places]
-        step = np.linalg.solve(precision, toward[:, :, None])[:, :, 0]
-        gained[some] = 0.5 * (toward * step).sum(axis=1) - 0.5 * np.linalg.slogdet(precision)[1]
-    return gained
+        matrices, vectors = matrix[places[:, :, None], places[:, None, :]], vector[places]
+        squares[some] = 0.5 * (vectors * np.linalg.solve(matrices, vectors[:, :, None])[:, :, 0]).sum(axis=1)
+        volumes[some] = 0.5 * np.linalg.slogdet(matrices)[1]
+    return squares, volumes
 
 
 def _without(chosen: tuple[int, ...], group: Sequence[int]) -> tuple[int, ...]:
@@ -464,7 +470,7 @@ def together(start: Fit, hypotheses: Sequence[Effect], tell: Callable[[str], Non
         start: without a background.
         tell: called with short messages on progress.
     """
-    known = [_Place(start.tolerating(Scales()), hypotheses)]
+    known = [_Place(start.tolerating(Scales()), hypotheses, ())]
     while len(known) < _MOST_REFITTED:
         looked_at = {place.name for place in known}
         proposals = [
@@ -473,7 +479,7 @@ def together(start: Fit, hypotheses: Sequence[Effect], tell: Callable[[str], Non
         worth, place, one = max(proposals, key=lambda proposal: proposal[0], default=(-np.inf, known[0], known[0].here))
         if worth < max(place.here.worth for place in known) - _COMES_NEAR:
             break
-        known.append(_Place(place.refitted(one), hypotheses))
+        known.append(_Place(place.refitted(one), hypotheses, known))
         tell(f"{len(known)} fitted")
     return max(known, key=lambda place: place.here.worth).fit
 
@@ -524,17 +530,23 @@ def _beside_tolerances(fit: Fit, cause: Effect) -> float:
 class _Place:
     """A fit with its causes, and the sets of causes reached from it."""
 
-    def __init__(self, fit: Fit, hypotheses: Sequence[Effect]) -> None:
+    def __init__(self, fit: Fit, hypotheses: Sequence[Effect], others: Sequence[_Place]) -> None:
         self.fit = fit
         present = {cause.key for cause in fit.causes}
-        others = [one for one in hypotheses if one.key not in present and not one.kind.refines]
-        scanned = Scan(fit).candidates(others)
+        absent = [one for one in hypotheses if one.key not in present and not one.kind.refines]
+        scanned = Scan(fit).candidates(absent)
         candidates = [Candidate(cause, 0.0, 1) for cause in fit.causes] + [_at_rest(one) for one in scanned]
         candidates = [part for candidate in candidates for part in _in_parts(candidate)]
         self._sets = Sets(fit, candidates, float(np.log(max(len(hypotheses), 1))))
         own = self._sets.again(fit.causes)
         self.here = self._sets.of(own)
-        self.reached = self._sets.climbed(self._sets.starts(own, links=not present))
+        if self.here.worth > max((place.here.worth for place in others), default=-np.inf):
+            starts = self._sets.starts(own, links=not others)
+        else:
+            # A fit no better than others leads on from what these have reached.
+            reached = (self._sets.again(place.numbers_of(one)) for place in others for one in place.reached)
+            starts = dict.fromkeys([own, *reached])
+        self.reached = self._sets.climbed(starts)
         self.name = self.name_of(self.here)
         # Drop cached results, which are large for many rows.
         self.fit = replace(fit)
@@ -542,6 +554,10 @@ class _Place:
     def name_of(self, one: Together) -> frozenset[Key]:
         """Return the keys of the causes of a set, without their parameters."""
         return frozenset(self._sets.effects[k].key for k in one.chosen)
+
+    def numbers_of(self, one: Together) -> list[Effect]:
+        """Return the causes of a set, those of which some numbers may be free once for each."""
+        return [self._sets.effects[k] for k in one.chosen]
 
     def refitted(self, one: Together) -> Fit:
         """Refit one of the sets about its own parameters."""

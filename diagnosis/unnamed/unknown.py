@@ -13,7 +13,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from scipy.special import chdtri
 
-from bodyschema.diagnosis.fit.background import weighted_products
+from bodyschema.diagnosis.fit.background import rows_in_part
 from bodyschema.diagnosis.fit.fit import Fit, solved
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.fit.worth import nats
@@ -76,13 +76,25 @@ class Way:
     def columns(self) -> FloatArray:
         """Columns (3 n, p) of its parameters, computed on demand to save memory."""
         columns = self.moved[:, :, :, None] * self.functions[:, None, None, :]
-        return columns.reshape(3 * len(self.moved), -1)
+        return columns.reshape(3 * len(self.moved), self.moves * self.amounts)
 
     @cached_property
     def inner(self) -> FloatArray:
         """Products (p, p) of the columns with one another."""
         columns = self.columns
         return columns.T @ columns
+
+    def weighted_inner(self, weights: FloatArray) -> FloatArray:
+        """Return the products (p, p) of the columns, rows weighted (n,)."""
+        partly = rows_in_part(weights)
+        some = replace(self, moved=self.moved[partly], functions=self.functions[partly]).columns
+        return self.inner - (some * np.repeat(1.0 - weights[partly], 3)[:, None]).T @ some
+
+    def toward(self, others: FloatArray) -> FloatArray:
+        """Return the products (p, r) of the columns with others (n, 3, r), without forming the columns."""
+        along = np.swapaxes(self.moved, 1, 2) @ others
+        products = self.functions.T @ along.reshape(len(along), -1)
+        return np.swapaxes(products.reshape(self.amounts, self.moves, -1), 0, 1).reshape(len(self.scales), -1)
 
     @property
     def moves(self) -> int:
@@ -177,19 +189,17 @@ class Unknowns:
 
     def _ranked(self, fit: Fit, others: Sequence[Way]) -> list[tuple[Way, float]]:
         basis, left = self.beside(fit, others)
-        weights = np.repeat(fit.root_weights[:, 0], 3)
         rss, rows = float(left @ left), float(fit.noise.weights.sum())
         directions, shares = fit.absorbed
         twice = np.column_stack([directions * np.sqrt(shares), fit.unshared(np.column_stack([basis, left]))])
-        seen = np.ascontiguousarray((twice * weights[:, None]).T)
+        seen = twice.reshape(*fit.left.shape, -1) * fit.root_weights[:, :, None]
         ranked: list[tuple[float, Way, FloatArray | None]] = []
         for way in map(self._way, range(self.count)):
             if way in others:
                 continue
-            columns = way.columns
-            products = seen @ columns
-            onto, toward = products[:-1], products[-1]
-            inner = weighted_products(columns, way.inner, fit.noise.weights) - onto.T @ onto
+            products = way.toward(seen)
+            onto, toward = products[:, :-1], products[:, -1]
+            inner = way.weighted_inner(fit.noise.weights) - onto @ onto.T
             values, vectors = np.linalg.eigh(inner)
             told = (values > _TOLD * max(float(values.max()), 1e-12)) & (values > _LEFT)
             explained = float(np.square(vectors[:, told].T @ toward / np.sqrt(values[told])).sum())

@@ -2,8 +2,19 @@
 
 from __future__ import annotations
 
-from bodyschema.diagnosis.report.result import Cause, Errors, Gain, Indistinguishable, Interval, Tolerances
-from bodyschema.diagnosis.report.text import finding, made_to, sentence
+from bodyschema.diagnosis.report import tables
+from bodyschema.diagnosis.report.result import (
+    Cause,
+    DiagnosisFile,
+    Errors,
+    Gain,
+    Indistinguishable,
+    Interval,
+    Pairs,
+    Tolerances,
+    Unexplained,
+)
+from bodyschema.diagnosis.report.text import finding, made_to, sentence, to_do
 
 SHIFT = {"x_m": 0.001, "y_m": 0.0, "z_m": 0.0}
 TURN = {"rx_rad": 0.0, "ry_rad": 0.01, "rz_rad": 0.0}
@@ -106,3 +117,19 @@ def test_small_causes_less_probable_than_others_are_no_causes_in_the_headline() 
     of = Interval(0.1, (0.05, 0.2))
     said = sentence("explained", causes, errors, gain, Tolerances(of, of, of, links_share_percent=50.0))
     assert "small errors everywhere and 2 corrections whose cause is not known" in said
+
+
+def test_small_causes_less_probable_than_others_stand_in_no_table_and_change_nothing() -> None:
+    heavy, few = _zero("elbow"), [_zero(f"joint_{k}", probability=0.1, share=1.0) for k in range(2)]
+    none, gain = Errors(5.0, 5.0, 1.0, 1.0, 0.9), Gain(80.0, (75.0, 85.0))
+    left = Unexplained(0.0, (), 1.0)
+    file = DiagnosisFile("undecided", "", Pairs(9, 9, 0), none, none, gain, (*few, heavy), (), left, None, (), ())
+    shown = tables.causes(file, timed=False)
+    assert "elbow" in shown
+    assert "joint_0" not in shown
+    assert "2 corrections whose cause is not known" in shown
+    todo, small = to_do(file, ["turn the elbow", "turn joint_0", "turn joint_1"])
+    assert todo == ["turn the elbow"]
+    assert [said.split(":")[0] for said in small] == [
+        "Change nothing because of 2 corrections whose cause is not known"
+    ]
