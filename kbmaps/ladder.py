@@ -20,7 +20,6 @@ from kbmaps.chains.tool_layer import ToolLayer
 from kbmaps.contest import PrequentialComparison
 from kbmaps.errors import KBMapsError, ModelFormatError, SettingError
 from kbmaps.kernel.kernel_learner import KernelLearner
-from kbmaps.kernel.structured_learner import StructuredLearner
 from kbmaps.maps.basis import learning_bases
 from kbmaps.model import Estimate, Model
 from kbmaps.packed import complete, count, flag, named, number, pack, restoring, unpack
@@ -35,7 +34,6 @@ _STORED: tuple[type[Model], ...] = (
     RecursiveRigidLearner,
     ResidualLearner,
     RigidLearner,
-    StructuredLearner,
     TensorLearner,
     ToolLayer,
 )
