@@ -346,7 +346,7 @@ class Ladder:
             self._contest.add({name: float(values[k]) for name, values in squares.items()})
 
     def _teach(self, name: str, until: int) -> None:
-        """Teach a model all pairs up to `until`, from its own count on."""
+        """Teach a model the pairs that it has not learnt yet, up to `until`."""
         model = self._rungs[name].model
         part = slice(model.pairs, until)
         told = ~np.isnan(self._sigma[part])

@@ -120,7 +120,7 @@ class KernelFit:
 
     def _left_open(self, weights: FloatArray) -> FloatArray:
         """Return k(q, q) − kᵀ (K + λ I)⁻¹ k (m,)."""
-        parts = [self._kernel_rows(part) for part in _parts(weights)]
+        parts = (self._kernel_rows(part) for part in _parts(weights))
         taken = [np.einsum("mn,nm->m", rows, self._gram.solve(rows.T)) for rows in parts]
         return np.clip(self._kernel.diagonal(weights) - np.concatenate(taken), 0.0, None)
 
