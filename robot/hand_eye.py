@@ -77,7 +77,7 @@ class MarkerPose(msgspec.Struct, frozen=True):
     def of(
         cls, x: list[float], sigma: list[float], quaternion: list[float] | None, sigma_R: list[float] | None
     ) -> Self:
-        """Return a pose from a position with its 1-sigma [m], and an orientation with its own [rad], if any."""
+        """Return a pose from a position and an orientation, if any, with their 1-sigma [m, rad]."""
         narrow = np.diag(np.square(sigma)).ravel().tolist()
         if quaternion is None or sigma_R is None:
             return cls(x, None, None, None, narrow)

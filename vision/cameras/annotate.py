@@ -1,4 +1,4 @@
-"""Annotated camera images that show what the tracker sees."""
+"""Camera images annotated with the detections of the tracker."""
 
 from __future__ import annotations
 
@@ -15,11 +15,10 @@ from bodyschema.vision.ball.colour import gate_of
 from bodyschema.vision.ball.sphere import Pinhole
 from bodyschema.vision.config import VisionConfig
 
-from .annotate_tags import TagDrawing, TagSight, outline
+from .annotate_tags import SUBPIXEL_BITS, TagDrawing, TagSight, outline
 
 GREEN, YELLOW, RED, BLACK = (80, 220, 80), (0, 220, 255), (110, 110, 255), (0, 0, 0)
 FONT, LETTERS, LINE_PX = cv2.FONT_HERSHEY_SIMPLEX, 0.5, 18
-SUBPIXEL_BITS = 4
 MAGNIFIED = 10  # the row difference is a fraction of a pixel
 
 
