@@ -73,7 +73,7 @@ class KernelBuildHook(BuildHookInterface):
 
 
 def mend_links(folder: Path) -> None:
-    """Make links of what a zip archive, or git without core.symlinks, has left as files with the link's target."""
+    """Replace files that hold a link's target, as zip archives and git without core.symlinks leave them, by links."""
     for file in folder.iterdir():
         if file.suffix or file.is_symlink() or not file.is_file():
             continue

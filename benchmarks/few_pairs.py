@@ -31,7 +31,6 @@ from kbmaps import (
     Model,
     RigidChain,
     StepSize,
-    StructuredLearner,
     ToolLayer,
     learning_bases,
 )
@@ -84,26 +83,20 @@ def evidence(prior: RigidChain | None, joints: int, q: FloatArray, x: FloatArray
 
 def one_table(arm: RoughArm, q: FloatArray, test: FloatArray, rng: np.random.Generator) -> list[float]:
     d, x, true = arm.drawing.joints, arm.measured(q, SIGMA, rng), arm.positions(test)
-    structured = taught(StructuredLearner(arm.drawing, ROUGH, bases(d)), q, x)
     return [
         error_mm(pseudo_inverse(d, q, x), true, test),
         error_mm(evidence(None, d, q, x), true, test),
         error_mm(evidence(arm.drawing, d, q, x), true, test),
-        error_mm(structured, true, test),
         1e3 * least_error(arm, q, SIGMA, test, rng),
-        *covered(structured, true, test),
     ]
 
 
-HEADER = "    n |  pinv | evidence, from nothing | from the drawing | structured | bound | within 1 / 2 sigma"
+HEADER = "    n |  pinv | evidence, from nothing | from the drawing | bound"
 
 
 def print_rows(label: str, rows: Sequence[Sequence[float]]) -> None:
-    pinv, scratch, anchored, structured, bound, one, two = np.mean(rows, axis=0)
-    print(
-        f"{label:>5} | {pinv:5.0f} | {scratch:22.1f} | {anchored:16.1f} | {structured:10.1f} | {bound:5.1f} | "
-        f"{one:.0f} / {two:.0f}"
-    )
+    pinv, scratch, anchored, bound = np.mean(rows, axis=0)
+    print(f"{label:>5} | {pinv:5.0f} | {scratch:22.1f} | {anchored:16.1f} | {bound:5.1f}")
 
 
 def table(seeds: int) -> None:
@@ -169,19 +162,11 @@ def large(seeds: int) -> None:
             arm = random_arm(joints, rng)
             q, test = arm.angles(500, 80, rng), arm.angles(TEST_ROWS, 80, rng)
             x, true = arm.measured(q, SIGMA, rng), arm.positions(test)
-            row = [error_mm(arm.drawing, true, test)]
-            for model in (
-                KernelLearner(bases(joints), arm.drawing),
-                StructuredLearner(arm.drawing, ROUGH, bases(joints)),
-            ):
-                begin = time.perf_counter()
-                row += [error_mm(taught(model, q, x), true, test), time.perf_counter() - begin]
-            rows.append(row)
-        drawing, kernel, kernel_s, linear, linear_s = np.mean(rows, axis=0)
-        print(
-            f"  d = {joints}: drawing {drawing:.0f} mm, kernel {kernel:.0f} mm in {kernel_s:.2f} s, "
-            f"structured {linear:.1f} mm in {linear_s:.2f} s"
-        )
+            begin = time.perf_counter()
+            learnt = error_mm(taught(KernelLearner(bases(joints), arm.drawing), q, x), true, test)
+            rows.append([error_mm(arm.drawing, true, test), learnt, time.perf_counter() - begin])
+        drawing, kernel, kernel_s = np.mean(rows, axis=0)
+        print(f"  d = {joints}: drawing {drawing:.0f} mm, kernel {kernel:.0f} mm in {kernel_s:.2f} s")
 
 
 def random_arm(joints: int, rng: np.random.Generator) -> RoughArm:

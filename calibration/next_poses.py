@@ -1,4 +1,4 @@
-"""Poses to measure next, chosen to reduce what a calibration leaves uncertain."""
+"""Poses to measure next, chosen to reduce the uncertainty of a calibration."""
 
 from __future__ import annotations
 

@@ -217,7 +217,7 @@ def _learners(
 
 
 def _told(recording: Recording, learner: RigidLearner, rows: IntArray) -> FloatArray | None:
-    """Return covariances (n, 3, 3) [m²]: stated, plus what the arm adds in some rows; None where none are stated."""
+    """Return the stated covariances (n, 3, 3) [m²], the arm's share added in some rows; None if none are stated."""
     if recording.cov is None:
         return None
     return recording.cov + (ROUNDING_M**2 + _of_the_arm(learner, recording, rows)) * np.eye(3)

@@ -21,6 +21,7 @@ from bodyschema.diagnosis.report.result import DiagnosisFile
 from bodyschema.interfaces.errors import BodyschemaError, RecordingError, RequestError
 from bodyschema.interfaces.interpreter import module_command
 from bodyschema.interfaces.records import Pair
+from bodyschema.interfaces.waits import NICENESS
 from bodyschema.recordings import files as recordings
 
 from .documents import DiagnosisDocument
@@ -29,9 +30,6 @@ log = logging.getLogger(__name__)
 
 # More pairs would take many minutes, and hardly change the result.
 NEWEST_PAIRS = 4000
-# Sampler and learner have priority.
-NICENESS = 10
-END_LIMIT_S = 5.0
 RECORDING = "newest_pairs.csv"
 
 

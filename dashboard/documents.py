@@ -211,7 +211,7 @@ class LinkShape(msgspec.Struct, frozen=True):
 
 
 class CameraShape(msgspec.Struct, frozen=True):
-    """What the cameras see.
+    """Field of view of the cameras.
 
     Attributes:
         eyes: places of the cameras in the measurement frame [m].

@@ -20,6 +20,7 @@ import numpy as np
 from bodyschema.interfaces.errors import BodyschemaError, RobotError
 from bodyschema.interfaces.interpreter import module_command
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.waits import NICENESS
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.limited import bounded_memory
 from bodyschema.robot.meshes import MeshSet
@@ -38,7 +39,6 @@ MOST_TRIANGLES = 30_000
 # Reading 256 MiB of text meshes takes minutes; the page is drawn without them meanwhile.
 READ_LIMIT_S = 180.0
 MOST_MEMORY_BYTES = 2**31
-NICENESS = 10
 # Edges that are sharper than this stay sharp; a cylinder of 12 sides looks round.
 _CREASE_COSINE = float(np.cos(np.radians(32.0)))
 # Corners at one vertex whose normals are compared, so that no mesh takes long.
@@ -46,7 +46,7 @@ _MOST_NEIGHBOURS = 24
 
 
 class LinkShapes(msgspec.Struct, frozen=True):
-    """What the child process found.
+    """Result of the child process.
 
     Attributes:
         shapes: of each link, by its name.
@@ -202,7 +202,7 @@ def mesh_buffer(triangles: FloatArray) -> bytes:
 
 
 def _corner_normals(triangles: FloatArray, vertex: np.ndarray) -> FloatArray:
-    """Return the normal (3n, 3) of each corner: the mean of the faces at its vertex that lie about as its own.
+    """Return the normal (3n, 3) of each corner: the mean over the faces at its vertex that have a similar normal.
 
     Args:
         triangles: (n, 3, 3).

@@ -24,6 +24,7 @@ from bodyschema.dashboard.scene import TRAIL, arm
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import BusError, RecordingError, RequestError
 from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.waits import ANSWER_LIMIT_S, STATUS_EVERY_S
 
 # A process publishes its status every second; less often on a busy machine.
 SILENT_AFTER_S = 5.0
@@ -85,9 +86,7 @@ class Heard(Generic[S]):
 
 log = logging.getLogger(__name__)
 
-EVERY_S = 1.0
 CLOUD_EVERY_S = 2.0
-PREDICT_LIMIT_S = 2.0
 PICTURE_EVERY_S = 0.5
 # Longer than a tool change or switching torque on takes.
 COMMAND_LIMIT_S = 10.0
@@ -154,7 +153,7 @@ class Watch:
         with self._picturing:
             now = self._clock.now()
             if self._picture is None or now - self._picture[0] > PICTURE_EVERY_S:
-                jpeg = self._sessions["sampler"].ask_one(self._keys.picture, timeout_s=PREDICT_LIMIT_S)
+                jpeg = self._sessions["sampler"].ask_one(self._keys.picture, timeout_s=ANSWER_LIMIT_S)
                 self._picture = now, jpeg
             return self._picture[1]
 
@@ -188,7 +187,7 @@ class Watch:
                 log.debug("%s", error)  # the page shows which process does not answer
             except Exception:
                 log.exception("the page is not up to date")
-            if self._stopping.wait(EVERY_S):
+            if self._stopping.wait(STATUS_EVERY_S):
                 return
 
     def _look(self) -> None:
@@ -242,7 +241,7 @@ class Watch:
 
     def _predict(self, q: list[list[float]]) -> PredictReply:
         payload = encode(JointsRequest([*q]))
-        reply = self._sessions["learner"].ask_one(self._keys.predict, payload, timeout_s=PREDICT_LIMIT_S)
+        reply = self._sessions["learner"].ask_one(self._keys.predict, payload, timeout_s=ANSWER_LIMIT_S)
         return decode(reply, PredictReply)
 
     def _catch_up(self) -> None:

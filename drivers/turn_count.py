@@ -13,6 +13,7 @@ from .turns import nearest_turn
 
 log = logging.getLogger(__name__)
 
+LOST_AFTER_S = 0.25  # without a reading; no joint makes half a turn unnoticed in this time
 LOOK_AGAIN_S = 1.0  # period of checking if a joint was turned back
 
 

@@ -25,8 +25,8 @@ from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import decode
 from bodyschema.daemon.transport.zenoh_config import ENDPOINT, PROCESSES
 from bodyschema.interfaces.errors import BusError, RequestError
+from bodyschema.interfaces.waits import ANSWER_LIMIT_S
 
-ANSWER_LIMIT_S = 2.0
 EVERYBODY = "*"
 
 Status = TypeVar("Status", SamplerStatus, LearnerStatus)

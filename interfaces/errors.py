@@ -1,4 +1,4 @@
-"""Exceptions of all packages except the maths (`kbmaps` has a tree of its own).
+"""Exceptions of all packages except `kbmaps`, which has its own.
 
 BodyschemaError
 ├── ConfigError         a configuration file is wrong: names file, line, key and remedy

@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from kbmaps.inverse.kinematics import InverseKinematics, InverseSolution
     from kbmaps.inverse.resolved_rates import resolved_rates
     from kbmaps.kernel.kernel_learner import KernelLearner
-    from kbmaps.kernel.structured_learner import StructuredLearner
     from kbmaps.ladder import Ladder, Rung
     from kbmaps.maps.basis import JointBasis, learning_bases
     from kbmaps.maps.block_choice import blockwise_precision, follow_a_path
@@ -125,7 +124,6 @@ __all__ = [
     "SharedNoise",
     "SingularAlphaError",
     "StepSize",
-    "StructuredLearner",
     "SupportSet",
     "TensorLearner",
     "TensorPosterior",
@@ -193,7 +191,6 @@ _MODULES = {
     "inverse.kinematics": ["InverseKinematics", "InverseSolution"],
     "inverse.resolved_rates": ["resolved_rates"],
     "kernel.kernel_learner": ["KernelLearner"],
-    "kernel.structured_learner": ["StructuredLearner"],
     "ladder": ["Ladder", "Rung"],
     "maps.basis": ["JointBasis", "learning_bases"],
     "maps.block_choice": ["blockwise_precision", "follow_a_path"],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import TypeAlias
 
 import numpy as np
@@ -77,6 +78,14 @@ def rows_or_vector(name: str, values: ArrayLike, width: int) -> FloatArray:
     if not np.isfinite(array).all():
         raise NonFiniteError(name)
     return array
+
+
+_BATCH_ROWS = 1024  # small enough to stay in the cache
+
+
+def batches(count: int) -> Iterator[slice]:
+    """Yield slices of at most `_BATCH_ROWS` rows that together cover `count` rows."""
+    return (slice(start, start + _BATCH_ROWS) for start in range(0, count, _BATCH_ROWS))
 
 
 def limits(name: str, values: ArrayLike, width: int) -> FloatArray:

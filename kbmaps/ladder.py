@@ -20,7 +20,6 @@ from kbmaps.chains.tool_layer import ToolLayer
 from kbmaps.contest import PrequentialComparison
 from kbmaps.errors import KBMapsError, ModelFormatError, SettingError
 from kbmaps.kernel.kernel_learner import KernelLearner
-from kbmaps.kernel.structured_learner import StructuredLearner
 from kbmaps.maps.basis import learning_bases
 from kbmaps.model import Estimate, Model
 from kbmaps.packed import complete, count, flag, named, number, pack, restoring, unpack
@@ -35,7 +34,6 @@ _STORED: tuple[type[Model], ...] = (
     RecursiveRigidLearner,
     ResidualLearner,
     RigidLearner,
-    StructuredLearner,
     TensorLearner,
     ToolLayer,
 )
@@ -348,7 +346,7 @@ class Ladder:
             self._contest.add({name: float(values[k]) for name, values in squares.items()})
 
     def _teach(self, name: str, until: int) -> None:
-        """Teach a model all pairs up to `until`, from its own count on."""
+        """Teach a model the pairs that it has not learnt yet, up to `until`."""
         model = self._rungs[name].model
         part = slice(model.pairs, until)
         told = ~np.isnan(self._sigma[part])

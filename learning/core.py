@@ -1,4 +1,4 @@
-"""State machine of learning: pairs in, one regime after another, with counters. It has no lock of its own."""
+"""State machine of learning: takes pairs, runs one regime after another, and counts. Not thread-safe."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class LearnerCore:
         return not self.settled and now - self._met_at >= self._together_s
 
     def judge(self) -> None:
-        """Judge all waiting pairs: compare models, gate outliers, look for a change; and keep the pairs."""
+        """Process all waiting pairs: compare the models, gate outliers, look for a change, and keep the pairs."""
         while (regime := self.regimes.present) is not None and regime.met:
             self._judged(regime, *regime.judge())
             if self.regimes.present is not None and self.regimes.present is not regime:

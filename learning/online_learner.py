@@ -196,7 +196,7 @@ class OnlineLearner:
             self._publish()
 
     def judge_due(self, now: float) -> None:
-        """Judge the pairs that have waited long enough."""
+        """Process the pairs that have waited long enough."""
         with self._lock:
             if self._core.judge_due(now):
                 self._core.judge()

@@ -148,7 +148,7 @@ class OrientationModel:
 
 
 class Orientations:
-    """Learns the orientation of one marker. It has no lock of its own.
+    """Learns the orientation of one marker. Not thread-safe.
 
     Args:
         chain: the nominal chain, placed; it predicts orientations before anything is solved.

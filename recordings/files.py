@@ -91,7 +91,7 @@ def stored_pairs(file: Path) -> StoredPairs:
 
 
 def devices_of(store: Path) -> list[Devices]:
-    """Return what the joints of a store's pairs were read with. StoreError if it cannot be read."""
+    """Return the encoders that the joints of a store's pairs were read with. StoreError if it cannot be read."""
     with PairReader(store) as reader:
         return reader.devices()
 

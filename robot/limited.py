@@ -72,7 +72,7 @@ def read_at_most(file: Path, most: int = MOST_TEXT_BYTES) -> bytes:
 
 @contextmanager
 def bounded_memory(most: int) -> Iterator[None]:
-    """Limit what a library takes for a file that it unpacks: `most` bytes more of memory, and as much in a file.
+    """Limit a library that unpacks a file to `most` bytes of additional memory, and to files of as many bytes.
 
     Beyond that allocations fail in the whole process: MemoryError, or what the library makes of it. A limit that is
     lower already stays; where the system tells no sizes, memory is not limited.

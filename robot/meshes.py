@@ -159,7 +159,7 @@ class MeshError(Exception):
 
 
 def read_mesh(file: Path) -> FloatArray:
-    """Return the triangles (n, 3, 3) of a mesh file, n at least 1, in its own unit, in metres where it tells that.
+    """Return the triangles (n, 3, 3) of a mesh file, n at least 1, in metres if the file states its unit.
 
     Raises:
         MeshError: it cannot be read, is malformed or empty, or has numbers that are not finite.

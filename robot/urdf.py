@@ -244,7 +244,7 @@ def standing(joint: UrdfJoint, upward: bool, position: float) -> FloatArray:
 
 
 def motions(joint: UrdfJoint, positions: FloatArray) -> FloatArray:
-    """Return the transforms (n, 4, 4) of a joint's frame by its own motion to positions (n,) [rad or m]."""
+    """Return the transforms (n, 4, 4) of a joint's motion at positions (n,) [rad or m]."""
     T = np.tile(np.eye(4), (len(positions), 1, 1))
     moved = positions[:, None] * joint.axis
     if joint.kind in REVOLUTE:

@@ -1,4 +1,4 @@
-"""The table [sim]: what the simulated robot, its sensors and the guiding hand are like."""
+"""The table [sim]: properties of the simulated robot, its sensors and the guiding hand."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class CameraConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 class ErrorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [sim.errors]: how the true robot differs from its description, as 1-sigma of what the seed draws.
+    """The table [sim.errors]: 1-sigma of the random differences between the true robot and its description.
 
     Attributes:
         joint_offset_rad: zero position of each joint's encoder [rad] (m for a prismatic joint, a tenth of it).

@@ -145,7 +145,7 @@ class _Writer:
         return element
 
     def _shape(self, link: str, source: ElementTree.Element) -> ElementTree.Element | None:
-        """Return a <visual> or <collision> as pybullet is given it; None where it cannot be drawn."""
+        """Return a <visual> or <collision> converted for pybullet; None if it cannot be rendered."""
         geometry = source.find("geometry/*")
         pose = _origin(source)
         if geometry is None or pose is None:

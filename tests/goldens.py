@@ -42,7 +42,6 @@ from kbmaps import (
     RecursiveRigidLearner,
     ResidualLearner,
     RigidLearner,
-    StructuredLearner,
     TensorLearner,
     ToolLayer,
     learning_bases,
@@ -64,7 +63,6 @@ def models() -> Iterator[Golden]:
     bases, chain = learning_bases(-reach, reach), arm.drawing
     taught: dict[str, Model] = {
         "kernel": KernelLearner(bases, chain),
-        "structured": StructuredLearner(chain, ROUGH, bases),
         "tool layer": ToolLayer(chain),
         "rigid": RigidLearner(chain, ROUGH),
         "recursive rigid": RecursiveRigidLearner(chain, ROUGH),

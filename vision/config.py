@@ -49,7 +49,7 @@ NAMED_COLOURS: dict[str, HueBand] = {
 
 
 class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [vision]: what the marker looks like, and when a find is doubtful.
+    """The table [vision]: appearance of the marker, and limits for doubtful detections.
 
     Attributes:
         marker: what is looked for: a coloured ball, a ball that is brighter than all around it, one tag ([vision.tag]),

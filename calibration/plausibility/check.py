@@ -196,24 +196,16 @@ def plausibility(
         found = _hardly(_mm(before), _mm(after), looks)
     elif chosen != as_it_is:
         frame = _frame(fit.rotation, True) if robot.camera.pose_known and chosen.mirrored else ""
-        text = (
-            f"it seems that {chosen.looks(names, fit.zeros)}{frame}: the pairs then fit to {_mm(after)}, and as they "
-            f"are to {_mm(before)}"
-        )
+        fits = f"the pairs then fit to {_mm(after)}, and as they are to {_mm(before)}"
+        text = f"{chosen.looks(names, fit.zeros)}{frame}: {fits}"
         either = "; or ".join(other.looks(names, search.fits[other].zeros) for other in others)
         either = f". These pairs fit as well if {either}" if others else ""
-        remedy = chosen.remedy(names, fit.zeros) + either
         if before > _SETTINGS.much_better * fit.error:
-            found = Plausibility(text, remedy, misread=True)
+            found = Plausibility(f"it seems that {text}", chosen.remedy(names, fit.zeros) + either, misread=True)
         else:
-            found = Plausibility(warnings=(f"perhaps {text.removeprefix('it seems that ')}{either}",))
+            found = Plausibility(warnings=(f"perhaps {text}{either}",))
     else:
-        far = [
-            f"with the nominal links, the zero of {name} comes out {math.degrees(zero):+.0f}°: it is wrong, or the "
-            "URDF is of another arm"
-            for joint, (name, zero, slides) in enumerate(zip(names, fit.zeros, chain.prismatic, strict=True))
-            if not slides and abs(zero) > _SETTINGS.far_zero_rad and search.nearer_is_worse(joint, fit)
-        ]
+        far = _far_zeros(search, fit, names, chain)
         if fit.error > max(_SETTINGS.named * spread, noise):
             far.append(f"{_drawn_arm_misses(_mm(before))}: they may be of another robot, or their columns misread")
         found = Plausibility(warnings=tuple(far), undirected=search.undirected(names))
@@ -225,6 +217,15 @@ def plausibility(
         return found
     few = f"{found.refusal}. {found.remedy}. (These are {len(q)} pairs: {FEWEST_ROWS} are needed to decide.)"
     return Plausibility(warnings=(few,))
+
+
+def _far_zeros(search: _Search, fit: _Fit, names: tuple[str, ...], chain: RigidChain) -> list[str]:
+    return [
+        f"with the nominal links, the zero of {name} comes out {math.degrees(zero):+.0f}°: it is wrong, or the URDF is "
+        "of another arm"
+        for joint, (name, zero, slides) in enumerate(zip(names, fit.zeros, chain.prismatic, strict=True))
+        if not slides and abs(zero) > _SETTINGS.far_zero_rad and search.nearer_is_worse(joint, fit)
+    ]
 
 
 def _hardly(before: str, after: str, nearest: str) -> Plausibility:

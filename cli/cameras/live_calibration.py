@@ -13,6 +13,7 @@ from bodyschema.daemon.sampler.reconnect import ReconnectingSource
 from bodyschema.interfaces.errors import SourceEnded, SourceError
 from bodyschema.interfaces.protocols import Clock, StereoEyes
 from bodyschema.interfaces.records import StereoFrame
+from bodyschema.interfaces.waits import READ_S
 from bodyschema.vision.calibration.calibrate import Calibrated
 from bodyschema.vision.calibration.check import Check, check
 from bodyschema.vision.calibration.gather import Gathered, require_both
@@ -23,7 +24,6 @@ from bodyschema.vision.rig.stereo_rig import CalibrationError
 
 from .calibration import Tell, pair_in
 
-READ_S = 0.2
 # Number of further views taken after a refused calibration before the next try.
 MORE_VIEWS = 4
 

@@ -11,14 +11,13 @@ from rich.table import Table
 from rich.text import Text
 
 from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.waits import LINE_EVERY_S
 from bodyschema.vision.calibration.guidance import TILTED_EACH_WAY, WANTED_VIEWS, Coverage, cell_counts
 from bodyschema.vision.calibration.live import Look, Outcome
 from bodyschema.vision.calibration.view import Eye, all_px, image_of
 
 from .live_calibration import Show, Shown
 
-# Between two lines that say what the cameras see.
-LINE_EVERY_S = 2.0
 _DONE, _OPEN = ("✓", "green"), ("·", "yellow")
 
 

@@ -1,4 +1,4 @@
-"""The demo's folder: a robot.toml of its own with free ports, the robot's URDF, and what the demo leaves behind."""
+"""The demo's folder: a robot.toml with free ports, the robot's URDF, and the results."""
 
 from __future__ import annotations
 

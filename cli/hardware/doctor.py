@@ -38,9 +38,9 @@ from bodyschema.daemon.wiring.servos import (
 )
 from bodyschema.interfaces.errors import BodyschemaError, BusError
 from bodyschema.interfaces.extras import require_extra
+from bodyschema.recordings.store.file import LOW_DISK_BYTES
 from bodyschema.recordings.store.store import PairReader
 
-LOW_DISK_BYTES = 200 * 2**20  # the sampler warns below this
 LITTLE_DISK_BYTES = 2**30
 TIME_ERROR = 5  # adjtimex(2): the clock is not synchronised
 TIMEX_BYTES = 512  # more than struct timex has
@@ -105,7 +105,7 @@ def _description(config: Config) -> Iterator[Check]:
 
 
 def _cameras(config: Config) -> Iterator[Check]:
-    """Yield checks of what the cameras send; a running sampler holds them, so its status is used instead."""
+    """Yield checks of the camera images. A running sampler holds the cameras; then its status is checked instead."""
     if not is_alive(config.route("sampler"), Keys(config.robot.name).alive("sampler"), open_timeout_s=OPEN_S):
         require_extra("cameras", "looking at the cameras")
         from bodyschema.daemon.wiring.cameras import camera_checks
@@ -118,7 +118,7 @@ def _cameras(config: Config) -> Iterator[Check]:
 
 
 def _marker_sources(config: Config) -> Iterator[Check]:
-    """Yield checks of what the marker sources send; a running sampler reads them, so its status is used instead."""
+    """Yield checks of the marker sources. A running sampler reads them; then its status is checked instead."""
     if not is_alive(config.route("sampler"), Keys(config.robot.name).alive("sampler"), open_timeout_s=OPEN_S):
         from bodyschema.daemon.wiring.wiring import marker_source_checks
 

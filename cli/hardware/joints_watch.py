@@ -21,11 +21,10 @@ from bodyschema.daemon.transport.status import JointRange
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.interfaces.servos import EncoderJoints, ServoJoints
+from bodyschema.interfaces.waits import POLL_S
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.urdf import chain_between
 from kbmaps import RigidChain
-
-READ_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -122,7 +121,7 @@ class JointsWatch:
 
     def look(self) -> Seen | None:
         """Read once and return the state; None until all joints are known."""
-        reading = self._reading.read(READ_S)
+        reading = self._reading.read(POLL_S)
         if reading is not None:
             self._low = reading.q if self._q is None else np.minimum(self._low, reading.q)
             self._high = reading.q if self._q is None else np.maximum(self._high, reading.q)

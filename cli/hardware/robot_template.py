@@ -23,7 +23,7 @@ class Guess(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What the cameras are and what they look for.
+    """Cameras of the robot and the marker that they look for.
 
     Attributes:
         cameras: those that are plugged in; with two or more, the first two are the eyes.

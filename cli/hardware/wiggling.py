@@ -1,4 +1,4 @@
-"""Encoder readings and marker positions while the arm is moved, each as it came: live, into a file, out of one."""
+"""Read encoders and marker while the arm is moved, unpaired: live, or from a file; and write them to one."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from bodyschema.daemon.sampler.sources import Sources
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import RecordingError, SourceEnded, SourceLost
 from bodyschema.interfaces.records import JointReading, MarkerFix, MarkerMiss
+from bodyschema.interfaces.waits import READ_S
 from bodyschema.interfaces.whole_files import write_whole
 from bodyschema.robot.limited import read_at_most
 
-READ_S = 0.2
 LIMIT_S = 30.0  # without a fix
 POSITION = ("x", "y", "z")
 

@@ -24,12 +24,12 @@ from bodyschema.daemon.transport.identity import SECURE, Identity, TlsConfig
 from bodyschema.daemon.transport.zenoh_config import ENDPOINT, HOW_TO
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.waits import POLL_S
 from bodyschema.robot.description import NAME
 from bodyschema.robot.toml_file import convert, line_of, read_toml
 
 log = logging.getLogger(__name__)
 
-TICK_S = 0.1
 PASSING_ON = "passing on"
 
 
@@ -132,5 +132,5 @@ def run_router(config: RouterConfig, stopping: Callable[[], bool], notifier: Not
         service.tell(f"takes connections on {config.tables.listen}")
         while not stopping():
             service.beat(PASSING_ON)
-            time.sleep(TICK_S)
+            time.sleep(POLL_S)
         service.stopping()

@@ -23,10 +23,8 @@ from bodyschema.daemon.transport.status import UNDECIDED, BusStatus, LearnerStat
 from bodyschema.daemon.transport.wire import decode
 from bodyschema.daemon.transport.zenoh_config import PROCESSES
 from bodyschema.interfaces.errors import BusError, RequestError
+from bodyschema.interfaces.waits import ANSWER_LIMIT_S, STATUS_EVERY_S
 from bodyschema.learning.status import OrientationStatus
-
-ANSWER_LIMIT_S = 2.0
-EVERY_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +67,7 @@ class Watcher:
         """Yield their states about once a second, without end."""
         while True:
             yield self.look()
-            time.sleep(EVERY_S)
+            time.sleep(STATUS_EVERY_S)
 
     def _ask(self, process: str) -> bytes | None:
         try:

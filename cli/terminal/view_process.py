@@ -11,10 +11,10 @@ from pathlib import Path
 
 from bodyschema.daemon.service.signals import with_parent
 from bodyschema.interfaces.interpreter import module_command
+from bodyschema.interfaces.waits import END_LIMIT_S
 
 log = logging.getLogger(__name__)
 
-END_LIMIT_S = 5.0
 PORT = 8420
 
 

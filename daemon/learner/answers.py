@@ -25,6 +25,7 @@ from bodyschema.daemon.transport.wire import (
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import JointReading
+from bodyschema.interfaces.waits import READ_S, RETRY_S
 from bodyschema.learning.model_bank import LearntModel
 from bodyschema.learning.online_learner import OnlineLearner
 from bodyschema.learning.snapshot import NoFrameError, Prediction, Snapshot
@@ -127,9 +128,6 @@ def _poses(prediction: Prediction) -> list[MarkerPose]:
 
 log = logging.getLogger(__name__)
 
-READ_TIMEOUT_S = 0.2
-RETRY_S = 1.0
-
 
 class ExpectedMarker:
     """Follows the encoders, and publishes the current model's prediction for them.
@@ -196,6 +194,6 @@ class ExpectedMarker:
 
     def _follow(self, joints: ReconnectingSource[JointReading]) -> None:
         while not self._stop.is_set():
-            reading = joints.read(READ_TIMEOUT_S)
+            reading = joints.read(READ_S)
             if reading is not None:
                 self.take(reading)

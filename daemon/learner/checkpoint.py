@@ -162,7 +162,7 @@ def _decode(file: Path, data: bytes) -> tuple[_Header, memoryview]:
 
 
 def _keep_previous(file: Path) -> None:
-    """Give the current checkpoint a second name first, so that its own name always exists."""
+    """Link the current checkpoint under a second name before it is replaced, so that one is always complete."""
     if not file.exists():
         return
     previous = generations(file)[1]

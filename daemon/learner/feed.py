@@ -15,12 +15,12 @@ from bodyschema.daemon.sampler.history import Page, Unreadable
 from bodyschema.daemon.transport.wire import PairMessage, decode, pair_from_wire
 from bodyschema.interfaces.errors import BusError, RequestError
 from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.waits import RETRY_S
 from bodyschema.learning.online_learner import OnlineLearner
 
 log = logging.getLogger(__name__)
 
 WAITING = 1024
-RETRY_S = 1.0
 # Health reports a learner that is this many pairs behind: more than arrive in two or three seconds.
 BEHIND = 100
 

@@ -33,11 +33,10 @@ from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.wire import encode
 from bodyschema.interfaces.errors import BodyschemaError, ConfigError
 from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.waits import NICENESS, RETRY_S, STATUS_EVERY_S
 
 IDLE_S = 0.02
 SOLVE_WHEN_IDLE_S = 0.5
-RESTART_S = 1.0
-NICENESS = 10
 # A thread that waits for a lock gets it between two pieces of work.
 BREATH_S = 1e-4
 
@@ -90,7 +89,7 @@ class Background:
                 log.warning("%s", error)
                 for worker in self._workers:
                     worker.restart_solver()
-                self._stop.wait(RESTART_S)
+                self._stop.wait(RETRY_S)
                 continue
             if worked:
                 self._stop.wait(max(self._rest * (time.thread_time() - begin), BREATH_S))
@@ -115,7 +114,6 @@ class Background:
 log = logging.getLogger(__name__)
 
 TICK_S = 0.05
-STATUS_EVERY_S = 1.0
 # Fraction of one processor; the rest is left to new pairs and queries, which share the interpreter.
 SHARED_WORK = 0.3
 # Python's thread switch interval; its default of 5 ms would delay every query.

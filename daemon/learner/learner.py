@@ -29,6 +29,7 @@ from bodyschema.daemon.transport.wire import OCTETS, CommandReply, CommandReques
 from bodyschema.daemon.wiring.wiring import open_marker_topic
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.waits import READ_S
 from bodyschema.learning.nominal import NominalModel
 from bodyschema.learning.online_learner import OnlineLearner
 from bodyschema.learning.solvers.solver import LARGEST_NET, Solver
@@ -36,7 +37,6 @@ from bodyschema.learning.solvers.solver import LARGEST_NET, Solver
 log = logging.getLogger(__name__)
 
 HISTORY_LIMIT_S = 5.0
-IDLE_S = 0.2
 # How long pairs may wait to be evaluated as one batch, per robot of a process, and at most [s].
 TOGETHER_S, LONGEST_TOGETHER_S = 0.08, 1.0
 # Up to this many robots per process, states and checkpoints are as frequent as for one alone.
@@ -323,7 +323,7 @@ class Learner:
     def _learn_pairs(self) -> None:
         while not self._stop.is_set():
             self._service.beat(self._loop)
-            self._feed.step(IDLE_S)
+            self._feed.step(READ_S)
             self._learning.judge_due(self._clock.now())
             with self._feed.lock:
                 self._changes.note(self._learning.change)

@@ -24,6 +24,7 @@ import numpy as np
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.interpreter import module_command
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.waits import END_LIMIT_S
 from bodyschema.learning.model_bank import RESIDUAL
 from bodyschema.learning.solvers.orientation import OrientationSolution
 from bodyschema.learning.solvers.solver import DirectSolver, Solved, Task
@@ -31,7 +32,6 @@ from kbmaps import ChainBelief, ChainTolerances, KBMap, OrientedChain, ResidualM
 
 NICENESS = 5
 LONGEST_REST_S = 5.0
-END_LIMIT_S = 5.0
 _LENGTH = struct.Struct("<I")
 
 

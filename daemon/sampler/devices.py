@@ -64,7 +64,7 @@ class DeviceWatch:
         self.changes: list[str] = []
 
     def note_again(self) -> None:
-        """Start again for a new session, which has its own record."""
+        """Start the record of a new session."""
         self._kept = ()
 
     def look(self) -> bool:

@@ -17,6 +17,7 @@ from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode
 from bodyschema.interfaces.errors import BusError, ConfigError, RequestError
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.waits import RETRY_S
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.pointing import Pointing
 
@@ -27,7 +28,6 @@ log = logging.getLogger(__name__)
 PERIOD_S = 0.04
 GAIN = 0.5  # fraction of a step towards the centre; the head follows with a delay
 GOOD_M = 0.02  # a learnt model with a larger uncertainty at the hand is not used
-ASK_AGAIN_S = 1.0
 PREDICT_S = 0.2  # how long the head waits for the learner
 
 Predict = Callable[[bytes], bytes]
@@ -59,7 +59,7 @@ class HandModel:
         try:
             reply = decode(self._predict(encode(JointsRequest(q.tolist()))), PredictReply)
         except (BusError, RequestError):
-            self._ask_s = self._clock.now() + ASK_AGAIN_S
+            self._ask_s = self._clock.now() + RETRY_S
             return None
         x = np.array(reply.x)
         is_good = reply.in_support[:1] == [True] and max(reply.sigma[0]) <= GOOD_M
@@ -67,7 +67,7 @@ class HandModel:
 
 
 class GazeLoop:
-    """Aims the head, in a thread of its own. If that fails the head stands still, as its target is stale."""
+    """Aims the head in a separate thread. If the thread fails, the target becomes stale and the head stands still."""
 
     def __init__(self, robot: RobotDescription, head: Head, model: HandModel) -> None:
         """Store the settings; nothing is started yet.

@@ -11,12 +11,11 @@ from typing import Generic, Protocol, Self, TypeVar
 from bodyschema.interfaces.errors import SourceError, SourceLost, StoreUnwritable
 from bodyschema.interfaces.protocols import Clock, Source
 from bodyschema.interfaces.records import FloatArray, MarkerFix, Pair
+from bodyschema.interfaces.waits import FIRST_WAIT_S, LONGEST_WAIT_S
 from bodyschema.recordings.store.store import PairStore
 
 log = logging.getLogger(__name__)
 
-FIRST_WAIT_S = 0.5
-LONGEST_WAIT_S = 30.0
 
 R_co = TypeVar("R_co", covariant=True)
 

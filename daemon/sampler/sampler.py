@@ -24,7 +24,8 @@ from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, RequestError, SourceEnded
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray, JointReading, MarkerFix, MarkerMiss, Reason
-from bodyschema.recordings.store.file import disk_free
+from bodyschema.interfaces.waits import READ_S, SILENT_AFTER_S, STATUS_EVERY_S
+from bodyschema.recordings.store.file import LOW_DISK_BYTES, disk_free
 from bodyschema.recordings.store.store import PairStore
 
 from .align import JointBuffer
@@ -40,14 +41,10 @@ from .sources import Sources
 
 log = logging.getLogger(__name__)
 
-READ_TIMEOUT_S = 0.2
 JOINTS_TIMEOUT_S = 1.0  # how long a frame waits for the encoders to reach its time
 AROUND_S = 0.1  # [s] around a frame whose time is uncertain, to estimate the joints' speed
-STATUS_EVERY_S = 1.0
-SILENT_AFTER_S = 2.0  # a source without data for this long is reported
 ZERO_FORCE = "zero_force"  # value of [robot] hold, and name of the drive
 PAIR_CACHE = 1000
-LOW_DISK_BYTES = 200 * 2**20
 # Loops that must keep running.
 LOOPS = ("encoders", "frames")
 
@@ -210,7 +207,7 @@ class Sampler:
         while not self._stopping:
             self._tell_when_due()
             try:
-                seen = self._marker.read(READ_TIMEOUT_S)
+                seen = self._marker.read(READ_S)
             except SourceEnded:
                 break
             self._check_encoders()
@@ -234,7 +231,7 @@ class Sampler:
         log.info("the sources are through; %d pairs are in the store", self._seq)
         self._tell()
         while not (self._stopping or self._exit_at_end):
-            time.sleep(READ_TIMEOUT_S)
+            time.sleep(READ_S)
             self._tell_when_due()
 
     def _take(self, seen: MarkerFix | MarkerMiss) -> Reason | None:
@@ -302,7 +299,7 @@ class Sampler:
         try:
             while not self._stopping:
                 self._service.beat("encoders")
-                reading = self._joints.read(READ_TIMEOUT_S)
+                reading = self._joints.read(READ_S)
                 if reading is not None:
                     self._take_reading(reading)
                 elif self._joints.trouble is not None:

@@ -16,6 +16,7 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.protocols import Clock, JointSource, MarkerSource, Source
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.robot.description import LONGEST_TOOL_M
 from kbmaps import RigidChain
 
 Picture = Callable[[], bytes | None]
@@ -57,7 +58,7 @@ class Powered(Protocol):
         ...
 
     def ask(self, on: bool) -> Future[str]:
-        """Request torque on or off; the answer comes from the reading thread, unless it is cancelled before."""
+        """Request torque on or off. The reading thread answers, unless the request is cancelled before."""
         ...
 
 
@@ -166,10 +167,6 @@ class MarkerTopic(Source, Protocol):
     def publish(self, stamp_ns: int, x: FloatArray, sigma: FloatArray) -> None:
         """Publish a position [m] and its 1-sigma per axis [m], shapes (3,), at a time on the encoders' clock [ns]."""
         ...
-
-
-# A longer tool is a mistake of units.
-LONGEST_TOOL_M = 2.0
 
 
 class ToolRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -32,7 +32,7 @@ class PlainFormatter(logging.Formatter):
 
 
 class JournalFormatter(PlainFormatter):
-    """One line per event, with a priority like `<4>` at its head and without a time: the journal has its own."""
+    """Format an event as one line with a priority such as `<4>`, without a time: the journal adds its own."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the formatted record; several lines, as in a traceback, are joined into one."""

@@ -11,13 +11,11 @@ from collections.abc import Sequence
 
 from bodyschema.daemon.service.signals import with_parent
 from bodyschema.interfaces.errors import BodyschemaError
+from bodyschema.interfaces.waits import FIRST_WAIT_S, LONGEST_WAIT_S, POLL_S
 
 log = logging.getLogger(__name__)
 
-POLL_S = 0.1
 SETTLED_AFTER_S = 30.0  # longer than any start, also on a busy machine
-FIRST_WAIT_S = 0.5
-LONGEST_WAIT_S = 30.0
 END_LIMIT_S = 10.0
 
 

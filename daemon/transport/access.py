@@ -98,7 +98,7 @@ def deeds(role: str, keys: Keys) -> dict[Deed, tuple[str, ...]]:
 
 
 def access_control(names_of_robot: Mapping[str, Names], subjects: Subjects) -> dict[str, Any]:
-    """Return zenoh's table `access_control`: deny everything except what the roles do under their robots' keys.
+    """Return zenoh's table `access_control`: each role may use the keys of its robots; all else is denied.
 
     Args:
         names_of_robot: names per role, by the robot's name, or `*` for every robot.

@@ -274,7 +274,7 @@ class ZenohSession:
             query.drop()
 
     def _refuse(self) -> None:
-        """Refuse queries beyond the limits, in a thread of its own: a client that does not listen blocks it."""
+        """Refuse queries beyond the limits, in a separate thread: a client that does not listen blocks it."""
         while (refused := self._refusals.get()) is not None:
             with contextlib.suppress(zenoh.ZError), refused[0]:  # a closed session cannot answer
                 _reply_error(*refused)

@@ -16,6 +16,7 @@ from bodyschema.daemon.sampler.reconnect import ReconnectingSource
 from bodyschema.interfaces.errors import ConfigError, SourceEnded
 from bodyschema.interfaces.protocols import Clock, StereoEyes
 from bodyschema.interfaces.records import ImageArray, Reason
+from bodyschema.interfaces.waits import READ_S
 from bodyschema.robot.hand_eye import HandEye
 from bodyschema.robot.rpy import pose_of
 from bodyschema.vision.calibration.images import Images, read_pairs
@@ -29,7 +30,6 @@ from bodyschema.vision.tags.dictionary import tags_of
 from bodyschema.vision.tags.finder import Seen, TagFinder
 from bodyschema.vision.tags.image import TagImage
 
-READ_S = 0.2
 _IMAGES = 20  # images during the observation
 
 

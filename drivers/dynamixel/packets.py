@@ -26,7 +26,7 @@ PING, REBOOT = 1, 8
 
 
 class _Caught:
-    """Stand-in for a port that captures what the SDK would send."""
+    """Port that captures the packets of the SDK instead of sending them."""
 
     is_using = False
     packet = b""

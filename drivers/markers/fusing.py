@@ -154,7 +154,7 @@ class Member:
 
 
 class FusedMarkers:
-    """A `MarkerSource` of several, each in its own frame and at its own times.
+    """`MarkerSource` that fuses several sources with different frames and time stamps.
 
     The first source that sees the marker leads. The others' positions are interpolated to its times, and all are
     averaged with their full covariances as weights. Where they contradict each other, there is no position.
@@ -290,7 +290,7 @@ def _rigid(points: FloatArray, targets: FloatArray) -> tuple[FloatArray, float]:
 
 
 def _moved(fix: MarkerFix, pose: FloatArray) -> MarkerFix:
-    """Return the fix in the frame in which `pose` (4, 4) is that of its own."""
+    """Return the fix transformed by `pose` (4, 4), the pose of its frame in the target frame."""
     if np.array_equal(pose, np.eye(4)):
         return fix
     R = pose[:3, :3]

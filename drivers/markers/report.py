@@ -1,4 +1,4 @@
-"""What a program sent about a body, and the reasons for which it is not used."""
+"""Report of a program about a body, and the reasons to reject it."""
 
 from __future__ import annotations
 

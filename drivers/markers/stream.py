@@ -20,6 +20,7 @@ from bodyschema.drivers.ros2.senders import Refusal, Sender
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, frozen_array
+from bodyschema.interfaces.waits import POLL_S, RIVAL_AFTER_S, SILENT_AFTER_S
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ class Ledger:
             yield f"{name}: {counts[fault]} of the last {whole} messages {self.explained(fault)}"
 
     def explained(self, fault: Fault) -> str:
-        """Return what a fault is, with its newest detail and the remedy."""
+        """Return the description of a fault, with its newest detail and the remedy."""
         what, remedy = ADVICE[fault]
         detail = self._details.get(fault, "")
         return f"{what}{f' ({detail})' if detail else ''}: {remedy}"
@@ -106,8 +107,6 @@ class Ledger:
 
 log = logging.getLogger(__name__)
 
-SILENT_AFTER_S = 2.0
-RIVAL_AFTER_S = 1.0  # after this silence of a sender another one is accepted
 FARTHEST_M = 50.0  # no arm is measured over a larger distance: such a number is in millimetres
 STAMPS = {
     Refusal.NO_STAMP: Fault.NO_STAMP,
@@ -313,7 +312,7 @@ class MarkerStream:
         return t - report.age_s - self._table.latency_s, math.hypot(self._clock_of.sigma_s, self._table.sigma_s)
 
     def _count_lost(self, seq: int | None, packet: Packet) -> Fault | None:
-        """Count the numbers that the sender's messages leave out; return what the order of its numbers says."""
+        """Count the sequence numbers missing in the sender's messages; return the verdict on their order."""
         if seq is None:
             return None
         numbers = self._numbers.get(packet.sender)
@@ -390,7 +389,6 @@ class _Numbers:
 
 
 READ_S = 2.5  # until the clock of the stamps is known to milliseconds
-WAIT_S = 0.1
 
 
 def stream_checks(stream: MarkerStream, clock: Clock, read_s: float = READ_S) -> Iterator[Check]:
@@ -405,9 +403,9 @@ def stream_checks(stream: MarkerStream, clock: Clock, read_s: float = READ_S) ->
     try:
         with stream:
             fixes: list[MarkerFix] = []
-            end = clock.now() + max(read_s, SILENT_AFTER_S + WAIT_S)
+            end = clock.now() + max(read_s, SILENT_AFTER_S + POLL_S)
             while clock.now() < end:
-                seen = stream.read(WAIT_S)
+                seen = stream.read(POLL_S)
                 if isinstance(seen, MarkerFix):
                     fixes.append(seen)
             complaints = stream.health
@@ -426,7 +424,7 @@ def stream_checks(stream: MarkerStream, clock: Clock, read_s: float = READ_S) ->
 
 def _of_fixes(subject: str, fixes: list[MarkerFix]) -> Iterator[Check]:
     last = fixes[-1]
-    rate = (len(fixes) - 1) / max(last.t - fixes[0].t, WAIT_S)
+    rate = (len(fixes) - 1) / max(last.t - fixes[0].t, POLL_S)
     place = ", ".join(f"{1e3 * value:.1f}" for value in last.x)
     sigma = 1e3 * float(np.sqrt(np.linalg.eigvalsh(last.cov)[-1]))
     said = f"{rate:.0f} positions/s, last at ({place}) mm ± {sigma:.2g} mm, time known to {1e3 * last.t_sigma:.1f} ms"

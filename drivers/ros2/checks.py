@@ -8,13 +8,13 @@ from collections.abc import Iterator, Sequence
 from bodyschema.drivers.checks import MANY_TROUBLES, READ_S, Check
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.waits import POLL_S
 
 from .config import Ros2Config
 from .joints import SILENT_AFTER_S, Ros2Joints
 from .link import OpenLink, open_zenoh
 
 FEW_PER_S = 20.0
-WAIT_S = 0.1
 LAST_PART = re.compile(r"[;.] (?!.*[;.] )", re.DOTALL)
 
 
@@ -55,9 +55,9 @@ def joint_state_checks(
 
 def _begins(robot: Ros2Joints, clock: Clock) -> bool:
     """Return True if a reading arrives before the robot counts as silent."""
-    end = clock.now() + SILENT_AFTER_S + WAIT_S
+    end = clock.now() + SILENT_AFTER_S + POLL_S
     while clock.now() < end:
-        if robot.read(WAIT_S) is not None:
+        if robot.read(POLL_S) is not None:
             return True
     return False
 

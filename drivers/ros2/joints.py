@@ -19,6 +19,7 @@ from bodyschema.drivers.ros2.senders import Gates, Refusal, Sender
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import JointReading, frozen_array
+from bodyschema.interfaces.waits import RIVAL_AFTER_S, SILENT_AFTER_S
 
 LONGEST = 4096
 
@@ -178,8 +179,6 @@ def _unheard(config: Ros2Config, topics: Sequence[rmw.Topic]) -> str:
 log = logging.getLogger(__name__)
 
 SLACK_RAD, SLACK_M = 0.02, 2e-3
-SILENT_AFTER_S = 2.0
-RIVAL_AFTER_S = 1.0  # after this silence of the node that published a joint, another node is accepted
 SENDERS = 64
 NAMES = 256  # upper bound of the names kept for messages
 

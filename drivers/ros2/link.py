@@ -12,6 +12,7 @@ import zenoh
 
 from bodyschema.interfaces.errors import SourceLost
 from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.waits import POLL_S
 
 from . import rmw
 from .config import Ros2Config
@@ -19,7 +20,6 @@ from .messages import JOINT_STATE
 
 RETRY_S = 0.5  # asking for an absent router is cheap
 WAITING = 4096  # messages: four seconds at 1 kHz
-LOOK_EVERY_S = 0.1  # period of checking that the router is still there
 GRAPH_LIMIT_S = 1.0
 
 
@@ -120,9 +120,9 @@ class ZenohLink:
         while True:
             left = until - self._clock.now()
             try:
-                return self._waiting.get(timeout=min(max(left, 0.0), LOOK_EVERY_S))
+                return self._waiting.get(timeout=min(max(left, 0.0), POLL_S))
             except queue.Empty:
-                if left <= LOOK_EVERY_S or not self.is_connected:
+                if left <= POLL_S or not self.is_connected:
                     return None
 
     def tokens(self) -> Sequence[str]:

@@ -14,7 +14,7 @@ from bodyschema.drivers.echo import BITS_PER_BYTE
 from bodyschema.drivers.serial_line import RETRY_S, SerialLine
 from bodyschema.drivers.serial_lines.config import SerialLinesConfig
 from bodyschema.drivers.servos.port import Port
-from bodyschema.drivers.turn_count import TurnCount
+from bodyschema.drivers.turn_count import LOST_AFTER_S, TurnCount
 from bodyschema.drivers.turns import SpeedGate
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.protocols import Clock
@@ -44,7 +44,6 @@ _SETTINGS = _Settings()
 
 ASK_EVERY_S = 0.5
 LARGEST_SIGMA_S = 5e-3  # of a reading's time
-LOST_AFTER_S = 0.25  # without a reading; no joint makes half a turn unnoticed in this time
 
 OpenPort = Callable[[SerialLinesConfig, Clock], Port]
 

@@ -104,7 +104,7 @@ class Finding:
 
 
 def identify(bus: Bus, config: ServoConfig, model: Model, known: Mapping[int, Model]) -> Finding:
-    """Ask the servo of `config` whether it is a `model`; `known` are those that can be told by their number."""
+    """Check that the servo of `config` is a `model`; `known` are the models that have a model number."""
     layout = model.layout
     head = Register(0, max(layout["model"].end, layout["firmware"].end))
     data, trouble = read_register(bus, model, config.id, head)

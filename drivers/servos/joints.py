@@ -14,7 +14,7 @@ from bodyschema.drivers.echo import without_echo
 from bodyschema.drivers.servos.channel import Drive
 from bodyschema.drivers.servos.health import Inspection
 from bodyschema.drivers.servos.vendor import Plan
-from bodyschema.drivers.turn_count import TurnCount
+from bodyschema.drivers.turn_count import LOST_AFTER_S, TurnCount
 from bodyschema.drivers.turns import SpeedGate
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.protocols import Clock
@@ -30,8 +30,6 @@ from .port import Port
 from .vendor import ServoVendor
 
 log = logging.getLogger(__name__)
-
-LOST_AFTER_S = 0.25  # without a reading; no joint makes half a turn unnoticed in this time
 
 
 @dataclass(frozen=True)

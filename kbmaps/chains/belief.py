@@ -10,14 +10,13 @@ from typing import Self, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import FloatArray, IntArray, frozen, rows, rows_or_vector
+from kbmaps.arrays import FloatArray, IntArray, batches, frozen, rows, rows_or_vector
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import CHAIN, WIDE, ChainParameters, ChainTolerances, chain_arrays, chain_from_arrays
 from kbmaps.errors import NonFiniteError, SettingError, ShapeError
 from kbmaps.packed import complete, number, pack, restoring, unpack
 
 _KIND = "belief in a rigid chain, 2"
-_BLOCK = 2048
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,8 +89,7 @@ class ChainBelief:
         """Return positions at q (n, d) and the first-order variance of each coordinate, both (n, 3) [m, m²]."""
         angles = rows("q", q, self.parameters.reference.joints)
         x, variance = np.empty((len(angles), 3)), np.empty((len(angles), 3))
-        for start in range(0, len(angles), _BLOCK):
-            part = slice(start, start + _BLOCK)
+        for part in batches(len(angles)):
             x[part], jacobian = self.parameters.linearised(self.mean, angles[part])
             variance[part] = np.square(jacobian @ self.root).sum(axis=2)
         return x, variance

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import solve_triangular  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 
-from kbmaps.arrays import FloatArray, frozen, rows
+from kbmaps.arrays import FloatArray, batches, frozen, rows
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import CHAIN, ChainParameters, chain_arrays, chain_from_arrays
@@ -28,7 +28,6 @@ _STEPS = 8
 _FREEDOM = 6.0
 # Lower bound of the noise of a measured orientation [rad]: below is rounding.
 _ROUNDING_RAD = 1e-8
-_BLOCK = 2048
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +86,7 @@ class OrientedChain:
         """
         angles = rows("q", q, self.parameters.reference.joints)
         rotations, variance = np.empty((len(angles), 3, 3)), np.empty((len(angles), 3))
-        for start in range(0, len(angles), _BLOCK):
-            part = slice(start, start + _BLOCK)
+        for part in batches(len(angles)):
             hand, omega = self.parameters.turned(self.mean, angles[part])
             rotations[part] = hand @ self.turn
             full = np.concatenate([omega, hand], axis=2)

@@ -54,8 +54,8 @@ class KeptPairs:
         """Replace the prior model behind the same pairs."""
         self.behind = model.predict(self.q)
 
-    def observations(self, kernel: ProductKernel, features: FloatArray) -> Observations:
-        """Return the pairs, weighted by their sigma and their age, with features (n, 3, p)."""
+    def observations(self, kernel: ProductKernel) -> Observations:
+        """Return the pairs, weighted by their sigma and their age."""
         pairs = with_units(self.q, self.x, self.sigma)
         shares = self._memory.weights(len(self.q))
         weights = shares / np.square(pairs.unit)
@@ -64,7 +64,6 @@ class KeptPairs:
             weights=kernel.joint_weights(self.q),
             scale=scale,
             errors=(self.x - self.behind) * scale[:, None],
-            features=features * scale[:, None, None],
             count=float(shares.sum()),
             log_weights=-2.0 * float(shares @ np.log(pairs.unit)),
             noise_known=pairs.known,

@@ -1,9 +1,8 @@
 """Gaussian inference on KB-Maps with as many unknowns as pairs: no vector of 3^d numbers is formed.
 
-Positions are y = H β + r + e with features H whose coefficients are β ~ N(0, 1), a KB-Map r whose coefficients are
-N(0, τ²) each, so that r has the covariance τ² k(q, q'), and noise e of variance s². With λ = s² / τ² everything
-follows from one Cholesky factorisation of K + λ I (Rasmussen and Williams, Gaussian Processes for Machine Learning,
-2006, sections 2.2 and 2.7).
+Positions are y = r + e with a KB-Map r whose coefficients are N(0, τ²) each, so that r has the covariance τ² k(q, q'),
+and noise e of variance s². With λ = s² / τ² everything follows from one Cholesky factorisation of K + λ I (Rasmussen
+and Williams, Gaussian Processes for Machine Learning, 2006, section 2.2).
 """
 
 from __future__ import annotations
@@ -54,7 +53,6 @@ class Observations:
         weights: of every joint (n, d, 3).
         scale: roots (n,) of the pairs' weights.
         errors: scaled residuals of the prior's mean (n, 3).
-        features: H, scaled (n, 3, p).
         count: effective number of pairs; less than n where some are partly forgotten.
         log_weights: sum of the logarithms of the pairs' inverse variances.
         noise_known: True if the noise of the scaled errors is 1; False if it is to be estimated.
@@ -63,7 +61,6 @@ class Observations:
     weights: FloatArray
     scale: FloatArray
     errors: FloatArray
-    features: FloatArray
     count: float
     log_weights: float
     noise_known: bool
@@ -76,14 +73,12 @@ class KernelFit:
         kernel: the product kernel.
         observations: the pairs.
         precision: λ; "evidence" takes the most probable one; None explains the pairs exactly by the smallest
-            coefficients (without features, where no pair contradicts another).
+            coefficients, where no pair contradicts another.
 
     Attributes:
         precision: λ; 0 for the exact one.
         noise_variance: s² of the scaled errors [m², or 1 where known].
         prior_variance: τ² of the map's coefficients [m²].
-        change: posterior mean of β (p,).
-        covariance: of β (p, p).
         log_evidence: log marginal likelihood at λ; None for the exact one.
 
     Raises:
@@ -94,7 +89,6 @@ class KernelFit:
         self._kernel = kernel
         self._seen = observations
         self._gram = ShiftedGram(self._scaled_gram())
-        self._flat = observations.features.reshape(len(observations.scale), -1)
         if precision is None:
             self._explain_exactly()
             return
@@ -112,37 +106,23 @@ class KernelFit:
             )
         self._condition(precision)
 
-    def mean(self, weights: FloatArray, features: FloatArray) -> FloatArray:
-        """Return the posterior mean minus the prior's (m, 3), for joint weights (m, d, 3) and features (m, 3, p)."""
-        added = features @ self.change
-        for start in range(0, len(weights), _SETTINGS.block):
-            part = slice(start, start + _SETTINGS.block)
-            added[part] += self._kernel_rows(weights[part]) @ self._multipliers
-        return added
+    def mean(self, weights: FloatArray) -> FloatArray:
+        """Return the posterior mean minus the prior's (m, 3), for joint weights (m, d, 3)."""
+        return np.concatenate([self._kernel_rows(part) @ self._multipliers for part in _parts(weights)])
 
-    def variance(self, weights: FloatArray, features: FloatArray) -> FloatArray:
-        """Return the posterior variance (m, 3) of each coordinate without noise [m²]."""
-        variance = np.empty((len(weights), 3))
-        for start in range(0, len(weights), _SETTINGS.block):
-            part = slice(start, start + _SETTINGS.block)
-            rows = self._kernel_rows(weights[part])
-            left = self.prior_variance * self._left_open(weights[part], rows)
-            unexplained = features[part] - (rows @ self._solved_features).reshape(features[part].shape)
-            spread = np.einsum("nip,pr,nir->ni", unexplained, self.covariance, unexplained, optimize=True)
-            variance[part] = left[:, None] + np.maximum(spread, 0.0)
-        return variance
+    def variance(self, weights: FloatArray) -> FloatArray:
+        """Return the posterior variance (m,) of each coordinate without noise [m²]."""
+        return self.prior_variance * self._left_open(weights)
 
     def unexplained(self, weights: FloatArray) -> FloatArray:
         """Return the share (m,) in 0..1 of the map's prior variance that remains after the pairs."""
-        shares = [
-            self._left_open(part, self._kernel_rows(part)) / self._kernel.diagonal(part) for part in _parts(weights)
-        ]
-        return np.concatenate(shares)
+        return self._left_open(weights) / self._kernel.diagonal(weights)
 
-    def _left_open(self, weights: FloatArray, rows: FloatArray) -> FloatArray:
+    def _left_open(self, weights: FloatArray) -> FloatArray:
         """Return k(q, q) − kᵀ (K + λ I)⁻¹ k (m,)."""
-        taken = np.einsum("mn,nm->m", rows, self._gram.solve(rows.T))
-        return np.clip(self._kernel.diagonal(weights) - taken, 0.0, None)
+        parts = (self._kernel_rows(part) for part in _parts(weights))
+        taken = [np.einsum("mn,nm->m", rows, self._gram.solve(rows.T)) for rows in parts]
+        return np.clip(self._kernel.diagonal(weights) - np.concatenate(taken), 0.0, None)
 
     def _kernel_rows(self, weights: FloatArray) -> FloatArray:
         return self._kernel.between(weights, self._seen.weights) * self._seen.scale
@@ -163,29 +143,17 @@ class KernelFit:
         products = [self._kernel_rows(part) @ multipliers for part in _parts(self._seen.weights)]
         return np.concatenate(products) * self._seen.scale[:, None]
 
-    def _evidence_of_noise(self, precision: float) -> tuple[LinearEvidence, FloatArray]:
-        """Return the evidence of s² at λ, and the directions V (p, p) of β that belong to it.
-
-        K + λ I must be factorised.
-        """
-        seen = self._seen
-        # Whitened by (K / λ + I)^(-1/2), the pairs are H β + e with equal independent noise.
-        scale = math.sqrt(precision)
-        errors = scale * self._gram.whiten(seen.errors).ravel()
-        features = scale * self._gram.whiten(self._flat).reshape(errors.size, -1)
-        # With fewer coordinates than features, add rows of zeros, so that V includes every direction of β.
-        lacking = max(features.shape[1] - errors.size, 0)
-        errors, features = np.pad(errors, (0, lacking)), np.pad(features, ((0, lacking), (0, 0)))
-        # Not by Hᵀ H: for a wide prior, rounding would exceed the pairs' information about its narrow directions.
-        reach, sizes, directions = np.linalg.svd(features, full_matrices=False)
-        along = errors @ reach
-        unreached = float(np.square(errors - reach @ along).sum())
-        return LinearEvidence(3.0 * seen.count, unreached, np.square(sizes), along), directions.T
+    def _evidence_of_noise(self, precision: float) -> LinearEvidence:
+        """Return the evidence of s² at λ. K + λ I must be factorised."""
+        # Whitened by (K / λ + I)^(-1/2), the errors have equal independent noise.
+        errors = math.sqrt(precision) * self._gram.whiten(self._seen.errors)
+        none = np.zeros(0)
+        return LinearEvidence(3.0 * self._seen.count, float(np.square(errors).sum()), none, none)
 
     def _log_evidence(self, precision: float) -> float:
         if not self._gram.factorise(precision):
             return -math.inf
-        evidence, _ = self._evidence_of_noise(precision)
+        evidence = self._evidence_of_noise(precision)
         return self._complete(evidence, precision, self._noise_variance(evidence))
 
     def _noise_variance(self, evidence: LinearEvidence) -> float:
@@ -200,15 +168,12 @@ class KernelFit:
         """Compute the posterior at λ."""
         if not self._gram.factorise(precision):
             raise SettingError(f"precision = {precision:.3g} is below rounding here; use None or a larger one")
-        evidence, directions = self._evidence_of_noise(precision)
+        evidence = self._evidence_of_noise(precision)
         variance = self._noise_variance(evidence)
         self.precision, self.noise_variance = precision, variance
         self.prior_variance = variance / precision
         self.log_evidence: float | None = self._complete(evidence, precision, variance)
-        self.change: FloatArray = directions @ evidence.mean(variance)
-        self.covariance: FloatArray = (directions * (variance / (variance + evidence.eigenvalues))) @ directions.T
-        self._solved_features = self._gram.solve(self._flat)
-        errors = self._seen.errors - self._seen.features @ self.change
+        errors = self._seen.errors
         multipliers = self._gram.solve(errors)
         # One step of refinement corrects the rounding of the factorisation.
         remaining = errors - self._times_gram(multipliers) - precision * multipliers
@@ -236,8 +201,6 @@ class KernelFit:
         # At λ = 0 the evidence is greatest at this variance of the coefficients.
         square = float(np.vdot(errors, self._multipliers)) / (3.0 * self._seen.count)
         self.prior_variance = max(square, VARIANCE_FLOOR)
-        self.change, self.covariance = np.zeros(0), np.zeros((0, 0))
-        self._solved_features = self._flat
 
 
 def _parts(weights: FloatArray) -> list[FloatArray]:

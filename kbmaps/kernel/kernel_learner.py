@@ -16,9 +16,10 @@ from kbmaps.arrays import FloatArray, rows_or_vector
 from kbmaps.chains.carried import Origin, Predictor, packable, unpacked
 from kbmaps.errors import DegenerateDataError, ModelFormatError, SettingError
 from kbmaps.kernel.kept_pairs import KeptPairs
-from kbmaps.kernel.kernel_fit import Precision
-from kbmaps.kernel.regression import KernelRegression
-from kbmaps.maps.basis import JointBasis, describe_bases, parse_bases
+from kbmaps.kernel.kernel_fit import KernelFit, Precision
+from kbmaps.kernel.product_kernel import ProductKernel
+from kbmaps.maps.basis import JointBasis, check_net_size, describe_bases, parse_bases
+from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap
 from kbmaps.maps.support import SUPPORT_LIMIT
 from kbmaps.memory import Memory, describe_memory, parse_memory
 from kbmaps.model import Estimate
@@ -29,7 +30,63 @@ _KIND = "kernel learner, 1"
 _ROUNDING = 1e-11
 
 
-class KernelLearner(KernelRegression):
+_THIRD_OF_A_TURN = 2.0 * math.pi / 3.0
+
+
+def sampled_map(model: Predictor, bases: Sequence[JointBasis]) -> KBMap:
+    """Return the KB-Map in these bases that agrees with a model at 3^d configurations (2 for each prismatic joint).
+
+    If the model is a KB-Map in another form, such as a rigid chain or a kernel learner around one, they agree
+    everywhere.
+
+    Raises:
+        NetSizeError: more than 3^13 control points.
+        BasisError, and errors of the model for joint values outside its domain.
+    """
+    check_net_size(bases, POSITION_OUTPUTS)
+    nodes = [_nodes(basis) for basis in bases]
+    grid = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, len(nodes))
+    net = model.predict(grid).T.reshape(3, *(len(values) for values in nodes))
+    for k, (basis, values) in enumerate(zip(bases, nodes, strict=True)):
+        solved = np.linalg.inv(basis.weights(values))
+        net = np.moveaxis(np.tensordot(solved, net, axes=(1, k + 1)), 0, k + 1)
+    return KBMap(tuple(bases), net)
+
+
+def _nodes(basis: JointBasis) -> FloatArray:
+    """Return values at which the basis functions differ well: the ends of the range and the middle [rad, m]."""
+    if basis.is_prismatic:
+        return np.array(basis.parameters[:2])
+    if basis.kind == "orthonormal":
+        low, high, _ = basis.parameters
+        centre, reach = 0.5 * (low + high), 0.5 * (high - low)
+    elif basis.kind == "bernstein":
+        reach, centre = basis.parameters
+    else:
+        centre, reach = 0.0, _THIRD_OF_A_TURN
+    return centre + min(reach, _THIRD_OF_A_TURN) * np.array([-1.0, 0.0, 1.0])
+
+
+# Large enough that rounding costs only two digits, small enough for a map that is not exactly of this form.
+_STEP = 1e-2
+
+
+def slopes(model: Predictor, q: ArrayLike, bases: Sequence[JointBasis]) -> FloatArray:
+    """Return the derivative (3, d) [m/rad, or m/m] of a model's positions at q (d,), or (n, 3, d) at q (n, d).
+
+    f(θ + h) − f(θ − h) = 2 sin h f'(θ) for any f = a + b cos θ + c sin θ and any h. So this is exact for KB-Maps in any
+    form; likewise with 2 h for a prismatic joint.
+    """
+    angles = rows_or_vector("q", q, len(bases))
+    steps = _STEP * np.eye(len(bases))
+    flat = angles.reshape(-1, 1, len(bases))
+    ahead, behind = (model.predict((flat + way * steps).reshape(-1, len(bases))) for way in (1.0, -1.0))
+    lengths = np.array([2.0 * (_STEP if basis.is_prismatic else math.sin(_STEP)) for basis in bases])
+    columns = (ahead - behind).reshape(len(flat), len(bases), 3) / lengths[:, None]
+    return columns.swapaxes(1, 2).reshape(*angles.shape[:-1], 3, len(bases))
+
+
+class KernelLearner:
     """Learns a KB-Map around a prior from n pairs with n² numbers instead of 3^d control points. A `Model`.
 
     Gives the same solution as `ExactLearner` where both can be computed. Use this one for fewer pairs than control
@@ -61,8 +118,69 @@ class KernelLearner(KernelRegression):
                 raise SettingError(f"precision must be finite and greater than 0, got {precision!r}")
         elif precision not in (None, "evidence"):
             raise SettingError(f'precision must be None, "evidence" or a number, got {precision!r}')
-        super().__init__(bases, precision, memory)
+        self._kernel = ProductKernel(bases)
+        self._precision: Precision = precision
+        self._memory = Memory() if memory is None else memory
+        self._pairs = KeptPairs(self.joints, self._memory)
+        self._fit: KernelFit | None = None
         self._prior: Predictor = Origin(self.joints) if prior is None else prior
+
+    @property
+    def joints(self) -> int:
+        """Number of joints d."""
+        return self._kernel.joints
+
+    @property
+    def bases(self) -> tuple[JointBasis, ...]:
+        return self._kernel.bases
+
+    @property
+    def pairs(self) -> int:
+        """Number of learnt pairs, those that no longer count included."""
+        return self._pairs.total
+
+    @property
+    def kept(self) -> int:
+        """Number of pairs that count."""
+        return len(self._pairs)
+
+    @property
+    def noise(self) -> float:
+        """Noise of a measured coordinate, 1-sigma [m]: estimated, or given with the pairs.
+
+        Raises:
+            DegenerateDataError: no pair has been learnt.
+        """
+        return math.sqrt(self._fitted().noise_variance) * self._pairs.mean_unit
+
+    @property
+    def log_evidence(self) -> float | None:
+        """Log marginal likelihood of the pairs; None for the exact solution. Raises DegenerateDataError."""
+        return self._fitted().log_evidence
+
+    def predict(self, q: ArrayLike) -> FloatArray:
+        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,)."""
+        angles = rows_or_vector("q", q, self.joints)
+        batch = np.atleast_2d(angles)
+        x = self._prior.predict(batch)
+        if self.kept:
+            x = x + self._fitted().mean(self._kernel.joint_weights(batch))
+        return x[0] if angles.ndim == 1 else x
+
+    def jacobian(self, q: ArrayLike) -> FloatArray:
+        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) at q (n, d).
+
+        Exact if the prior model is a KB-Map, also in another form such as a chain.
+        """
+        return slopes(self, q, self.bases)
+
+    def to_kbmap(self) -> KBMap:
+        """Return the learnt map with its 3^d control points, exact if the prior model is a KB-Map or a rigid chain.
+
+        Raises:
+            NetSizeError: more than 3^13 control points.
+        """
+        return sampled_map(self, self.bases)
 
     @property
     def prior_precision(self) -> float:
@@ -123,7 +241,7 @@ class KernelLearner(KernelRegression):
             return unknown.like(angles)
         weights = self._kernel.joint_weights(batch)
         fit = self._fitted()
-        sigma = np.sqrt(fit.variance(weights, _no_features(n)))
+        sigma = np.sqrt(np.repeat(fit.variance(weights)[:, None], 3, axis=1))
         return Estimate(self.predict(batch), sigma, fit.unexplained(weights) <= SUPPORT_LIMIT).like(angles)
 
     def to_bytes(self) -> bytes:
@@ -165,11 +283,12 @@ class KernelLearner(KernelRegression):
                 raise ModelFormatError("the prior predicts otherwise than the one that the stored learner had")
         return learner
 
-    def _behind(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return self._prior.predict(q), _no_features(len(q))
-
-    def _features(self) -> FloatArray:
-        return _no_features(self.kept)
+    def _fitted(self) -> KernelFit:
+        if not self.kept:
+            raise DegenerateDataError("there is nothing to tell before the first pair was learnt")
+        if self._fit is None:
+            self._fit = KernelFit(self._kernel, self._pairs.observations(self._kernel), self._precision)
+        return self._fit
 
 
 def _same(x: FloatArray, other: FloatArray) -> bool:
@@ -180,7 +299,3 @@ def _same(x: FloatArray, other: FloatArray) -> bool:
 def _parse_precision(value: Any) -> Precision:
     """Return a stored precision. Raises ModelFormatError."""
     return value if value is None or value == "evidence" else number(value, "the precision")
-
-
-def _no_features(count: int) -> FloatArray:
-    return np.zeros((count, 3, 0))

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from kbmaps import lapack
-from kbmaps.arrays import FloatArray, IntArray
+from kbmaps.arrays import FloatArray, IntArray, batches
 from kbmaps.maps.stack import BasisStack
 
 Check = Callable[[ArrayLike], FloatArray]
 """Turns what a caller gave into a finite array of the right shape, or raises."""
 
-_BATCH_ROWS = 1024
 _BLOCK = 64
 
 
@@ -43,7 +42,7 @@ class NumpyNet:
             left, right = stack.halves(angles)
             return planes.dot(right).reshape(count, -1).dot(left)
         out = np.empty((len(angles), count))
-        for rows in _batches(len(angles)):
+        for rows in batches(len(angles)):
             left, right = stack.halves(angles[rows])
             out[rows] = contracted(planes, left, right)
         return out
@@ -54,7 +53,7 @@ class NumpyNet:
         if angles.ndim == 1:
             return self._derivatives_of_few(angles, begin, end)
         out = np.empty((len(angles), end - begin, self._stack.joints))
-        for rows in _batches(len(angles)):
+        for rows in batches(len(angles)):
             out[rows] = self._derivatives_of_few(angles[rows], begin, end)
         return out
 
@@ -123,8 +122,3 @@ def contracted(planes: FloatArray, left: FloatArray, right: FloatArray) -> Float
     rows, width = left.shape
     by_left = (planes @ right.T).reshape(len(planes) // width, width, rows)
     return np.einsum("oln,nl->no", by_left, left)
-
-
-def _batches(count: int) -> Iterator[slice]:
-    """Yield batches of rows small enough to stay in the cache."""
-    return (slice(start, start + _BATCH_ROWS) for start in range(0, count, _BATCH_ROWS))

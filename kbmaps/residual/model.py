@@ -13,7 +13,7 @@ from typing import Self, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import FloatArray, IntArray, frozen, rows, rows_or_vector
+from kbmaps.arrays import FloatArray, IntArray, batches, frozen, rows, rows_or_vector
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import CHAIN, ChainParameters, chain_arrays, chain_from_arrays
@@ -26,7 +26,6 @@ _SCALING = ("middle", "half", "centre", "load")
 _GROUP = "group "
 # Lumped loads on linear springs are accurate to a few per cent of the deflection that they explain.
 _LAW_ERROR = 0.03
-_BLOCK = 1024
 # Fourth-order differences [rad, m]: truncation and rounding errors are both about 1e-13 of the derivative.
 _STEP = 1e-3
 _STENCIL = np.array([-2.0, -1.0, 1.0, 2.0])
@@ -134,8 +133,7 @@ class ResidualModel:
         """Return positions at q (n, d) and the first-order variance of each coordinate, both (n, 3) [m, m²]."""
         angles = rows("q", q, self.joints)
         x, variance = np.empty((len(angles), 3)), np.empty((len(angles), 3))
-        for start in range(0, len(angles), _BLOCK):
-            part = slice(start, start + _BLOCK)
+        for part in batches(len(angles)):
             point = self.features.linearised(self.change, self.chain, self.weights, angles[part], tuple(self.weights))
             design = np.concatenate([point.chain, *point.groups.values()], axis=2)
             x[part], variance[part] = point.x, np.square(design @ self.root).sum(axis=2)

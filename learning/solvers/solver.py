@@ -212,7 +212,7 @@ class DirectSolver:
             yield Solved(task.number, self._pairs, orientation=turns.solve(rigid.belief))
 
     def _solved_of_some(self, task: Task) -> Iterator[Solved]:
-        """Yield the chain of the first pairs only: the others can judge it, even if none come after them."""
+        """Yield the chain fitted to the first pairs only, so that the remaining pairs can test it."""
         some = int(len(self._q) * _SETTINGS.first_share)
         if some >= _SETTINGS.fewest_first:
             wide = fitted_belief(self._before, self._q[:some], self._x[:some])

@@ -89,6 +89,9 @@ def free_bytes(file: Path) -> int:
     return shutil.disk_usage(file.parent).free
 
 
+LOW_DISK_BYTES = 200 * 2**20  # below this the sampler warns, and the doctor
+
+
 def disk_free(file: Path) -> int:
     """Return the free bytes on the store's disk. StoreError if its directory is gone."""
     try:

@@ -357,7 +357,7 @@ class PairStore:
         return pair
 
     def note_devices(self, utc: str, record: Sequence[Mapping[str, object]]) -> None:
-        """Store what the joints are read with from the next pair on.
+        """Store the encoders that the joints are read with from the next pair on.
 
         Raises:
             StoreError: the disk is full or broken.

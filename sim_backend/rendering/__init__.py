@@ -1,1 +1,1 @@
-"""Rendered stereo images: what the cameras see, in a process of its own."""
+"""Stereo images rendered in a separate process."""

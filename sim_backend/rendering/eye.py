@@ -132,7 +132,7 @@ def _colour(rng: np.random.Generator, ball: int, gap: int) -> tuple[int, int, in
 
 
 class TagSheets:
-    """Tags on a rigid body, each on a sheet of its own that is seen from its front alone."""
+    """Tags on a rigid body, each on a separate sheet that is visible from the front only."""
 
     def __init__(self, tags: Sequence[SimTag], dictionary: int) -> None:
         patterns = cv2.aruco.getPredefinedDictionary(dictionary)

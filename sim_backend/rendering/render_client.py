@@ -15,13 +15,12 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import SourceLost
 from bodyschema.interfaces.interpreter import module_command
 from bodyschema.interfaces.records import ImageArray
+from bodyschema.interfaces.waits import END_LIMIT_S
 from bodyschema.sim_backend.bullet import PhysicsUrdf
 from bodyschema.sim_backend.config import SimConfig
 
 from .render_messages import SLOTS, Frame, Setup, Tool, frame_bytes, send, slot_images
 from .scene import Scene
-
-_END_S = 5.0
 
 
 class RenderProcess:
@@ -120,7 +119,7 @@ class RenderProcess:
 
     def _end(self) -> None:
         try:
-            self.process.wait(_END_S)
+            self.process.wait(END_LIMIT_S)
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from .arrays import FloatArray, vector
 from .files import write_recording
-from .mujoco_urdf import FLOOR, MARKER, MODELS, Urdf
+from .mujoco_urdf import FLOOR, MARKER, MODELS, Model, Urdf
 from .mujoco_world import STEP_S, Hinge, World
 
 Style = Literal["walk", "static"]
@@ -385,16 +385,8 @@ def hide(
     loads = nominal.loads(postures)[:, [nominal.address(name) for name in model.joints]]
     drawn_dense = float(np.exp(rng.uniform(*np.log(DENSE_SCALES)))) if rng.random() < 0.5 else 0.0
     dense = drawn_dense if dense is None else dense
-    drawn = Drawn(
-        urdf,
-        urdf.copy(),
-        rng,
-        postures,
-        _levers(nominal, postures),
-        loads,
-        float(np.exp(rng.uniform(*np.log(NOISE_M)))),
-        dense,
-    )
+    levers, noise_m = _levers(nominal, postures), float(np.exp(rng.uniform(*np.log(NOISE_M))))
+    drawn = Drawn(urdf, urdf.copy(), rng, postures, levers, loads, noise_m, dense)
     pose_known, marker_known = (bool(known) for known in rng.random(2) < 0.5)
     kind = list(KINDS)[seed % len(KINDS)] if kind is None else kind
     KINDS[kind](drawn)
@@ -415,18 +407,7 @@ def hide(
     truth = [one for one in drawn.truth if style == "walk" or one.name not in IN_MOTION_ALONE]
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "arm.urdf").write_text(urdf.text, encoding="utf-8")
-    config = CONFIG.format(
-        name=model.name,
-        joints=", ".join(f'"{name}"' for name in model.joints),
-        marker=MARKER,
-        marker_xyz=list(vector(marker)),
-        marker_known=str(marker_known).lower(),
-        floor=FLOOR,
-        xyz=list(vector(stated[1])),
-        rpy=list(vector(stated[0].as_euler("xyz"))),
-        pose_known=str(pose_known).lower(),
-    )
-    (folder / "robot.toml").write_text(config, encoding="utf-8")
+    (folder / "robot.toml").write_text(_config(model, marker, marker_known, stated, pose_known), encoding="utf-8")
     for file, one in (("recording.csv", taken), ("fresh.csv", fresh)):
         write_recording(folder / file, model.joints, one.t, None, one.q, one.x, None)
     return Case(
@@ -446,6 +427,22 @@ def hide(
         pose_known,
         marker_known,
         (nominal.poses(taken.q), nominal.poses(fresh.q)),
+    )
+
+
+def _config(
+    model: Model, marker: FloatArray, marker_known: bool, pose: tuple[Rotation, FloatArray], pose_known: bool
+) -> str:
+    return CONFIG.format(
+        name=model.name,
+        joints=", ".join(f'"{name}"' for name in model.joints),
+        marker=MARKER,
+        marker_xyz=list(vector(marker)),
+        marker_known=str(marker_known).lower(),
+        floor=FLOOR,
+        xyz=list(vector(pose[1])),
+        rpy=list(vector(pose[0].as_euler("xyz"))),
+        pose_known=str(pose_known).lower(),
     )
 
 

@@ -8,11 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from planted_chains import bases_for, random_chain, random_map, random_q
 
-from kbmaps import ChainTolerances, ExactLearner, KernelLearner, Memory, SettingError, StructuredLearner
+from kbmaps import ExactLearner, KernelLearner, Memory, SettingError
 
 seeds = st.integers(0, 2**32 - 1)
 KINDS = "RPR"
-TOLERANCES = ChainTolerances(axes=0.05, points=0.01, tool=0.03)
 
 
 def stream(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -71,18 +70,6 @@ def test_a_window_stays_exact_over_a_long_run():
         windowed.learn(q[part], x[part])
     fresh.learn(q[-200:], x[-200:])
     np.testing.assert_allclose(windowed.solve(0.1).map.net, fresh.solve(0.1).map.net, rtol=0, atol=1e-12)
-
-
-@given(seed=seeds, window=st.integers(5, 30))
-def test_a_window_of_the_structured_learner_is_a_fresh_one_on_the_last_pairs(seed, window):
-    rng = np.random.default_rng(seed)
-    nominal = random_chain(rng, KINDS)
-    q, x = stream(rng, 40)
-    windowed = StructuredLearner(nominal, TOLERANCES, bases_for(KINDS), memory=Memory(window))
-    fresh = StructuredLearner(nominal, TOLERANCES, bases_for(KINDS))
-    windowed.learn(q, x)
-    fresh.learn(q[-window:], x[-window:])
-    np.testing.assert_array_equal(windowed.predict(q), fresh.predict(q))
 
 
 @given(seed=seeds, forgetting=st.floats(0.8, 1.0), n=st.integers(1, 150), precision=st.floats(1e-2, 10.0))

@@ -27,7 +27,6 @@ from kbmaps import (
     RigidLearner,
     SettingError,
     ShapeError,
-    StructuredLearner,
     TensorLearner,
     ToolLayer,
 )
@@ -38,7 +37,6 @@ MODELS: dict[str, Callable[[Arm], Model]] = {
     "kernel, from nothing": lambda arm: KernelLearner(bases_for(KINDS)),
     "kernel, exact": lambda arm: KernelLearner(bases_for(KINDS), arm.nominal, precision=None),
     "kernel, with a window": lambda arm: KernelLearner(bases_for(KINDS), arm.nominal, memory=Memory(8, 0.95)),
-    "structured": lambda arm: StructuredLearner(arm.nominal, ROUGH, bases_for(KINDS)),
     "tool layer": lambda arm: ToolLayer(arm.nominal),
     "tool layer on a map": lambda arm: ToolLayer(arm.nominal.to_kbmap(bases_for(KINDS), orientation=True)),
     "rigid": lambda arm: RigidLearner(arm.nominal, ROUGH),

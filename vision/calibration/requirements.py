@@ -27,7 +27,7 @@ _MOST_HAND_ERROR_M = 0.0015
 
 
 def lacking(coverage: Coverage) -> list[str]:
-    """Return messages for what the views lack, before a fit."""
+    """Return the requirements that the views do not meet, before a fit."""
     reasons = []
     who = "both eyes saw" if len(coverage.eyes) > 1 else "the camera saw"
     if coverage.whole_views < LEAST_VIEWS:

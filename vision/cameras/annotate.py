@@ -1,4 +1,4 @@
-"""Annotated camera images that show what the tracker sees."""
+"""Camera images annotated with the detections of the tracker."""
 
 from __future__ import annotations
 

@@ -17,11 +17,11 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import ConfigError, SourceError, SourceLost
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import ImageArray, StereoFrame
+from bodyschema.interfaces.waits import SILENT_AFTER_S
 
 from .config import CamerasConfig, RealsenseConfig
 from .stamps import Stamps
 
-SILENT_AFTER_S = 2.0
 WAITING = 16  # images in the SDK's queue: five frames of three images
 SKEW = 1e-3  # of rectified images: different focal lengths or turned eyes, relative or [rad]
 WINDOW_PX = 3  # around the marker's centre, in the depth image

@@ -4,21 +4,11 @@ from __future__ import annotations
 
 from benchmarks.peers.competitors.chains import drawing_of
 from benchmarks.peers.problem import Competitor, Fitted, Problem, any_of, needs_drawing
-from kbmaps import Ladder, ResidualLearner, StructuredLearner, learning_bases
-
-_MOST_PAIRS_STRUCTURED = 1000
+from kbmaps import Ladder, ResidualLearner
 
 
 def learn_residual(problem: Problem, _: Fitted | None) -> Fitted:
     learner = ResidualLearner(*drawing_of(problem))
-    learner.learn(problem.q, problem.x, problem.sigma)
-    learner.predict(problem.q[0])
-    return learner
-
-
-def learn_structured(problem: Problem, _: Fitted | None) -> Fitted:
-    chain, tolerances = drawing_of(problem)
-    learner = StructuredLearner(chain, tolerances, learning_bases(problem.low, problem.high))
     learner.learn(problem.q, problem.x, problem.sigma)
     learner.predict(problem.q[0])
     return learner
@@ -32,12 +22,6 @@ def learn_ladder(problem: Problem, _: Fitted | None) -> Fitted:
 
 def _one_tool(problem: Problem) -> str | None:
     return None if problem.tool_move is None else "learns one tool"
-
-
-def _few(problem: Problem) -> str | None:
-    if problem.pairs <= _MOST_PAIRS_STRUCTURED:
-        return None
-    return f"grows with the cube of the pairs: {_MOST_PAIRS_STRUCTURED} at most"
 
 
 COMPETITORS = (
@@ -56,13 +40,5 @@ COMPETITORS = (
         learn_residual,
         "The chain, and what the pairs say it errs by: encoders, gears, loads, camera, smooth rest.",
         any_of(needs_drawing, _one_tool),
-    ),
-    Competitor(
-        "structured",
-        "KB-Map, structured prior",
-        "ours",
-        learn_structured,
-        "Linear in closed form: the drawing's tolerances as a Gaussian prior on maps, and the map's kernel.",
-        any_of(needs_drawing, _one_tool, _few),
     ),
 )

@@ -20,13 +20,12 @@ from bodyschema.cli.commands.options import (
     flag,
     robot_file,
 )
+from bodyschema.interfaces.waits import LINE_EVERY_S
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
-
-LINE_EVERY_S = 2.0
 
 
 def replay(

@@ -94,8 +94,8 @@ def _list(looked_at: list[Place], *, watch: bool, json: bool) -> None:
     from rich.console import Console
     from rich.live import Live
 
-    from bodyschema.cli.terminal.status_view import EVERY_S
     from bodyschema.fleet.roster import Fleet, as_json, screen
+    from bodyschema.interfaces.waits import STATUS_EVERY_S
 
     console = Console(highlight=False)
     with Fleet(looked_at) as robots:
@@ -103,7 +103,7 @@ def _list(looked_at: list[Place], *, watch: bool, json: bool) -> None:
             with Live(console=console, auto_refresh=False, screen=console.is_terminal) as live:
                 while True:
                     live.update(screen(robots.look(), robots.unreached), refresh=True)
-                    time.sleep(EVERY_S)
+                    time.sleep(STATUS_EVERY_S)
         while True:
             members = robots.look()
             if json:
@@ -113,7 +113,7 @@ def _list(looked_at: list[Place], *, watch: bool, json: bool) -> None:
                 console.print(screen(members, robots.unreached))
             if not watch:
                 break
-            time.sleep(EVERY_S)
+            time.sleep(STATUS_EVERY_S)
     if not any(member.alive for member in members):
         _nobody(looked_at)
 

@@ -10,6 +10,7 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from bodyschema.cli.commands.options import HERE, RobotFile, flag, several
+from bodyschema.interfaces.waits import POLL_S
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
     from bodyschema.cli.hardware.bench_run import BenchRun
 
 PORT = Path("bus")
-GLANCE_S = 0.1
 
 
 def bench(
@@ -81,4 +81,4 @@ def _look_on(run: BenchRun, console: Console) -> None:
                 console.print(said, markup=False)
             if run.count:
                 status.update(f"{run.count:,} {run.unit}")
-            time.sleep(GLANCE_S)
+            time.sleep(POLL_S)

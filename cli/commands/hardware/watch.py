@@ -11,6 +11,7 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from bodyschema.cli.commands.options import HERE, RobotFile, flag
+from bodyschema.interfaces.waits import LINE_EVERY_S, POLL_S, STATUS_EVERY_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -19,9 +20,6 @@ if TYPE_CHECKING:
     from bodyschema.daemon.sampler.sources import Powered
 
 READ_S = 0.5
-TELL_EVERY_S = 2.0
-MARKER_EVERY_S = 1.0
-SHOW_EVERY_S = 0.1
 PRINT_EVERY_S = 0.5
 FIRST_READING_S = 5.0
 PORT = 8080
@@ -113,7 +111,7 @@ def _joints(robot: Path, *, once: bool, json: bool, zero_force: bool) -> None:
             )
         else:
             with Live(screen(seen), console=console, auto_refresh=False, screen=True) as live:
-                _follow(watch, ending, SHOW_EVERY_S, lambda now: live.update(screen(now), refresh=True))
+                _follow(watch, ending, POLL_S, lambda now: live.update(screen(now), refresh=True))
 
 
 def _cameras(robot: Path, out: Path | None, port: int, every: float, count: int | None) -> None:
@@ -140,10 +138,10 @@ def _cameras(robot: Path, out: Path | None, port: int, every: float, count: int 
             console.print("nothing says how the cameras see: the images as they come. `bodyschema calibrate cameras`")
         stack.enter_context(watched.camera)
         stack.enter_context(on_termination(watching.stop))
-        tell_at = time.monotonic() + TELL_EVERY_S
+        tell_at = time.monotonic() + LINE_EVERY_S
         while watching.step(READ_S):
             if time.monotonic() >= tell_at:
-                tell_at = time.monotonic() + TELL_EVERY_S
+                tell_at = time.monotonic() + LINE_EVERY_S
                 for line in (watching.said, *watched.eyes.health):
                     console.print(line, markup=False)
     for line in (watching.said, *watched.eyes.health):
@@ -173,7 +171,7 @@ def _marker(robot: Path, seconds: float | None) -> None:
         stack.enter_context(on_termination(lambda: stopping.append(True)))
         end = clock.now() + (float("inf") if seconds is None else seconds)
         while not stopping and clock.now() < end:
-            tell_at = min(clock.now() + MARKER_EVERY_S, end)
+            tell_at = min(clock.now() + STATUS_EVERY_S, end)
             while clock.now() < tell_at and not stopping:
                 for each in watches:
                     each.read(READ_S / 10)

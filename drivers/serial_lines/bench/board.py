@@ -12,6 +12,7 @@ from bodyschema.drivers.serial_lines.lines import SEQUENCES, STAMP_S, STAMPS, VE
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.protocols import JointSource
 from bodyschema.interfaces.records import JointReading
+from bodyschema.interfaces.waits import POLL_S
 
 HEADER_EVERY_S = 1.0
 Angle = Callable[[float], float]
@@ -112,9 +113,6 @@ class EncoderBoard:
         return with_checksum(",".join(("H", str(VERSION), str(self._boot), str(len(self.encoders)), *words)))
 
 
-READ_S = 0.1
-
-
 class Listener:
     """Thread that reads an open source and keeps the newest reading."""
 
@@ -152,7 +150,7 @@ class Listener:
     def _listen(self) -> None:
         try:
             while not self._stop.is_set():
-                reading = self._source.read(READ_S)
+                reading = self._source.read(POLL_S)
                 if reading is not None:
                     with self._told:
                         self._newest = reading
