@@ -220,7 +220,11 @@ def test_a_port_in_use_is_named_and_leaves_no_trace(robot, process) -> None:
 @pytest.mark.parametrize(
     ("state_dir", "said"),
     [
-        ("locked", "cannot write {}: Permission denied. Give a --state-dir that can be written"),
+        pytest.param(
+            "locked",
+            "cannot write {}: Permission denied. Give a --state-dir that can be written",
+            marks=pytest.mark.soak,
+        ),
         ("locked/new", "cannot make the directory {}: Permission denied. Give another one with --state-dir"),
     ],
 )

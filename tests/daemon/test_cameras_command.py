@@ -191,6 +191,7 @@ def test_a_refused_calibration_writes_nothing(few, tmp_path) -> None:
     assert not (tmp_path / "c.toml").exists()
 
 
+@pytest.mark.soak
 def test_the_ruler_on_the_print_scales_the_baseline(few, tmp_path, capsys) -> None:
     out = tmp_path / "c.toml"
     called("calibrate", "cameras", few, "--ruler-mm", 0.97 * 240, "--out", out, "--lens", "pinhole", "--json")

@@ -94,6 +94,7 @@ def test_it_ends_by_itself_when_nothing_is_missing(views) -> None:
     assert (result.rig.serials, eyes.is_open) == (RIGHT, False)
 
 
+@pytest.mark.soak
 def test_serials_that_are_given_come_before_those_of_the_cameras(views) -> None:
     seen, frames = held(views)
     found, _ = live(PluggedEyes(frames), seen).run()

@@ -194,6 +194,7 @@ def test_the_terminal_tells_a_quantity_once_and_each_way_to_read_it() -> None:
     assert all(words in text for words in ("23.5 mm", "not reached", "< 1e-09", "118"))
 
 
+@pytest.mark.soak
 def test_the_command_draws_the_curves_and_tells_the_papers_figure_beside_ours(tmp_path, capsys, monkeypatch) -> None:
     def told(run: Run) -> Experiment:
         run.say("exact learning")

@@ -51,7 +51,9 @@ def test_help_is_shown_however_narrow_the_terminal(tmp_path: Path, columns: str)
     ("command", "said"),
     [
         ("mkdir gone; cd gone; rmdir ../gone; exec $B backup a.zip --robot ../robot.toml", "folder was deleted"),
-        (f"$B simulate --like a.csv --out {'n' * 300}.csv", "nnn.csv: File name too long"),
+        pytest.param(
+            f"$B simulate --like a.csv --out {'n' * 300}.csv", "nnn.csv: File name too long", marks=pytest.mark.soak
+        ),
     ],
 )
 def test_an_unexpected_error_of_the_system_is_one_line(tmp_path: Path, command: str, said: str) -> None:

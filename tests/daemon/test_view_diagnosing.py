@@ -93,6 +93,7 @@ def test_a_diagnosis_leaves_its_report(config, said, diagnoses) -> None:
     assert b"<!doctype html>" in asked.report()
 
 
+@pytest.mark.soak
 def test_what_the_diagnosis_says_it_lacks_comes_to_the_page(config, said, diagnoses) -> None:
     diagnoses(lambda: stored(config, 3)).start()
     assert said.over.wait(LIMIT_S)

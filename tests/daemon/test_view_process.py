@@ -47,6 +47,7 @@ def test_the_page_is_there_as_long_as_the_process_that_shows_it(robot: Path, end
     assert page(port) is None
 
 
+@pytest.mark.soak
 def test_a_port_that_is_taken_is_no_matter_for_whoever_is_shown(robot: Path, caplog) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken, shown(robot, taken.getsockname()[1]) as process:
         process.wait(LIMIT_S)

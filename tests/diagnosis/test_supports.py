@@ -120,6 +120,7 @@ def test_a_joint_that_gives_is_named_where_the_urdf_states_no_masses(robot, only
     assert all(probability <= 0.5 for probability in beside)
 
 
+@pytest.mark.soak
 def test_what_may_be_a_mount_that_gives_is_told_with_how_to_see_it(robot) -> None:
     truth = Effect.at(robot, "joint_compliance", SHOULDER, values=[4e-4])
     file = found(seen(robot, walk(robot, 1), (truth,), 1), robot)

@@ -79,6 +79,7 @@ def with_zeros(robot: RobotDescription) -> DiagnosisFile:
     return found_in(robot, 2, *(Effect.at(robot, "joint_offset", at, values=[size]) for at, size in HIDDEN.items()))
 
 
+@pytest.mark.soak
 def test_causes_that_larger_tolerances_could_follow_are_named_again_by_resamplings(with_zeros: DiagnosisFile) -> None:
     assert with_zeros.stability is not None
     assert with_zeros.stability.same_causes > 0.9 * with_zeros.stability.resampled

@@ -148,7 +148,12 @@ def readings_of(joints: JointSource, until: float) -> list[JointReading]:
     return readings
 
 
-@pytest.mark.parametrize("source", SOURCES)
+QUICK = ("simulated source", "Dynamixel 2.0", "Feetech")
+
+
+@pytest.mark.parametrize(
+    "source", [*QUICK, *(pytest.param(name, marks=pytest.mark.soak) for name in SOURCES if name not in QUICK)]
+)
 def test_one_hand_guided_path_gives_the_same_model_whatever_reads_the_joints(source) -> None:
     arm = guided()
     with SOURCES[source](arm) as (joints, begin_s):

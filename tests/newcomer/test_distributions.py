@@ -63,6 +63,7 @@ def test_the_wheel_has_every_file_of_every_part_and_two_packages(wheel: Path) ->
     assert "bodyschema/effects/exports/correction_reader.py" in files
 
 
+@pytest.mark.soak
 def test_the_sdist_has_no_link_and_makes_the_same_wheel(sdist: Path, wheel: Path, tmp_path: Path) -> None:
     with tarfile.open(sdist) as archive:
         assert [member.name for member in archive if member.issym() or member.islnk()] == []

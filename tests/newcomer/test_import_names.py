@@ -42,6 +42,7 @@ def test_each_part_is_a_relative_link(part: str) -> None:
     assert (ROOT / "bodyschema" / part).readlink() in (Path("..", part), Path("..", "benchmarks", part))
 
 
+@pytest.mark.soak
 def test_no_file_is_loaded_under_two_names() -> None:
     code = f"PARTS = {PARTS}\n{LOAD_ALL}"
     done = subprocess.run(

@@ -189,7 +189,9 @@ def doubled(case):
     )
 
 
-@pytest.mark.parametrize("names", SEEN, ids="-".join)
+@pytest.mark.parametrize(
+    "names", [SEEN[0], *(pytest.param(names, marks=pytest.mark.soak) for names in SEEN[1:])], ids="-".join
+)
 def test_the_tracker_measures_what_the_world_says_that_it_shows(names) -> None:
     simulation = extended(*(doubled(case) for case in EFFECTS if case[0] in names))
     plain = SimConfig(seed=4, errors=NO_ERRORS)

@@ -17,11 +17,8 @@ JUMPS_S = (HOUR_S, -HOUR_S, 20 * YEAR_S, -40 * YEAR_S, 0)
 BETWEEN = 12
 
 
-@pytest.mark.parametrize(
-    "jumping",
-    [("sampler",), *(pytest.param(names, marks=pytest.mark.soak) for names in (("learner",), ("sampler", "learner")))],
-    ids="-and-".join,
-)
+@pytest.mark.soak
+@pytest.mark.parametrize("jumping", [("sampler",), ("learner",), ("sampler", "learner")], ids="-and-".join)
 def test_jumps_of_the_wall_clock_cost_no_pair_and_no_order(tmp_path, free_endpoint, disk_shim, jumping) -> None:
     config = write_robot(tmp_path, free_endpoint)
     disk = FailingDisk(config.state_dir, disk_shim)

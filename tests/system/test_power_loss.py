@@ -138,6 +138,7 @@ def hundred(tmp_path_factory, free_endpoint, disk_shim) -> tuple[Config, list[Do
     return worked(tmp_path_factory.mktemp("hundred"), free_endpoint, disk_shim, 100)
 
 
+@pytest.mark.soak
 def test_after_a_power_loss_accepted_pairs_are_there_and_the_checkpoint_is_the_old_or_the_new(
     tmp_path, hundred
 ) -> None:
@@ -161,6 +162,7 @@ def without_syncs(log: list[Done]) -> list[Done]:
     return [done for done in log if done.operation not in (Operation.SYNC, Operation.SYNC_FOLDER)]
 
 
+@pytest.mark.soak
 def test_a_store_that_never_synced_would_lose_pairs(tmp_path, hundred) -> None:
     config, log = hundred[0], without_syncs(hundred[1])
     with pytest.raises((AssertionError, StoreError)):

@@ -105,6 +105,7 @@ def desk(network: Network, tmp_path_factory) -> Iterator[dict[str, Any]]:
         yield json.loads(done.stdout)
 
 
+@pytest.mark.soak
 def test_pairs_of_the_robot_are_learnt_elsewhere_and_a_viewer_is_answered(desk: dict[str, Any]) -> None:
     assert (desk["predict"]["pairs"], desk["sampler"]["pairs"]) == (PAIRS, PAIRS)
 

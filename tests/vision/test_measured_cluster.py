@@ -216,6 +216,7 @@ def test_a_number_that_images_show_twice_is_named_with_them() -> None:
         _require_tags(views, {3: ["04", "07"]}, Wanted("apriltag_36h11", SIDE_M))
 
 
+@pytest.mark.soak
 def test_rendered_images_of_a_cluster_become_its_tables(tmp_path, capsys) -> None:
     rng = np.random.default_rng(5)
     places = built(rng)
