@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bodyschema.effects import Effect, Motion, Simulated
+from bodyschema.effects import Effect, Motion
 from bodyschema.interfaces.records import FloatArray
 
 from .fit import Fit
@@ -44,21 +44,8 @@ def instruments(fit: Fit, effect: Effect) -> FloatArray:
         q = motion.q.copy()
         q[every_other, joint] = between[every_other]
         run = simulation.run(replace(motion, q=q))
-        columns[every_other] = _per_amount(run, effect)[every_other]
+        columns[every_other] = run.columns(effect)[every_other][:, :, effect.amounts]
     return fit.weighted(columns)
-
-
-def _per_amount(run: Simulated, effect: Effect) -> FloatArray:
-    """Return the change of the measurements by an effect (n, 3, k) [m], over its amounts.
-
-    The derivative by the width of a backlash does not contain what the joint does inside a wide one.
-    """
-    encoder = effect.kind.encoder
-    if encoder is None or effect.kind.is_linear:
-        return run.columns(effect)[:, :, effect.amounts]
-    place = run.simulation.place(effect)
-    change = encoder.correction(run.readings, place, effect.values) / effect.values[effect.amounts]
-    return run.by_joint[:, :, [place.joint]] * change[:, None, None]
 
 
 def beyond_single_rows(one: Fit, other: Fit) -> float:

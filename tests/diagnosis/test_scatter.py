@@ -91,14 +91,6 @@ def test_a_play_of_several_times_the_scatter_is_clearly_seen_beside_it(robot, se
     assert chance(fit_of(robot, seed, play), play, beside=True) < CLEARLY
 
 
-def test_a_play_wider_than_the_moves_is_tested_by_what_it_does(robot) -> None:
-    play = Effect.at(robot, "backlash", ELBOW, values={"width_rad": 0.05})
-    fit = fit_of(robot, 0, scatter_rad=0.0)
-    does = Simulation(robot, (play,)).positions(fit.observations.motion) - fit.run.measured
-    tested, seen = instruments(fit, play).ravel(), fit.weighted(does[:, :, None]).ravel()
-    assert tested @ seen > 0.95 * np.linalg.norm(tested) * np.linalg.norm(seen)
-
-
 @pytest.mark.parametrize("name", [pytest.param("backlash", marks=pytest.mark.soak), "settling"])
 @pytest.mark.soak
 def test_of_memories_that_no_joint_has_one_in_a_hundred_is_as_improbable_as_one_in_a_hundred(robot, name) -> None:
