@@ -45,7 +45,7 @@ HALF_WIDTH_95 = 1.959964
 
 @dataclass(frozen=True, eq=False)
 class ChainFigures:
-    """Return (9 + d,) figures: camera xyz [m], rpy [rad] and marker xyz [m] in their links, joint zeros [rad, m].
+    """Figures (9 + d,): camera xyz [m], rpy [rad] and marker xyz [m] in their links, joint zeros [rad, m].
 
     Attributes:
         robot: the nominal model.

@@ -24,6 +24,13 @@ from bodyschema.robot.toml_file import NAME, convert, read_toml
 OVERRIDES = ("BODYSCHEMA_ROBOT_", "BODYSCHEMA_ZENOH_")
 
 
+class _Plain(ElementTree.TreeBuilder):
+    """Refuses a DOCTYPE, as `parse_urdf` does: entities are not expanded."""
+
+    def doctype(self, *_: object) -> None:
+        raise ValueError("a DOCTYPE")
+
+
 class _Robot(msgspec.Struct, frozen=True):
     name: Annotated[str, Meta(pattern=NAME)]
     urdf: str
@@ -97,9 +104,11 @@ class ClientConfig:
             ConfigError: the URDF is not one.
         """
         try:
-            found = ElementTree.fromstring(read_at_most(self.urdf)).findall("joint")
+            found = ElementTree.fromstring(read_at_most(self.urdf), ElementTree.XMLParser(target=_Plain())).findall(
+                "joint"
+            )
             return {joint.attrib["name"]: (joint.attrib["type"], *_limits(joint.find("limit"))) for joint in found}
-        except (OSError, ElementTree.ParseError, KeyError, ValueError):
+        except (OSError, ElementTree.ParseError, LookupError, ValueError):
             from bodyschema.daemon.config import Config
 
             tree = Config.load(self.file).robot.tree

@@ -440,8 +440,7 @@ def _found(
         # What rattles has no place of its own, and does not slip.
         fixed = [effect for effect in hypotheses if effect.kind.stage != "tool"]
         search = Search(fixed, told)
-        observations = observations.with_rattle(loose.ratio, loose.ways)
-        start = aligned(observations, simulation)
+        start = aligned(start.observations.with_rattle(loose.ratio, loose.ways), simulation)
         unknowns = Unknowns(start)
         enough = partial(needs_no_more_names, unknowns=unknowns, search=search)
         extended = _searched(together(start, fixed, told), search, enough)

@@ -399,7 +399,9 @@ class Ladder:
 def _restored(entry: Mapping[str, Any], classes: Mapping[str, type[Model]]) -> Rung:
     kind = classes.get(str(entry["class"]))
     if kind is None:
-        raise ModelFormatError(f"the class {entry['class']} is not known; name it in `kinds`")
+        raise ModelFormatError(
+            f"the class {entry['class']} is not known; name it in `kinds`, or learn again if there is none"
+        )
     model = kind.from_bytes(base64.b64decode(entry["model"], validate=True))
     return Rung(model, number(entry["growth"], "growth"), flag(entry["extrapolates"], "extrapolates"))
 

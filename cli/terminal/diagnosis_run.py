@@ -18,7 +18,7 @@ from bodyschema.calibration.plausibility.limits import require_units
 from bodyschema.cli.recordings.recorder import History
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.transport.bus import client
-from bodyschema.diagnosis.assess.stored import marker_covariance
+from bodyschema.diagnosis.assess.stored import predicted_pose_covariance
 from bodyschema.diagnosis.diagnosis import Diagnosis
 from bodyschema.diagnosis.diagnosis import diagnose as diagnosed
 from bodyschema.diagnosis.fit.observations import ticks
@@ -40,7 +40,7 @@ from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.hand_eye import HandEye, pose_covariance
 from bodyschema.robot.suggest import did_you_mean
 
-DIAGNOSIS, REPORT, MARKER_COVARIANCE = "diagnosis.json", "report.html", "marker_covariance"
+DIAGNOSIS, REPORT, POSE_COVARIANCE = "diagnosis.json", "report.html", "pose_covariance"
 # Effects that are always looked for.
 ALWAYS = ("outliers",)
 # Minimum number of pairs per joint.
@@ -151,9 +151,10 @@ class Found:
     @property
     def json(self) -> str:
         """diagnosis.json, with the camera's pose beside what was found, and the covariance of predicted poses."""
+        covariance = predicted_pose_covariance(self.diagnosis.stored)
         told = msgspec.to_builtins(self.file, enc_hook=float) | {
             "hand_eye": msgspec.to_builtins(self.hand_eye),
-            MARKER_COVARIANCE: marker_covariance(self.diagnosis.stored).ravel().tolist(),
+            POSE_COVARIANCE: None if covariance is None else covariance.ravel().tolist(),
         }
         return msgspec.json.format(msgspec.json.encode(told), indent=1).decode()
 

@@ -34,17 +34,24 @@ def _write_correction(simulation: Simulation, file: Path, heading: str) -> list[
     found, known = simulation.robot.file.with_name(DIAGNOSIS), None
     if simulation.robot.file.name == EXTENDED_FILE and found.is_file():
         try:
-            known = msgspec.json.decode(read_at_most(found), type=_Known).marker_covariance
+            known = msgspec.json.decode(read_at_most(found), type=_Known).pose_covariance
         except (OSError, msgspec.DecodeError) as error:
             raise ConfigError(f"is not what diagnose wrote: {error}", file=found, remedy="Diagnose again") from error
     told = write_correction(simulation, file, heading, known)
-    return told if known else [*told, f"not in it: the pose's covariance, which {DIAGNOSIS} beside {EXTENDED_FILE} has"]
+    return (
+        told
+        if known
+        else [
+            *told,
+            f"not in it: the pose's covariance, which {DIAGNOSIS} beside {EXTENDED_FILE} has if something was fitted",
+        ]
+    )
 
 
 class _Known(msgspec.Struct, frozen=True):
     """What a correction takes of diagnosis.json."""
 
-    marker_covariance: Annotated[list[float], Meta(min_length=36, max_length=36)] | None = None
+    pose_covariance: Annotated[list[float], Meta(min_length=36, max_length=36)] | None = None
 
 
 _WRITERS: dict[str, Callable[[Simulation, Path, str], list[str]]] = {

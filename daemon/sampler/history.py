@@ -9,7 +9,7 @@ from typing import Annotated
 import msgspec
 
 from bodyschema.daemon.transport.bus import Request
-from bodyschema.daemon.transport.wire import PairMessage, PairsReply, decode, encode, pair_to_wire
+from bodyschema.daemon.transport.wire import PairMessage, PairsReply, decode, encode, pairs_to_wire
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.recordings.store.store import PairReader
 
@@ -77,7 +77,7 @@ def answer_pairs(reader: PairReader, request: Request) -> bytes:
         raise RequestError(f"from={first} is after to={to}")
     # Read the newest number after the pairs: a client that sees it knows that nothing before it is missing.
     pairs = reader.read(first, to, LARGEST_REPLY)
-    reply = PairsReply(reader.identity, reader.last_seq(), [pair_to_wire(pair) for pair in pairs])
+    reply = PairsReply(reader.identity, reader.last_seq(), pairs_to_wire(pairs))
     return encode(reply, request.encoding)
 
 

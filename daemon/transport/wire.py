@@ -6,7 +6,8 @@ Requests are checked for unknown keys. Replies and publications may gain keys, s
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from itertools import groupby
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 
 import msgspec
@@ -238,6 +239,30 @@ def decode(payload: bytes, kind: type[M], encoding: str = JSON) -> M:
 
 def pair_to_wire(pair: Pair) -> PairMessage:
     """Return a pair as its message."""
+    return pairs_to_wire([pair])[0]
+
+
+def pairs_to_wire(pairs: Sequence[Pair]) -> list[PairMessage]:
+    """Return pairs as their messages; their poses are computed at once."""
+    return [
+        _as_message(pair, pose)
+        for _, alike in groupby(pairs, lambda pair: (pair.R is None, pair.cov_R is None))
+        for pair, pose in _with_poses(list(alike))
+    ]
+
+
+def _with_poses(pairs: Sequence[Pair]) -> Iterable[tuple[Pair, MarkerPose]]:
+    """Return pairs of which all or none have an orientation and its covariance, with their poses."""
+    import numpy as np
+
+    R = [pair.R for pair in pairs if pair.R is not None]
+    cov_R = [pair.cov_R for pair in pairs if pair.cov_R is not None]
+    x, cov = np.array([pair.x for pair in pairs]), np.array([pair.cov for pair in pairs])
+    poses = MarkerPose.rows(x, cov, np.array(R) if R else None, np.array(cov_R) if cov_R else None)
+    return zip(pairs, poses, strict=True)
+
+
+def _as_message(pair: Pair, pose: MarkerPose) -> PairMessage:
     from bodyschema.interfaces.covariance import upper_triangle
 
     x, y, z = pair.x.tolist()
@@ -252,7 +277,7 @@ def pair_to_wire(pair: Pair) -> PairMessage:
         cov=upper_triangle(pair.cov),
         R=None if pair.R is None else _four(pair.R),
         cov_R=None if pair.cov_R is None else upper_triangle(pair.cov_R),
-        pose=MarkerPose.of(pair.x, pair.cov, pair.R, pair.cov_R),
+        pose=pose,
     )
 
 

@@ -97,12 +97,14 @@ class _Elsewhere:
         return float(gains.sum()) - unsure > max(self.variance - simpler.variance, 0.0)
 
 
-def marker_covariance(fit: Fit) -> FloatArray:
-    """Return the covariance (6, 6) of the marker's pose as the fit predicts it in the measurement frame.
+def predicted_pose_covariance(fit: Fit) -> FloatArray | None:
+    """Return the covariance (6, 6) of the marker's pose as the fit predicts it, or None if nothing was fitted.
 
-    It is that of all fitted numbers together, in the mean of recorded poses, without the instrument's noise: x, y, z
-    [m²], then turns about the frame's axes [rad²].
+    It is that of all fitted numbers together, in the mean of recorded poses and without the instrument's noise: x, y,
+    z [m²] in the measurement frame, then turns about its axes [rad²].
     """
+    if not fit.covariance.size:
+        return None
     motion = fit.observations.motion
     motion = motion.some(np.arange(0, len(motion), -(-len(motion) // _POSES)))
     here, covariance = _marker_poses(fit, np.zeros(len(fit.covariance)), motion), np.zeros((6, 6))

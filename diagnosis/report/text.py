@@ -148,7 +148,8 @@ def _head(causes: Sequence[Cause], tolerances: Tolerances | None, seen_by: str, 
     """Return the largest causes as a sentence without its full stop."""
     ordered = in_order(causes)
     everywhere = ["small errors everywhere"] if tolerances is not None and tolerances.share_percent >= SMALL else []
-    first = [cause for cause in ordered if not (everywhere and cause.is_small)][:_TOLD]
+    named = [cause for cause in ordered if not (cause.is_correction or (everywhere and cause.is_small))]
+    first = named[:_TOLD]
     said = [finding(c.effect, c.where, c.source, told_values(c), seen_by, timed=timed, weighed=weighed) for c in first]
     told = [clause + _or(cause) for clause, cause in zip(said, first, strict=True)]
     others = [cause.is_outvoted or cause.is_correction for cause in ordered if cause not in first]

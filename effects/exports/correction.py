@@ -55,13 +55,13 @@ def _rows(simulation: Simulation, effect: Effect) -> Rows | None:
 
 
 def write_correction(
-    simulation: Simulation, file: Path, heading: str, marker_covariance: list[float] | None = None
+    simulation: Simulation, file: Path, heading: str, pose_covariance: list[float] | None = None
 ) -> list[str]:
     """Write the simulation's correction of readings to `file`.
 
     Args:
         heading: one line that names the origin.
-        marker_covariance: of the poses that the file gives, 6 x 6 row by row; None if it is not known.
+        pose_covariance: of the poses that the file gives, 6 x 6 row by row; None if it is not known.
 
     Returns:
         Sentences on what the file does not hold, or holds in another form.
@@ -83,7 +83,7 @@ def write_correction(
         "from": heading,
         "notes": told,
         "joints": list(simulation.robot.joints),
-        "marker_covariance": marker_covariance,
+        "pose_covariance": pose_covariance,
     }
     entries = [f'"{name}": {json.dumps(value, ensure_ascii=False)}' for name, value in head.items()]
     file.write_text("{\n " + ",\n ".join([*entries, f'"numbers": {program}']) + "\n}\n", encoding="utf-8")

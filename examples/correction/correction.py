@@ -6,7 +6,6 @@ python correction.py correction.json < readings.txt    # readings in each line; 
 import json
 import math
 import sys
-from math import copysign, exp, isfinite, nan
 
 
 class Correction:
@@ -17,12 +16,13 @@ class Correction:
         if file.get("format") != "bodyschema correction 3":
             raise ValueError("not a correction of version 3: write it again with `bodyschema export`")
         self.joints, end = map(int, file["numbers"][:2])
-        self.registers, numbers = list(map(float, file["numbers"][:end])), map(int, file["numbers"][end:])
-        # The steps as one function of Python, made of these numbers alone: four times as fast as a call for each.
-        steps, scope = zip(*[numbers] * 5, strict=True), {**vars(math), "remember": remember}
+        self.registers, self.runs = list(map(float, file["numbers"][:end])), []
+        # The steps as functions of Python, made of these numbers alone: four times as fast as a call for each.
+        steps, scope = zip(*[map(int, file["numbers"][end:])] * 5, strict=True), {**vars(math), "remember": remember}
         lines = [STEPS[step].format(to=to, a=a, b=b, c=self.registers[c : c + 13]) for step, to, a, b, c in steps]
-        exec("\n ".join(["def run(r):", *lines]), scope)
-        self.run = scope["run"]
+        for k in range(0, len(lines), 50):  # compiling longer functions takes memory without limit
+            exec("\n ".join(["def run(r):", *lines[k : k + 50]]), scope)
+            self.runs.append(scope["run"])
 
     def read(self, q, pace=1.0):
         """Return true joint angles, and the marker's pose (3 rows of 4) in the measurement frame, at the next readings.
@@ -30,11 +30,12 @@ class Correction:
         pace: time since the last readings, as a multiple of the usual one; None after an interruption. A reading that
         is not finite makes what depends on it NaN, and is not remembered.
         """
-        r, d, q = self.registers, self.joints, [reading if isfinite(reading) else nan for reading in q]
+        r, d, q = self.registers, self.joints, [reading if math.isfinite(reading) else math.nan for reading in q]
         if len(q) != d:
             raise ValueError("another number of readings than of joints")
         r[2], r[15 + d : 15 + 2 * d] = -1.0 if pace is None else pace, q
-        self.run(r)
+        for run in self.runs:
+            run(r)
         return r[15 : 15 + d], r[3:15]
 
 
@@ -42,12 +43,12 @@ def remember(r, to, reading, pace, kind, scale):
     """Set a strain (0 play, 1 hysteresis, 2 settling), its last reading, and how far it has begun."""
     (strain, last, begun), now = r[to : to + 3], r[reading]
     move = now - last if begun else 0.0
-    way, left = copysign(1.0, move), 1.0 - copysign(1.0, move) * strain if begun > 1 else 0.0
+    way, left = math.copysign(1.0, move), 1.0 - math.copysign(1.0, move) * strain if begun > 1 else 0.0
     if kind == 2:
-        strain = 0.0 if r[pace] < 0 else move + copysign(abs(scale) ** r[pace], scale) * strain
+        strain = 0.0 if r[pace] < 0 else move + math.copysign(abs(scale) ** r[pace], scale) * strain
     elif move:  # the first shows the side
-        strain = way * (1.0 - (left * exp(-abs(move) / scale) if kind else max(left - abs(move) / scale, 0.0)))
-    if isfinite(now):
+        strain = way * (1.0 - (left * math.exp(-abs(move) / scale) if kind else max(left - abs(move) / scale, 0.0)))
+    if math.isfinite(now):
         r[to : to + 3] = strain, now, 2 if move else max(begun, 1)
 
 
@@ -67,10 +68,9 @@ INWARDS = MOTION + (
 )
 # A row of a pose, as the next joint's.
 ROW = (
-    "x, y, z, w = r[{a}], r[{a} + 1], r[{a} + 2], r[{a} + 3]; w = w + {c[4]} * x + {c[8]} * y + {c[12]} * z; "
-    "x, y, z = {c[1]} * x + {c[5]} * y + {c[9]} * z, {c[2]} * x + {c[6]} * y + {c[10]} * z, "
-    "{c[3]} * x + {c[7]} * y + {c[11]} * z; "
-    "r[{to}], r[{to} + 1], r[{to} + 2], r[{to} + 3] = u * x + v * y, u * y - v * x, z, w + s * z; "
+    "x, y, z, w = r[{a}:{a} + 4]; x, y, z, w = {c[1]} * x + {c[5]} * y + {c[9]} * z, "
+    "{c[2]} * x + {c[6]} * y + {c[10]} * z, {c[3]} * x + {c[7]} * y + {c[11]} * z, "
+    "w + {c[4]} * x + {c[8]} * y + {c[12]} * z; r[{to}:{to} + 4] = u * x + v * y, u * y - v * x, z, w + s * z; "
 )
 ROWS = [ROW.replace("{a}", f"{{a}} + {k}").replace("{to}", f"{{to}} + {k}") for k in (0, 4, 8)]
 STEPS = ADD, ADD_THREE, WAVE, MEMORY, TORQUE, SIDE, INWARDS, MOTION + ROW, None, MOTION + "".join(ROWS)

@@ -27,7 +27,9 @@ from bodyschema.robot.calibrated_files import CAMERA_LINK, MARKER_LINK
 from bodyschema.robot.hand_eye import HandEye
 
 NODE = "bodyschema_correction"
-UNKNOWN = "correction.json has none: export it from an extended.toml that has its diagnosis.json beside it"
+UNKNOWN = (
+    "correction.json has none: export it from an extended.toml in which something was fitted, beside its diagnosis.json"
+)
 
 
 class CorrectedJoints:
@@ -36,7 +38,7 @@ class CorrectedJoints:
     def __init__(self, session, file, domain, topic):
         contents = json.loads(file)
         self.arm, self.names = Correction(file), contents["joints"]
-        known = contents.get("marker_covariance")
+        known = contents.get("pose_covariance")
         self.covariance = None if known is None else np.reshape(known, (6, 6))
         self.session, self.sequence = session, 0
         corrected, name = f"{topic}_corrected", str(session.info.zid())

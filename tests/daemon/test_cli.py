@@ -90,6 +90,15 @@ def test_a_client_config_agrees_with_the_whole(robot, monkeypatch) -> None:
     assert renamed.name == "other"
 
 
+@pytest.mark.parametrize("first", ['<!DOCTYPE robot [<!ENTITY a "b">]>', '<?xml version="1.0" encoding="foo"?>'])
+def test_a_client_config_reads_a_urdf_as_strictly_as_the_whole(robot, first) -> None:
+    own = ClientConfig.load(robot, {})
+    urdf = own.urdf
+    urdf.write_text(first + re.sub(r"<\?xml.*?\?>", "", urdf.read_text()).strip())
+    with pytest.raises(ConfigError):
+        assert own.slides
+
+
 def test_status_and_predict_load_neither_effects_nor_solvers(robot) -> None:
     loaded = loaded_by(["status"], ["predict", "0", "0"], cwd=robot.parent)
     assert {"bodyschema.cli.commands.run.status", "bodyschema.cli.commands.run.predict", "zenoh"} <= loaded

@@ -41,7 +41,7 @@ KEYS = {
     "unexplained",
     "advice",
     "hand_eye",
-    "marker_covariance",
+    "pose_covariance",
 }
 RMS_KEYS = {"nominal", "aligned", "geometry", "extended", "noise_floor"}
 CAUSE_KEYS = {

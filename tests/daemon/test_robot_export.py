@@ -88,11 +88,11 @@ def test_the_covariance_of_a_diagnosis_is_in_its_correction(extended, tmp_path, 
     export(extended, tmp_path / "without.json")
     assert "not in it: the pose's covariance" in " ".join(capsys.readouterr().out.split())
     covariance = np.eye(6).ravel().tolist()
-    extended.with_name("diagnosis.json").write_text(json.dumps({"marker_covariance": covariance}))
+    extended.with_name("diagnosis.json").write_text(json.dumps({"pose_covariance": covariance}))
     export(extended, tmp_path / "with.json")
-    found = [json.loads((tmp_path / name).read_text())["marker_covariance"] for name in ("without.json", "with.json")]
+    found = [json.loads((tmp_path / name).read_text())["pose_covariance"] for name in ("without.json", "with.json")]
     assert found == [None, covariance]
-    extended.with_name("diagnosis.json").write_text('{"marker_covariance": [1, 2]}')
+    extended.with_name("diagnosis.json").write_text('{"pose_covariance": [1, 2]}')
     with pytest.raises(ConfigError, match="Diagnose again"):
         export(extended, tmp_path / "wrong.json")
 

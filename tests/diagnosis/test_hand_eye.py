@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bodyschema.cli.terminal.diagnosis_run import Found, Source
-from bodyschema.diagnosis.assess.stored import marker_covariance
+from bodyschema.diagnosis.assess.stored import predicted_pose_covariance
 from bodyschema.diagnosis.diagnosis import Diagnosis
 from bodyschema.diagnosis.fit.fit import fitted
 from bodyschema.diagnosis.fit.observations import Observations
@@ -64,9 +64,14 @@ def test_covariance_of_predicted_poses_covers_the_truth() -> None:
     for seed in range(12):
         fit = found(robot, truth, seed, unknown).diagnosis.stored
         off = fit.simulation.positions(motion)[0] - truth.positions(motion)[0]
-        cov = marker_covariance(fit)
+        cov = predicted_pose_covariance(fit)
+        assert cov is not None
         assert np.allclose(cov, cov.T)
         assert np.linalg.eigvalsh(cov).min() > 0.0
         squares.append(off @ np.linalg.solve(cov[:3, :3], off))
     # Chi-squared with 3 degrees of freedom; a pose in the middle is predicted a little better than the mean of all.
     assert 0.7 < np.mean(squares) < 6.0
+
+
+def test_where_nothing_was_fitted_the_covariance_of_predicted_poses_is_not_known() -> None:
+    assert predicted_pose_covariance(found(RobotDescription.load(DESK_ARM), None, 0, ()).diagnosis.stored) is None

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from planted_cases import SIGMA_M, measured, scattered, surveyed_arm
 
+from bodyschema.diagnosis import diagnosis
 from bodyschema.diagnosis.diagnosis import diagnose
+from bodyschema.diagnosis.fit.fit import Fit
+from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.diagnosis.report.result import DiagnosisFile
 from bodyschema.effects import Effect, Simulation
@@ -34,3 +39,39 @@ def test_a_loose_marker_is_unexplained_and_told_with_its_play(file) -> None:
 
 def test_the_play_of_a_loose_marker_is_not_in_the_noise(file) -> None:
     assert file.rms_mm.noise_floor == pytest.approx(1e3 * np.sqrt(3.0) * SIGMA_M, rel=0.15)
+
+
+def test_beside_a_loose_marker_the_noise_and_the_rows_left_out_stay(monkeypatch) -> None:
+    robot, rng = surveyed_arm(), np.random.default_rng(0)
+    simulation, motion = Simulation(robot), scattered(robot, 1, rows=40)
+    x = simulation.run(motion).measured + SIGMA_M * rng.normal(size=(40, 3))
+    left_out, begun = np.arange(40) < 4, []
+
+    def aligned(observations: Observations, of: Simulation) -> Fit:
+        begun.append(observations)
+        return alignment(observations, of)
+
+    class Searched(Exception):
+        pass
+
+    def explained(*_: object) -> None:
+        raise Searched
+
+    alignment, loose = (
+        diagnosis.aligned,
+        SimpleNamespace(what="loose", ratio=3.0, ways=np.tile([0.0, 0.0, 1.0], (40, 1))),
+    )
+    monkeypatch.setattr(diagnosis, "aligned", aligned)
+    monkeypatch.setattr(diagnosis, "together", lambda start, *_: start.tolerating(diagnosis.Scales()))
+    monkeypatch.setattr(diagnosis, "_searched", lambda begun, *_: begun)
+    monkeypatch.setattr(diagnosis, "instrument_factor", lambda _: 2.0)
+    monkeypatch.setattr(diagnosis, "_left_out", lambda _: left_out)
+    monkeypatch.setattr(diagnosis, "reshaped", lambda _: None)
+    monkeypatch.setattr(diagnosis, "explain", lambda *_: SimpleNamespace(unknown=None))
+    monkeypatch.setattr(diagnosis, "rattle", lambda _: loose)
+    monkeypatch.setattr(diagnosis, "useful", explained)
+    with pytest.raises(Searched):
+        diagnosis.diagnose(measured(robot, motion, x), simulation)
+    assert begun[-1].rattling is not None
+    assert begun[-1].stated_factor == 2.0
+    assert (begun[-1].doubtful == left_out).all()

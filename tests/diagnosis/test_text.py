@@ -119,6 +119,12 @@ def test_small_causes_less_probable_than_others_are_no_causes_in_the_headline() 
     assert "small errors everywhere and 2 corrections whose cause is not known" in said
 
 
+def test_without_small_errors_everywhere_they_are_none_either() -> None:
+    causes = [_zero("elbow"), *(_zero(f"joint_{k}", probability=0.1, share=1.0) for k in range(2))]
+    said = sentence("explained", causes, Errors(5.0, 5.0, 1.0, 1.0, 0.9), Gain(80.0, (75.0, 85.0)))
+    assert said.startswith("The zero of joint elbow is off by +1.15° and 2 corrections whose cause is not known")
+
+
 def test_small_causes_less_probable_than_others_stand_in_no_table_and_change_nothing() -> None:
     heavy, few = _zero("elbow"), [_zero(f"joint_{k}", probability=0.1, share=1.0) for k in range(2)]
     none, gain = Errors(5.0, 5.0, 1.0, 1.0, 0.9), Gain(80.0, (75.0, 85.0))

@@ -95,7 +95,7 @@ def test_an_unknown_covariance_has_its_reason(correction, monkeypatch) -> None:
     from ros2_node import CorrectedJoints
 
     session, sample = MagicMock(), MagicMock()
-    without = json.dumps(json.loads(correction) | {"marker_covariance": None})
+    without = json.dumps(json.loads(correction) | {"pose_covariance": None})
     message = JointState(Header(1, ""), NAMES, (0.1,) * len(NAMES))
     sample.payload.to_bytes.return_value = encode_joint_state(message)
     CorrectedJoints(session, without, 0, "/joint_states").take(sample)

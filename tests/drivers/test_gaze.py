@@ -187,7 +187,6 @@ def test_asked_off_and_on_at_once_the_head_stays_where_it_is() -> None:
         assert robot.heads[0](robot.clock.now()) == pytest.approx(before, abs=0.01)
 
 
-@pytest.mark.soak
 def test_a_head_that_is_held_fast_ends_it() -> None:
     with (robot := GazingRobot(blocked_deg=8.0)).joints:
         robot.switch_on()

@@ -42,7 +42,7 @@ class KnownCameras:
     right_serial: Annotated[str, Parameter(help="Serial number of the right camera.", show_default=False)] = ""
 
     def wanted(self) -> Wanted:
-        """Return the parameters that the calibration estimates."""
+        """Return the settings of the calibration."""
         from bodyschema.cli.cameras.calibration import Wanted
 
         serials = (self.left_serial, self.right_serial)
