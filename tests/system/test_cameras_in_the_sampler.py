@@ -115,9 +115,9 @@ def test_a_hidden_latency_is_found_by_moving_the_arm(library, moving) -> None:
 
 
 def test_servos_and_images_in_a_folder_give_pairs(tmp_path, free_endpoint) -> None:
-    cameras = '[vision.cameras.images]\nleft = "left_*.png"\nright = "right_*.png"\nfps = 10.0\n'
+    cameras = '[vision.cameras.images]\nleft = "left_*.png"\nright = "right_*.png"\nfps = 5.0\n'
     config = write_arm(tmp_path, free_endpoint, cameras, "[daemon]\nany_step = true\n")
-    for number in range(2_000):  # three minutes, which end by the clock: a busy machine is late for most
+    for number in range(2_000):  # six minutes, which end by the clock: a busy machine is late for most
         if number == 0:
             for eye, image in zip(("left", "right"), drawn(config, MIDDLE), strict=True):
                 cv2.imwrite(str(tmp_path / f"{eye}_0.png"), image)
@@ -125,6 +125,6 @@ def test_servos_and_images_in_a_folder_give_pairs(tmp_path, free_endpoint) -> No
             for eye in ("left", "right"):
                 (tmp_path / f"{eye}_{number}.png").symlink_to(tmp_path / f"{eye}_0.png")
     with on_the_bench(config, tmp_path, lambda t: MIDDLE) as (benched, _), sampling(benched) as sampler:
-        until(sampler, lambda said: said.pairs >= 5)
+        until(sampler, lambda said: said.pairs >= 2)
     x = np.array([pair.x for pair in pairs_of(benched)])
     assert np.abs(x - config.robot.chain.positions(MIDDLE[None])).max() < 3e-3
