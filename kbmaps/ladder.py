@@ -399,9 +399,7 @@ class Ladder:
 def _restored(entry: Mapping[str, Any], classes: Mapping[str, type[Model]]) -> Rung:
     kind = classes.get(str(entry["class"]))
     if kind is None:
-        raise ModelFormatError(
-            f"the class {entry['class']} is not known. Name it in `kinds`, or learn again"
-        )
+        raise ModelFormatError(f"the class {entry['class']} is not known. Name it in `kinds`, or learn again")
     model = kind.from_bytes(base64.b64decode(entry["model"], validate=True))
     return Rung(model, number(entry["growth"], "growth"), flag(entry["extrapolates"], "extrapolates"))
 
