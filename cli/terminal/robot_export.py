@@ -38,14 +38,11 @@ def _write_correction(simulation: Simulation, file: Path, heading: str) -> list[
         except (OSError, msgspec.DecodeError) as error:
             raise ConfigError(f"is not what diagnose wrote: {error}", file=found, remedy="Diagnose again") from error
     told = write_correction(simulation, file, heading, known)
-    return (
-        told
-        if known
-        else [
-            *told,
-            f"not in it: the pose's covariance, which {DIAGNOSIS} beside {EXTENDED_FILE} has if something was fitted",
-        ]
-    )
+    if known is None:
+        told.append(
+            f"not in it: the pose's covariance, which {DIAGNOSIS} beside {EXTENDED_FILE} has if anything was fitted"
+        )
+    return told
 
 
 class _Known(msgspec.Struct, frozen=True):
