@@ -231,7 +231,6 @@ def test_a_joint_that_is_still_never_moves(hold: str, tmp_path: Path) -> None:
     assert np.flatnonzero(np.ptp(case.measured.q, axis=0) == 0.0).tolist() == [case.arm.read.index("elbow")]
 
 
-@pytest.mark.soak
 def test_rendered_images_show_the_hidden_lens(tmp_path: Path) -> None:
     case = hide(28, tmp_path, ["lens_distortion"], arm="industrial", pairs=8, fresh_pairs=2, size=20.0, rendered=True)
     taken = case.measured

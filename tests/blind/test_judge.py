@@ -183,14 +183,7 @@ def test_chi_square_grows_with_the_square_of_the_effect(truth_of: Hide) -> None:
     assert large.told_chi2 / small.told_chi2 == pytest.approx(9.0, rel=0.3)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        name if k % 4 == 0 or name == "settling" else pytest.param(name, marks=pytest.mark.soak)
-        for k, name in enumerate(KINDS)
-        if name != "outliers"
-    ],
-)
+@pytest.mark.parametrize("name", [name for name in KINDS if name != "outliers"])
 def test_the_table_says_with_the_meant_numbers_what_the_world_shows(name: str, truth_of: Hide) -> None:
     truth = truth_of(name)
     target, effect = truth.case.measured.x_noise_free, truth.meanings[0].effect
@@ -286,7 +279,6 @@ def test_a_small_effect_that_nobody_sees_may_be_left_out() -> None:
     assert outcome(_file(verdict="nothing_found"), [hidden], [], False) == "honest"
 
 
-@pytest.mark.soak
 def test_a_diagnosis_of_a_large_offset_is_judged_right(tmp_path: Path) -> None:
     judgement = judge(_hidden(tmp_path, ELBOW, arm="humanoid", size=8.0), "one", "command")
     assert judgement.outcome == "right"

@@ -4,6 +4,7 @@ import select
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from queue import Queue
 
@@ -111,7 +112,7 @@ FOR_EVER = {"transport/link/tx/queue/congestion_control/block/wait_before_close"
 
 
 def test_a_stopped_subscriber_holds_up_no_publication(endpoint) -> None:
-    last = threading.Event()
+    last, deadline = threading.Event(), time.monotonic() + LIMIT_S
     with (
         ZenohSession(listen=endpoint, settings=FOR_EVER) as bus,
         client(endpoint) as well,
@@ -124,8 +125,10 @@ def test_a_stopped_subscriber_holds_up_no_publication(endpoint) -> None:
             well.subscribe(KEY, lambda payload: last.set() if payload == b"last" else None, quick=True)
             for _ in range(100):
                 publish(bytes(100_000))  # more than all buffers on the way hold
-            while not last.wait(0.05):
+            while not last.wait(0.05) and time.monotonic() < deadline:
                 publish(b"last")
+            assert last.is_set()
+            assert stopped.poll() is None
         finally:
             stopped.kill()
 

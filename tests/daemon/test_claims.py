@@ -171,7 +171,7 @@ def test_claims_are_the_same_after_a_restart(walk: FloatArray) -> None:
         )
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 3))])
+@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.soak
 def test_the_claim_holds_between_poses_of_a_sweep_in_large_steps(seed: int) -> None:
     # The gears ripple nine times per turn: the error at a pose is unrelated to the next one, 25 degrees away.

@@ -91,7 +91,7 @@ def test_a_play_of_several_times_the_scatter_is_clearly_seen_beside_it(robot, se
     assert chance(fit_of(robot, seed, play), play, beside=True) < CLEARLY
 
 
-@pytest.mark.parametrize("name", [pytest.param("backlash", marks=pytest.mark.soak), "settling"])
+@pytest.mark.parametrize("name", ["backlash", "settling"])
 @pytest.mark.soak
 def test_of_memories_that_no_joint_has_one_in_a_hundred_is_as_improbable_as_one_in_a_hundred(robot, name) -> None:
     """More than 4 of 80 p-values below 0.01 occur by chance in 1 of 700 such tests."""

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import re
-import shlex
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from so101_on_a_port import So101
-from typed_pages import DOCS, TypedPage, commands_of, expected_mm
+from typed_pages import DOCS, TypedPage, command_of, commands_of, expected_mm
 
-from bodyschema.cli.main import command_line
 from bodyschema.daemon.config import Config
 from bodyschema.robot.lerobot import read_calibration
 
@@ -36,8 +34,7 @@ def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
 
 @pytest.mark.parametrize("command", commands_of(PAGE))
 def test_commands_are_understood(command: str) -> None:
-    words = shlex.split(command)[1:]
-    command_line(words[0]).parse_args(words, exit_on_error=False, print_error=False)
+    assert command_of(command).startswith("bodyschema.cli.commands.")  # not that of a help page
 
 
 def test_offsets_go_into_the_servos_and_errors_fall(page: TypedPage) -> None:

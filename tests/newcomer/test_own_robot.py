@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import warm
 from scipy.spatial.transform import Rotation
+from typed_pages import command_of
 
-from bodyschema.cli.main import command_line
 from bodyschema.daemon.config import Config
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.recordings.recording import Recording
@@ -99,8 +99,7 @@ def test_the_page_shows_the_example_s_robot_toml() -> None:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_on_the_page_is_understood(command: str) -> None:
-    words = shlex.split(command)[1:]
-    command_line(words[0]).parse_args(words, exit_on_error=False, print_error=False)
+    assert command_of(command).startswith("bodyschema.cli.commands.")  # not that of a help page
 
 
 def test_init_writes_what_the_page_says_and_guesses_what_the_example_has(desk) -> None:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-import shlex
 from pathlib import Path
 
 import pytest
+from typed_pages import command_of
 
 from bodyschema.cli.hardware.bench_run import BenchRun
 from bodyschema.cli.main import COMMANDS, command_line
@@ -44,8 +44,7 @@ def test_the_page_of_commands_has_them_all() -> None:
 
 @pytest.mark.parametrize("command", re.findall(r"^\.venv/bin/(bodyschema .*)$", README, re.MULTILINE))
 def test_every_command_in_the_readme_is_understood(command: str) -> None:
-    words = shlex.split(command)[1:]
-    command_line(words[0]).parse_args(words, exit_on_error=False, print_error=False)
+    assert command_of(command).startswith("bodyschema.cli.commands.")  # not that of a help page
 
 
 @pytest.mark.usefixtures("patient_host")

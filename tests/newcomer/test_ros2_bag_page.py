@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import re
 import runpy
-import shlex
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from bodyschema.cli.main import command_line
 from bodyschema.interfaces.errors import RecordingError
 
 pytest.importorskip("rosbags")
-from typed_pages import DOCS, TypedPage, commands_of, expected_mm
+from typed_pages import DOCS, TypedPage, command_of, commands_of, expected_mm
 
 PAGE = (DOCS / "ros2_bag.md").read_text(encoding="utf-8")
 DESK_ARM = DOCS.parent / "examples" / "desk_arm"
@@ -24,8 +22,7 @@ COMMANDS = commands_of(PAGE)
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_commands_are_understood(command: str) -> None:
-    words = shlex.split(command)[1:]
-    command_line(words[0]).parse_args(words, exit_on_error=False, print_error=False)
+    assert command_of(command).startswith("bodyschema.cli.commands.")  # not that of a help page
 
 
 def test_a_new_bag_is_predicted_to_the_noise(tmp_path, monkeypatch, capsys) -> None:

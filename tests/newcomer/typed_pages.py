@@ -51,6 +51,12 @@ def commands_of(text: str) -> list[str]:
     return re.findall(r"^\$ (bodyschema .*)$", text, re.MULTILINE)
 
 
+def command_of(words: str) -> str:
+    """Return the module of the command that the typed words run; raise if an option or a value is refused."""
+    arguments = shlex.split(words)[1:]
+    return command_line(arguments[0]).parse_args(arguments, exit_on_error=False, print_error=False)[0].__module__
+
+
 def expected_mm(text: str) -> tuple[float, float]:
     """Return the errors on new poses that a text tells: the mean, and what 95 % stay within [mm]."""
     told = re.search(r"Expect ([\d.]+) mm on new\s+poses, 95 % ≤ ([\d.]+) mm", text)

@@ -99,21 +99,13 @@ def test_a_single_tag_is_turned_to_the_eyes_in_nine_frames_of_ten(seed):
 @pytest.mark.parametrize(
     "joints",
     [
-        pytest.param(
-            ("neck_yaw", "neck_pitch", "shoulder_flexion", "upperarm_rotation", "elbow_flexion"),
-            marks=pytest.mark.soak,
-        ),
-        pytest.param(
-            ("neck_yaw", "neck_pitch", "shoulder_flexion", "shoulder_abduction", "upperarm_rotation", "elbow_flexion"),
-            marks=pytest.mark.soak,
-        ),
+        ("neck_yaw", "neck_pitch", "shoulder_flexion", "upperarm_rotation", "elbow_flexion"),
+        ("neck_yaw", "neck_pitch", "shoulder_flexion", "shoulder_abduction", "upperarm_rotation", "elbow_flexion"),
         (
             "neck_yaw", "neck_roll", "neck_pitch", "shoulder_flexion", "shoulder_abduction", "upperarm_rotation",
             "elbow_flexion", "forearm_rotation", "wrist_flexion", "wrist_abduction",
         ),
-        pytest.param(
-            ("shoulder_flexion", "shoulder_abduction", "upperarm_rotation", "elbow_flexion"), marks=pytest.mark.soak
-        ),
+        ("shoulder_flexion", "shoulder_abduction", "upperarm_rotation", "elbow_flexion"),
     ],
     ids=len,
 )  # fmt: skip

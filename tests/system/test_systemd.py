@@ -175,6 +175,7 @@ def test_a_service_over_its_memory_is_restarted(machine, robot) -> None:
     machine.systemctl("restart", "--no-block", LEARNER)
     machine.until(lambda: restarts(machine, LEARNER) >= 1)
     await_pairs(machine, SAMPLER)
+    assert restarts(machine, SAMPLER) == 0
 
 
 def test_a_robot_out_of_reach_is_awaited(machine, robot) -> None:
@@ -278,6 +279,7 @@ def test_one_learner_serves_several_robots(machine, tmp_path) -> None:
     await_pairs(machine, *units)
     for name in ("left", "right"):
         machine.until(partial(machine.has, f"/var/lib/bodyschema/{name}/learner.ckpt"))
+    assert [restarts(machine, unit) for unit in units] == [0, 0, 0]
 
 
 def without_network(machine: Machine) -> None:

@@ -153,7 +153,7 @@ def test_a_tag_that_moved_in_one_view_is_left_out_and_named() -> None:
     assert np.abs(errors(found, places)[0]).max() < 4e-4
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 2))])
+@pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.soak
 def test_a_number_that_is_there_twice_is_no_rigid_body_and_named(seed: int) -> None:
     """Check duplicate numbers on opposite faces, so that no image shows both."""
