@@ -17,6 +17,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from chance import highest_rate, successes
 
 from .judge import TOLD
 from .judgement import Crash, told
@@ -74,16 +75,12 @@ def _failed(record: Record) -> bool:
 
 def _allowed(rate: float, cases: int) -> int:
     """Return the number of failures exceeded with a probability of at most BY_CHANCE, shared among the tests here."""
-    from scipy.stats import binom  # it takes a second to import
-
-    return int(binom.isf(BY_CHANCE / len(SEALED), cases, rate))
+    return successes(1.0 - BY_CHANCE / len(SEALED), cases, rate)
 
 
 def _rate(names: tuple[str, ...]) -> float:
     """Return the upper end of the confidence interval of the sealed run's failure rate."""
-    from scipy.stats import binomtest
-
-    return float(binomtest(*SEALED[names]).proportion_ci(method="exact").high)
+    return highest_rate(*SEALED[names])
 
 
 def _check(names: tuple[str, ...]) -> None:

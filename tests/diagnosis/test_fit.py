@@ -6,8 +6,8 @@ import dataclasses
 
 import numpy as np
 import pytest
+from chance import chi_square, successes
 from planted_cases import BASE, ELBOW, SHOULDER, at_rest, desk_arm, observed, start_of, walk
-from scipy import stats
 
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.fit import Fit, improved
@@ -68,13 +68,13 @@ def fits(robot) -> list[Fit]:
 def test_each_amount_lies_in_its_stated_interval_as_often_as_stated(robot, fits) -> None:
     truth = np.concatenate([effect.values for effect in planted(robot)])
     held = sum(np.abs(amounts(fit) - truth) <= 1.959964 * np.sqrt(np.diag(covariance(fit))) for fit in fits)
-    assert (held >= stats.binom.ppf(CHANCE, len(fits), 0.95)).all()
+    assert (held >= successes(CHANCE, len(fits), 0.95)).all()
 
 
 def test_the_stated_covariance_is_neither_too_small_nor_too_large(robot, fits) -> None:
     truth = np.concatenate([effect.values for effect in planted(robot)])
     total = sum((amounts(f) - truth) @ np.linalg.solve(covariance(f), amounts(f) - truth) for f in fits)
-    low, high = stats.chi2.ppf([CHANCE, 1.0 - CHANCE], len(truth) * len(fits))
+    low, high = chi_square([CHANCE, 1.0 - CHANCE], len(truth) * len(fits))
     assert low < total < high
 
 
@@ -98,7 +98,7 @@ def test_a_period_or_time_constant_lies_in_its_stated_interval_as_often_as_state
         (cause,) = fit.causes
         place = fit.places(cause)[-1]
         held += abs(cause.values[-1] - values[-1]) <= 1.959964 * np.sqrt(fit.covariance[place, place])
-    assert held >= stats.binom.ppf(CHANCE, 20, 0.95)
+    assert held >= successes(CHANCE, 20, 0.95)
 
 
 def test_the_size_of_the_noise_is_that_of_the_recording(fits) -> None:
@@ -106,7 +106,7 @@ def test_the_size_of_the_noise_is_that_of_the_recording(fits) -> None:
     # Each fit has three coordinates a trusted row less its amounts: 9 of camera and marker, 4 of the causes.
     coordinates = 3 * int(fits[0].observations.trusted.sum())
     dof = len(fits) * (coordinates - 13)
-    low, high = stats.chi2.ppf([CHANCE, 1.0 - CHANCE], dof) / (len(fits) * coordinates)
+    low, high = chi_square([CHANCE, 1.0 - CHANCE], dof) / (len(fits) * coordinates)
     assert low < squares < high
 
 
@@ -120,7 +120,7 @@ def test_a_tenth_of_scattered_outliers_changes_the_amounts_no_more_than_their_ab
     moved = amounts(after) - amounts(before)
     distance = moved @ np.linalg.solve(covariance(before), moved)
     # A share s of the rows less moves the amounts by about s / (1 - s) of their variance.
-    assert distance < stats.chi2.ppf(1.0 - CHANCE, len(moved)) / 9.0
+    assert distance < chi_square(1.0 - CHANCE, len(moved)) / 9.0
 
 
 @pytest.mark.parametrize("ends", [[], [-1]], ids=["inside", "last row"])

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from chance import uniform_p_value
 from planted_cases import (
     BASE,
     ELBOW,
@@ -19,7 +20,7 @@ from planted_cases import (
     start_of,
     walk,
 )
-from scipy import stats
+from scipy.special import chdtrc
 
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.fit import Fit, fitted
@@ -144,11 +145,11 @@ def chances(robot: RobotDescription, starts: list[Fit], name: str, where: str | 
 def chances_of_independent_rows(robot: RobotDescription, starts: list[Fit], name: str, where: str) -> FloatArray:
     """Return the same probabilities if each row were an independent measurement."""
     found = [Scan(fit).candidate(Effect.at(robot, name, where)) for fit in starts]
-    return np.array([stats.chi2.sf(candidate.gain, candidate.dof) for candidate in found if candidate is not None])
+    return np.array([chdtrc(candidate.dof, candidate.gain) for candidate in found if candidate is not None])
 
 
 def is_uniform(p_values: FloatArray) -> bool:
-    return stats.kstest(p_values, "uniform").pvalue > CHANCE
+    return uniform_p_value(p_values) > CHANCE
 
 
 def test_blocks_without_a_fix_that_counts_promise_nothing() -> None:

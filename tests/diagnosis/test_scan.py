@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from chance import successes
 from planted_cases import BASE, ELBOW, SHOULDER, desk_arm, start_of, surveyed_arm, walk
-from scipy import stats
 
 from bodyschema.diagnosis.search.scan import Candidate, Scan
 from bodyschema.effects import Effect
@@ -107,7 +107,7 @@ def test_the_moment_of_a_barely_visible_jump_lies_in_its_interval_as_often_as_st
     intervals = np.array([scanned(robot, planted, seed).interval for seed in SEEDS])
     assert (intervals[:, 0] < intervals[:, 1]).any()
     held = (intervals[:, 0] - half < t0) & (t0 < intervals[:, 1] + half)
-    assert held.sum() >= stats.binom.ppf(CHANCE, len(SEEDS), 0.95)
+    assert held.sum() >= successes(CHANCE, len(SEEDS), 0.95)
 
 
 @pytest.mark.parametrize("cycles", [2.0, 8.0, 12.4, 50.0, 81.0])

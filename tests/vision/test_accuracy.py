@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from ball_renderer import SMALL, VGA, Look, clutter, render_pair
+from chance import successes
 from scenes import RADIUS_M, Errors, compare, measure_errors, place
 
 from bodyschema.interfaces.camera import StereoCalibration
@@ -74,10 +75,8 @@ def test_the_centres_have_no_bias(errors):
 
 
 def test_a_ball_in_full_view_is_found_nearly_always(errors):
-    from scipy.stats import binom  # it takes a second to import
-
     # 45 of 1200 others are missed; at a rate of 4 % there are more than this once in a thousand times.
-    most = binom.isf(1e-3, len(errors.x) + len(errors.misses), 0.04)
+    most = successes(1.0 - 1e-3, len(errors.x) + len(errors.misses), 0.04)
     assert len(errors.misses) <= most, errors.misses
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from bodyschema.interfaces.records import FloatArray
 
@@ -52,7 +52,7 @@ def focal_spread(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -
         freedom += len(off) - 6 - len(normal)
     variance = squares / max(freedom, 1)
     explained = np.mean(by_focal) / max(variance, np.mean(by_others, axis=0).max())
-    if explained < max(_CLEARLY, float(chi2.isf(_FALSE_ALARMS, len(by_focal))) / len(by_focal)):
+    if explained < max(_CLEARLY, float(chdtri(len(by_focal), _FALSE_ALARMS)) / len(by_focal)):
         return None
     spread = float(np.mean(np.square(factors))) - variance * float(np.mean(variances))
     return float(np.sqrt(max(spread, 0.0)))
