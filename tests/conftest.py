@@ -12,6 +12,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when numpy is importe
 
 import free_ports
 import pytest
+import warm
 from _pytest.doctest import DoctestModule
 from hypothesis import HealthCheck, settings
 from hypothesis.internal.conjecture import providers
@@ -43,6 +44,12 @@ def pytest_make_collect_report(collector: pytest.Collector) -> Generator[None, R
 def pytest_collect_file() -> Generator[None, list[pytest.Collector], list[pytest.Collector]]:
     """Look for doctests in the package only: among the tests there are none, and the search takes a second."""
     return [collector for collector in (yield) if not isinstance(collector, DoctestModule)]
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_setupnodes() -> None:
+    """Start the process that forks all others once, not once in each worker."""
+    warm.start()
 
 
 @pytest.hookimpl(optionalhook=True)

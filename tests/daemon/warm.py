@@ -37,6 +37,7 @@ RARELY_NEEDED = (
 )
 PR_SET_PDEATHSIG = 1
 LONGEST_REQUEST = 1 << 17
+SHARED = "BODYSCHEMA_FORKING"  # where the forking process listens
 _ASKING = threading.Lock()
 
 
@@ -121,16 +122,26 @@ def run(
 
 @functools.cache
 def _server() -> socket.socket:
-    """Return the socket to the forking process, which ends with this one."""
+    """Return the socket to the forking process: the one that started pytest's workers, or one of this process's own."""
+    if SHARED not in os.environ:
+        return start()
+    ours = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours.connect(bytes.fromhex(os.environ[SHARED]))
+    return ours
+
+
+def start() -> socket.socket:
+    """Start the forking process, which ends with this one; later child processes of this one find it, too."""
     ours, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     environment = {"OPENBLAS_NUM_THREADS": "1"} | os.environ
-    with its:
+    with its, socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as others:
+        others.bind("")  # to a name that is not in use
+        others.listen()
+        files = [its.fileno(), others.fileno()]
         subprocess.Popen(
-            [sys.executable, __file__, str(its.fileno())],
-            stdin=subprocess.DEVNULL,
-            env=environment,
-            pass_fds=[its.fileno()],
+            [sys.executable, __file__, *map(str, files)], stdin=subprocess.DEVNULL, env=environment, pass_fds=files
         ).returncode = 0  # never waited for
+        os.environ[SHARED] = others.getsockname().hex()
     atexit.register(ours.close)
     return ours
 
@@ -144,20 +155,29 @@ def _import_all() -> None:
                 importlib.import_module(module.name)
 
 
-def _serve(wire: socket.socket) -> list[str]:
-    """Fork for each request, until the other end closes; return in the fork the program to run."""
+def _serve(wire: socket.socket, others: socket.socket) -> list[str]:
+    """Fork for each request, until the other end of `wire` closes; return in the fork the program to run."""
     alive: dict[int, tuple[int, int]] = {}  # pidfd: pid, where its exit code goes
+    asking = {wire.fileno(): wire}
     while True:
-        for ready in select.select([wire.fileno(), *alive], [], [])[0]:
-            if ready != wire.fileno():
+        for ready in select.select([others.fileno(), *asking, *alive], [], [])[0]:
+            if ready == others.fileno():
+                one = others.accept()[0]
+                asking[one.fileno()] = one
+                continue
+            if ready in alive:
                 pid, fate = alive.pop(ready)
-                os.write(fate, b"%d\n" % os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
+                with suppress(BrokenPipeError):  # of a worker that is gone
+                    os.write(fate, b"%d\n" % os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
                 os.close(fate)
                 os.close(ready)
                 continue
-            message, files, *_ = socket.recv_fds(wire, LONGEST_REQUEST, 3)
+            message, files, *_ = socket.recv_fds(asking[ready], LONGEST_REQUEST, 3)
             if not message:
-                os._exit(0)
+                if ready == wire.fileno():
+                    os._exit(0)
+                asking.pop(ready).close()
+                continue
             if (pid := os.fork()) == 0:
                 return _settle(json.loads(message), files)
             os.write(files[0], b"%d\n" % pid)
@@ -206,7 +226,7 @@ if __name__ == "__main__":
     sys.path.pop(0)
     _import_all()
     gc.freeze()  # a collection would copy every page
-    code = _run(_serve(socket.socket(fileno=int(sys.argv[1]))))
+    code = _run(_serve(*(socket.socket(fileno=int(file)) for file in sys.argv[1:])))
     threading._shutdown()
     atexit._run_exitfuncs()
     for stream in (sys.stderr, sys.stdout):
