@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import stdtrit  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 
 from kbmaps.arrays import FloatArray
 from kbmaps.pairs import Pairs
@@ -27,6 +26,9 @@ _HALVINGS = 40
 
 def student(freedom: float) -> float:
     """Return the factor by which a sigma with an estimated noise must be multiplied for Gaussian coverage."""
+    # Imported here: it takes half a second, and not every process learns.
+    from scipy.special import stdtrit  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
+
     return float(stdtrit(max(freedom, 1.0), _ONE_SIGMA))
 
 

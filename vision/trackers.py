@@ -6,8 +6,6 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.plugins import load
 from bodyschema.vision.ball.one_eye import OneEyeBallTracker
-from bodyschema.vision.tags.body import TagBody
-from bodyschema.vision.tags.tracker import TagTracker
 
 from .config import VisionConfig
 from .tracked_camera import MarkerTracker
@@ -23,10 +21,14 @@ def tracker_of(calibration: StereoCalibration, config: VisionConfig) -> MarkerTr
     match config.marker:
         case "ball" | "bright_ball":
             return (StereoTracker if calibration.is_stereo else OneEyeBallTracker)(calibration, config)
-        case "tag":
-            return TagTracker(calibration, TagBody.single(config.tag), config.tag)
-        case "cluster":
-            return TagTracker(calibration, TagBody.cluster(config.cluster, config.tag), config.tag)
+        case "tag" | "cluster":
+            # They import scipy, which takes half a second, and a ball is found without it.
+            from bodyschema.vision.tags.body import TagBody
+            from bodyschema.vision.tags.tracker import TagTracker
+
+            single = config.marker == "tag"
+            body = TagBody.single(config.tag) if single else TagBody.cluster(config.cluster, config.tag)
+            return TagTracker(calibration, body, config.tag)
         case "plugin":
             if config.plugin is None:
                 raise ConfigError('[vision] marker = "plugin" names none', remedy="Add [vision.plugin] with its name")

@@ -7,15 +7,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, ImageArray, MarkerFix, Reason
 from bodyschema.vision.config import VisionConfig
-from bodyschema.vision.tags.body import TagBody
-from bodyschema.vision.tags.dictionary import tags_of
-from bodyschema.vision.tags.finder import TagFinder
-from bodyschema.vision.tags.image import measure_tag
+from kbmaps import rotation_matrices
 
 SUBPIXEL_BITS = 4
 AXES = ((60, 60, 255), (60, 220, 60), (255, 140, 60))  # x, y, z
@@ -40,7 +36,13 @@ class TagDrawing:
     """Drawing of the tags that [vision] names, and of others of their dictionary."""
 
     def __init__(self, calibration: StereoCalibration, config: VisionConfig) -> None:
-        self._calibration, self._config = calibration, config.tag
+        # They import scipy, which takes half a second, and where a ball is sought they are not needed.
+        from bodyschema.vision.tags.body import TagBody
+        from bodyschema.vision.tags.dictionary import tags_of
+        from bodyschema.vision.tags.finder import TagFinder
+        from bodyschema.vision.tags.image import measure_tag
+
+        self._calibration, self._config, self._measured = calibration, config.tag, measure_tag
         single = config.marker == "tag"
         self._body = TagBody.single(config.tag) if single else TagBody.cluster(config.cluster, config.tag)
         self._finder = TagFinder(config.tag, range(len(tags_of(config.tag.dictionary).bytesList)))
@@ -49,7 +51,7 @@ class TagDrawing:
         """Yield all tags of the dictionary in one eye's image."""
         grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
         for id, rough in self._finder.squares(grey):
-            found = measure_tag(grey, id, rough, self._config)
+            found = self._measured(grey, id, rough, self._config)
             corners, reason = (rough, found) if isinstance(found, Reason) else (found.corners_px, None)
             yield TagSight(id, corners, reason, id in self._body.corners)
 
@@ -57,7 +59,7 @@ class TagDrawing:
         """Draw the outlines of the marker's tags that face the left eye, and the marker's axes."""
         if fix.R is None:
             return
-        turn = Rotation.from_quat(fix.R).as_matrix()
+        turn = rotation_matrices("R", fix.R)
         shown = [corners @ turn.T + fix.x for corners in self._body.corners.values()]
         for corners in shown:
             if np.cross(corners[1] - corners[0], corners[3] - corners[0]) @ corners.mean(axis=0) > 0.0:
