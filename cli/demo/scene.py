@@ -8,15 +8,17 @@ import socket
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from bodyschema.daemon.wiring.wiring import demonstration_model
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation  # it takes half a second to import, and a ball has no rotation
 
 # Side of the cube [m], and of its black squares as a fraction: the white margin of a tag is an eighth of its side.
 CUBE_M, SQUARE = 0.07, 0.8
@@ -33,6 +35,8 @@ def tag_tables(towards_hand: FloatArray) -> str:
     Args:
         towards_hand: direction of the tool from the marker (3,), in the marker's frame, any length, not forward.
     """
+    from scipy.spatial.transform import Rotation
+
     up = towards_hand / np.linalg.norm(towards_hand)
     ahead = FORWARD - (FORWARD @ up) * up
     ahead = ahead / np.linalg.norm(ahead)
@@ -48,6 +52,8 @@ def cube_tables(towards_hand: FloatArray) -> str:
     Args:
         towards_hand: direction of the tool from the marker (3,), in the marker's frame, any length.
     """
+    from scipy.spatial.transform import Rotation
+
     lines = _head(SQUARE * CUBE_M)
     on_corner = Rotation.align_vectors(towards_hand[None] / np.linalg.norm(towards_hand), np.ones((1, 3)) / np.sqrt(3))[
         0
@@ -68,6 +74,8 @@ def _tag(id: int, xyz: FloatArray, rpy: FloatArray) -> list[str]:
 
 def _outward(normal: FloatArray) -> Rotation:
     """Return a rotation that turns z into `normal` (3,)."""
+    from scipy.spatial.transform import Rotation
+
     side = np.roll(normal, 1)
     return Rotation.from_matrix(np.column_stack([side, np.cross(normal, side), normal]))
 
