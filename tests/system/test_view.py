@@ -6,10 +6,9 @@ import os
 import re
 import shutil
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +23,7 @@ from bodyschema.daemon.transport.keys import Keys
 from bodyschema.recordings.recording import Recording
 
 pytest.importorskip("uvicorn")
-playwright = pytest.importorskip("playwright.sync_api")
-expect = playwright.expect
+pytest.importorskip("playwright")
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 QUIET = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
@@ -42,21 +40,22 @@ class PageServer:
     """`bodyschema view` on a port of its own, which can be stopped and restarted."""
 
     def __init__(self, robot: Path, port: str) -> None:
-        self._command = [sys.executable, "-m", "bodyschema", "view", "--robot", str(robot), "--port", port]
+        self._command = ["-m", "bodyschema", "view", "--robot", str(robot), "--port", port]
         self.address = f"http://127.0.0.1:{port}/"
         self.start()
 
     def start(self) -> None:
         """Start the page's process and wait until a browser may connect."""
-        self._process = subprocess.Popen(self._command, stdout=subprocess.PIPE, text=True)
-        assert self._process.stdout is not None
-        assert self._process.stdout.readline() == f"look at {self.address}\n"
+        said, writes = os.pipe()
+        with os.fdopen(said) as first, os.fdopen(writes, "w") as out:
+            self._process = warm.Child(*self._command, stdout=out)
+            out.close()
+            assert first.readline() == f"look at {self.address}\n"
 
     def end(self) -> None:
         """End the process by SIGTERM, in order, even with open pages."""
         self._process.terminate()
         assert self._process.wait() == 0
-        self._process.communicate()
 
 
 def recorded(config: Config) -> Recording:
@@ -69,9 +68,16 @@ def recorded(config: Config) -> Recording:
     return Recording(config.robot.joints, q, chain.positions(q), t)
 
 
+@dataclass(frozen=True)
+class Running:
+    """An upper body whose sampler and learner run."""
+
+    robot: Path
+    learner: int
+
+
 @pytest.fixture(scope="module")
-def robot_file(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Yield the robot.toml of an upper body whose sampler and learner run."""
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     scene = prepare(tmp_path_factory.mktemp("view") / "demo", 3)
     file, config = scene.robot_file, Config.load(scene.robot_file, {})
     recorded(config).write_csv(file.with_name("walk.csv"))
@@ -81,21 +87,24 @@ def robot_file(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     rarely = "[learner]\nsolve_every = 50\nreplays_per_pair = 1.0\n"
     file.write_text(f'{text}\n[drivers]\nrecording = "walk.csv"\n{rarely}', encoding="utf-8")
     with scene.log_file.open("wb") as log:
-        daemon = warm.Child("-m", "bodyschema", "run", "--robot", file, stderr=log)
+        words = ["-m", "bodyschema", "run"]
+        both = {name: warm.Child(*words, name, "--robot", file, stderr=log) for name in ("sampler", "learner")}
     try:
-        for process in ("sampler", "learner"):
-            while not is_alive(getattr(config.tables.zenoh, process), Keys(config.robot.name).alive(process)):
-                assert daemon.poll() is None, scene.log_file.read_text()
-        yield file
-        daemon.terminate()
-        assert daemon.wait() == 0
+        for name, process in both.items():
+            while not is_alive(getattr(config.tables.zenoh, name), Keys(config.robot.name).alive(name)):
+                assert process.poll() is None, scene.log_file.read_text()
+        yield Running(file, both["learner"].pid)
+        for process in both.values():
+            process.terminate()
+        assert [process.wait() for process in both.values()] == [0, 0]
     finally:
-        daemon.kill()
+        for process in both.values():
+            process.kill()
 
 
 @pytest.fixture(scope="module")
-def server(robot_file: Path, free_endpoint) -> Iterator[PageServer]:
-    server = PageServer(robot_file, free_endpoint().rpartition(":")[2])
+def server(running: Running, free_endpoint) -> Iterator[PageServer]:
+    server = PageServer(running.robot, free_endpoint().rpartition(":")[2])
     yield server
     server.end()
 
@@ -107,8 +116,10 @@ def address(server: PageServer) -> str:
 
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
-    with playwright.sync_playwright() as running:
-        yield running.chromium
+    from playwright.sync_api import sync_playwright  # half a second, in every worker, if it stood above
+
+    with sync_playwright() as playwright:
+        yield playwright.chromium
 
 
 @pytest.fixture(scope="module")
@@ -159,20 +170,15 @@ def drawn(chromium, address: str, complaints: list[str]) -> Iterator[Any]:
     browser.close()
 
 
+def expect(locator) -> Any:
+    """Return the assertions about a part of the page, which wait until they hold."""
+    from playwright.sync_api import expect
+
+    return expect(locator)
+
+
 def says(page, name: str, text: str) -> None:
     expect(page.locator(name)).to_contain_text(re.compile(text), timeout=LIMIT_MS)
-
-
-def child_of(name: str, robot: Path) -> int:
-    """Return the process of this robot that `bodyschema run` started under this name."""
-    for folder in Path("/proc").iterdir():
-        try:
-            words = (folder / "cmdline").read_bytes().decode().split("\0") if folder.name.isdigit() else []
-        except OSError:
-            continue
-        if name in words and str(robot) in words:
-            return int(folder.name)
-    raise AssertionError(f"there is no {name}")
 
 
 def test_every_panel_shows_what_runs(page) -> None:
@@ -229,16 +235,15 @@ def test_a_diagnosis_is_begun_and_stopped_by_buttons(page) -> None:
     expect(page.locator("#diagnose")).to_be_enabled()
 
 
-def test_a_learner_that_is_silent_is_named_and_the_page_goes_on_when_it_is_back(page, robot_file: Path) -> None:
+def test_a_learner_that_is_silent_is_named_and_the_page_goes_on_when_it_is_back(page, running: Running) -> None:
     says(page, "#pill-learner", "learning")
-    learner = child_of("learner", robot_file)
-    os.kill(learner, signal.SIGSTOP)
+    os.kill(running.learner, signal.SIGSTOP)
     try:
         says(page, "#notices", "The learner has not answered since .*bodyschema run learner")
         says(page, "#pill-learner", "gone")
         expect(page.locator("#tool")).to_be_disabled()
     finally:
-        os.kill(learner, signal.SIGCONT)
+        os.kill(running.learner, signal.SIGCONT)
     says(page, "#pill-learner", "learning")
     expect(page.locator("#notices")).not_to_contain_text("The learner has not answered", timeout=LIMIT_MS)
     expect(page.locator("#tool")).to_be_enabled()
