@@ -6,7 +6,7 @@
 #include <cstring>
 #include <fstream>
 #include <map>
-#include <regex>
+#include <stdexcept>
 #include <vector>
 using Error = std::runtime_error;
 using Parameters = std::map<std::string, double>;
@@ -17,16 +17,17 @@ Model read_model(const std::string& bytes) {
   unsigned length = 0;  // of 32 bits
   std::memcpy(&length, &bytes[12], sizeof length);
   const std::string header = bytes.substr(16, length);
-  const std::regex outputs(R"("outputs"\s*:\s*(\d+))"), number(R"re("(\w+)"\s*:\s*([-+.\deE]+))re");
-  const std::regex basis(R"re("kind"\s*:\s*"(\w+)"\s*,\s*"parameters"\s*:\s*\{([^}]*)\})re");
-  std::sregex_iterator found(header.begin(), header.end(), outputs), end;
-  size_t count = found == end ? 0 : std::stoul((*found)[1]);
+  size_t count = 0;
+  for (const char* at = header.c_str(); !count && (at = std::strstr(at, "\"outputs\""));) std::sscanf(at += 9, " : %zu", &count);
   Model model;
-  for (std::sregex_iterator i(header.begin(), header.end(), basis); i != end; ++i) {
-    const std::string kind = (*i)[1], inside = (*i)[2];
+  for (const char* at = header.c_str(); (at = std::strstr(at, "\"kind\""));) {
+    char kind[32], name[32];
+    double value = 0;  // below, %n: the characters so far, if all before it is there; a blank: any number of them
+    int read = 0;
+    if (at += 6, std::sscanf(at, " : \"%31[a-z_]\" , \"parameters\" : %n", kind, &read), !read) continue;
     auto& [_, p] = model.bases.emplace_back(kind, Parameters());
-    for (std::sregex_iterator j(inside.begin(), inside.end(), number); j != end; ++j) p[(*j)[1]] = std::stod((*j)[2]);
-    count *= kind.rfind("prismatic", 0) == 0 ? 2 : 3;
+    while (at += read, std::sscanf(at, " %*[{,] \"%31[a-z_]\" : %lf%n", name, &value, &read) == 2) p[name] = value;
+    count *= std::strncmp(kind, "prismatic", 9) ? 3 : 2;
   }
   if (bytes.size() != 32 + size_t(length) + 8 * count) throw Error("the file is damaged or truncated");
   model.net.resize(count);
