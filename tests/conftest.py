@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import subprocess
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when numpy is imported; more threads only spin
@@ -14,6 +14,7 @@ import free_ports
 import pytest
 import warm
 from _pytest.doctest import DoctestModule
+from _pytest.mark import ParameterSet
 from hypothesis import HealthCheck, settings
 from hypothesis.internal.conjecture import providers
 from skip_remedies import Report, with_remedy
@@ -58,12 +59,30 @@ def pytest_xdist_auto_num_workers() -> int:
     return (3 * len(os.sched_getaffinity(0)) + 1) // 2
 
 
+def leaves_soak_out(config: pytest.Config) -> bool:
+    return config.option.markexpr == "not soak" and not any("::" in argument for argument in config.args)
+
+
+def is_soak(marks: Iterable[pytest.Mark]) -> bool:
+    return any(mark.name == "soak" for mark in marks)
+
+
 def pytest_pycollect_makeitem(collector: pytest.Collector, obj: object) -> list[pytest.Item] | None:
     """Make no items of soak tests that are left out and were not named: a third of all, and thousands of parameters."""
-    config = collector.config
-    left_out = config.option.markexpr == "not soak" and not any("::" in argument for argument in config.args)
-    marks = getattr(obj, "pytestmark", []) if left_out and callable(obj) else []
-    return [] if any(mark.name == "soak" for mark in marks) else None
+    left_out = callable(obj) and leaves_soak_out(collector.config) and is_soak(getattr(obj, "pytestmark", []))
+    return [] if left_out else None
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Leave soak parameters out in the same way."""
+    marks = metafunc.definition.own_markers
+    for place, mark in enumerate(marks if leaves_soak_out(metafunc.config) else ()):
+        if mark.name == "parametrize" and len(mark.args) == 2 and not isinstance(mark.kwargs.get("ids"), list):
+            values = list(mark.args[1])
+            kept = [value for value in values if not (isinstance(value, ParameterSet) and is_soak(value.marks))]
+            if 0 < len(kept) < len(values):
+                marks[place] = pytest.mark.parametrize(mark.args[0], kept, **mark.kwargs).mark
 
 
 def pytest_collection(session: pytest.Session) -> None:
