@@ -23,7 +23,7 @@ MODEL = "XM430-W350"
 CONSTANT = torque_constant(MODEL) or math.nan
 WEIGHT_N_M = 1.2  # of a pendulum that lies level
 INERTIA, DAMPING, FRICTION_N_M = 0.03, 0.02, 0.01
-STEP_S = 5e-4
+STEP_S = 1e-3
 
 
 class Pendulum:
