@@ -126,6 +126,7 @@ def _server() -> socket.socket:
     if SHARED not in os.environ:
         return start()
     ours = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    atexit.register(ours.close)
     ours.connect(bytes.fromhex(os.environ[SHARED]))
     return ours
 
