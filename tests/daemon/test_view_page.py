@@ -22,7 +22,7 @@ HERE = "http://127.0.0.1:8420"
 PAUSE = {"process": "sampler", "command": "pause"}
 ADDRESSES = ["/", "/api/state", "/api/events", "/api/picture", "/report", "/static/style.css", "/static/js/main.js"]
 ADDRESSES += ["/api/body", "/api/body/0"]
-LIMIT_S = 30.0
+LIMIT_S = 300.0
 
 
 @dataclass
@@ -126,11 +126,11 @@ class SlowShapes(Processes):
         self.read = threading.Event()
 
     def document(self) -> BodyDocument:
-        assert self.read.wait(60.0)
+        assert self.read.wait(LIMIT_S)
         return super().document()
 
     def mesh(self, number: int) -> bytes | None:
-        assert self.read.wait(60.0)
+        assert self.read.wait(LIMIT_S)
         return super().mesh(number)
 
 

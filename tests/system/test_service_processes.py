@@ -27,6 +27,7 @@ from bodyschema.recordings.store.store import PairReader
 
 LIMIT_S = 500.0
 WATCHDOG_S = 0.8
+PAIRS_PER_S = 24.0
 STARVED_S = 2 * WATCHDOG_S
 LOOPS = {"sampler": sampler.LOOPS, "learner": learner.LOOPS}
 
@@ -81,7 +82,7 @@ def systemd(tmp_path: Path) -> Iterator[Systemd]:
 
 @pytest.fixture
 def config(tmp_path: Path, free_endpoint: Callable[[], str]) -> Config:
-    return write_robot(tmp_path, free_endpoint, rows=12_000)
+    return write_robot(tmp_path, free_endpoint, rows=round(PAIRS_PER_S * LIMIT_S), pairs_per_s=PAIRS_PER_S)
 
 
 def started(
@@ -201,7 +202,7 @@ def test_a_sampler_that_is_told_to_read_robot_toml_again_loses_no_frame(config: 
     assert "in force now: daemon.segment_gap_s = 7.0" in log_of(config).read_text()
     with PairReader(config.store_file) as store:
         t = [pair.t for pair in store.read()]
-    assert max(b - a for a, b in pairwise(t)) < 1.5 / 60  # every frame of the recording's 60 a second
+    assert max(b - a for a, b in pairwise(t)) < 1.5 / PAIRS_PER_S  # every frame of the recording
 
 
 def test_a_sampler_goes_on_when_robot_toml_is_wrong(config: Config, systemd: Systemd) -> None:
