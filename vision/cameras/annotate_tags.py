@@ -11,7 +11,6 @@ import numpy as np
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, ImageArray, MarkerFix, Reason
 from bodyschema.vision.config import VisionConfig
-from kbmaps import rotation_matrices
 
 SUBPIXEL_BITS = 4
 AXES = ((60, 60, 255), (60, 220, 60), (255, 140, 60))  # x, y, z
@@ -57,9 +56,11 @@ class TagDrawing:
 
     def draw_fix(self, eyes: list[ImageArray], fix: MarkerFix, colour: tuple[int, int, int]) -> None:
         """Draw the outlines of the marker's tags that face the left eye, and the marker's axes."""
+        from scipy.spatial.transform import Rotation
+
         if fix.R is None:
             return
-        turn = rotation_matrices("R", fix.R)
+        turn = Rotation.from_quat(fix.R).as_matrix()
         shown = [corners @ turn.T + fix.x for corners in self._body.corners.values()]
         for corners in shown:
             if np.cross(corners[1] - corners[0], corners[3] - corners[0]) @ corners.mean(axis=0) > 0.0:
