@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import subprocess
+import tempfile
 from collections.abc import Callable, Generator, Iterable, Iterator
 from pathlib import Path
 
@@ -131,6 +132,13 @@ def free_endpoint() -> Callable[[], str]:
 def endpoint(free_endpoint: Callable[[], str]) -> str:
     """Return an unused zenoh endpoint on this machine."""
     return free_endpoint()
+
+
+@pytest.fixture(scope="session")
+def hidden_folder() -> Iterator[Path]:
+    """Yield a folder that services see only if their units say so."""
+    with tempfile.TemporaryDirectory(prefix="bodyschema-", dir="/tmp") as folder:
+        yield Path(folder)
 
 
 @pytest.fixture

@@ -100,11 +100,11 @@ def test_a_folders_name_adds_no_line_to_a_unit(tmp_path: Path, name: str) -> Non
             make()
 
 
-def test_signs_of_systemd_in_a_path_stay_signs(tmp_path: Path) -> None:
-    config = in_folder(tmp_path / 'a:b $HOME ${x} %h "c"')
+def test_signs_of_systemd_in_a_path_stay_signs(hidden_folder: Path) -> None:
+    config = in_folder(hidden_folder / 'a:b $HOME ${x} %h "c"')
     text = of_host([config], "pi", HERE)
-    assert rf'"{tmp_path}/a:b $$HOME $${{x}} %%h \"c\"/robot.toml"' in text
-    assert rf'BindReadOnlyPaths="-{tmp_path}/a:b $HOME ${{x}} %%h \"c\""' in text
+    assert rf'"{hidden_folder}/a:b $$HOME $${{x}} %%h \"c\"/robot.toml"' in text
+    assert rf'BindReadOnlyPaths="-{hidden_folder}/a:b $HOME ${{x}} %%h \"c\""' in text
 
 
 @pytest.mark.parametrize("name", ["../../x", "a/b", "a\nb", "a\n", "", "a b", "%i"])

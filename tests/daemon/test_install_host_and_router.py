@@ -44,8 +44,9 @@ def robots(tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def router_file(tmp_path_factory) -> Path:
-    folder = carried_out(tmp_path_factory.mktemp("pki"))
+def router_file(hidden_folder) -> Path:
+    (hidden_folder / "pki").mkdir()
+    folder = carried_out(hidden_folder / "pki")
     shutil.copy(SEVERAL / "router.toml", folder)
     return folder / "router.toml"
 
@@ -129,7 +130,7 @@ def test_the_router_is_started_with_its_file_and_sees_its_certificates(tmp_path,
     assert values(unit, "ExecStart")[0].endswith(f"router {router_file}")
     assert values(unit, "User") == ["daemon"]
     seen = (Path(value.removeprefix("-")) for value in values(unit, "BindReadOnlyPaths"))
-    assert any(router_file.is_relative_to(folder) for folder in seen)  # pytest's folders are below /tmp
+    assert any(router_file.is_relative_to(folder) for folder in seen)
 
 
 @analyze
