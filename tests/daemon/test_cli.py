@@ -93,6 +93,13 @@ def test_silence_is_explained_by_a_wrong_table(robot, words) -> None:
         called(*words.split(), "--robot", robot)
 
 
+def test_a_message_does_not_quote_a_file_without_end(robot) -> None:
+    robot.write_text(robot.read_text() + f'["{"a=." * 100_000}"]\n')
+    said = run("config", cwd=robot.parent).stderr
+    assert "unknown table [a=.a=." in said
+    assert len(said) < 5000
+
+
 def test_a_client_config_agrees_with_the_whole(robot, monkeypatch) -> None:
     whole, own = Config.load(robot, {}), ClientConfig.load(robot, {})
     assert (own.name, own.joints, own.zenoh) == (whole.robot.name, whole.robot.joints, whole.tables.zenoh)
