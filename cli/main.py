@@ -126,6 +126,10 @@ def allow_enough_files() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
 
 
+# A message may quote a file: a key in quotes, a name in a model.
+LONGEST_MESSAGE = 4000
+
+
 # Help pages put text beside names: where no column is left for the text, wrapping fails or never ends.
 NARROWEST = 20
 
@@ -174,7 +178,9 @@ def _drop_output() -> None:
 
 
 def _fail(error: BodyschemaError) -> NoReturn:
-    print(f"bodyschema: {as_typed(printable(str(error)))}", file=sys.stderr)  # noqa: T201
+    text = str(error)
+    shortened = text if len(text) <= LONGEST_MESSAGE else f"{text[:LONGEST_MESSAGE]}..."
+    print(f"bodyschema: {as_typed(printable(shortened))}", file=sys.stderr)  # noqa: T201
     sys.exit(1)
 
 

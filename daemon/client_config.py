@@ -16,7 +16,7 @@ from msgspec import Meta
 
 from bodyschema.daemon.transport.identity import Route
 from bodyschema.daemon.transport.zenoh_config import ZenohConfig
-from bodyschema.interfaces.errors import ConfigError, RequestError
+from bodyschema.interfaces.errors import BusError, ConfigError, RequestError
 from bodyschema.robot.limited import read_at_most
 from bodyschema.robot.toml_file import NAME, convert, read_toml
 
@@ -85,15 +85,26 @@ class ClientConfig:
         """Return the endpoint and identity with which a client connects to `sampler` or `learner`."""
         return self.zenoh.route(process, self.file.parent)
 
+    def check(self) -> None:
+        """Check all of robot.toml.
+
+        Raises:
+            ConfigError: as `Config.load`.
+        """
+        from bodyschema.daemon.config import Config
+
+        Config.load(self.file)
+
     @contextmanager
     def checked_on_error(self) -> Iterator[None]:
-        """Raise the ConfigError of a wrong robot.toml in the place of the error of a wrong request."""
+        """Raise the ConfigError of a wrong robot.toml in the place of an error that it may have caused.
+
+        A process with a wrong robot.toml does not start, and then nothing answers.
+        """
         try:
             yield
-        except RequestError:
-            from bodyschema.daemon.config import Config
-
-            Config.load(self.file)
+        except (BusError, RequestError):
+            self.check()
             raise
 
     @cached_property

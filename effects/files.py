@@ -19,6 +19,7 @@ factors = [1.0, 1.0]            # factor on each input; 1 by default
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -261,7 +262,7 @@ def _number(entry: Mapping[str, Any], parameter: Parameter, effect: Effect) -> f
     value = entry[name]
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise _WrongEntry(f"{name} = {value!r} is no number", name, "Write it like 0.05 or 1e-3, without a unit")
-    if not math.isfinite(value):
+    if not abs(value) <= sys.float_info.max:  # an integer of TOML may be larger
         raise _WrongEntry(f"{name} = {value} is not finite", name)
     if parameter.never_negative and value < 0.0:
         raise _WrongEntry(f"{name} = {value:g}: it is never negative", name, "Take the minus away, or the effect")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -212,7 +212,10 @@ def plausibility(
         if robot.camera.pose_known:
             found = _turned(chain, q[rows], x[rows], fit) or found
         if held is not None and found.refusal is None:
-            found = _turned_last(names, fit, *held)
+            found = _turned_end(names, fit, *held)
+        elif not robot.robot.marker_known and (nearer := search.with_marker_nearer(as_it_is)) is not None:
+            looks, tool_m = nearer.looks(names, fit.zeros), search.fits[nearer].tool_m
+            found = replace(found, warnings=(*found.warnings, f"perhaps {looks}: {_marker_then(tool_m, fit.tool_m)}"))
     if found.refusal is None or len(q) >= FEWEST_ROWS:
         return found
     few = f"{found.refusal}. {found.remedy}. (These are {len(q)} pairs: {FEWEST_ROWS} are needed to decide.)"
@@ -295,11 +298,17 @@ def _turned(chain: RigidChain, q: FloatArray, x: FloatArray, fit: _Fit) -> Plaus
     )
 
 
-def _turned_last(names: tuple[str, ...], as_it_is: _Fit, reading: Reading, fit: _Fit) -> Plausibility:
-    """Report that the last joint's zero is off by quarter turns: only that explains the known marker position."""
+def _marker_then(then_m: float, now_m: float) -> str:
+    return (
+        f"the marker then comes out {_mm(then_m)} from its place in [robot] of robot.toml, and as the columns are "
+        f"{_mm(now_m)} from it"
+    )
+
+
+def _turned_end(names: tuple[str, ...], as_it_is: _Fit, reading: Reading, fit: _Fit) -> Plausibility:
+    """Report that a zero near the hand is off by quarter turns: only that explains the known marker position."""
     return Plausibility(
-        f"it seems that {reading.looks(names, fit.zeros)}: the marker then comes out {_mm(fit.tool_m)} from its place "
-        f"in [robot] of robot.toml, and as the columns are {_mm(as_it_is.tool_m)} from it",
+        f"it seems that {reading.looks(names, fit.zeros)}: {_marker_then(fit.tool_m, as_it_is.tool_m)}",
         f"{reading.remedy(names, fit.zeros)}. Or correct marker_xyz, or set marker_known = false",
         misread=True,
     )
@@ -392,7 +401,7 @@ class _Search:
         return np.maximum(placed.errors(MEASURED), self._exact_m)
 
     def with_marker_known(self, reading: Reading) -> tuple[Reading, _Fit] | None:
-        """Return the reading with the last joint off by quarter turns, and its fit, if the known marker shows it.
+        """Return the reading with a zero near the hand off by quarter turns, and its fit, if the known marker shows it.
 
         With a free marker position such a turn makes no difference.
         """
@@ -400,15 +409,33 @@ class _Search:
             return None
         last = np.arange(self._chain.joints) == self._chain.joints - 1
         std = np.where(last, _SETTINGS.last_zero_rad, self._std)
-        turned = [reading.turned((turns * last).tolist()) for turns in (0, 1, -1, 2)]
+        turned = [reading.turned((turns * last).tolist()) for turns in (0, 1, -1, 2)] + self._turned_alike(reading)
         fits = self._placed(turned, std=std, tool_m=KNOWN_TOOL_M)
         as_given = fits.pop(reading, None)
         best = min(fits, key=lambda each: fits[each].nats + _SETTINGS.a_change * each.changes, default=reading)
-        if as_given is None or best not in turned:
+        if best not in turned or best == reading:
             return None
         fit = fits[best]
-        clearly = fit.nats + _SETTINGS.certain < as_given.nats and _SETTINGS.nearer * fit.tool_m < as_given.tool_m
-        return (best, fit) if clearly else None
+        # Without a fit the known marker itself has led from this reading to another one.
+        clearly = as_given is None or fit.nats + _SETTINGS.certain < as_given.nats
+        far = _SETTINGS.nearer * fit.tool_m < (as_given or self.fits[reading]).tool_m
+        return (best, fit) if clearly and far else None
+
+    def with_marker_nearer(self, reading: Reading) -> Reading | None:
+        """Return the reading with other quarter turns, as good a fit, that brings a far marker near to its place."""
+        best = min(self._turned_alike(reading), key=lambda each: self.fits[each].tool_m, default=reading)
+        far = self.fits[reading].tool_m > _SETTINGS.nearer * max(self.fits[best].tool_m, KNOWN_TOOL_M)
+        return best if far else None
+
+    def _turned_alike(self, reading: Reading) -> list[Reading]:
+        """Return the readings with other quarter turns that fit as well."""
+        return [
+            other
+            for other, fit in self.fits.items()
+            if other != reading
+            and replace(other, quarters=reading.quarters) == reading
+            and self._as_good(fit, self.fits[reading])
+        ]
 
     def undirected(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """Return the joints whose sign makes no difference."""

@@ -274,7 +274,7 @@ def _is_listening(endpoint: str) -> bool:
     try:
         with socket.create_connection((host.strip("[]"), int(port)), CONNECT_S):
             return True
-    except OSError:
+    except (OSError, OverflowError, UnicodeError):  # as in `unreached`
         return False
 
 

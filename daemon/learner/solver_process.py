@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import os
 import select
+import signal
 import struct
 import subprocess
 import sys
@@ -32,6 +33,8 @@ from kbmaps import ChainBelief, ChainTolerances, KBMap, OrientedChain, ResidualM
 
 NICENESS = 5
 LONGEST_REST_S = 5.0
+# A child that owes an answer and uses no processor for this long is stopped or locked up: the learner's `WatchdogSec`.
+HUNG_AFTER_S = 60.0
 _LENGTH = struct.Struct("<I")
 
 
@@ -107,6 +110,8 @@ class SolverProcess:
     def __init__(self) -> None:
         self._child: subprocess.Popen[bytes] | None = None
         self._received = bytearray()
+        self._owes = False
+        self._moved_s, self._looked_at = 0.0, 0.0  # the child's processor time at the last look, and when that was
 
     def __enter__(self) -> Self:
         return self
@@ -151,6 +156,7 @@ class SolverProcess:
     def solve(self, robot: int = 0) -> None:
         """Request the solution for all pairs so far."""
         self._send(Solve(robot))
+        self._owes, self._looked_at = True, time.monotonic()
 
     def poll(self) -> Solved | None:
         """Return the next solution that has arrived, without waiting."""
@@ -162,7 +168,22 @@ class SolverProcess:
             if not part:
                 raise self._lost()
             self._received += part
-        return self._next_solution()
+        solved = self._next_solution()
+        if solved is None and self._owes:
+            self._require_progress(child.pid)
+        elif solved is not None:
+            self._owes = not solved.last
+        return solved
+
+    def _require_progress(self, pid: int) -> None:
+        if time.monotonic() - self._looked_at < HUNG_AFTER_S:
+            return
+        used_s = time.clock_gettime(~pid << 3 | 2)  # as clock_getcpuclockid(3) has it
+        if used_s == self._moved_s:
+            os.kill(pid, signal.SIGKILL)
+            self._end()
+            raise SolverLostError(f"the solver did nothing for {HUNG_AFTER_S:.0f} s; it is started again")
+        self._moved_s, self._looked_at = used_s, time.monotonic()
 
     def _next_solution(self) -> Solved | None:
         if len(self._received) < _LENGTH.size:
@@ -187,7 +208,7 @@ class SolverProcess:
         return SolverLostError(f"the solver's process ended with exit code {code}; it is started again")
 
     def _end(self) -> int | None:
-        child, self._child = self._child, None
+        child, self._child, self._owes = self._child, None, False
         self._received.clear()
         if child is None or child.stdin is None or child.stdout is None:
             return None

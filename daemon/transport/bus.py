@@ -400,5 +400,5 @@ def _accepts(endpoint: str) -> bool:
     try:
         with socket.create_connection((host.strip("[]"), int(port)), ACCEPT_LIMIT_S):
             return True
-    except OSError:
+    except (OSError, OverflowError, UnicodeError):  # a port above 65535, a name with a part above 63 characters
         return False

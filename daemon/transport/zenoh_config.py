@@ -14,8 +14,9 @@ from bodyschema.robot.toml_file import line_of
 from .access import Names, Subjects, access_control
 from .identity import SECURE, Identity, LoginConfig, Route, TlsConfig, is_local
 
-# Sockets in the file system have no port.
-ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws)/.+:[0-9]+|unixsock-stream/.+")
+# Up to 65535. Sockets in the file system have no port.
+_PORT = "([1-9][0-9]{0,3}|[1-5][0-9]{4}|6[0-4][0-9]{3}|65[0-4][0-9]{2}|655[0-2][0-9]|6553[0-5])"
+ENDPOINT = re.compile(rf"(tcp|udp|tls|quic|ws)/.+:{_PORT}|unixsock-stream/.+")
 PROCESSES = ("sampler", "learner")
 HOW_TO = "docs/security.md shows how"
 

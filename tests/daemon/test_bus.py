@@ -10,7 +10,8 @@ from queue import Queue
 
 import pytest
 
-from bodyschema.daemon.transport.bus import Request, ZenohSession, client
+from bodyschema.cli.hardware.doctor import zenoh_check
+from bodyschema.daemon.transport.bus import Request, ZenohSession, client, unreached
 from bodyschema.daemon.transport.identity import Route
 from bodyschema.daemon.transport.wire import JSON, MSGPACK, ErrorReply, decode
 from bodyschema.interfaces.errors import BusError, RequestError
@@ -136,6 +137,13 @@ def test_a_stopped_subscriber_holds_up_no_publication(endpoint) -> None:
 def test_where_nobody_answers_the_process_to_start_is_named(asking) -> None:
     with pytest.raises(BusError, match=r"Is the sampler running\? Start it with `bodyschema run sampler`"):
         asking.ask_one(KEY)
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:65536", f"{'a' * 64}.org:7447", "a..org:7447"])
+def test_nothing_listens_on_an_impossible_address(address) -> None:
+    route = Route((f"tcp/{address}",))
+    assert unreached(route).startswith(f"nothing listens on tcp/{address}")
+    assert "is free" in zenoh_check("sampler", route, "x/alive").said
 
 
 def test_the_learners_keys_name_the_learner(asking) -> None:

@@ -40,9 +40,15 @@ def robot(tmp_path: Path, free_endpoint) -> Path:
     )
 
 
-def loaded_by(*lines: list[str], cwd: Path) -> set[str]:
-    """Return the modules that a process has imported after running these command lines."""
-    code = """
+# All of robot.toml is checked only where nothing answers.
+AS_IF_ANSWERED = "from bodyschema.daemon.client_config import ClientConfig; ClientConfig.check = lambda _: None"
+
+
+def loaded_by(*lines: list[str], cwd: Path, first: str = "") -> set[str]:
+    """Return the modules that a process has imported after running `first` and these command lines."""
+    code = (
+        first
+        + """
 import json, sys
 from bodyschema.cli.main import main
 for words in json.loads(sys.argv[1]):
@@ -53,6 +59,7 @@ for words in json.loads(sys.argv[1]):
         pass
 print(*sys.modules)
 """
+    )
     done = subprocess.run(
         [sys.executable, "-c", code, json.dumps(lines)],
         capture_output=True, text=True, timeout=LIMIT_S, check=True, cwd=cwd,
@@ -68,7 +75,7 @@ def test_help_loads_nothing_that_takes_long(tmp_path) -> None:
 
 
 def test_status_and_predict_load_no_numpy(robot) -> None:
-    loaded = loaded_by(["status"], ["predict", "0", "0"], cwd=robot.parent)
+    loaded = loaded_by(["status"], ["predict", "0", "0"], cwd=robot.parent, first=AS_IF_ANSWERED)
     assert {"bodyschema.daemon.client_config", "zenoh"} <= loaded
     assert loaded & {"numpy", "scipy", "kbmaps", "lxml", "tomlkit", "bodyschema.daemon.config"} == set()
 
@@ -77,6 +84,20 @@ def test_a_wrong_request_is_told_what_is_wrong_in_robot_toml(robot) -> None:
     robot.write_text(robot.read_text() + "[daemon.more]\n")
     with pytest.raises(ConfigError, match="more"):
         app(["predict", "0", "--robot", str(robot)], exit_on_error=False, result_action="return_value")
+
+
+@pytest.mark.parametrize("words", ["status", "status --json", "predict 0 0", "ik 0.1 0.2 0.3"])
+def test_silence_is_explained_by_a_wrong_table(robot, words) -> None:
+    robot.write_text(robot.read_text() + "[vision]\nradius = 1\n")
+    with pytest.raises(ConfigError, match="unknown key 'radius'"):
+        called(*words.split(), "--robot", robot)
+
+
+def test_a_message_does_not_quote_a_file_without_end(robot) -> None:
+    robot.write_text(robot.read_text() + f'["{"a=." * 100_000}"]\n')
+    said = run("config", cwd=robot.parent).stderr
+    assert "unknown table [a=.a=." in said
+    assert len(said) < 5000
 
 
 def test_a_client_config_agrees_with_the_whole(robot, monkeypatch) -> None:
@@ -100,7 +121,7 @@ def test_a_client_config_reads_a_urdf_as_strictly_as_the_whole(robot, first) -> 
 
 
 def test_status_and_predict_load_neither_effects_nor_solvers(robot) -> None:
-    loaded = loaded_by(["status"], ["predict", "0", "0"], cwd=robot.parent)
+    loaded = loaded_by(["status"], ["predict", "0", "0"], cwd=robot.parent, first=AS_IF_ANSWERED)
     assert {"bodyschema.cli.commands.run.status", "bodyschema.cli.commands.run.predict", "zenoh"} <= loaded
     heavy = {
         "bodyschema.effects",

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
@@ -350,6 +351,17 @@ def misread_ur5(case: str | None) -> tuple[Config, Recording]:
 def test_a_misread_recording_of_a_real_arm_is_named(case) -> None:
     config, recording = misread_ur5(case)
     assert case in (plausibility(config.robot, recording.q, recording.x).refusal or "")
+
+
+@real
+@pytest.mark.parametrize("known", [False, True])
+def test_a_wrist_turned_round_is_told_by_the_marker(known) -> None:
+    config, recording = misread_ur5(None)
+    robot = msgspec.structs.replace(config.robot.robot, marker_known=known)
+    turned = recording.q + np.array([0.0, 0.0, 0.0, 0.0, np.pi, 0.0])
+    found = plausibility(dataclasses.replace(config.robot, robot=robot), turned, recording.x)
+    assert "the zero of q5 is about 180° off: the marker then comes out" in found.sentences[0]
+    assert (found.refusal is None) == (not known)
 
 
 @real

@@ -1,9 +1,13 @@
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 from guided_arm import JOINTS, nominal_model
 
+from bodyschema.daemon.learner import solver_process
+from bodyschema.daemon.learner.solver_process import SolverLostError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.model_bank import RIGID
 from bodyschema.learning.solvers.solver import Solved, SolverClient, Task
@@ -101,3 +105,15 @@ def test_a_solver_that_lost_everything_is_given_everything_again(solver: Scripte
     solving.restart()
     assert solving.begin(TASK)
     assert (solver.told[-1], solving.fed) == (("start", 1), 0)
+
+
+def test_a_solver_that_hangs_is_replaced(monkeypatch) -> None:
+    program = (sys.executable, "-S", "-c", "import signal; signal.pause()")
+    monkeypatch.setattr(solver_process, "module_command", lambda _: program)
+    monkeypatch.setattr(solver_process, "HUNG_AFTER_S", 0.001)
+    with solver_process.SolverProcess() as process:
+        process.start(TASK)
+        process.solve()
+        with pytest.raises(SolverLostError, match="started again"):
+            list(iter(process.poll, ()))
+        assert process.pid is None

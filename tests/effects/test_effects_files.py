@@ -112,6 +112,7 @@ def test_a_file_that_is_there_is_not_replaced_unasked(robot, tmp_path) -> None:
         ('effect = "joint_offset"\nwhere = "rail"\noffset_m = 5', "looks like millimetres", "offset_m"),
         ('effect = "joint_offset"\nwhere = "elbow"\noffset_rad = "5"', "is no number", "offset_rad"),
         ('effect = "joint_offset"\nwhere = "elbow"\noffset_rad = nan', "is not finite", "offset_rad"),
+        (f'effect = "joint_offset"\nwhere = "elbow"\noffset_rad = {10**309}', "is not finite", "offset_rad"),
         ('effect = "joint_offset"\nwhere = "elbow"', "says of nothing how much", "[[effects]]"),
         ('effect = "joint_eccentricity"\nwhere = "rail"\nsine_m = 0.1', "joint_ripple", "where ="),
         ('effect = "camera_latency"\nlatency_s = 20', "looks like milliseconds", "latency_s"),

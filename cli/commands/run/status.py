@@ -40,7 +40,9 @@ def status(
             if json:
                 console.file.write(as_json(seen) + "\n")
                 console.file.flush()
-            else:
+            if seen.nobody and not watch:
+                config.check()  # `Start it` would be no remedy
+            if not json:
                 console.print(screen(seen, config))
             if seen.nobody and not watch:
                 sys.exit(1)
