@@ -326,13 +326,14 @@ class Sets:
             spent, squares = members @ told, members @ (np.square(amounts) / variances)
             steps = (squares - spent - logs / SPREAD**2) / (2.0 * np.maximum(spent, 0.5) + 1.0 / SPREAD**2)
             steps = np.minimum(np.maximum(steps, -_FARTHEST), _FARTHEST)
+            moved = np.minimum(np.maximum(logs + steps, _LOG_SMALLEST), _LOG_MOST)
             rss = self._square - 2.0 * float(amounts @ toward) + float(amounts @ inner @ amounts)
             free = max(self._rows - float(told.sum()), 1.0)
             quieter = 0.5 * math.log(max(rss, 1e-300) / free) - math.log(sigma)
             quieter = min(max(quieter, -_FARTHEST), _FARTHEST)
-            if done and max(np.abs(steps).max(), abs(quieter)) < _STILL:
+            if done and max(np.abs(moved - logs).max(), abs(quieter)) < _STILL:
                 break
-            logs = np.minimum(np.maximum(logs + steps, _LOG_SMALLEST), _LOG_MOST)
+            logs = moved
             sigma = max(sigma * math.exp(quieter), _QUIETEST * self._noise)
         worth, factor, amounts = self._worth(inner, toward, group, logs, sigma)
         scales = Scales(*np.exp(logs).tolist())
