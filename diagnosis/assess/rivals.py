@@ -13,7 +13,7 @@ from bodyschema.diagnosis.fit.scatter import beyond_single_rows, limited_rows, r
 from bodyschema.diagnosis.fit.worth import nats
 from bodyschema.diagnosis.search.held_out import Blocks
 from bodyschema.diagnosis.search.scan import Candidate
-from bodyschema.diagnosis.search.search import Search, describe
+from bodyschema.diagnosis.search.search import Search
 from bodyschema.diagnosis.unnamed.unknown import Unknowns
 from bodyschema.effects import Effect, Motion
 from bodyschema.interfaces.records import FloatArray
@@ -31,7 +31,6 @@ PROBABLE = 0.02
 _COMES_NEAR = 0.7
 # A rival less probable by this is not fitted to convergence [nats].
 _HOPELESS = 40.0
-_Other = tuple[Fit | Nameless, Effect | None, str]
 # Number of poses over the whole range of the joints, which stand for any motion, and the scatter of the logarithms of
 # the times between them.
 _POSES, _UNEVEN = 400, 1.0
@@ -45,8 +44,7 @@ class Rival:
 
     Attributes:
         instead: the fit with it in the place of the cause.
-        effect: with its best-fitting numbers; None where it has no name.
-        described: short description.
+        itself: the effect with its best-fitting numbers, or what has no name.
         probability: given that the cause or one of its rivals is present.
         difference: Δχ² by which this motion is expected to separate them.
         anywhere: the same for as many poses over the whole range of the joints.
@@ -55,8 +53,7 @@ class Rival:
     """
 
     instead: Fit | Nameless
-    effect: Effect | None
-    described: str
+    itself: Effect | Nameless
     probability: float
     difference: float
     anywhere: float
@@ -127,24 +124,24 @@ def _standing(
         worth + (beyond_single_rows(fit, one.fit) if remembers(cause) and remembers(effect) else 0.0)
         for worth, (one, effect) in zip(behind, tried, strict=True)
     ]
-    others: list[_Other] = [_as_fitted(one.fit, effect) for one, effect in tried]
+    others: list[tuple[Fit | Nameless, Effect | Nameless]] = [_as_fitted(one.fit, effect) for one, effect in tried]
     if unknowns is not None:
         near = unknowns.specific(without, _COMES_NEAR * itself.gain)
         aparts = [unknowns.apart(without, (way,)) for way in near]
         if (nameless := Nameless.in_place_of(cause, fit, aparts, unknowns, search)) is not None:
-            others.append((nameless, None, nameless.what))
+            others.append((nameless, nameless))
             behind.append(nameless.behind)
     # What a cause is worth allows for blocks already.
-    rows = [np.zeros(len(fit.left)), *(_at_rows(fit, other, cause, effect) for other, effect, _ in others)]
+    rows = [np.zeros(len(fit.left)), *(_at_rows(fit, other, cause, itself) for other, itself in others)]
     probable = bagged([-worth, *behind], rows, blocks, seed)
     wide = widened(fit, range(fit.observations.motion.q.shape[1]), uneven=_UNEVEN)
     signal = apart_on(fit, without, wide)
     rivals = []
-    for (other, effect, told), share in zip(others, probable[2:], strict=True):
+    for (other, alternative), share in zip(others, probable[2:], strict=True):
         if share >= PROBABLE:
             anywhere = apart_on(fit, other, wide)
             one = anywhere < _SAME_SHARE * signal and _is_no_more(other, fit, without, wide)
-            rivals.append(Rival(other, effect, told, float(share), _difference(fit, other), anywhere, signal, one))
+            rivals.append(Rival(other, alternative, float(share), _difference(fit, other), anywhere, signal, one))
     same = sum(rival.probability for rival in rivals if rival.is_one)
     ordered = tuple(sorted(rivals, key=lambda rival: rival.probability, reverse=True))
     return Standing(
@@ -158,10 +155,10 @@ def _standing(
     )
 
 
-def _at_rows(fit: Fit, other: Fit | Nameless, cause: Effect, effect: Effect | None) -> FloatArray:
+def _at_rows(fit: Fit, other: Fit | Nameless, cause: Effect, itself: Effect | Nameless) -> FloatArray:
     """Return the log-likelihood of an alternative over a fit at each row (n,) [nats]."""
     there = other if isinstance(other, Fit) else other.apart.fit
-    if effect is not None and remembers(cause) and remembers(effect):
+    if isinstance(itself, Effect) and remembers(cause) and remembers(itself):
         return limited_rows(fit, there)
     return there.row_log_likelihoods - fit.row_log_likelihoods
 
@@ -173,9 +170,8 @@ def _is_no_more(other: Fit | Nameless, fit: Fit, without: Fit, wide: Motion) -> 
     return apart_on(other, fit, wide) < _SAME_SHARE * apart_on(other, without, wide)
 
 
-def _as_fitted(fit: Fit, effect: Effect) -> _Other:
-    cause = next(cause for cause in fit.causes if cause.identity == effect.identity)
-    return fit, cause, describe(cause)
+def _as_fitted(fit: Fit, effect: Effect) -> tuple[Fit, Effect]:
+    return fit, next(cause for cause in fit.causes if cause.identity == effect.identity)
 
 
 def _difference(one: Fit, other: Fit | Nameless) -> float:

@@ -47,15 +47,15 @@ _HARDLY_CHANCE = 1e-3
 def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
     """Return the machine-readable form of a diagnosis."""
     percent, interval = diagnosis.gain()
-    causes = _causes(diagnosis)
+    # A tracker or a scanner has no intrinsics in robot.toml.
+    seen_by = "instrument" if diagnosis.aligned.simulation.robot.calibration is None else "camera"
+    causes = _causes(diagnosis, seen_by)
     rms = _rms_mm(diagnosis)
     verdict = _verdict(diagnosis, causes, percent)
     counted = diagnosis.gain_with_outliers() if diagnosis.outliers else (None, None)
     gain = Gain(percent, interval, with_outliers_percent=counted[0], with_outliers_ci95=counted[1])
     tolerances = _tolerances(diagnosis)
     timed = diagnosis.aligned.observations.motion.t is not None
-    # A tracker or a scanner has no intrinsics in robot.toml.
-    seen_by = "instrument" if diagnosis.aligned.simulation.robot.calibration is None else "camera"
     weighed = diagnosis.aligned.simulation.gravity.known
     named_mm, tolerated_mm = _named_mm(diagnosis), _tolerated_mm(diagnosis)
     return DiagnosisFile(
@@ -71,7 +71,7 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
         rejected=_rejected(diagnosis),
         unexplained=_unexplained(diagnosis),
         stability=_stability(diagnosis, causes),
-        advice=advice(diagnosis, causes),
+        advice=advice(diagnosis, causes, seen_by),
         limitations=_limitations(diagnosis),
         alike=_alike(diagnosis),
         tolerances=tolerances,
@@ -134,7 +134,7 @@ def _mean_mm(diagnosis: Diagnosis) -> Errors:
     return Errors(**figures, noise_floor=min(1e3 * float(lengths.mean()), figures["extended"]))
 
 
-def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:
+def _causes(diagnosis: Diagnosis, seen_by: str) -> tuple[Cause, ...]:
     fit, worse = diagnosis.extended, [max(diagnosis.worse_without[c.identity], 1.0) for c in diagnosis.causes]
     sure, causes = _OF_A_DESCRIPTION if diagnosis.ended_early else 1.0, []
     parts = zip(fit.causes, diagnosis.standings, diagnosis.shares.causes, worse, strict=True)
@@ -151,7 +151,7 @@ def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:
                 stability_percent=100.0 * float(standing.again.mean()),
                 indistinguishable_from=tuple(_named(r) for r in standing.rivals if r.is_same_here),
                 rivals=tuple(_named(r) for r in standing.rivals),
-                evidence=evidence(standing),
+                evidence=evidence(standing, seen_by),
             )
         )
     if not diagnosis.aligned.simulation.gravity.known:
@@ -177,11 +177,10 @@ def _or_sag(cause: Cause) -> Cause:
 
 
 def _named(rival: Rival) -> Indistinguishable:
-    effect = rival.effect
     by = "any_motion" if rival.is_same_anywhere else "this_motion"
-    if effect is None:
-        return Indistinguishable("unexplained", None, None, by, rival.probability, rival.described)
-    return Indistinguishable(effect.name, effect.where, effect.source, by, rival.probability)
+    if isinstance(rival.itself, Effect):
+        return Indistinguishable(*rival.itself.key, by, rival.probability)
+    return Indistinguishable("unexplained", None, None, by, rival.probability, rival.itself.what)
 
 
 def _outliers(diagnosis: Diagnosis) -> Cause:

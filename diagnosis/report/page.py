@@ -163,7 +163,7 @@ def _cause(
     return (
         f'<details class="cause"{state}><summary>{escape(said[0].upper() + said[1:])}</summary><div class="beside">'
         f"{_panels([plot])}<div><p>{tables.numbers(cause, timed=residuals.timed)}</p><p>{escape(cause.evidence)}</p>"
-        f"{tables.rivals(cause)}<p><b>What to do.</b> {escape(remedy)}</p></div></div></details>"
+        f"{tables.rivals(cause, file.seen_by)}<p><b>What to do.</b> {escape(remedy)}</p></div></div></details>"
     )
 
 

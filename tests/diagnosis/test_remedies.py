@@ -155,7 +155,7 @@ def test_of_a_cause_that_may_be_another_one_that_is_said_first(robot) -> None:
     effect = Effect.at(robot, "backlash", "elbow_pitch", values=[0.01])
     rival = Indistinguishable("settling", "elbow_pitch", None, "this_motion", 0.4)
     remedy = told(robot, cause(effect, probability=0.6, rivals=(rival,)))[0]
-    assert remedy.startswith("If it is backlash at elbow_pitch and not settling at elbow_pitch: tighten")
+    assert remedy.startswith("If it is play of joint elbow_pitch and not joint elbow_pitch read before")
 
 
 def test_numbers_have_the_digits_that_their_interval_has() -> None:

@@ -80,7 +80,7 @@ def test_tolerances_come_before_causes_of_little_weight():
 def test_an_undecided_headline_names_what_is_unsure():
     causes = [_zero("elbow", 0.6), _zero("wrist")]
     said = sentence("undecided", causes, Errors(5.0, 5.0, 1.0, 1.0, 0.9), Gain(80.0, (75.0, 85.0)))
-    assert said.endswith("Not sure: joint_offset at elbow; other causes explain as much")
+    assert said.endswith("Not sure: a wrong zero of joint elbow; other causes explain as much")
 
 
 def test_an_instrument_is_not_called_a_camera():
@@ -108,7 +108,7 @@ def test_tolerances_that_do_not_show_are_told_by_what_they_are_at_most():
 def test_an_alternative_that_is_more_probable_is_told_to_be_so() -> None:
     errors, gain = Errors(5.0, 5.0, 1.0, 1.0, 0.9), Gain(80.0, (75.0, 85.0))
     said = sentence("undecided", [_zero("elbow", probability=0.1)], errors, gain)
-    assert said.startswith("The zero of joint elbow is off by +1.15° (more probably link_geometry at elbow)")
+    assert said.startswith("The zero of joint elbow is off by +1.15° (more probably a wrong link before joint elbow)")
 
 
 def test_small_causes_less_probable_than_others_are_no_causes_in_the_headline() -> None:
