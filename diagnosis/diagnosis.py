@@ -27,7 +27,6 @@ from bodyschema.diagnosis.fit.contact import doubtful
 from bodyschema.diagnosis.fit.fit import Fit, fitted
 from bodyschema.diagnosis.fit.instrument import instrument_factor, reshaped
 from bodyschema.diagnosis.fit.observations import IntArray, Observations
-from bodyschema.diagnosis.search.alike import Alike, alike
 from bodyschema.diagnosis.search.drives import with_small_ripples
 from bodyschema.diagnosis.search.held_out import Added, Blocks, added, gain_percent, held_out_errors, is_marker
 from bodyschema.diagnosis.search.hypotheses import Hypotheses
@@ -247,15 +246,6 @@ class Diagnosis:
     def sought(self) -> Fit:
         """The complete fit over the rows in which causes were sought."""
         return self.extended if self.part is None else self.extended.over(self.part)
-
-    @cached_property
-    def alike(self) -> tuple[Alike, ...]:
-        """Confounded effects beside the best geometry."""
-        named = {cause.key for cause in self.causes}
-        joints = {cause.where for cause in self.causes}
-        geometry = self.geometry if self.part is None else self.geometry.over(self.part)
-        pairs = alike(geometry, (effect for effect in self.hypotheses.effects if effect.where in joints))
-        return tuple(pair for pair in pairs if named & {pair.one.key, pair.other.key})
 
     @cached_property
     def rejected(self) -> list[tuple[Candidate, Added]]:

@@ -21,7 +21,7 @@ from bodyschema.diagnosis.report.numbers import (
     telling,
 )
 from bodyschema.diagnosis.report.result import SMALL, Cause, DiagnosisFile, Errors, Indistinguishable, Verdict
-from bodyschema.diagnosis.report.text import beside_geometry, in_order, made_to, modelled, other_shares, to_do
+from bodyschema.diagnosis.report.text import in_order, made_to, modelled, other_shares, to_do
 
 # Number of rejected hypotheses shown.
 NEAREST = 6
@@ -72,8 +72,6 @@ def view(diagnosis: DiagnosisFile, remedies: Sequence[str], *, timed: bool) -> G
         parts.append(_list("Not distinguished", rivals))
     if diagnosis.rejected:
         parts.append(_rejected(diagnosis))
-    if alike := beside_geometry(diagnosis.rms_mm, diagnosis.alike):
-        parts.append(_list("Beside the best geometry", alike))
     first, small = to_do(diagnosis, remedies)
     if first:
         parts.append(_list("What to do", first, numbered=True))

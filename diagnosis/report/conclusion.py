@@ -19,7 +19,6 @@ from bodyschema.effects.effect_type import EffectType
 from bodyschema.interfaces.records import FloatArray
 
 from .result import (
-    Alike,
     Cause,
     DiagnosisFile,
     Errors,
@@ -73,7 +72,6 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
         stability=_stability(diagnosis, causes),
         advice=advice(diagnosis, causes, seen_by),
         limitations=_limitations(diagnosis),
-        alike=_alike(diagnosis),
         tolerances=tolerances,
         seen_by=seen_by,
         weighed=weighed,
@@ -83,10 +81,10 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
 def _tolerances(diagnosis: Diagnosis) -> Tolerances:
     found = diagnosis.tolerated
     units = np.array([1e3 * LENGTH_M, np.degrees(ANGLE_RAD), np.degrees(DRIVE_RAD)])
-    sizes = units * np.asarray(found.scales)
-    wide = np.exp(_HALF_WIDTH_95 * found.unsure)
-    lowest = np.where(found.seen, sizes / wide, 0.0)
-    highest = np.where(found.seen, sizes * wide, units * found.most)
+    sizes, seen = units * np.asarray(found.scales)[:3], found.seen[:3]
+    wide = np.exp(_HALF_WIDTH_95 * found.unsure[:3])
+    lowest = np.where(seen, sizes / wide, 0.0)
+    highest = np.where(seen, sizes * wide, units * found.most[:3])
     ends = zip(sizes.tolist(), lowest.tolist(), highest.tolist(), strict=True)
     intervals = [Interval(size, (low, high)) for size, low, high in ends]
     shares = diagnosis.shares
@@ -302,21 +300,6 @@ def _left_out(stored: Fit) -> str:
     return (
         f"extended.toml holds {held}: with all that was found here it would not surely be better on another recording. "
         "Record poses over the whole range of all joints."
-    )
-
-
-def _alike(diagnosis: Diagnosis) -> tuple[Alike, ...]:
-    return tuple(
-        Alike(
-            where=str(pair.one.where),
-            effect=pair.one.name,
-            other=pair.other.name,
-            explains_percent=100.0 * pair.one_explains,
-            other_explains_percent=100.0 * pair.other_explains,
-            shared_percent=100.0 * pair.shared,
-            delta_chi2=pair.preferred,
-        )
-        for pair in diagnosis.alike
     )
 
 

@@ -15,7 +15,7 @@ from bodyschema.diagnosis.report.numbers import chance, mm, share, told_values
 from bodyschema.diagnosis.report.presenters.outliers import outlier_panel
 from bodyschema.diagnosis.report.presenters.registry import presenter_of
 from bodyschema.diagnosis.report.result import Cause, DiagnosisFile, Gain, Verdict
-from bodyschema.diagnosis.report.text import beside_geometry, corrections, finding, in_order, made_to, modelled, to_do
+from bodyschema.diagnosis.report.text import corrections, finding, in_order, made_to, modelled, to_do
 from bodyschema.effects import Effect
 
 from . import tables
@@ -65,7 +65,6 @@ def page(diagnosis: Diagnosis, file: DiagnosisFile, remedies: Sequence[str], abo
         _glance(residuals, file),
         _causes(residuals, file, remedies),
         _tolerances(file),
-        _alike(file),
         _advice(file),
         _where(residuals),
         _against(residuals),
@@ -173,14 +172,6 @@ def _tolerances(file: DiagnosisFile) -> str:
     use = to_do(file, [])[0]
     told = " ".join([made_to(file.tolerances), *use])
     return f'<section id="tolerances"><p>{escape(told)}</p></section>'
-
-
-def _alike(file: DiagnosisFile) -> str:
-    told = beside_geometry(file.rms_mm, file.alike)
-    if not told:
-        return ""
-    pairs = _items(told[1:])
-    return f'<section id="alike"><h2>Beside the best geometry</h2><p>{escape(told[0])}</p><ul>{pairs}</ul></section>'
 
 
 def _advice(file: DiagnosisFile) -> str:

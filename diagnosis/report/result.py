@@ -120,26 +120,6 @@ class Rejected(msgspec.Struct, frozen=True):
     why: str = ""
 
 
-class Alike(msgspec.Struct, frozen=True):
-    """Two confounded effects at one joint, each fitted alone beside the best geometry.
-
-    Attributes:
-        effect: the one that explains most there.
-        other: the effect confounded with it.
-        explains_percent, other_explains_percent: explained shares of the squared error that the best geometry leaves.
-        shared_percent: share of what `other` explains that `effect` explains too.
-        delta_chi2: Δχ² of `effect` less that of `other`.
-    """
-
-    where: str
-    effect: str
-    other: str
-    explains_percent: float
-    other_explains_percent: float
-    shared_percent: float
-    delta_chi2: float
-
-
 class Unexplained(msgspec.Struct, frozen=True):
     """Structure that no effect fits: its size, the joints it depends on (`time` among them), and its p-value.
 
@@ -228,7 +208,6 @@ class DiagnosisFile(msgspec.Struct, frozen=True):
     stability: Stability | None
     advice: tuple[str, ...]
     limitations: tuple[str, ...]
-    alike: tuple[Alike, ...] = ()
     tolerances: Tolerances | None = None
     seen_by: Literal["camera", "instrument"] = "camera"
     weighed: bool = True

@@ -18,7 +18,7 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 
 from .numbers import told_values
-from .result import SMALL, SURE, Alike, Cause, DiagnosisFile, Errors, Gain, Interval, Tolerances, Unexplained, Verdict
+from .result import SMALL, SURE, Cause, DiagnosisFile, Errors, Gain, Interval, Tolerances, Unexplained, Verdict
 
 # Tolerances that leave at most this share of the error are mentioned.
 _BY_TOLERANCES = 0.95
@@ -215,23 +215,6 @@ def to_do(diagnosis: DiagnosisFile, remedies: Sequence[str]) -> tuple[list[str],
             " and no single one is worth mending."
         )
     return told, small
-
-
-def beside_geometry(rms: Errors, alike: Sequence[Alike]) -> list[str]:
-    """Return sentences on what the best geometry explains and which effects are confounded; empty if there are none."""
-    if rms.geometry is None or not alike:
-        return []
-    told = [
-        f"The best geometry, with every link, zero, the tool and the camera free, brings {rms.aligned:.3g} mm to "
-        f"{rms.geometry:.3g} mm. What is left can be described in more than one way:"
-    ]
-    for pair in alike:
-        told.append(
-            f"{pair.effect} and {pair.other} at {pair.where} share a direction: alone they explain "
-            f"{pair.explains_percent:.0f} % and {pair.other_explains_percent:.0f} % of what is left, and "
-            f"{pair.shared_percent:.0f} % of the smaller part is the same (Δχ² = {pair.delta_chi2:.0f} for the first)."
-        )
-    return told
 
 
 def modelled(left: Unexplained) -> str:

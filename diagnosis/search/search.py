@@ -13,7 +13,7 @@ from scipy.special import chdtri
 from bodyschema.diagnosis.fit.fit import Fit, improved
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.fit.scatter import beyond_single_rows, instruments, remembers
-from bodyschema.diagnosis.fit.worth import ANOTHER, NAMED, choices, nats, rise_for
+from bodyschema.diagnosis.fit.worth import NAMED, choices, nats, rise_for
 from bodyschema.effects import Effect, Identity
 
 from .held_out import Blocks, block_p_value
@@ -44,12 +44,10 @@ _OF_SINGLE_ROWS = 10.0
 _ELSEWHERE = 1.0
 # A period that explains less than before by this has diverged [nats].
 _ASTRAY = 5.0
-# An exchange with a smaller loss may pay off with one further cause [nats].
-_WITH_ONE_MORE = 100.0
 # With fewer blocks of time, p-values are too coarse; a gain above this needs no p-value [nats].
 _FEW_BLOCKS, _BEYOND_DOUBT = 20, 30.0
-# The camera's pose and the marker's position are simpler than the adjacent link, and so are two effects of one amount.
-_OF_A_LINK, _OF_A_PAIR = 1, 2
+# The camera's pose and the marker's position are simpler than the adjacent link.
+_OF_A_LINK = 1
 
 
 class Beside:
@@ -147,20 +145,15 @@ class Search:
             self._went_to(fit)
         while len(self.path) <= _MOST_STEPS and len(fit.causes) <= _MOST_CAUSES and len(self._seen) < _MOST_SETS:
             added, worth = self._added(fit)
-            if added is not None and len(fit.causes) >= asked + _ASKED_EACH:
+            if added is None or (causes := named(added.causes)) in self._seen:
+                break
+            if len(fit.causes) >= asked + _ASKED_EACH:
                 asked = len(fit.causes)
                 if enough(self.path, worth):
                     break
-            better = added or self._two_in_place_of_one(fit) or self._simpler_and_one_more(fit)
-            if better is None:
-                break
-            causes = named(better.causes)
-            if causes in self._seen:
-                break
-            if added is not None:
-                self._tell(f"found {describe(added.causes[-1])}")
+            self._tell(f"found {describe(added.causes[-1])}")
             self._seen.add(causes)
-            fit = self._reviewed(better)
+            fit = self._reviewed(added)
             self._went_to(fit)
         is_long = len(self.path) > _MOST_STEPS or len(self._seen) >= _MOST_SETS
         self.ended_early = is_long or len(fit.causes) > _MOST_CAUSES
@@ -191,62 +184,6 @@ class Search:
     def is_complete(self, fit: Fit) -> bool:
         """Return True if no further cause is worth naming."""
         return self._added(fit)[0] is None
-
-    def _two_in_place_of_one(self, fit: Fit) -> Fit | None:
-        """Replace a cause of many parameters by two causes of one parameter each; None if it does not pay."""
-        for cause in fit.causes:
-            beside = self.beside(fit, cause)
-            if simplicity(cause) <= _OF_A_PAIR:
-                continue
-            open_ones = [effect for effect in self._open(fit) if effect.key != cause.key]
-            pair = self._scan(fit).without(cause).best_pair(open_ones)
-            if pair is None or pair[0].gain < _COMES_NEAR * beside.itself.gain:
-                continue
-            pair = self._with_moments(beside.without, pair)
-            doubts = self.doubt(beside.itself) - self._doubt_of_pair(*pair)
-            dof = len(pair) - beside.itself.dof
-            least = fit.log_likelihood + rise_for(-doubts, dof)
-            tried = beside.with_instead(*(one.effect for one in pair), least=least)
-            worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), dof) + doubts
-            if worth > 0.0 and named(tried.causes) not in self._seen and all(c.is_possible for c in tried.causes):
-                self._tell(f"exchanged {describe(cause)} for {' and '.join(describe(one.effect) for one in pair)}")
-                return tried
-        return None
-
-    def _doubt_of_pair(self, one: Candidate, other: Candidate) -> float:
-        """Return the multiplicity penalty of two causes named together [nats]."""
-        alike = one.effect.kind is other.effect.kind
-        further = min(self.doubt(other), ANOTHER + float(np.log(other.trials))) if alike else self.doubt(other)
-        return self.doubt(one) + further
-
-    def _with_moments(self, fit: Fit, pair: tuple[Candidate, Candidate]) -> tuple[Candidate, Candidate]:
-        """Return two candidates; the moment of each is the best one beside the other."""
-        one, other = pair
-        if one.effect.kind.begins:
-            one = Scan(fit.with_causes([*fit.causes, other.effect])).candidate(one.effect) or one
-        if other.effect.kind.begins:
-            other = Scan(fit.with_causes([*fit.causes, one.effect])).candidate(other.effect) or other
-        return one, other
-
-    def _simpler_and_one_more(self, fit: Fit) -> Fit | None:
-        """Replace a cause by a simpler rival and add another cause; None if it does not pay.
-
-        A cause of many parameters may stand for a simpler one and a small one together.
-        """
-        for cause in fit.causes:
-            beside = self.beside(fit, cause)
-            for candidate in beside.candidates:
-                if candidate.dof >= beside.itself.dof or candidate.gain < _COMES_NEAR * beside.itself.gain:
-                    continue
-                tried, worth = self._exchanged(fit, beside, candidate, -_WITH_ONE_MORE)
-                if worth < -_WITH_ONE_MORE or named(tried.causes) in self._seen or not tried.causes[-1].is_possible:
-                    continue
-                better, more = self._added(tried)
-                if better is not None and worth + more > 1.0:
-                    found = f"{describe(candidate.effect)} and {describe(better.causes[-1])}"
-                    self._tell(f"exchanged {describe(cause)} for {found}")
-                    return better
-        return None
 
     def _exchanged(self, fit: Fit, beside: Beside, candidate: Candidate, least: float) -> tuple[Fit, float]:
         """Exchange a cause for a candidate, and return the evidence gain [nats]; approximate if below `least`."""
