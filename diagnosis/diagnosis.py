@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,6 @@ from bodyschema.diagnosis.assess.explanation import (
     Explanation,
     changed_by_the_way,
     explain,
-    needs_no_more_names,
     useful,
     without_one,
 )
@@ -408,8 +407,7 @@ def _found(
     # The set of causes compared best tells the noise, and the rows that they leave out, before the long search.
     begun, start = _counted(begun, start, simulation)
     unknowns = Unknowns(start)
-    enough = partial(needs_no_more_names, unknowns=unknowns, search=search)
-    extended = search.run(begun, enough) if start.is_exact else _searched(begun, search, enough)
+    extended = search.run(begun) if start.is_exact else _searched(begun, search)
     other_shape = None if start.is_exact else reshaped(extended)
     if other_shape is not None and (rattle(extended) or explain(extended, search.path, unknowns, search, told).unknown):
         # What is left is not noise alone.
@@ -417,8 +415,7 @@ def _found(
     again, start = (extended, start) if search.ended_early else _counted(extended, start, simulation, other_shape)
     if again is not extended:
         unknowns = Unknowns(start)
-        enough = partial(needs_no_more_names, unknowns=unknowns, search=search)
-        extended = _searched(again, search, enough)
+        extended = _searched(again, search)
     loose = None if start.is_exact else rattle(extended)
     if loose is not None and explain(extended, search.path, unknowns, search, told).unknown:
         # An error of the last joint moves the marker along one line as well.
@@ -432,8 +429,7 @@ def _found(
         search = Search(fixed, told)
         start = aligned(start.observations.with_rattle(loose.ratio, loose.ways), simulation)
         unknowns = Unknowns(start)
-        enough = partial(needs_no_more_names, unknowns=unknowns, search=search)
-        extended = _searched(together(start, fixed, told), search, enough)
+        extended = _searched(together(start, fixed, told), search)
         loose = rattle(extended) or loose
     told.begin(NAMELESS, SEARCH)
     explanation = useful(explain(extended, search.path, unknowns, search, told), search, blocks, told)
@@ -487,12 +483,12 @@ def _stored(start: Fit, alone: Fit, complete: Fit, left: Leftover, blocks: Block
     return best
 
 
-def _searched(begun: Fit, search: Search, enough: Callable[[Sequence[Fit], float], bool]) -> Fit:
+def _searched(begun: Fit, search: Search) -> Fit:
     """Run the search for causes from a fit, and refit with tolerances updated to what it finds."""
     extended = begun
     for _ in range(_RESCALED):
         begun = _with_small_ones_tolerated(begun)
-        extended = search.run(begun, enough)
+        extended = search.run(begun)
         before = extended.background.scales or Scales()
         # Unnamed causes may be all there is, and inflate the apparent tolerances.
         bare = extended.with_causes([])

@@ -19,6 +19,7 @@ from bodyschema.effects.effect_type import EffectType
 from bodyschema.interfaces.records import FloatArray
 
 from .result import (
+    OUTLIERS,
     Cause,
     DiagnosisFile,
     Errors,
@@ -27,7 +28,6 @@ from .result import (
     Interval,
     Pairs,
     Rejected,
-    Stability,
     Tolerances,
     Unexplained,
     Verdict,
@@ -69,7 +69,6 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
         causes=causes,
         rejected=_rejected(diagnosis),
         unexplained=_unexplained(diagnosis),
-        stability=_stability(diagnosis, causes),
         advice=advice(diagnosis, causes, seen_by),
         limitations=_limitations(diagnosis),
         tolerances=tolerances,
@@ -146,7 +145,6 @@ def _causes(diagnosis: Diagnosis, seen_by: str) -> tuple[Cause, ...]:
                 probability=sure * standing.probability,
                 share_of_gain_percent=100.0 * share,
                 held_out_gain_percent=100.0 * (1.0 - squares**-0.5),
-                stability_percent=100.0 * float(standing.again.mean()),
                 indistinguishable_from=tuple(_named(r) for r in standing.rivals if r.is_same_here),
                 rivals=tuple(_named(r) for r in standing.rivals),
                 evidence=evidence(standing, seen_by),
@@ -186,14 +184,13 @@ def _outliers(diagnosis: Diagnosis) -> Cause:
     share = found / n
     half = _HALF_WIDTH_95 * float(np.sqrt(share * (1.0 - share) / n))
     return Cause(
-        effect="outliers",
+        effect=OUTLIERS,
         where=None,
         source=None,
         parameters={"share": Interval(share, (max(share - half, 0.0), share + half))},
         probability=1.0,
         share_of_gain_percent=0.0,
         held_out_gain_percent=0.0,
-        stability_percent=None,
         indistinguishable_from=(),
         rivals=(),
         evidence=f"{found} of {n} fixes are farther from all others than the noise can put them.",
@@ -301,12 +298,6 @@ def _left_out(stored: Fit) -> str:
         f"extended.toml holds {held}: with all that was found here it would not surely be better on another recording. "
         "Record poses over the whole range of all joints."
     )
-
-
-def _stability(diagnosis: Diagnosis, causes: tuple[Cause, ...]) -> Stability | None:
-    # Outliers come last and have no standing.
-    again = [standing.again for cause, standing in zip(causes, diagnosis.standings, strict=False) if not cause.is_small]
-    return Stability(len(again[0]), int(np.all(again, axis=0).sum())) if again else None
 
 
 def _unexplained(diagnosis: Diagnosis) -> Unexplained:

@@ -122,9 +122,6 @@ def _glance(residuals: Residuals, file: DiagnosisFile) -> str:
         (f"{mm(rms.noise_floor)} mm", "noise alone (RMS)"),
         (f"{file.pairs.outliers:,} of {file.pairs.total:,}", f"fixes that are not the marker{_counted(gain)}"),
     ]
-    if file.stability is not None:
-        same = f"{file.stability.same_causes} of {file.stability.resampled}"
-        tiles.append((same, "resampled recordings with the same large causes"))
     items = "".join(f"<div><b>{value}</b><span>{escape(label)}</span></div>" for value, label in tiles)
     return (
         f'<section><div class="tiles">{items}</div><div class="beside"><div>{_panels([histogram(residuals)])}</div>'

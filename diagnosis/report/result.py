@@ -10,6 +10,8 @@ import msgspec
 SMALL = 5.0
 # A less probable cause leaves the verdict open, and is to be confirmed first.
 SURE = 0.9
+# Fixes that are not the marker, as a cause.
+OUTLIERS = "outliers"
 # Probability of what is no more probable than not.
 _EVEN = 0.5
 Verdict = Literal["explained", "nothing_found", "undecided", "unexplained"]
@@ -62,7 +64,6 @@ class Cause(msgspec.Struct, frozen=True):
     Attributes:
         share_of_gain_percent: share of the explained squared error, tolerances included.
         held_out_gain_percent: rise of the held-out RMS without it, all else refitted.
-        stability_percent: share of block resamplings in which it is named again.
     """
 
     effect: str
@@ -72,7 +73,6 @@ class Cause(msgspec.Struct, frozen=True):
     probability: float
     share_of_gain_percent: float
     held_out_gain_percent: float
-    stability_percent: float | None
     indistinguishable_from: tuple[Indistinguishable, ...]
     rivals: tuple[Indistinguishable, ...]
     evidence: str
@@ -85,7 +85,7 @@ class Cause(msgspec.Struct, frozen=True):
     @property
     def is_small(self) -> bool:
         """True for an effect of little weight; fixes that are not the marker have none."""
-        return self.stability_percent is not None and self.weight_percent < SMALL
+        return self.effect != OUTLIERS and self.weight_percent < SMALL
 
     @property
     def leaves_open(self) -> bool:
@@ -181,13 +181,6 @@ class Errors(msgspec.Struct, frozen=True):
     noise_floor: float | None
 
 
-class Stability(msgspec.Struct, frozen=True):
-    """Number of block resamplings that give the same causes, small ones aside; None where all are small."""
-
-    resampled: int
-    same_causes: int
-
-
 class DiagnosisFile(msgspec.Struct, frozen=True):
     """The contents of `diagnosis.json`.
 
@@ -205,7 +198,6 @@ class DiagnosisFile(msgspec.Struct, frozen=True):
     causes: tuple[Cause, ...]
     rejected: tuple[Rejected, ...]
     unexplained: Unexplained
-    stability: Stability | None
     advice: tuple[str, ...]
     limitations: tuple[str, ...]
     tolerances: Tolerances | None = None

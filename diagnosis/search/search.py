@@ -27,8 +27,6 @@ _WORTH_IN_FULL = 0.2
 _MOST_CAUSES, _MOST_STEPS = 12, 20
 # More jumps, slips and bumps than this in one recording describe something that comes and goes.
 _MOST_MOMENTS = 3
-# Check for completeness each time after this many further causes.
-_ASKED_EACH = 3
 # Maximum of sets of causes to examine; none is examined twice.
 _MOST_SETS = 60
 # Multiple of a limit, and the margin to it [nats], beyond which the first order decides.
@@ -129,28 +127,21 @@ class Search:
         self.path: list[Fit] = []
         self.ended_early = False
 
-    def run(self, start: Fit, enough: Callable[[Sequence[Fit], float], bool] = lambda *_: False) -> Fit:
+    def run(self, start: Fit) -> Fit:
         """Find the causes on top of the parameters that `start` has fitted.
 
         Afterwards `ended_early` is True if the number of steps ended the search before it converged.
-
-        Args:
-            enough: called with the fits so far and the worth of one more cause [nats]; True ends the search.
         """
-        fit, self.ended_early, asked = start, False, 0
+        fit, self.ended_early = start, False
         self._seen: set[Named] = set()
         self.path = [start]
         if start.causes:
             fit = self._reviewed(start)
             self._went_to(fit)
         while len(self.path) <= _MOST_STEPS and len(fit.causes) <= _MOST_CAUSES and len(self._seen) < _MOST_SETS:
-            added, worth = self._added(fit)
+            added = self._added(fit)
             if added is None or (causes := named(added.causes)) in self._seen:
                 break
-            if len(fit.causes) >= asked + _ASKED_EACH:
-                asked = len(fit.causes)
-                if enough(self.path, worth):
-                    break
             self._tell(f"found {describe(added.causes[-1])}")
             self._seen.add(causes)
             fit = self._reviewed(added)
@@ -164,8 +155,8 @@ class Search:
         self.path[-1] = replace(self.path[-1])
         self.path.append(fit)
 
-    def _added(self, fit: Fit) -> tuple[Fit | None, float]:
-        """Add one more cause and return its worth [nats]; None if no candidate is probable enough."""
+    def _added(self, fit: Fit) -> Fit | None:
+        """Add one more cause; None if no candidate is probable enough."""
         best, most = None, NAMED
         known = self._known[1] if self._known[0] is fit else None
         for candidate in self.shortlist(known or Scan(fit), self._open(fit)):
@@ -179,11 +170,7 @@ class Search:
             worth = nats(gain, candidate.dof) - doubt
             if worth > most and tried.causes[-1].is_possible:
                 best, most = tried, worth
-        return best, most
-
-    def is_complete(self, fit: Fit) -> bool:
-        """Return True if no further cause is worth naming."""
-        return self._added(fit)[0] is None
+        return best
 
     def _exchanged(self, fit: Fit, beside: Beside, candidate: Candidate, least: float) -> tuple[Fit, float]:
         """Exchange a cause for a candidate, and return the evidence gain [nats]; approximate if below `least`."""

@@ -50,7 +50,6 @@ def cause(effect: Effect, **more) -> Cause:
         told["probability"],
         100.0,
         1.0,
-        100.0,
         (),
         told["rivals"],
         "",
@@ -60,7 +59,7 @@ def cause(effect: Effect, **more) -> Cause:
 def told(robot: RobotDescription, *causes: Cause, step: float = 0.0, torque: float | None = None) -> list[str]:
     file = DiagnosisFile(
         "explained", "", Pairs(1, 1, 0), ERRORS, ERRORS, Gain(0.0, (0.0, 0.0)), causes, (), Unexplained(0.0, (), 1.0),
-        None, (), (),
+        (), (),
     )  # fmt: skip
     d = len(robot.joints)
     return remedies(file, robot, np.full(d, step), None if torque is None else np.full(d, torque))
