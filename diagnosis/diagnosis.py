@@ -22,7 +22,6 @@ from bodyschema.diagnosis.assess.shares import Shares, shares
 from bodyschema.diagnosis.assess.stored import is_better_with, stored
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.background import Scales
-from bodyschema.diagnosis.fit.contact import doubtful
 from bodyschema.diagnosis.fit.fit import Fit, fitted
 from bodyschema.diagnosis.fit.instrument import instrument_factor, reshaped
 from bodyschema.diagnosis.fit.observations import IntArray, Observations
@@ -155,7 +154,7 @@ class Diagnosis:
 
     @property
     def _off(self) -> np.ndarray:
-        return ~self.markers & self.extended.observations.trusted & ~doubtful(self.extended)
+        return ~self.markers & self.extended.observations.trusted & ~self.extended.doubtful()
 
     @property
     def outliers_are_found(self) -> bool:
@@ -387,7 +386,7 @@ def _moment_anew(fit: Fit, cause: Effect, searched: FloatArray) -> Candidate | N
 
 def _left_out(fit: Fit) -> NDArray[np.bool_]:
     """Return the rows (n,) to leave out because their history is not known well enough, if they are not too many."""
-    rows = doubtful(fit)
+    rows = fit.doubtful()
     return rows if rows.mean() <= MOST_DOUBTFUL else np.zeros_like(rows)
 
 

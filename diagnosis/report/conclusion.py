@@ -8,7 +8,6 @@ import numpy as np
 from bodyschema.diagnosis.assess.rivals import Rival, Standing
 from bodyschema.diagnosis.diagnosis import MOST_DOUBTFUL, Diagnosis
 from bodyschema.diagnosis.fit.background import ANGLE_RAD, DRIVE_RAD, LENGTH_M
-from bodyschema.diagnosis.fit.contact import doubtful
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.worth import NAMED, nats
 from bodyschema.diagnosis.search.aliases import alias_sentences
@@ -268,7 +267,7 @@ def _why_not(diagnosis: Diagnosis, candidate: Candidate, tried: int) -> str:
 def _limitations(diagnosis: Diagnosis) -> tuple[str, ...]:
     told = list(diagnosis.hypotheses.limitations)
     sided = [cause for cause in diagnosis.causes if cause.kind.by_direction]
-    unknown_side = doubtful(diagnosis.extended, sided).mean()
+    unknown_side = diagnosis.extended.doubtful(sided).mean()
     if unknown_side > MOST_DOUBTFUL:
         joints = ", ".join(str(cause.where) for cause in sided)
         told.append(

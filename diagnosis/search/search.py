@@ -91,9 +91,9 @@ class Beside:
         least = self._fit.log_likelihood - rise
         return improved(self._fit.starting(self._others), least).log_likelihood > least
 
-    def with_instead(self, *effects: Effect, least: float = -np.inf) -> Fit:
-        """Refit with others in the place of the cause; give up where `least` is out of reach [nats]."""
-        return improved(self._fit.starting([*self._others, *effects]), least)
+    def elsewhere(self, least: float) -> Fit:
+        """Refit with the best moment or period of the cause; give up where `least` is out of reach [nats]."""
+        return improved(self._fit.starting([*self._others, self.itself.effect]), least)
 
     def exchanged(self, candidate: Candidate, least: float) -> Fit:
         """Refit with a candidate in the place of the cause; the best such fit is kept."""
@@ -293,7 +293,7 @@ class Search:
         """Return the fit with a cause refined, dropped or exchanged; None if it stays as it is."""
         beside = self.beside(fit, cause)
         if beside.itself.gain > beside.gain + _ELSEWHERE:
-            tried = beside.with_instead(beside.itself.effect, least=fit.log_likelihood + _ELSEWHERE)
+            tried = beside.elsewhere(fit.log_likelihood + _ELSEWHERE)
             if tried.log_likelihood > fit.log_likelihood + _ELSEWHERE:
                 return tried
         if beside.in_parts is not None and beside.in_parts.effect.free != cause.free:
